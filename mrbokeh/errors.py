@@ -1,0 +1,12 @@
+"""The one exception that means "the user can mend this": the command line prints it as a sentence, without a traceback."""
+
+
+class InputError(ValueError):
+    """Bad input. The message says what was expected, what came, and what to do next."""
+
+
+class MissingExtraError(InputError):
+    """A package of an optional extra is not installed; the message names the pip command that adds it."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(f"this command needs the package {package!r}, which is not installed. Add it with: pip install 'mrbokeh[{extra}]'")

@@ -1,0 +1,188 @@
+"""FocalStack: one viewpoint photographed at many focus distances, and the folder that holds it (contract 1)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.camera import Camera
+from mrbokeh.camera_file import camera_from_json, camera_to_json
+from mrbokeh.errors import InputError
+from mrbokeh.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.image_io import read_image, write_image
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import lens_from_json, lens_to_json
+
+FORMAT = "mrbokeh-focal-stack"
+VERSION = 1
+FILE_NAME = "stack.json"
+
+
+@dataclass(frozen=True)
+class Slice:
+    """One photograph of the stack.
+
+    path: relative to the folder of the stack; scene-linear EXR.
+    focus_distance_m: from the lens to the plane in focus, or None where nobody knows.
+    scale: how much registration enlarged the slice to match the reference (1 where it did nothing).
+    metadata: what the source file told (exposure_time_s, iso, source, ...).
+    """
+
+    path: str
+    focus_distance_m: float | None
+    scale: float = 1.0
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FocalStack:
+    """A folder with slices, and once merged an all-in-focus image and depth. Pictures are read when asked for.
+
+    lens: the lens with the focus of the reference slice, or None where focal length, f-number or sensor are unknown.
+    camera: intrinsics of the registered pictures, or None.
+    registered: the slices share the geometry of the all-in-focus image.
+    """
+
+    folder: Path
+    slices: tuple[Slice, ...]
+    lens: Lens | None = None
+    camera: Camera | None = None
+    reference: int = 0
+    registered: bool = False
+    merged: bool = False
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.slices)
+
+    @property
+    def focus_distances_m(self) -> tuple[float | None, ...]:
+        return tuple(each.focus_distance_m for each in self.slices)
+
+    @property
+    def is_metric(self) -> bool:
+        """Every focus distance is known, so that depth is in metres; else it is the index of the sharpest slice."""
+        return all(distance is not None for distance in self.focus_distances_m)
+
+    def slice_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
+        return read_image(self.folder / self.slices[index].path)
+
+    def iter_rgb(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
+        return (self.slice_rgb(index) for index in range(len(self)))
+
+    @property
+    def all_in_focus_path(self) -> Path:
+        return self.folder / "all_in_focus.exr"
+
+    @property
+    def depth_path(self) -> Path:
+        return self.folder / "depth.exr"
+
+    def all_in_focus(self) -> Float32[np.ndarray, "height width 3"]:
+        self._require_merged()
+        return read_image(self.all_in_focus_path)
+
+    def depth_m(self) -> Float32[np.ndarray, "height width"]:
+        """(H, W) metres along the optical axis. Raises InputError where focus distances are unknown."""
+        if not self.is_metric:
+            raise InputError(f"{self.folder} has no depth in metres because its focus distances are unknown: add them to lens.toml and ingest again")
+        return self._depth_channel("Z")
+
+    def focus_index(self) -> Float32[np.ndarray, "height width"]:
+        """(H, W) the (fractional) index of the slice in which each pixel is sharp."""
+        return self._depth_channel("focus_index")
+
+    def depth_confidence(self) -> Float32[np.ndarray, "height width"]:
+        """(H, W) in [0, 1]: how far the depth of a pixel can be trusted; 0 is a guess from its neighbours."""
+        return self._depth_channel("confidence")
+
+    def depth_valid(self, least_confidence: float = 0.1) -> Bool[np.ndarray, "height width"]:
+        return self.depth_confidence() >= least_confidence
+
+    def lens_of(self, index: int) -> Lens:
+        """The lens as it was focused for one slice."""
+        distance = self.slices[index].focus_distance_m
+        if self.lens is None or distance is None:
+            raise InputError(
+                f"{self.folder} does not know its lens and focus distances: give focal_length_mm, f_number, sensor_width_mm and "
+                f"focus_distances_m in a lens.toml beside the photographs and ingest again"
+            )
+        return self.lens.focused_at(distance)
+
+    def coc_px(self, index: int, depth_m: Float[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
+        """Signed circle of confusion (diameter) of a registered slice: what registration enlarged grew with it."""
+        coc_px = self.lens_of(index).coc_px(depth_m, depth_m.shape[1]) * self.slices[index].scale
+        return coc_px.astype(np.float32)
+
+    def _depth_channel(self, name: str) -> Float32[np.ndarray, "height width"]:
+        self._require_merged()
+        return read_exr(self.depth_path)[0].stacked([name])[..., 0]
+
+    def _require_merged(self) -> None:
+        if not self.merged:
+            raise InputError(f"{self.folder} has no all-in-focus image and depth yet: run `mrbokeh capture merge` on it")
+
+
+def write_merged(
+    folder: Path,
+    all_in_focus: Float32[np.ndarray, "height width 3"],
+    focus_index: Float32[np.ndarray, "height width"],
+    confidence: Float32[np.ndarray, "height width"],
+    depth_m: Float32[np.ndarray, "height width"] | None,
+) -> None:
+    """The pictures of a merged stack: all_in_focus.exr and depth.exr (focus_index, confidence and, if metric, Z)."""
+    write_image(folder / "all_in_focus.exr", all_in_focus, half=False)
+    channels = {"focus_index": focus_index, "confidence": confidence} | ({} if depth_m is None else {"Z": depth_m})
+    write_exr(folder / "depth.exr", ExrPart(channels))
+
+
+def write_focal_stack(stack: FocalStack) -> None:
+    """Write stack.json; the pictures must be in the folder already."""
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "reference": stack.reference,
+        "registered": stack.registered,
+        "merged": stack.merged,
+        "lens": None if stack.lens is None else lens_to_json(stack.lens),
+        "camera": None if stack.camera is None else camera_to_json(stack.camera),
+        "slices": [vars(each) for each in stack.slices],
+        "metadata": stack.metadata,
+    }
+    write_json(stack.folder / FILE_NAME, document)
+
+
+def read_focal_stack(folder: Path) -> FocalStack:
+    """The stack in a folder; pictures are not opened. Raises InputError where the folder is not one."""
+    folder = Path(folder)
+    document = read_json(folder / FILE_NAME, "a focal stack")
+    if document.get("format") != FORMAT or document.get("version") != VERSION:
+        raise InputError(
+            f"{folder / FILE_NAME}: expected format {FORMAT!r} version {VERSION}, "
+            f"got {document.get('format')!r} version {document.get('version')!r}; ingest the photographs again"
+        )
+    try:
+        return FocalStack(
+            folder=folder,
+            slices=tuple(Slice(**each) for each in document["slices"]),
+            lens=None if document["lens"] is None else lens_from_json(document["lens"], str(folder)),
+            camera=None if document["camera"] is None else camera_from_json(document["camera"]),
+            reference=document["reference"],
+            registered=document["registered"],
+            merged=document["merged"],
+            metadata=document["metadata"],
+        )
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder / FILE_NAME} is incomplete ({error!r}): ingest the photographs again") from None
+
+
+def find_focal_stacks(scene: Path) -> list[FocalStack]:
+    """The stacks of a scene: the folder itself, or the folders under it, by name."""
+    folders = sorted(path.parent for path in Path(scene).rglob(FILE_NAME))
+    if not folders:
+        raise InputError(f"expected a focal stack (a folder with {FILE_NAME}) in {scene}, found none: run `mrbokeh capture ingest` first")
+    return [read_focal_stack(folder) for folder in folders]

@@ -1,0 +1,117 @@
+"""Pictures and layers to and from scene-linear float32: EXR and HDR as they are, PNG, TIFF and JPEG through a stated encoding."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mrbokeh.atomic_files import atomic_path
+from mrbokeh.color import linear_to_srgb, srgb_to_linear
+from mrbokeh.errors import InputError
+from mrbokeh.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.layer import Layer
+
+Encoding = Literal["srgb", "linear"]
+
+INTEGER_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+LINEAR_SUFFIXES = (".exr", ".hdr")
+_DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z")
+_INTEGER_RANGE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+
+
+def read_image(path: Path, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
+    """A picture as scene-linear RGB (H, W, 3); transparent pictures lose their alpha (see `read_layer`).
+
+    encoding: what the numbers of an integer file (PNG, TIFF, JPEG) mean; EXR, HDR and float TIFF are linear already.
+    """
+    return _read_rgba(Path(path), encoding)[..., :3]
+
+
+def write_image(path: Path, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
+    """Write scene-linear RGB. EXR keeps it (half or float); PNG and TIFF store 16 bit, JPEG 8 bit, clipped to [0, 1]."""
+    path = Path(path)
+    if path.suffix.lower() == ".exr":
+        dtype = np.float16 if half else np.float32
+        return write_exr(path, ExrPart({name: rgb[..., i].astype(dtype) for i, name in enumerate("RGB")}))
+    _write_integer_image(path, np.asarray(rgb, np.float32), encoding)
+
+
+def read_layer(path: Path) -> Layer:
+    """A layer from an EXR with R, G, B and, where present, A and Z (or depth.Z), in one part or several.
+
+    Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf.
+    """
+    channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
+    rgb = ExrPart(channels).stacked("RGB")
+    alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
+    depth = next((channels[name] for name in _DEPTH_NAMES if name in channels), np.zeros(rgb.shape[:2])).astype(np.float32)
+    return Layer(rgb, alpha, np.where((depth > 0) & (alpha > 0), depth, np.inf).astype(np.float32))
+
+
+def write_layer(path: Path, layer: Layer, *, half: bool = True) -> None:
+    """A layer as EXR: R, G, B, A in half or float and Z (metres along the optical axis, not antialiased) in float."""
+    colour = np.float16 if half else np.float32
+    channels = {name: layer.rgb[..., i].astype(colour) for i, name in enumerate("RGB")}
+    channels |= {"A": layer.alpha.astype(colour), "Z": layer.depth_m.astype(np.float32)}
+    write_exr(path, ExrPart(channels, attributes={"comments": "premultiplied alpha; Z in metres along the optical axis, not antialiased"}))
+
+
+def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height width channels"]:
+    if not path.is_file():
+        raise InputError(f"expected a picture at {path}, but there is no such file")
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        layer = read_layer(path)
+        return np.dstack([layer.rgb, layer.alpha])
+    if suffix not in INTEGER_SUFFIXES + LINEAR_SUFFIXES:
+        raise InputError(f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
+    pixels = _decode(path)
+    if pixels.dtype.kind == "f":
+        return pixels.astype(np.float32)
+    if pixels.dtype not in _INTEGER_RANGE:
+        raise InputError(f"{path} stores {pixels.dtype}: expected 8 or 16 bit integers or float")
+    scaled = (pixels / np.float32(_INTEGER_RANGE[pixels.dtype])).astype(np.float32)
+    if encoding == "srgb":
+        scaled[..., :3] = srgb_to_linear(scaled[..., :3])
+    return scaled
+
+
+def _decode(path: Path) -> np.ndarray:
+    """The stored numbers as (H, W, 3 or 4), RGB order."""
+    import cv2
+
+    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise InputError(f"{path} cannot be read as a picture: it is damaged or not what its suffix says")
+    if pixels.ndim == 2:
+        return np.repeat(pixels[..., None], 3, axis=2)
+    order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]
+    return np.ascontiguousarray(pixels[..., order])
+
+
+def _write_integer_image(path: Path, rgb: Float32[np.ndarray, "height width 3"], encoding: Encoding) -> None:
+    import cv2
+
+    suffix = path.suffix.lower()
+    if suffix not in INTEGER_SUFFIXES:
+        raise InputError(f"cannot write {path}: expected .exr, {', '.join(INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
+    stored = linear_to_srgb(rgb) if encoding == "srgb" else rgb
+    dtype = np.uint8 if suffix in (".jpg", ".jpeg") else np.uint16
+    integers = np.round(np.clip(np.nan_to_num(stored), 0, 1) * np.iinfo(dtype).max).astype(dtype)
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(integers[..., ::-1]))
+    if not done:
+        raise InputError(f"cannot encode a picture of shape {rgb.shape} as {suffix}")
+    with atomic_path(path) as temporary:
+        data.tofile(temporary)
+
+
+def write_preview(path: Path, rgb: Float32[np.ndarray, "height width 3"], exposure_stops: float = 0.0) -> None:
+    """An 8-bit tone-mapped sRGB picture for people to look at."""
+    import cv2
+
+    from mrbokeh.color import display_rgb8
+
+    data = cv2.imencode(Path(path).suffix, np.ascontiguousarray(display_rgb8(rgb, exposure_stops)[..., ::-1]))[1]
+    with atomic_path(path) as temporary:
+        data.tofile(temporary)
