@@ -1,0 +1,35 @@
+# Everything sets itself up: a virtual environment in .venv with the tested versions of constraints.txt.
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin
+READY := $(VENV)/.installed
+OUT ?= demo_out
+
+.PHONY: demo test test-slow check bench clean
+
+demo: $(READY)
+	$(RUN)/mrbokeh demo --out $(OUT)
+
+test: $(READY)
+	$(RUN)/python -m pytest -n 2 -m "not slow"
+
+test-slow: $(READY)
+	$(RUN)/python -m pytest -m slow
+
+check: $(READY)
+	$(RUN)/ruff format --check .
+	$(RUN)/ruff check .
+	$(RUN)/mypy
+	$(RUN)/python -m pytest -n 2 -m "not slow"
+
+bench: $(READY)
+	for bench in tests/bench_*.py; do $(RUN)/python -m tests.$$(basename $$bench .py) || exit 1; done
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(RUN)/python -m pip install --quiet --upgrade pip
+	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,38 @@
+"""mrbokeh: rendered 3D objects in real photographs, with the blur of the real lens.
+
+The public names load on first use, so that `import mrbokeh` stays cheap.
+"""
+
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+_PUBLIC = {
+    "Aperture": "mrbokeh.aperture",
+    "Camera": "mrbokeh.camera",
+    "FocalStack": "mrbokeh.focal_stack",
+    "InputError": "mrbokeh.errors",
+    "Layer": "mrbokeh.layer",
+    "Lens": "mrbokeh.lens",
+    "Psf": "mrbokeh.psf",
+    "Renderer": "mrbokeh.renderers.base",
+    "read_focal_stack": "mrbokeh.focal_stack",
+    "read_image": "mrbokeh.image_io",
+    "read_layer": "mrbokeh.image_io",
+    "read_lens": "mrbokeh.lens_file",
+    "write_image": "mrbokeh.image_io",
+    "write_layer": "mrbokeh.image_io",
+    "write_lens": "mrbokeh.lens_file",
+}
+__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+
+try:
+    __version__ = version("mrbokeh")
+except PackageNotFoundError:
+    __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'mrbokeh' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)

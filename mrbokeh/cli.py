@@ -1,0 +1,105 @@
+"""`mrbokeh`: one typer app; the package behind a sub-command is imported when it is called, not before."""
+
+import sys
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import typer
+from rich.console import Console
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from mrbokeh.errors import InputError, MissingExtraError
+
+# Where a module can be missing because its extra was not installed.
+EXTRA_OF_MODULE = {
+    "rawpy": "capture",
+    "pyexiv2": "capture",
+    "torch": "train",
+    "onnx": "train",
+    "onnxscript": "train",
+    "aiohttp": "viewfinder",
+}
+
+
+class SubCommand(NamedTuple):
+    module: str
+    summary: str
+
+
+SUB_COMMANDS = {
+    "capture": SubCommand("capture.cli", "Photographs at many focus distances become an all-in-focus image with depth."),
+    "train": SubCommand("training.cli", "Focal stacks become a network that blurs like this very lens."),
+    "lens": SubCommand("mrbokeh.commands.lens", "Make, inspect and draw lens files."),
+    "render": SubCommand("mrbokeh.commands.render", "Blur layers as a lens does."),
+    "composite": SubCommand("mrbokeh.commands.composite", "Put virtual objects into a photograph."),
+    "video": SubCommand("mrbokeh.commands.video", "Put virtual objects into a video."),
+    "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),
+    "demo": SubCommand("mrbokeh.commands.demo", "The whole way on shipped photographs, with a report."),
+    "doctor": SubCommand("mrbokeh.commands.doctor", "What is installed, what is missing, and what it would enable."),
+}
+
+
+def _placeholder(name: str, summary: str) -> Any:
+    """What the list of commands shows in place of a command that is not loaded."""
+    app = typer.Typer(add_completion=False)
+    app.command(name, help=summary)(lambda: None)
+    return get_command(app)
+
+
+class LazyGroup(TyperGroup):
+    """A group that loads a sub-command's module when the sub-command is called (or completed, or asked for help)."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = {name: _placeholder(name, each.summary) for name, each in SUB_COMMANDS.items()}
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, command, rest = super().resolve_command(ctx, args)
+        if name in SUB_COMMANDS:
+            command = get_command(import_module(SUB_COMMANDS[name].module).app)
+            command.name = name
+        return name, command, rest
+
+
+app = typer.Typer(cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]})
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from mrbokeh import __version__
+
+        typer.echo(f"mrbokeh {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Print the version and leave.")) -> None:
+    """Rendered 3D objects in real photographs, videos and a live viewfinder, with the blur of the real lens.
+
+    Example: mrbokeh demo --out demo_out
+    """
+
+
+def main() -> None:
+    """The console script: mistakes of the user end in one sentence and exit code 2, without a traceback."""
+    try:
+        app()
+    except InputError as error:
+        _fail(str(error))
+    except ModuleNotFoundError as error:
+        extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        _fail(str(MissingExtraError(str(error.name), extra)))
+
+
+def _fail(message: str) -> None:
+    console = Console(stderr=True, soft_wrap=True)
+    console.print("error:", style="bold red", end=" ")
+    console.print(message, markup=False, highlight=False)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

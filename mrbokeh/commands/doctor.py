@@ -1,0 +1,88 @@
+"""`mrbokeh doctor`: what is installed, what is missing, and what it would enable."""
+
+import os
+import platform
+import shutil
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from typing import NamedTuple
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from mrbokeh import __version__
+
+app = typer.Typer(add_completion=False)
+
+
+class Finding(NamedTuple):
+    name: str
+    found: str | None
+    enables: str
+    remedy: str
+
+
+PACKAGES = (
+    ("rawpy", "reading RAW photographs", "pip install 'mrbokeh[capture]'"),
+    ("pyexiv2", "focus distance, focal length and f-number from photographs", "pip install 'mrbokeh[capture]'"),
+    ("torch", "training networks", "pip install 'mrbokeh[train]'"),
+    ("onnx", "exporting networks", "pip install 'mrbokeh[train]'"),
+    ("onnxruntime", "rendering with trained networks", "pip install mrbokeh"),
+    ("embreex", "rendering 3D objects", "pip install mrbokeh"),
+    ("av", "reading and writing videos", "pip install mrbokeh"),
+    ("aiohttp", "the viewfinder in a browser", "pip install 'mrbokeh[viewfinder]'"),
+)
+PROGRAMS = (
+    ("exiftool", "metadata of more cameras (49 of 54 files are read without it)", "install exiftool with your system's package manager"),
+    ("nvidia-smi", "training and rendering on an NVIDIA GPU", "install the GPU driver; everything works without one, slower"),
+    ("gphoto2", "tethered cameras by the command line", "install gphoto2 with your system's package manager"),
+)
+
+
+@app.command()
+def doctor() -> None:
+    """Say what is present, what is missing and what it would enable; nothing here is required for `mrbokeh demo` but the packages.
+
+    Example: mrbokeh doctor
+    """
+    table = Table(title=f"mrbokeh {__version__} on Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores")
+    for column in ("what", "found", "enables", "if you want it"):
+        table.add_column(column)
+    for finding in findings():
+        table.add_row(finding.name, finding.found or "[yellow]missing[/]", finding.enables, "" if finding.found else escape(finding.remedy))
+    Console().print(table)
+
+
+def findings() -> list[Finding]:
+    """Every optional thing with its version or path, None where it is missing."""
+    packages = [Finding(name, _version(name), enables, remedy) for name, enables, remedy in PACKAGES]
+    programs = [Finding(name, shutil.which(name), enables, remedy) for name, enables, remedy in PROGRAMS]
+    return [*packages, _cuda(), *programs]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _cuda() -> Finding:
+    remedy = "needs an NVIDIA driver and a CUDA build of torch; training works without, slower"
+    return Finding("CUDA in torch", _quietly(_cuda_device), "training on the GPU", remedy)
+
+
+def _cuda_device() -> str | None:
+    import torch
+
+    return torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+
+
+def _quietly(question: Callable[[], str | None]) -> str | None:
+    """The answer, or None where the library that would know it is missing or broken."""
+    try:
+        return question()
+    except (ImportError, OSError, RuntimeError):
+        return None

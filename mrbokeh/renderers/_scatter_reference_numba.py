@@ -1,0 +1,30 @@
+"""The loop over pixels of scatter_reference, compiled; same words, nothing cleverer."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from mrbokeh._polygon_coverage_numba import fill_psf
+
+
+@njit(cache=True)
+def scatter_pixels(
+    values: np.ndarray, coc_px: np.ndarray, margin_px: int, unit_radius: float, vertices: np.ndarray, starts: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
+    """Spread values (H, W, C) by the PSF of each pixel; `margin_px` is the radius of the largest kernel."""
+    height, width, channels = values.shape
+    padded = np.zeros((height + 2 * margin_px, width + 2 * margin_px, channels))
+    for y in range(height):
+        for x in range(width):
+            diameter_px = coc_px[y, x]
+            radius_px = max(0, int(math.ceil(abs(diameter_px) * 0.5 * unit_radius - 0.5)))
+            size = 2 * radius_px + 1
+            kernel, steps = np.zeros((size, size)), np.zeros((size, size))
+            fill_psf(kernel, steps, vertices, starts, weights, diameter_px)
+            top, left = y + margin_px - radius_px, x + margin_px - radius_px
+            for j in range(size):
+                for i in range(size):
+                    for c in range(channels):
+                        padded[top + j, left + i, c] += kernel[j, i] * values[y, x, c]
+    return padded[margin_px : margin_px + height, margin_px : margin_px + width].copy()

@@ -1,0 +1,28 @@
+"""Shapes and types of array annotations are checked while tests run (jaxtyping + beartype); shared places of test data."""
+
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
+ROOT = Path(__file__).resolve().parent.parent
+SHARED_DATA = ROOT.parent / "shared" / "data"
+
+
+def _modules() -> list[str]:
+    """Every module but the compiled ones, whose functions numba and not Python calls."""
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in files if not path.stem.endswith("_numba")]
+    return [name for name in names if not name.endswith("__init__")]
+
+
+install_import_hook(_modules(), "beartype.beartype")
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Real photographs, stacks and objects that lie beside the checkout and are not shipped with the project."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip("the shared test data folder (../shared/data) is not beside the checkout")
+    return SHARED_DATA

@@ -1,0 +1,1 @@
+"""From FocalStack folders to an ONNX network that blurs like one lens."""

@@ -1,0 +1,1 @@
+"""Camera frames in, composited stream out."""
