@@ -30,7 +30,7 @@ def convert(rgb: Float[np.ndarray, "*batch 3"], target_from_source: Float[np.nda
     return (rgb @ np.asarray(target_from_source, rgb.dtype).T).astype(np.float32)
 
 
-def tone_map(rgb: Float32[np.ndarray, "*batch 3"], exposure_stops: float = 0.0, shoulder: float = 0.8) -> Float32[np.ndarray, "*batch 3"]:
+def tone_map(rgb: Float32[np.ndarray, "*shape"], exposure_stops: float = 0.0, shoulder: float = 0.8) -> Float32[np.ndarray, "*shape"]:
     """Scene-linear to displayable linear in [0, 1]: identity up to `shoulder`, then highlights roll off towards 1."""
     exposed = np.maximum(rgb * np.float32(2.0**exposure_stops), 0.0)
     room = 1.0 - shoulder

@@ -5,7 +5,8 @@ from jaxtyping import Bool, Float
 
 from mrbokeh.errors import InputError
 
-Image = Float[np.ndarray, "height width *channels"]
+# Two pictures of one shape (H, W) or (H, W, C); the functions check it themselves and say it in words.
+Image = Float[np.ndarray, "..."]
 
 
 def psnr(result: Image, truth: Image, peak: float = 1.0, mask: Bool[np.ndarray, "height width"] | None = None) -> float:

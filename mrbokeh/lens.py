@@ -64,4 +64,4 @@ class Lens:
         so that it is linear and finite at infinity. depth_m must be positive.
         """
         dioptres = 1.0 / np.asarray(depth_m)
-        return self.coc_px_per_dioptre(image_width_px) * (1.0 / self.focus_distance_m - dioptres)
+        return np.asarray(self.coc_px_per_dioptre(image_width_px) * (1.0 / self.focus_distance_m - dioptres))

@@ -1,0 +1,172 @@
+"""Between one stored video frame (PyAV) and pictures: linear light, 8-bit codes for a preview, and back.
+
+FFmpeg scales chroma and bit depth; the step between luma-chroma and RGB is ours, because FFmpeg's (swscale 9) goes
+through truncated 8 bit whatever the depth, and is half an 8-bit step too dark in the mean.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from mrbokeh.color import convert
+from mrbokeh.errors import InputError
+from mrbokeh.video_color import (
+    DECODE_TOP,
+    ENCODE_TOP,
+    LIMITED,
+    VideoColor,
+    decode_table,
+    encode_table,
+    linear_from_code,
+    rec709_from_primaries,
+)
+
+
+class Encoding(NamedTuple):
+    codec: str
+    pixel_format: str
+    bits: int
+    suffixes: tuple[str, ...]
+    options: dict[str, str]
+
+
+ENCODINGS = {
+    "h264": Encoding("libx264", "yuv420p", 8, (".mp4", ".mov", ".mkv"), {"crf": "14", "preset": "medium"}),
+    "h264-10bit": Encoding("libx264", "yuv420p10le", 10, (".mp4", ".mov", ".mkv"), {"crf": "12", "preset": "medium"}),
+    "prores4444": Encoding("prores_ks", "yuv444p10le", 10, (".mov",), {"profile": "4444", "vendor": "apl0"}),
+    "prores422": Encoding("prores_ks", "yuv422p10le", 10, (".mov",), {"profile": "hq", "vendor": "apl0"}),
+    "ffv1": Encoding("ffv1", "gbrp16le", 16, (".mkv",), {"level": "3", "slices": "16", "slicecrc": "1"}),
+}
+_BY_SUFFIX = {".mp4": "h264", ".mov": "prores4444", ".mkv": "ffv1"}
+
+
+def encoding_for(path: Path, name: str | None = None) -> Encoding:
+    """The encoding of that name, or the usual one of the file's suffix: .mp4 h264, .mov prores4444, .mkv ffv1 (lossless, 16 bit)."""
+    suffix = Path(path).suffix.lower()
+    name = name or _BY_SUFFIX.get(suffix)
+    if name is None:
+        raise InputError(f"cannot write {path}: expected .mp4, .mov or .mkv, not {suffix or 'a file without suffix'}")
+    if name not in ENCODINGS:
+        raise InputError(f"expected an encoding ({', '.join(ENCODINGS)}), got {name!r}")
+    if suffix not in ENCODINGS[name].suffixes:
+        raise InputError(
+            f"{path}: {name} is written to {' or '.join(ENCODINGS[name].suffixes)}, not to {suffix or 'a file without suffix'}"
+        )
+    return ENCODINGS[name]
+
+
+def _planes(frame: Any, count: int = 3) -> list[np.ndarray]:
+    """The stored numbers of the first planes, (H, W) each; they live as long as the frame."""
+    dtype = np.dtype(np.uint8) if frame.format.components[0].bits == 8 else np.dtype("<u2")
+    planes = [frame.planes[i] for i in range(count)]
+    return [np.frombuffer(p, dtype).reshape(p.height, p.line_size // dtype.itemsize)[:, : p.width] for p in planes]
+
+
+def _full_chroma(frame: Any, color: VideoColor, size: tuple[int, int] | None = None) -> Any:
+    """The frame with chroma of full resolution in 16 bit, the range and matrix untouched: codes are shifted up to 16 bit."""
+    from av.video.reformatter import Interpolation
+
+    width, height = size or (frame.width, frame.height)
+    how = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
+    matrix = {6: 5, 2: 5}.get(color.matrix, color.matrix)  # swscale's own numbers: 5 is BT.601
+    same = {"src_colorspace": matrix, "dst_colorspace": matrix, "src_color_range": color.code_range, "dst_color_range": color.code_range}
+    return frame.reformat(width=width, height=height, format="yuv444p16le", interpolation=how, **same)
+
+
+def _code_scale(color: VideoColor, bits: int) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float]]:
+    """(zeros, gains, matrix) of `_video_frames_numba` for codes of `bits` that were shifted up to 16 bit (H.273, 8.3)."""
+    unit = float(1 << 8)
+    if color.code_range == LIMITED:
+        zeros, gains = (16 * unit, 128 * unit), (1 / (219 * unit), 1 / (224 * unit))
+    else:
+        largest = float(((1 << bits) - 1) << (16 - bits))
+        zeros, gains = (0.0, 128 * unit), (1 / largest, 1 / largest)
+    red, blue = color.luma_weights
+    green = 1 - red - blue
+    matrix = (2 * (1 - red), -2 * (1 - blue) * blue / green, -2 * (1 - red) * red / green, 2 * (1 - blue))
+    return zeros, gains, matrix
+
+
+def _rgb_codes(frame: Any, size: tuple[int, int] | None = None) -> tuple[list[np.ndarray], int]:
+    """Red, green and blue planes of an RGB frame as they are stored, and their bits."""
+    from av.video.reformatter import Interpolation
+
+    bits = frame.format.components[0].bits
+    width, height = size or (frame.width, frame.height)
+    pixel_format = "gbrp" if bits == 8 else f"gbrp{bits}le"
+    planar = frame.reformat(width=width, height=height, format=pixel_format, interpolation=Interpolation.BICUBIC)
+    green, blue, red = _planes(planar)
+    return [red, green, blue], bits
+
+
+def linear_rgb(frame: Any, color: VideoColor) -> Float32[np.ndarray, "height width 3"]:
+    """The frame as linear Rec.709."""
+    rgb = _linear_of_rgb(frame, color) if frame.format.is_rgb else _linear_of_luma_chroma(frame, color)
+    return rgb if color.primaries == 1 else convert(rgb, rec709_from_primaries(color.primaries))
+
+
+def _linear_of_rgb(frame: Any, color: VideoColor) -> Float32[np.ndarray, "height width 3"]:
+    planes, bits = _rgb_codes(frame)
+    of_every_code = linear_from_code(np.arange(1 << bits) / ((1 << bits) - 1), color.transfer_name)
+    return of_every_code[np.dstack(planes)]
+
+
+def _linear_of_luma_chroma(frame: Any, color: VideoColor) -> Float32[np.ndarray, "height width 3"]:
+    from mrbokeh._video_frames_numba import linear_from_planes
+
+    upsampled = _full_chroma(frame, color)
+    scale = _code_scale(color, frame.format.components[0].bits)
+    table = decode_table(color.transfer_name)
+    return linear_from_planes(*_planes(upsampled), *scale, table, (len(table) - 1) / DECODE_TOP)
+
+
+def display_bgr(frame: Any, color: VideoColor, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
+    """The frame scaled to a size (width, height), its code values in 8 bit, blue first; primaries stay as they are."""
+    from mrbokeh._video_frames_numba import bgr8_from_planes
+
+    if frame.format.is_rgb:
+        planes, bits = _rgb_codes(frame, size)
+        return np.dstack([plane >> (bits - 8) for plane in planes[::-1]]).astype(np.uint8)
+    scaled = _full_chroma(frame, color, size)
+    return bgr8_from_planes(*_planes(scaled), *_code_scale(color, frame.format.components[0].bits))
+
+
+def encoded_frame(rgb: Float32[np.ndarray, "height width 3"], encoding: Encoding, color: VideoColor) -> Any:
+    """A PyAV frame of linear light, tagged."""
+    import av
+
+    frame = av.VideoFrame(rgb.shape[1], rgb.shape[0], encoding.pixel_format)
+    for target, plane in zip(_planes(frame), _stored_planes(np.asarray(rgb, np.float32), encoding, color), strict=True):
+        target[:] = plane
+    frame.colorspace, frame.color_range = color.matrix, color.code_range
+    frame.color_trc, frame.color_primaries = color.transfer, color.primaries
+    return frame
+
+
+def _stored_planes(rgb: Float32[np.ndarray, "height width 3"], encoding: Encoding, color: VideoColor) -> list[np.ndarray]:
+    """Integer planes in the order of the pixel format: green, blue, red or luma and chroma of limited range."""
+    from mrbokeh._video_frames_numba import codes_from_linear, planes_from_linear
+
+    table = encode_table(color.transfer_name)
+    per_linear = (len(table) - 1) / ENCODE_TOP
+    if color.matrix == 0:
+        largest = float((1 << encoding.bits) - 1)
+        return [codes_from_linear(np.ascontiguousarray(rgb[..., i]), largest, table, per_linear) for i in (1, 2, 0)]
+    floor, ceiling = (1 - 16) / 219, (254 - 16) / 219
+    luma, *chroma = planes_from_linear(rgb, *color.luma_weights, floor, ceiling, table, per_linear)
+    unit = 1 << (encoding.bits - 8)
+    chroma = [_subsampled(plane, encoding.pixel_format) for plane in chroma]
+    planes = [16 + 219 * luma, *(128 + 224 * plane for plane in chroma)]
+    return [np.clip(np.rint(plane * unit), unit, 255 * unit - 1) for plane in planes]
+
+
+def _subsampled(plane: Float32[np.ndarray, "height width"], pixel_format: str) -> Float32[np.ndarray, "rows columns"]:
+    """Chroma at the places of MPEG-2 and H.264: on every second column, halfway between two rows (4:2:0)."""
+    if "444" in pixel_format:
+        return plane
+    left = np.concatenate([plane[:, :1], plane[:, :-1]], axis=1)
+    right = np.concatenate([plane[:, 1:], plane[:, -1:]], axis=1)
+    columns = ((left + 2 * plane + right) / 4)[:, ::2]
+    return columns if "422" in pixel_format else (columns[::2] + columns[1::2]) / 2
