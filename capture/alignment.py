@@ -9,7 +9,9 @@ from jaxtyping import Float, Float32
 
 COARSEST_PX = 96
 LEAST_CORRELATION = 0.6
-LARGEST_STEP_FROM_PRIOR = 0.05
+# How far the scale between neighbours may be from what the lens predicts, or from 1 where the lens is unknown.
+LARGEST_STEP_FROM_PRIOR = 0.02
+LARGEST_STEP = 0.15
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -45,8 +47,8 @@ def register_stack(read_rgb: Callable[[int], Rgb], count: int, prior_scales: Seq
     previous = structure(read_rgb(0))
     for index in range(1, count):
         current = structure(read_rgb(index))
-        prior_scale = 1.0 if prior_scales is None else prior_scales[index - 1] / prior_scales[index]
-        step, correlation = register_pair(previous, current, prior_scale)
+        expected = None if prior_scales is None else prior_scales[index - 1] / prior_scales[index]
+        step, correlation = register_pair(previous, current, expected)
         first_from_slice.append(chained(first_from_slice[-1], step))
         correlations.append(correlation)
         previous = current
@@ -62,17 +64,18 @@ def structure(rgb: Rgb) -> Plane:
     return np.log(np.maximum(luminance, 0.0) + np.float32(0.02)).astype(np.float32)
 
 
-def register_pair(target: Plane, source: Plane, prior_scale: float = 1.0) -> tuple[Similarity, float]:
-    """(target_from_source, correlation). Falls back to scaling about the centre by the prior where ECC does not hold."""
+def register_pair(target: Plane, source: Plane, expected_scale: float | None = None) -> tuple[Similarity, float]:
+    """(target_from_source, correlation). Falls back to the expected scale about the centre where ECC does not hold."""
     height, width = target.shape
-    transform = about_centre(prior_scale, width, height)
+    start_scale, largest_step = (1.0, LARGEST_STEP) if expected_scale is None else (expected_scale, LARGEST_STEP_FROM_PRIOR)
+    transform = about_centre(start_scale, width, height)
     correlation = 0.0
     for level in _pyramid_levels(min(height, width)):
         refined, correlation = _ecc(_shrunk(target, level), _shrunk(source, level), _at_level(transform, level))
         if correlation < LEAST_CORRELATION:
             continue
         candidate = _at_level(as_similarity(refined), -level)
-        if abs(scale_of(candidate) / prior_scale - 1.0) <= LARGEST_STEP_FROM_PRIOR:
+        if abs(scale_of(candidate) / start_scale - 1.0) <= largest_step:
             transform = candidate
     return transform, correlation
 
@@ -124,7 +127,7 @@ def _pyramid_levels(smaller_side_px: int) -> range:
     return range(coarsest, -1, -1)
 
 
-def _shrunk(plane: Plane, level: int) -> Plane:
+def _shrunk(plane: Plane, level: int) -> Float32[np.ndarray, "small_height small_width"]:
     """Area-averaged by 2^level, then smoothed so that two slices differ less by their focus."""
     size = (max(1, plane.shape[1] >> level), max(1, plane.shape[0] >> level))
     return cv2.GaussianBlur(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), (0, 0), 1.5)

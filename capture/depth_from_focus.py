@@ -1,11 +1,13 @@
 """Depth from focus: in which slice, and between which two, every pixel is sharp, and how sure that is."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float32
+
+from capture.lights import Lights, find_lights
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -19,10 +21,16 @@ LARGEST_COST = 4.0
 
 @dataclass(frozen=True)
 class FocusMap:
-    """focus_index (H, W): fractional index of the sharpest slice; confidence (H, W) in [0, 1], 0 where it is a guess."""
+    """focus_index (H, W): fractional index of the slice in which the surface is sharp: its depth.
+
+    confidence: (H, W) in [0, 1], 0 where the index is a guess from the surroundings.
+    merge_index: (H, W) the index to take the merged picture from: the same but around bright lights, where the slice is
+    the one that has least of the light's spread.
+    """
 
     focus_index: Plane
     confidence: Plane
+    merge_index: Plane
 
 
 def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
@@ -32,22 +40,29 @@ def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
     return cv2.GaussianBlur((detail * detail).sum(axis=2), (0, 0), window_px)
 
 
-def depth_from_focus(registered: Iterable[Rgb]) -> FocusMap:
-    """The focus map of registered slices, in order of their focus; slices are read once."""
-    energies = np.stack([focus_energy(rgb) for rgb in registered])
-    return focus_map_from_energies(energies)
+def depth_from_focus(registered: Callable[[], Iterable[Rgb]]) -> FocusMap:
+    """The focus map of slices in the order of their focus. registered: gives a fresh pass over them; four are made."""
+    energies = np.stack([focus_energy(rgb) for rgb in registered()])
+    return focus_map(energies, find_lights(registered))
 
 
-def focus_map_from_energies(energies: Volume) -> FocusMap:
-    """Semi-global labelling (Hirschmueller 2008) of log focus energies, then a parabola through the peak."""
+def focus_map(energies: Volume, lights: Lights) -> FocusMap:
+    """Semi-global labelling (Hirschmueller 2008) of log focus energies, then a parabola through the peak.
+
+    Energies within the reach of a light have no say, but the light's own pixels are known to be sharp in its sharpest slice.
+    """
     from capture._semi_global_numba import aggregate_costs
 
-    floor = noise_floor(energies)
-    log_energies = np.log(energies + floor)
+    log_energies = np.log(energies + noise_floor(energies))
     costs = np.minimum(log_energies.max(axis=0) - log_energies, np.float32(LARGEST_COST)).astype(np.float32)
+    by_light = lights.slice_index()
+    costs[:, by_light >= 0] = 0.0
+    costs[:, lights.core] = LARGEST_COST * (np.arange(len(energies))[:, None] != by_light[lights.core])
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     offset, curvature = peak_parabola(log_energies, labels)
-    return FocusMap((labels + offset).astype(np.float32), confidence_of(log_energies, labels, curvature))
+    index = np.where(by_light >= 0, labels, labels + offset).astype(np.float32)
+    confidence = np.where(by_light >= 0, 0.0, confidence_of(log_energies, labels, curvature)).astype(np.float32)
+    return FocusMap(index, confidence, np.where(by_light >= 0, by_light, index).astype(np.float32))
 
 
 def noise_floor(energies: Volume) -> float:

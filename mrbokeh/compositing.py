@@ -15,14 +15,18 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 
-def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, softness_dioptres: float = 0.01) -> Plane:
+def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, tolerance: float = 0.03, softness: float = 0.02) -> Plane:
     """How much of the virtual surface the photographed scene leaves visible: 1 in front of it, 0 behind it.
 
-    Depths are compared in dioptres, the unit in which the error of depth from focus is even over the scene;
-    within `softness_dioptres` of touching the matte goes over smoothly, so that depth noise does not fray it.
+    Depths are compared by their ratio. The photographed surface must be nearer by more than `tolerance` (a share of the
+    depth, the size of the error of depth from focus) to hide the virtual one, so that what stands on it does not sink in;
+    over `softness` the matte goes from 1 to 0, so that depth noise does not fray it.
     """
-    lead_dioptres = 1.0 / virtual_depth_m - 1.0 / photo_depth_m
-    return np.clip(0.5 + lead_dioptres / softness_dioptres, 0.0, 1.0).astype(np.float32)
+    there = np.isfinite(virtual_depth_m)
+    behind_by = np.zeros_like(virtual_depth_m)
+    np.divide(virtual_depth_m, photo_depth_m, out=behind_by, where=there)
+    matte = np.clip(0.5 + (1.0 + tolerance - behind_by) / softness, 0.0, 1.0)
+    return np.where(there, matte, 0.0).astype(np.float32)
 
 
 def covered_by(layer: Layer, matte: Plane) -> Layer:

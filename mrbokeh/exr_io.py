@@ -73,9 +73,9 @@ def write_exr(path: Path, parts: Sequence[ExrPart] | ExrPart) -> None:
 def _part_from_openexr(part: Any) -> ExrPart:
     header = part.header
     data_min, display_min = header["dataWindow"][0], header["displayWindow"][0]
-    size = tuple((header["displayWindow"][1] - display_min + 1)[::-1])
-    offset_y, offset_x = (data_min - display_min)[::-1]
-    channels = {name: _placed(channel.pixels, size, int(offset_y), int(offset_x)) for name, channel in part.channels.items()}
+    size = tuple((header["displayWindow"][1] - display_min + 1)[::-1].tolist())
+    offset_y, offset_x = (data_min - display_min)[::-1].tolist()
+    channels = {name: _placed(channel.pixels, size, offset_y, offset_x) for name, channel in part.channels.items()}
     attributes = {key: value for key, value in header.items() if isinstance(value, (int, float, str)) and key != "name"}
     return ExrPart(channels, str(header.get("name", "")), attributes)
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 # What the containers hold and players expect in them.
 _STORABLE = {
@@ -26,7 +26,7 @@ class AudioCopy:
         self._waiting: Any = None
         self.note = "no audio"
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "AudioCopy":
         import av
 
         with ExitStack() as stack:

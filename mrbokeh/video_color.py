@@ -30,6 +30,8 @@ _XY_OF_PRIMARIES = {
     9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
 }
+# The constants of BT.709, 1.099 and 0.018, with the digits of BT.2020, table 4, without which the curve has a step at the knee.
+_SCALE, _KNEE = 1.09929682680944, 0.018053968510807
 _ENTRIES = 16384
 DECODE_TOP, ENCODE_TOP = 2.0, 1.25  # of code value and of linear light: beyond every code that a limited range can hold
 
@@ -90,8 +92,9 @@ def linear_from_code(code: Float[np.ndarray, "*shape"], transfer: str) -> Float3
     if transfer == "srgb":
         return srgb_to_linear(code)
     code = np.asarray(code, np.float64)
-    if transfer == "bt709":  # BT.709-6, 1.2, inverted
-        linear = np.where(code < 0.081, code / 4.5, ((np.maximum(code, 0.081) + 0.099) / 1.099) ** (1 / 0.45))
+    if transfer == "bt709":
+        knee = 4.5 * _KNEE
+        linear = np.where(code < knee, code / 4.5, ((np.maximum(code, knee) + _SCALE - 1) / _SCALE) ** (1 / 0.45))
     else:
         linear = np.sign(code) * np.abs(code) ** _GAMMA.get(transfer, 1.0)
     return linear.astype(np.float32)
@@ -103,7 +106,7 @@ def code_from_linear(linear: Float[np.ndarray, "*shape"], transfer: str) -> Floa
         return linear_to_srgb(linear)
     linear = np.asarray(linear, np.float64)
     if transfer == "bt709":
-        code = np.where(linear < 0.018, linear * 4.5, 1.099 * np.maximum(linear, 0.018) ** 0.45 - 0.099)
+        code = np.where(linear < _KNEE, linear * 4.5, _SCALE * np.maximum(linear, _KNEE) ** 0.45 - (_SCALE - 1))
     else:
         code = np.sign(linear) * np.abs(linear) ** (1.0 / _GAMMA.get(transfer, 1.0))
     return code.astype(np.float32)

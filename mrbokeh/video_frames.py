@@ -64,24 +64,45 @@ def _planes(frame: Any, count: int = 3) -> list[np.ndarray]:
     return [np.frombuffer(p, dtype).reshape(p.height, p.line_size // dtype.itemsize)[:, : p.width] for p in planes]
 
 
-def _full_chroma(frame: Any, color: VideoColor, size: tuple[int, int] | None = None) -> Any:
-    """The frame with chroma of full resolution in 16 bit, the range and matrix untouched: codes are shifted up to 16 bit."""
+def _full_chroma(frame: Any, color: VideoColor, size: tuple[int, int] | None = None) -> tuple[list[np.ndarray], int]:
+    """Luma and chroma planes of full resolution and the bits of their codes; range and matrix stay untouched.
+
+    Where chroma or the size has to be interpolated the codes are shifted up to 16 bit, to keep what lies between two of
+    them. Elsewhere they stay as they are: FFmpeg would not shift but stretch 8 bit to 16 if nothing else is to be done.
+    """
     from av.video.reformatter import Interpolation
 
     width, height = size or (frame.width, frame.height)
-    how = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
-    matrix = {6: 5, 2: 5}.get(color.matrix, color.matrix)  # swscale's own numbers: 5 is BT.601
+    if len(frame.format.components) < 3:
+        return _grey_planes(frame, width, height), frame.format.components[0].bits
+    whole = frame.format.chroma_width(width) == width and frame.format.chroma_height(height) == height
+    stored_bits = frame.format.components[0].bits if whole and (width, height) == (frame.width, frame.height) else 16
+    pixel_format = "yuv444p" if stored_bits == 8 else f"yuv444p{stored_bits}le"
+    matrix = {6: 5}.get(color.matrix, color.matrix)  # swscale's own number of BT.601 is 5
     same = {"src_colorspace": matrix, "dst_colorspace": matrix, "src_color_range": color.code_range, "dst_color_range": color.code_range}
-    return frame.reformat(width=width, height=height, format="yuv444p16le", interpolation=how, **same)
+    how = Interpolation.BICUBIC | Interpolation.ACCURATE_RND
+    scaled = frame.reformat(width=width, height=height, format=pixel_format, interpolation=how, **same)
+    # Copied, for the planes live no longer than their frame.
+    return [plane.copy() for plane in _planes(scaled)], stored_bits
 
 
-def _code_scale(color: VideoColor, bits: int) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float]]:
-    """(zeros, gains, matrix) of `_video_frames_numba` for codes of `bits` that were shifted up to 16 bit (H.273, 8.3)."""
-    unit = float(1 << 8)
+def _grey_planes(frame: Any, width: int, height: int) -> list[np.ndarray]:
+    """A picture without chroma with neutral chroma; FFmpeg would take it for full range, whatever its tag says."""
+    bits = frame.format.components[0].bits
+    luma = _planes(frame.reformat(width=width, height=height, format=frame.format.name), 1)[0].copy()
+    neutral = np.full_like(luma, 128 << (bits - 8))
+    return [luma, neutral, neutral]
+
+
+def _code_scale(
+    color: VideoColor, bits: int, stored_bits: int
+) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float]]:
+    """(zeros, gains, matrix) of `_video_frames_numba` for codes of `bits`, shifted up to `stored_bits` (H.273, 8.3)."""
+    unit = 2.0 ** (stored_bits - 8)
     if color.code_range == LIMITED:
         zeros, gains = (16 * unit, 128 * unit), (1 / (219 * unit), 1 / (224 * unit))
     else:
-        largest = float(((1 << bits) - 1) << (16 - bits))
+        largest = float(((1 << bits) - 1) << (stored_bits - bits))
         zeros, gains = (0.0, 128 * unit), (1 / largest, 1 / largest)
     red, blue = color.luma_weights
     green = 1 - red - blue
@@ -93,11 +114,11 @@ def _rgb_codes(frame: Any, size: tuple[int, int] | None = None) -> tuple[list[np
     """Red, green and blue planes of an RGB frame as they are stored, and their bits."""
     from av.video.reformatter import Interpolation
 
-    bits = frame.format.components[0].bits
+    bits = max(8, frame.format.components[0].bits)
     width, height = size or (frame.width, frame.height)
     pixel_format = "gbrp" if bits == 8 else f"gbrp{bits}le"
     planar = frame.reformat(width=width, height=height, format=pixel_format, interpolation=Interpolation.BICUBIC)
-    green, blue, red = _planes(planar)
+    green, blue, red = (plane.copy() for plane in _planes(planar))
     return [red, green, blue], bits
 
 
@@ -116,10 +137,10 @@ def _linear_of_rgb(frame: Any, color: VideoColor) -> Float32[np.ndarray, "height
 def _linear_of_luma_chroma(frame: Any, color: VideoColor) -> Float32[np.ndarray, "height width 3"]:
     from mrbokeh._video_frames_numba import linear_from_planes
 
-    upsampled = _full_chroma(frame, color)
-    scale = _code_scale(color, frame.format.components[0].bits)
+    (y, cb, cr), stored_bits = _full_chroma(frame, color)
+    zeros, gains, matrix = _code_scale(color, frame.format.components[0].bits, stored_bits)
     table = decode_table(color.transfer_name)
-    return linear_from_planes(*_planes(upsampled), *scale, table, (len(table) - 1) / DECODE_TOP)
+    return linear_from_planes(y, cb, cr, zeros, gains, matrix, table, (len(table) - 1) / DECODE_TOP)
 
 
 def display_bgr(frame: Any, color: VideoColor, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
@@ -129,8 +150,9 @@ def display_bgr(frame: Any, color: VideoColor, size: tuple[int, int]) -> UInt8[n
     if frame.format.is_rgb:
         planes, bits = _rgb_codes(frame, size)
         return np.dstack([plane >> (bits - 8) for plane in planes[::-1]]).astype(np.uint8)
-    scaled = _full_chroma(frame, color, size)
-    return bgr8_from_planes(*_planes(scaled), *_code_scale(color, frame.format.components[0].bits))
+    (y, cb, cr), stored_bits = _full_chroma(frame, color, size)
+    zeros, gains, matrix = _code_scale(color, frame.format.components[0].bits, stored_bits)
+    return bgr8_from_planes(y, cb, cr, zeros, gains, matrix)
 
 
 def encoded_frame(rgb: Float32[np.ndarray, "height width 3"], encoding: Encoding, color: VideoColor) -> Any:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -16,7 +16,6 @@ from mrbokeh.errors import InputError
 from mrbokeh.video_audio import AudioCopy
 from mrbokeh.video_color import BT709, BT709_RGB, VideoColor, color_of
 from mrbokeh.video_frames import display_bgr, encoded_frame, encoding_for, linear_rgb
-
 
 # Decoders that say where chroma lies, and JPEG, where it lies in the middle, which is what FFmpeg takes when nobody says.
 _PLACES_CHROMA = ("h264", "hevc", "av1", "mpeg1video", "mpeg2video", "mjpeg")
@@ -111,13 +110,14 @@ class VideoWriter:
         self.audio_note = "no audio"
         self._audio_from, self._audio_start_s = audio_from, audio_start_s
         self._last_tick: int | None = None
+        self.frame_count = 0
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "VideoWriter":
         import av
 
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_path(self.path))
-            self._container = stack.enter_context(av.open(str(temporary), "w"))
+            self._container = stack.enter_context(av.open(str(temporary), "w", options=self._container_options()))
             self._stream = self._add_stream()
             self._audio = None
             if self._audio_from is not None:
@@ -129,12 +129,11 @@ class VideoWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is not None:
+            self._stack.__exit__(kind, error, trace)
+            return
         with self._stack:
-            if kind is None:
-                self._finish()
-            else:
-                # The stack is left as if the error had been raised inside it, so that the temporary file goes.
-                self._stack.pop_all().__exit__(kind, error, trace)
+            self._finish()
 
     def write(self, rgb: Float32[np.ndarray, "height width 3"], time_s: float) -> None:
         """One picture of linear light (H, W, 3); times must grow."""
@@ -149,11 +148,19 @@ class VideoWriter:
         frame.pts, frame.time_base, self._last_tick = tick, self.time_base, tick
         frame.duration = round(1 / self.frame_rate / self.time_base)
         self._container.mux(self._stream.encode(frame))
+        self.frame_count += 1
         if self._audio is not None:
             self._audio.copy_until(time_s)
 
+    def _container_options(self) -> dict[str, str]:
+        """QuickTime stores when each stream begins in a unit of its own, 1 ms unless told otherwise: a finer multiple of ours."""
+        if self.path.suffix.lower() == ".mkv":
+            return {}
+        per_s = self.time_base.denominator
+        return {"movie_timescale": str(per_s * max(1, round(1_000_000 / per_s)))}
+
     def _add_stream(self) -> Any:
-        stream = self._container.add_stream(self.encoding.codec, rate=self.frame_rate, options=self.encoding.options)
+        stream: Any = self._container.add_stream(self.encoding.codec, rate=self.frame_rate, options=self.encoding.options)
         context = stream.codec_context
         stream.width, stream.height = self.size_px
         stream.pix_fmt = self.encoding.pixel_format
@@ -185,6 +192,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         if not container.streams.video:
             raise InputError(f"{path} holds no video stream")
         stream = container.streams.video[0]
+        if stream.sample_aspect_ratio not in (None, 0, 1):
+            raise InputError(f"{path} has pixels that are not square ({stream.sample_aspect_ratio}): scale it to square pixels first")
         stream.thread_type = "AUTO"
         yield container, stream
 

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mrbokeh.errors import InputError
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 
 
@@ -25,3 +27,13 @@ def make_renderer(name: str) -> Renderer:
 
         return OnnxNetwork(Path(name))
     raise InputError(f"expected a renderer ({', '.join(BY_NAME)}) or the path of a network (.onnx), got {name!r}")
+
+
+def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | None, Renderer]:
+    """What `--lens` and `--renderer` mean together: a network brings its lens, a lens file is rendered by the reference."""
+    if lens is not None and lens.suffix.lower() == ".onnx":
+        from mrbokeh.renderers.onnx_network import OnnxNetwork
+
+        network = OnnxNetwork(lens)
+        return network.lens, network if renderer is None else make_renderer(renderer)
+    return None if lens is None else read_lens(lens), make_renderer(renderer or "reference")

@@ -1,0 +1,145 @@
+"""Photographs into focal stacks: by folder, by pauses in time, by focus sweeps, or all into one."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+from capture.developing import is_raw
+from capture.photo_files import SkippedFile
+from capture.photo_metadata import PhotoMetadata
+from capture.sidecar import Sidecar
+from mrbokeh.errors import InputError
+
+_PAUSE_TIMES_MEDIAN = 5.0
+_LEAST_PAUSE_S = 20.0
+
+
+class Grouping(StrEnum):
+    folder = "folder"
+    time = "time"
+    focus = "focus"
+    none = "none"
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph with its shooting data, the sidecar's word already taken into account."""
+
+    path: Path
+    metadata: PhotoMetadata
+    sidecar: Sidecar
+
+    @property
+    def focus_distance_m(self) -> float | None:
+        return self.metadata.focus_distance_m
+
+
+@dataclass(frozen=True)
+class PhotoGroup:
+    """The photographs of one stack, in the order of their names, and the name that the stack gets."""
+
+    name: str
+    photos: tuple[Photo, ...]
+
+
+def group_photos(folders: Sequence[tuple[str, Sequence[Photo]]], grouping: Grouping) -> list[PhotoGroup]:
+    """Split (label, photographs) of each folder into stacks; Grouping.none puts everything into one.
+
+    Stacks of a split folder are numbered: label_00, label_01. Photographs within a stack stay in the given order.
+    """
+    if grouping is Grouping.none:
+        everything = tuple(photo for _, photos in folders for photo in photos)
+        return [PhotoGroup(folders[0][0] if len(folders) == 1 else "stack", everything)] if everything else []
+    split: Callable[[Sequence[Photo]], list[list[Photo]]] = {
+        Grouping.folder: lambda photos: [list(photos)],
+        Grouping.time: split_at_pauses,
+        Grouping.focus: split_into_sweeps,
+    }[grouping]
+    groups = []
+    for label, photos in folders:
+        parts = split(photos)
+        names = [label] if len(parts) == 1 else [f"{label}_{index:02d}" for index in range(len(parts))]
+        groups += [PhotoGroup(name, tuple(part)) for name, part in zip(names, parts, strict=True)]
+    return _with_unique_names(groups)
+
+
+def split_at_pauses(photos: Sequence[Photo]) -> list[list[Photo]]:
+    """A new stack after a pause of at least 20 s that is also five times as long as the usual one."""
+    times = [photo.metadata.taken_at for photo in photos]
+    unknown = [photo.path.name for photo, time in zip(photos, times, strict=True) if time is None]
+    if unknown:
+        names = ", ".join(unknown[:5])
+        raise InputError(f"--group time needs the time of each photograph, but {names} do not state it: use --group folder")
+    stamps = [time.timestamp() for time in times if time is not None]
+    order = sorted(range(len(photos)), key=lambda index: stamps[index])
+    ordered, stamps = [photos[index] for index in order], sorted(stamps)
+    gaps_s = [after - before for before, after in pairwise(stamps)]
+    pause_s = max(_LEAST_PAUSE_S, _PAUSE_TIMES_MEDIAN * median(gaps_s)) if gaps_s else 0.0
+    return _cut(ordered, [gap > pause_s for gap in gaps_s])
+
+
+def split_into_sweeps(photos: Sequence[Photo]) -> list[list[Photo]]:
+    """A new stack where the focus turns back: a sweep goes one way, near to far or far to near; standing still is no turn."""
+    distances_m = [photo.focus_distance_m for photo in photos]
+    unknown = [photo.path.name for photo, distance in zip(photos, distances_m, strict=True) if distance is None]
+    if unknown:
+        raise InputError(
+            f"--group focus needs the focus distance of each photograph, but {', '.join(unknown[:5])} do not state it: "
+            f"give focus_distances_m in a lens.toml, or use --group folder"
+        )
+    dioptres = [1.0 / distance for distance in distances_m if distance is not None]
+    cuts, direction = [], 0
+    for before, after in pairwise(dioptres):
+        step = (after > before) - (after < before)
+        turned = step * direction < 0
+        cuts.append(turned)
+        # The step that leads to a new sweep's first photograph says nothing about the way of that sweep.
+        direction = 0 if turned else step or direction
+    return _cut(photos, cuts)
+
+
+def in_focus_order(photos: Sequence[Photo]) -> list[Photo]:
+    """Nearest focus first where every distance is known, else as they come."""
+    if any(photo.focus_distance_m is None for photo in photos):
+        return list(photos)
+    return sorted(photos, key=lambda photo: photo.focus_distance_m or 0.0)
+
+
+def of_one_camera(photos: Sequence[Photo]) -> tuple[list[Photo], list[SkippedFile]]:
+    """The photographs of the camera that took most of them; the rest cannot share its lens and exposure and is left out.
+
+    So is a developed picture that names no camera where most do: typically a merged result that lies beside its sources.
+    RAW without a name stays: it may be damaged, which developing will tell.
+    """
+    usual = Counter(photo.metadata.camera_model for photo in photos).most_common(1)[0][0]
+    if usual is None:
+        return list(photos), []
+    kept = [photo for photo in photos if photo.metadata.camera_model == usual or (is_raw(photo.path) and not photo.metadata.camera_model)]
+    skipped = []
+    for photo in (each for each in photos if each not in kept):
+        other = f"was taken with {photo.metadata.camera_model}" if photo.metadata.camera_model else "names no camera"
+        skipped.append(SkippedFile(photo.path, f"it {other}, most of its stack with {usual} (--group none takes it all the same)"))
+    return kept, skipped
+
+
+def _cut(photos: Sequence[Photo], cuts: Sequence[bool]) -> list[list[Photo]]:
+    parts = [[photos[0]]] if photos else []
+    for photo, cut in zip(photos[1:], cuts, strict=True):
+        if cut:
+            parts.append([])
+        parts[-1].append(photo)
+    return parts
+
+
+def _with_unique_names(groups: list[PhotoGroup]) -> list[PhotoGroup]:
+    """Folders of the same name in different places get a number."""
+    seen: dict[str, int] = {}
+    result = []
+    for group in groups:
+        count = seen[group.name] = seen.get(group.name, 0) + 1
+        result.append(group if count == 1 else PhotoGroup(f"{group.name}_{count}", group.photos))
+    return result

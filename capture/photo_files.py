@@ -1,0 +1,92 @@
+"""Which files are photographs: folders are searched, files that are named are taken, RAW goes before the JPEG of the same shot."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from capture.raw import RAW_SUFFIXES
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FILE_NAME as STACK_FILE_NAME
+from mrbokeh.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES
+
+PHOTO_SUFFIXES = (*RAW_SUFFIXES, *INTEGER_SUFFIXES, *LINEAR_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class SkippedFile:
+    """A file that was left out, and why, in words."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True)
+class PhotoFolder:
+    """Photographs of one folder in the order of their names; top: the folder that the user named, which contains it."""
+
+    folder: Path
+    top: Path
+    paths: tuple[Path, ...]
+
+    @property
+    def label(self) -> str:
+        """The folder's name with those of its parents below `top`, as a name for a stack."""
+        below = self.folder.relative_to(self.top).parts
+        name = "_".join(below) or self.folder.name or "stack"
+        return re.sub(r"[^\w.-]+", "_", name).strip("._") or "stack"
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sorts IMG_9 before IMG_10, and numbers before words."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in re.split(r"(\d+)", path.name) if part]
+
+
+def find_photos(given: Sequence[Path], scene: Path) -> tuple[list[PhotoFolder], list[SkippedFile]]:
+    """Photographs under the given files and folders, folder by folder, and what was left out. The scene itself is not searched."""
+    found: dict[Path, Path] = {}
+    skipped: list[SkippedFile] = []
+    for path in (Path(each).resolve() for each in given):
+        if not path.exists():
+            raise InputError(f"expected photographs or folders of photographs, but there is nothing at {path}")
+        if path.is_dir():
+            photos, results = _photos_under(path, Path(scene).resolve())
+            found |= {each: path for each in photos if each not in found}
+            skipped += results
+        elif path.suffix.lower() in PHOTO_SUFFIXES:
+            found.setdefault(path, path.parent)
+        else:
+            skipped.append(SkippedFile(path, f"not a photograph by its suffix {path.suffix or '(none)'}"))
+    folders: dict[Path, list[Path]] = {}
+    for path in sorted(found, key=natural_key):
+        folders.setdefault(path.parent, []).append(path)
+    result = []
+    for folder in sorted(folders):
+        kept, doubles = _raw_before_jpeg(folders[folder])
+        skipped += doubles
+        result.append(PhotoFolder(folder, found[folders[folder][0]], tuple(kept)))
+    return result, skipped
+
+
+def _photos_under(top: Path, scene: Path) -> tuple[list[Path], list[SkippedFile]]:
+    """Photographs below a folder, without hidden files, our own scene and other focal stacks' folders.
+
+    Beside photographs, EXR and HDR files are taken for somebody's results and left out.
+    """
+    candidates = [path for path in top.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()]
+    stacks = {path.parent for path in top.rglob(STACK_FILE_NAME)} | {scene}
+    visible = [path for path in candidates if not any(part.startswith(".") for part in path.relative_to(top).parts)]
+    photos = [path for path in visible if not stacks.intersection(path.parents)]
+    results = [path for path in photos if path.suffix.lower() in LINEAR_SUFFIXES]
+    if len(results) == len(photos):
+        return photos, []
+    reason = "EXR and HDR files are left out where there are photographs too; name it to take it all the same"
+    return [path for path in photos if path not in results], [SkippedFile(path, reason) for path in sorted(results)]
+
+
+def _raw_before_jpeg(paths: list[Path]) -> tuple[list[Path], list[SkippedFile]]:
+    """Cameras store RAW and JPEG of the same shot side by side; the JPEG is left out."""
+    raw_stems = {path.stem: path.name for path in paths if path.suffix.lower() in RAW_SUFFIXES}
+    doubles = {path for path in paths if path.suffix.lower() not in RAW_SUFFIXES and path.stem in raw_stems}
+    skipped = [SkippedFile(path, f"the same shot as {raw_stems[path.stem]}, which is RAW") for path in sorted(doubles)]
+    return [path for path in paths if path not in doubles], skipped

@@ -1,0 +1,44 @@
+"""What stack.json keeps of each photograph: shooting data, focus as stated, exposure and white balance as applied."""
+
+from typing import Any
+
+from capture.exposure import ExposureGain
+from capture.focus_metadata import FocusReading
+from capture.grouping import Photo
+from capture.raw import DecodedPhoto
+
+
+def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> dict[str, Any]:
+    """JSON-ready metadata of a slice. Distances that may be infinite are given in dioptres (1/m), for which JSON has numbers.
+
+    saturated_fraction: share of the photosites that were full. saturation_level: the value of a full grey in the slice.
+    """
+    metadata = photo.metadata
+    level = decoded.saturation_level
+    return {
+        "exposure_time_s": metadata.exposure_time_s,
+        "iso": metadata.iso,
+        "f_number": metadata.f_number,
+        "focal_length_mm": metadata.focal_length_mm,
+        "taken_at": metadata.taken_at.isoformat() if metadata.taken_at else None,
+        "camera_model": metadata.camera_model,
+        "lens_model": metadata.lens_model,
+        "orientation": metadata.orientation,
+        "focus": None if metadata.focus is None else focus_record(metadata.focus),
+        "white_balance": None if decoded.white_balance is None else list(decoded.white_balance),
+        "exposure_gain": gain.total,
+        "exposure_gain_stated": gain.stated,
+        "exposure_gain_measured": None if gain.measured is None else gain.stated * gain.measured,
+        "saturated_fraction": float(decoded.saturated.mean()) if level is not None else None,
+        "saturation_level": None if level is None else level * gain.total,
+    }
+
+
+def focus_record(focus: FocusReading) -> dict[str, Any]:
+    """The focus distance as the file stated it, before it was counted from the lens."""
+    return {
+        "source": focus.source,
+        "origin": focus.origin,
+        "stated_dioptre": 1.0 / focus.distance_m,
+        "interval_dioptre": [1.0 / focus.farthest_m, 1.0 / focus.nearest_m],
+    }

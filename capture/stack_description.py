@@ -1,0 +1,133 @@
+"""stack.json of an ingested stack: slices in their order, lens, camera, and in words what a reader should know."""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from capture.grouping import Photo, in_focus_order
+from capture.photo_files import SkippedFile
+from capture.slice_files import FOLDER, arrange_slices, source_record
+from capture.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
+from capture.stack_lens import camera_of_lens, lens_of_photo, lens_remarks, reference_index
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.lens import Lens
+
+
+@dataclass(frozen=True)
+class StackReport:
+    """What became of the photographs of one stack; stack is None where none was usable; kept counts slices of earlier runs."""
+
+    name: str
+    stack: FocalStack | None
+    size_px: tuple[int, int] | None = None
+    kept: int = 0
+    skipped: tuple[SkippedFile, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+def ingest_digest(photos: Sequence[Photo], development: Development) -> str:
+    """A fingerprint of all that a stack depends on: the files, what they and lens.toml tell, and the settings."""
+    sources = [[source_record(photo.path), repr(photo.metadata), repr(replace(photo.sidecar, where=""))] for photo in photos]
+    text = json.dumps([PROCESS_VERSION, asdict(development), sources], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def finished_before(name: str, folder: Path, digest: str) -> StackReport | None:
+    """The report of a stack that an earlier run made of the same files and settings (merged since or not), else None."""
+    try:
+        stack = read_focal_stack(folder)
+    except InputError:
+        return None
+    if stack.metadata.get("ingest_digest") != digest or not all((folder / each.path).is_file() for each in stack.slices):
+        return None
+    skipped = tuple(SkippedFile(Path(each["source"]), each["reason"]) for each in stack.metadata["skipped"])
+    width_px, height_px = stack.metadata["size_px"]
+    return StackReport(name, stack, (width_px, height_px), len(stack), skipped, tuple(stack.metadata["remarks"]))
+
+
+def finish_stack(name: str, work: StackWork, digest: str) -> StackReport:
+    """Number the slices and write stack.json; a report without a stack where there are none."""
+    if not work.finished:
+        return StackReport(name, None, skipped=tuple(work.skipped))
+    was_merged = _was_merged(work.folder)
+    order = in_focus_order([each.photo for each in work.finished])
+    finished = sorted(work.finished, key=lambda each: order.index(each.photo))
+    # While slices change places there is no stack.json that could promise the wrong ones.
+    (work.folder / FILE_NAME).unlink(missing_ok=True)
+    paths = arrange_slices(work.folder, [each.path for each in finished])
+    slices = tuple(_slice(path, each) for path, each in zip(paths, finished, strict=True))
+    reference = reference_index([each.focus_distance_m for each in slices])
+    chosen = finished[reference]
+    width_px, height_px = chosen.record["size_px"]
+    native_width_px, native_height_px = chosen.record["native_size_px"]
+    lens, missing = lens_of_photo(chosen.photo, (native_width_px, native_height_px))
+    remarks = _remarks(work, chosen.photo, lens, missing)
+    if was_merged:
+        remarks.append("the stack changed since it was merged: merge it again")
+    stack = FocalStack(
+        folder=work.folder,
+        slices=slices,
+        lens=lens,
+        camera=None if lens is None else camera_of_lens(lens, width_px, height_px),
+        reference=reference,
+        metadata=_stack_metadata(work, digest, remarks),
+    )
+    write_focal_stack(stack)
+    return StackReport(name, stack, (width_px, height_px), work.kept, tuple(work.skipped), tuple(remarks))
+
+
+def _slice(path: Path, finished: FinishedSlice) -> Slice:
+    record = finished.record
+    metadata = {key: record["request"][key] for key in ("source", "source_size_bytes", "source_mtime_ns")} | record["metadata"]
+    return Slice(f"{FOLDER}/{path.name}", finished.photo.focus_distance_m, metadata=metadata)
+
+
+def _stack_metadata(work: StackWork, digest: str, remarks: Sequence[str]) -> dict[str, Any]:
+    return {
+        "ingest_digest": digest,
+        "colour": "scene-linear Rec.709; 1.0 is the white level of green in RAW files, white in others",
+        "white_balance": None if work.white_balance is None else list(work.white_balance),
+        "exposure_reference": work.finished[0].photo.path.name,
+        "size_px": work.finished[0].record["size_px"],
+        "skipped": [{"source": str(each.path), "reason": each.reason} for each in work.skipped],
+        "remarks": list(remarks),
+    }
+
+
+def _was_merged(folder: Path) -> bool:
+    try:
+        return read_focal_stack(folder).merged
+    except InputError:
+        return False
+
+
+def _remarks(work: StackWork, reference: Photo, lens: Lens | None, missing: str | None) -> list[str]:
+    photos = [each.photo for each in work.finished]
+    counted = Counter(remark for each in work.finished for remark in each.record["remarks"])
+    remarks = [remark if count == 1 or count == len(photos) else f"{remark} ({count} slices)" for remark, count in counted.items()]
+    if work.white_balance is not None:
+        multipliers = ",".join(f"{each:.4g}" for each in work.white_balance)
+        whose = "the one given" if work.development.white_balance else f"the camera's of {work.white_balance_source}"
+        remarks.append(f"one white balance for all RAW slices: {whose}. For the same in other stacks: --white-balance {multipliers}")
+    if any((photo.metadata.orientation or 1) != 1 for photo in photos):
+        remarks.append("EXIF asks to turn pictures of this stack: they are left as the sensor saw them")
+    remarks += _sidecar_remarks(photos)
+    if lens is None:
+        remarks.append(f"no lens: {missing}. Give what is missing in a lens.toml beside the photographs and ingest again")
+    elif reference.sidecar.sensor_width_mm is None and (sensor := reference.metadata.sensor) is not None:
+        remarks.append(f"sensor width {lens.sensor_width_mm:.4g} mm from {sensor.source}")
+    return remarks + lens_remarks(photos)
+
+
+def _sidecar_remarks(photos: Sequence[Photo]) -> list[str]:
+    sidecar = photos[0].sidecar
+    if not sidecar.where:
+        return []
+    unmatched = sidecar.unmatched_names([photo.path.name for photo in photos])
+    note = f"; it names files that are not in this stack: {', '.join(unmatched)}" if unmatched else ""
+    return [f"{Path(sidecar.where).name} was read{note}"]

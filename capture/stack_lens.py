@@ -1,0 +1,79 @@
+"""The lens and the camera of a stack, as far as metadata and lens.toml tell; and in words what is missing."""
+
+from collections.abc import Sequence
+
+from capture.grouping import Photo
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import lens_to_json
+
+
+def lens_of_photo(photo: Photo, native_size_px: tuple[int, int]) -> tuple[Lens | None, str | None]:
+    """The lens as it was focused for a photograph of native_size_px (width, height) before any reduction; or None and why."""
+    metadata, sidecar = photo.metadata, photo.sidecar
+    sensor_width_mm = sidecar.sensor_width_mm
+    if sensor_width_mm is None and metadata.sensor is not None:
+        sensor_width_mm = metadata.sensor.width_mm(*native_size_px)
+    focus_m = photo.focus_distance_m
+    wanted = {
+        "focal_length_mm": metadata.focal_length_mm,
+        "f_number": metadata.f_number,
+        "sensor_width_mm": sensor_width_mm,
+        "focus_distances_m": focus_m,
+    }
+    missing = [name for name, value in wanted.items() if value is None]
+    if metadata.focal_length_mm is None or metadata.f_number is None or sensor_width_mm is None or focus_m is None:
+        return None, f"{photo.path.name} does not tell {', '.join(missing)}{_why_no_focus(photo)}"
+    try:
+        return Lens(metadata.focal_length_mm, metadata.f_number, focus_m, sensor_width_mm, sidecar.aperture), None
+    except InputError as error:
+        return None, f"{photo.path.name}: {error}"
+
+
+def _why_no_focus(photo: Photo) -> str:
+    """A stated distance that could not be used needs a word of explanation."""
+    focus, focal_length_mm = photo.metadata.focus, photo.metadata.focal_length_mm
+    if focus is None or photo.focus_distance_m is not None:
+        return ""
+    if focal_length_mm is None:
+        return f" ({focus.source} counts from the film plane; the lens's distance follows once the focal length is known)"
+    return f" ({focus.source} from the film plane is nearer than a thin lens of {focal_length_mm:g} mm can focus)"
+
+
+def camera_of_lens(lens: Lens, width_px: int, height_px: int) -> Camera:
+    """Square pixels, the principal point in the middle of the picture."""
+    focal_px = lens.focal_px(width_px)
+    return Camera(width_px, height_px, (focal_px, focal_px), (width_px / 2.0, height_px / 2.0))
+
+
+def reference_index(focus_distances_m: Sequence[float | None]) -> int:
+    """The slice with the narrowest field: the one focused nearest, so far as distances are known, else the first."""
+    known = [(distance, index) for index, distance in enumerate(focus_distances_m) if distance is not None]
+    return min(known)[1] if known else 0
+
+
+def lens_remarks(photos: Sequence[Photo]) -> list[str]:
+    """What speaks against one lens for all slices: differing focal lengths or f-numbers, partly unknown distances."""
+    remarks = []
+    for name, unit in (("focal_length_mm", " mm"), ("f_number", "")):
+        values = sorted({round(value, 3) for photo in photos if (value := getattr(photo.metadata, name)) is not None})
+        if len(values) > 1:
+            listed = ", ".join(f"{value:g}{unit}" for value in values)
+            remarks.append(f"{name} differs within the stack ({listed}): the reference's is used")
+    unknown = [photo.path.name for photo in photos if photo.focus_distance_m is None]
+    if unknown:
+        remarks.append(
+            f"no focus distance for {len(unknown)} of {len(photos)} slices ({', '.join(unknown[:4])}{' ...' if len(unknown) > 4 else ''}): "
+            f"depth will be the index of the sharpest slice, in the order of the file names, not metres"
+        )
+    return remarks
+
+
+def lens_text(lens: Lens | None) -> str:
+    """A lens in a few words, for tables."""
+    if lens is None:
+        return "unknown"
+    sides = [len(outline) for outline in lens_to_json(lens)["aperture"]["outlines"]]
+    blades = f", {sides[0]} blades" if len(sides) == 1 and sides[0] < 32 else ""
+    return f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}{blades}, sensor {lens.sensor_width_mm:.4g} mm"

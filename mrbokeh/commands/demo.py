@@ -1,0 +1,35 @@
+"""`mrbokeh demo`: the whole way on shipped photographs, with a report."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for everything it makes.")] = Path("demo_out"),
+    minutes: Annotated[float, typer.Option(min=0.05, help="Training time of the first network; the second takes a third of it.")] = 2.3,
+) -> None:
+    """From RAW photographs to virtual objects with the blur of their lens: capture, train, composite, report.
+
+    Runs the commands of mrbokeh on shipped photographs and writes report.html. Finished stages are skipped when run again,
+    an interrupted one goes on.
+
+    Example: mrbokeh demo --out demo_out
+    """
+    from rich.console import Console
+
+    from mrbokeh.demo.plan import demo_stages
+    from mrbokeh.demo.stages import run_stages
+    from mrbokeh.demo.story import write_story
+
+    console = Console()
+    out.mkdir(parents=True, exist_ok=True)
+    done = run_stages(demo_stages(out, minutes), out, console)
+    measurements = write_story(out, done)
+    for each in measurements:
+        console.print(f"{'[green]ok    [/]' if each.met else '[red]missed[/]'} {each.what}: {each.text} ({each.wanted})", highlight=False)
+    console.print(f"\nOpen {(out / 'report.html').resolve()}", highlight=False, soft_wrap=True)

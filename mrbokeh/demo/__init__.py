@@ -1,0 +1,1 @@
+"""The demo: every command of the main job on shipped photographs, and a report of what came out."""

@@ -1,0 +1,105 @@
+"""What the demo does: the list of its commands, from RAW files to composites."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mrbokeh.demo.stages import Stage
+
+DATA = Path(__file__).resolve().parent.parent / "demo_data"
+HELD_OUT_VIEW = "view_2"
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An object in one slice of a stack: which slice, which pixel it stands on, how tall it is."""
+
+    name: str
+    glb: str
+    slice_index: int
+    at_pixel: str
+    height_m: float
+    turn_deg: float
+    tilt_deg: float
+    exposure: float
+
+
+DESK = (
+    Placement("cake_sharp", "cakeBirthday.glb", 1, "330,330", 0.075, 20.0, 10.0, 0.7),
+    Placement("cake_blurred", "cakeBirthday.glb", 5, "330,330", 0.075, 20.0, 10.0, 0.7),
+)
+BOARD = (
+    Placement("alien_sharp", "alien.glb", 2, "185,265", 0.012, 25.0, 35.0, 0.6),
+    Placement("alien_blurred", "alien.glb", 0, "185,265", 0.012, 25.0, 35.0, 0.6),
+)
+
+
+def demo_stages(out: Path, minutes: float) -> list[Stage]:
+    """Both stacks the whole way. minutes: training time of the desk's network; the board's takes a third of it."""
+    desk, board = out / "desk", out / "board"
+    views = [DATA / "raw_stack" / f"view_{i}" for i in range(3)]
+    return [
+        *_capture(desk, "RAW photographs of a desk (simulated camera, known truth)", views, []),
+        *_network(desk, minutes, HELD_OUT_VIEW),
+        *_composites(desk, desk / "scene" / HELD_OUT_VIEW, DESK),
+        *_capture(board, "photographs of a circuit board", [DATA / "pcb_oblique"], ["--max-width", "512"]),
+        *_network(board, minutes / 3.0, None),
+        *_composites(board, board / "scene" / "pcb_oblique", BOARD),
+    ]
+
+
+def _capture(folder: Path, what: str, sources: list[Path], options: list[str]) -> list[Stage]:
+    scene = folder / "scene"
+    stacks = [scene / source.name for source in sources]
+    ingest = ("capture", "ingest", *map(str, sources), "--out", str(scene), *options)
+    return [
+        Stage(f"{folder.name}_ingest", f"Develop {what}", ingest, tuple(stack / "stack.json" for stack in stacks)),
+        Stage(
+            f"{folder.name}_merge",
+            "Register the slices, merge all-in-focus pictures, find depth",
+            ("capture", "merge", str(scene)),
+            tuple(stack / name for stack in stacks for name in ("all_in_focus.exr", "depth.exr")),
+            when_stale=("--overwrite",),
+        ),
+    ]
+
+
+def _network(folder: Path, minutes: float, held_out: str | None) -> list[Stage]:
+    scene, run, network = folder / "scene", folder / "network", folder / "lens.onnx"
+    fit = ["train", "fit", str(scene), "--preset", "demo", "--minutes", f"{minutes:g}", "--out", str(run)]
+    stages = [
+        Stage(
+            f"{folder.name}_fit",
+            "Train a network that blurs like this lens",
+            (*fit, *(["--held-out", held_out] if held_out else [])),
+            (run / "settings.json",),
+            when_stale=("--overwrite",),
+        ),
+        Stage(
+            f"{folder.name}_export",
+            "Write the network as ONNX",
+            ("train", "export", str(run), "--out", str(network), "--overwrite"),
+            (network,),
+        ),
+    ]
+    if held_out:
+        evaluate = ("train", "evaluate", str(network), str(scene), "--out", str(folder / "evaluation"))
+        outputs = (folder / "evaluation" / "evaluation.csv", folder / "evaluation" / "evaluation.png")
+        stages.append(Stage(f"{folder.name}_evaluate", f"Compare the network with photographs it has not seen ({held_out})", evaluate, outputs))
+    return stages
+
+
+def _composites(folder: Path, stack: Path, placements: tuple[Placement, ...]) -> list[Stage]:
+    return [_composite(folder, stack, placement, renderer) for placement in placements for renderer in ("network", "reference")]
+
+
+def _composite(folder: Path, stack: Path, placement: Placement, renderer: str) -> Stage:
+    picture = folder / f"{placement.name}_{renderer}.png"
+    blur = ("--lens", str(folder / "lens.onnx")) if renderer == "network" else ("--renderer", "reference")
+    arguments = (
+        *("composite", str(stack), "--slice", str(placement.slice_index), "--object", str(DATA / "objects" / placement.glb)),
+        *("--at-pixel", placement.at_pixel, "--height", f"{placement.height_m:g}", "--turn", f"{placement.turn_deg:g}"),
+        *("--tilt", f"{placement.tilt_deg:g}", "--exposure", f"{placement.exposure:g}", "--shadow", "0.5", *blur),
+        *("--save-layer", str(picture.with_suffix(".exr")), "--out", str(picture), "--overwrite"),
+    )
+    purpose = f"Put {placement.glb} into slice {placement.slice_index} ({folder.name}), blurred by the {renderer}"
+    return Stage(f"{folder.name}_{placement.name}_{renderer}", purpose, arguments, (picture, picture.with_suffix(".exr")))

@@ -1,0 +1,51 @@
+"""Virtual objects: GLB scenes with physically based materials, and backends that turn scene and camera into a Layer.
+
+    from mrbokeh.scene import Environment, sun, world_from_scene_placing
+    from mrbokeh.scene.gltf_loader import load_glb
+    from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+
+    scene = load_glb("cake.glb")
+    scene = scene.transformed(world_from_scene_placing(scene, stands_at_m=(0.0, 0.3, 2.0), height_m=0.2))
+    scene = scene.with_environment(Environment(panorama)).with_lights(sun((0.3, 1.0, 0.5), irradiance=3.0))
+    layer = EmbreeRaycaster().render(scene, camera)
+
+What lies where:
+    virtual_scene      Scene; WORLD_FROM_GLTF (y up, z back -> y down, z forward); world_from_scene_placing
+    mesh, material     Mesh, Material, Texture, matte, emitter: glTF 2.0 metallic-roughness in linear light
+    light, environment Light (KHR_lights_punctual), sun; Environment (linear HDR panorama), split_sun, neutral_environment
+    shapes             sphere, rectangle, shadow_catcher
+    gltf_loader        load_glb(path, time_s, animation) -> Scene; GltfAsset for many moments of one file (needs pygltflib)
+    base               SceneRenderer: render(scene, camera) -> Layer, render_shadow_mask(scene, camera, catcher)
+    embree_raycaster   EmbreeRaycaster, the backend for any CPU (needs embreex and numba)
+
+Only light modules are imported here; the loader and the backends are imported by their own names.
+"""
+
+from mrbokeh.scene.base import SceneRenderer
+from mrbokeh.scene.environment import NEUTRAL_RADIANCE, Environment, neutral_environment, split_sun
+from mrbokeh.scene.light import Light, sun
+from mrbokeh.scene.material import Material, Texture, emitter, matte
+from mrbokeh.scene.mesh import Mesh
+from mrbokeh.scene.shapes import rectangle, shadow_catcher, sphere
+from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF, Scene, world_from_scene_placing
+
+__all__ = [
+    "NEUTRAL_RADIANCE",
+    "WORLD_FROM_GLTF",
+    "Environment",
+    "Light",
+    "Material",
+    "Mesh",
+    "Scene",
+    "SceneRenderer",
+    "Texture",
+    "emitter",
+    "matte",
+    "neutral_environment",
+    "rectangle",
+    "shadow_catcher",
+    "sphere",
+    "split_sun",
+    "sun",
+    "world_from_scene_placing",
+]

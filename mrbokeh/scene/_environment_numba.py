@@ -1,0 +1,154 @@
+"""Panoramas filtered for lighting: cosine convolution, GGX convolution, BRDF integral. Compiled with numba."""
+
+from math import acos, atan2, cos, log2, pi, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from mrbokeh.scene._compiled_numba import compiled
+from mrbokeh.scene._vectors_numba import Vector
+
+
+class PanoramaLevels(NamedTuple):
+    """Panoramas of several sizes, one after the other; texel centres at half-integers, as in `Environment`."""
+
+    radiance: np.ndarray  # (N, 3) float32
+    start: np.ndarray  # (L,) int32
+    size: np.ndarray  # (L, 2) int32 height, width
+
+
+@compiled
+def _index(x: int, y: int, height: int, width: int) -> int:
+    """Texel index; over a pole the panorama goes on at the opposite longitude."""
+    if y < 0:
+        y, x = -1 - y, x + width // 2
+    elif y >= height:
+        y, x = 2 * height - 1 - y, x + width // 2
+    return y * width + x % width
+
+
+@compiled
+def look_up(levels: PanoramaLevels, level: int, x: float, y: float, z: float) -> Vector:
+    """Radiance from the unit direction (x, y, z), bilinearly."""
+    height, width = levels.size[level, 0], levels.size[level, 1]
+    start = levels.start[level]
+    column = (atan2(x, z) / (2 * pi) + 0.5) * width - 0.5
+    row = acos(min(max(-y, -1.0), 1.0)) / pi * height - 0.5
+    left, top = int(np.floor(column)), int(np.floor(row))
+    right, down = column - left, row - top
+    a, b = start + _index(left, top, height, width), start + _index(left + 1, top, height, width)
+    c, d = start + _index(left, top + 1, height, width), start + _index(left + 1, top + 1, height, width)
+    w_a, w_b, w_c, w_d = (1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down
+    v = levels.radiance
+    return (
+        w_a * v[a, 0] + w_b * v[b, 0] + w_c * v[c, 0] + w_d * v[d, 0],
+        w_a * v[a, 1] + w_b * v[b, 1] + w_c * v[c, 1] + w_d * v[d, 1],
+        w_a * v[a, 2] + w_b * v[b, 2] + w_c * v[c, 2] + w_d * v[d, 2],
+    )
+
+
+@compiled
+def look_up_between(levels: PanoramaLevels, level: float, x: float, y: float, z: float) -> Vector:
+    """Radiance between two neighbouring levels (level is fractional)."""
+    level = min(max(level, 0.0), levels.start.size - 1.0)
+    low = int(level)
+    fraction = level - low
+    fine = look_up(levels, low, x, y, z)
+    if fraction == 0.0:
+        return fine
+    coarse = look_up(levels, low + 1, x, y, z)
+    return (
+        fine[0] + fraction * (coarse[0] - fine[0]),
+        fine[1] + fraction * (coarse[1] - fine[1]),
+        fine[2] + fraction * (coarse[2] - fine[2]),
+    )
+
+
+@compiled
+def cosine_convolved(moments: np.ndarray, normals: np.ndarray, out: np.ndarray) -> None:
+    """Irradiance / pi for each normal: sum over blocks of the panorama of max(0, normal . moment) / pi.
+
+    moments: (B, 3 colours, 3) integral of radiance times direction over each block. For a block wholly above or below the
+    horizon the sum is exact however its light is distributed; only the blocks that the horizon cuts are approximated.
+    """
+    for i in range(normals.shape[0]):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        for channel in range(3):
+            total = 0.0
+            for block in range(moments.shape[0]):
+                cosine = x * moments[block, channel, 0] + y * moments[block, channel, 1] + z * moments[block, channel, 2]
+                total += max(cosine, 0.0)
+            out[i, channel] = total / pi
+
+
+@compiled
+def _radical_inverse(i: int) -> float:
+    """Van der Corput's sequence: the second coordinate of Hammersley points."""
+    result, digit = 0.0, 0.5
+    while i > 0:
+        result += digit * (i & 1)
+        i >>= 1
+        digit *= 0.5
+    return result
+
+
+@compiled
+def ggx_convolved(source: PanoramaLevels, directions: np.ndarray, roughness: float, samples: int, out: np.ndarray) -> None:
+    """The panorama as a rough mirror sees it, with normal = view = reflection (Karis 2013, "Real Shading in Unreal Engine 4").
+
+    Each GGX sample reads a level of the panorama about as coarse as the sample's share of the sphere (filtered importance
+    sampling: Krivanek and Colbert 2008), so that a small bright sun gives no noise.
+    """
+    alpha2 = max(roughness, 1e-3) ** 4
+    texel_sr = 4 * pi / (source.size[0, 0] * source.size[0, 1])
+    for i in range(directions.shape[0]):
+        rx, ry, rz = directions[i, 0], directions[i, 1], directions[i, 2]
+        # A frame around the reflection (Duff et al. 2017).
+        sign = 1.0 if rz >= 0 else -1.0
+        a = -1.0 / (sign + rz)
+        b = rx * ry * a
+        tx, ty, tz = 1.0 + sign * rx * rx * a, sign * b, -sign * rx
+        bx, by, bz = b, sign + ry * ry * a, -ry
+        # Turned by a different angle per texel, the pattern's own shape does not show.
+        start = 2 * pi * _radical_inverse(i * 7 + 1)
+        red, green, blue, weight = 0.0, 0.0, 0.0, 0.0
+        for k in range(samples):
+            u, phi = (k + 0.5) / samples, 2 * pi * _radical_inverse(k) + start
+            cos2 = (1.0 - u) / (1.0 + (alpha2 - 1.0) * u)
+            n_l = 2.0 * cos2 - 1.0
+            if n_l <= 0.0:
+                continue
+            sin_l = sqrt(max(1.0 - n_l * n_l, 0.0))
+            across, along = sin_l * cos(phi), sin_l * sin(phi)
+            x, y, z = across * tx + along * bx + n_l * rx, across * ty + along * by + n_l * ry, across * tz + along * bz + n_l * rz
+            density = alpha2 / (pi * (cos2 * (alpha2 - 1.0) + 1.0) ** 2) / 4.0
+            level = 0.5 * log2(1.0 / (samples * density * texel_sr)) + 0.5
+            light = look_up_between(source, level, x, y, z)
+            red, green, blue, weight = red + n_l * light[0], green + n_l * light[1], blue + n_l * light[2], weight + n_l
+        out[i, 0], out[i, 1], out[i, 2] = red / weight, green / weight, blue / weight
+
+
+@compiled
+def brdf_integral(size: int, samples: int, out: np.ndarray) -> None:
+    """(size, size, 2): reflected share of uniform light = f0 * [..., 0] + f90 * [..., 1]; rows roughness, columns cosine.
+
+    The BRDF is the specification's: GGX, height-correlated Smith visibility, Schlick's Fresnel (glTF 2.0, appendix B).
+    """
+    for row in range(size):
+        alpha2 = max(row / (size - 1), 1e-3) ** 4
+        for column in range(size):
+            n_v = max(column / (size - 1), 1e-3)
+            vx = sqrt(1.0 - n_v * n_v)
+            first, second = 0.0, 0.0
+            for k in range(samples):
+                u, phi = (k + 0.5) / samples, 2 * pi * _radical_inverse(k)
+                n_h = sqrt((1.0 - u) / (1.0 + (alpha2 - 1.0) * u))
+                v_h = vx * sqrt(max(1.0 - n_h * n_h, 0.0)) * cos(phi) + n_v * n_h
+                n_l = 2.0 * v_h * n_h - n_v
+                if n_l <= 0.0 or v_h <= 0.0:
+                    continue
+                visibility = 0.5 / (n_l * sqrt(n_v * n_v * (1 - alpha2) + alpha2) + n_v * sqrt(n_l * n_l * (1 - alpha2) + alpha2))
+                share = visibility * n_l * 4.0 * v_h / n_h
+                fresnel = (1.0 - v_h) ** 5
+                first, second = first + (1.0 - fresnel) * share, second + fresnel * share
+            out[row, column, 0], out[row, column, 1] = first / samples, second / samples

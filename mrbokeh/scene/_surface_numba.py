@@ -1,0 +1,250 @@
+"""From a ray and the triangle it meets to a shading point: exact depth, normals, textures. Compiled with numba."""
+
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from mrbokeh.scene._compiled_numba import compiled
+from mrbokeh.scene._texture_numba import Texel, read_texture
+from mrbokeh.scene._vectors_numba import Vector, corner, cross, dot, mixed, row, scaled, sub, unit3, write
+from mrbokeh.scene.packed_scene import MASK, OPAQUE, PackedMaterials, PackedTextures, PackedTriangles
+
+
+class Surfaces(NamedTuple):
+    """Shading points of N rays (arrays that `fill_surfaces` writes)."""
+
+    depth: np.ndarray  # (N,) float64 along the optical axis, inf where nothing is met
+    alpha: np.ndarray  # (N,) how much the surface covers; 0 where there is none or it is seen from its invisible side
+    mesh: np.ndarray  # (N,) int32 index of the mesh, -1 for none
+    to_viewer: np.ndarray  # (N, 3) unit, towards the camera
+    face_normal: np.ndarray  # (N, 3) unit, of the triangle, on the viewer's side
+    smooth_normal: np.ndarray  # (N, 3) unit, interpolated
+    normal: np.ndarray  # (N, 3) unit, with the normal map
+    shadow_origin: np.ndarray  # (N, 3) float64, where shadow rays start
+    base: np.ndarray  # (N, 3) base colour
+    diffuse: np.ndarray  # (N, 3) Lambertian albedo before the reflection on top is taken off
+    f0: np.ndarray  # (N, 3) reflectance at normal incidence
+    f90: np.ndarray  # (N,) reflectance at grazing incidence
+    roughness: np.ndarray  # (N,) perceptual; -1 marks an unlit surface
+    occlusion: np.ndarray  # (N,)
+    emissive: np.ndarray  # (N, 3)
+
+
+def empty_surfaces(count: int) -> Surfaces:
+    """Room for `count` shading points."""
+
+    def vectors(dtype: type = np.float32) -> np.ndarray:
+        return np.zeros((count, 3), dtype)
+
+    def scalars(dtype: type = np.float32) -> np.ndarray:
+        return np.zeros(count, dtype)
+
+    return Surfaces(
+        depth=scalars(np.float64),
+        alpha=scalars(),
+        mesh=scalars(np.int32),
+        to_viewer=vectors(),
+        face_normal=vectors(),
+        smooth_normal=vectors(),
+        normal=vectors(),
+        shadow_origin=vectors(np.float64),
+        base=vectors(),
+        diffuse=vectors(),
+        f0=vectors(),
+        f90=scalars(),
+        roughness=scalars(),
+        occlusion=scalars(),
+        emissive=vectors(),
+    )
+
+
+@compiled
+def fill_surfaces(
+    triangles: PackedTriangles,
+    materials: PackedMaterials,
+    textures: PackedTextures,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    hits: np.ndarray,
+    footprint_per_depth: float,
+    both_sides: bool,
+    out: Surfaces,
+) -> None:
+    """Write the shading points of rays origin + depth * direction.
+
+    origins: (N, 3), or (1, 3) for all rays. directions: 1 long along the optical axis where depth is to be along it.
+    hits: (N,) triangle of each ray or -1. footprint_per_depth: width of a pixel at unit depth.
+    both_sides: single-sided surfaces count from behind too (as they do for shadows).
+    """
+    for i in range(hits.size):
+        triangle = hits[i]
+        out.depth[i], out.alpha[i], out.mesh[i] = inf, 0.0, -1
+        if triangle < 0:
+            continue
+        ray, origin = row(directions, i), row(origins, min(i, origins.shape[0] - 1))
+        a, b, c = (
+            corner(triangles.corners_m, triangle, 0),
+            corner(triangles.corners_m, triangle, 1),
+            corner(triangles.corners_m, triangle, 2),
+        )
+        # Where the ray meets the triangle's plane (Moeller and Trumbore 1997), in double precision.
+        side_1, side_2, to_origin = sub(b, a), sub(c, a), sub(origin, a)
+        p, q = cross(ray, side_2), cross(to_origin, side_1)
+        determinant = dot(p, side_1)
+        if determinant == 0.0:
+            continue
+        w1 = min(max(dot(p, to_origin) / determinant, 0.0), 1.0)
+        w2 = min(max(dot(q, ray) / determinant, 0.0), 1.0 - w1)
+        weights = (1.0 - w1 - w2, w1, w2)
+        out.depth[i], out.mesh[i] = dot(q, side_2) / determinant, triangles.mesh[triangle]
+        face = cross(side_1, side_2)
+        facing = 1.0 if dot(face, ray) < 0.0 else -1.0
+        material = triangles.material[triangle]
+        if facing < 0.0 and not (both_sides or materials.double_sided[material]):
+            continue
+        write(out.to_viewer, i, unit3(scaled(ray, -1.0)))
+        write(out.face_normal, i, scaled(unit3(face), facing))
+        uv = _texture_coordinates(triangles.uvs, triangle, weights)
+        footprint = _footprint(
+            triangles.uv_density, triangle, footprint_per_depth * out.depth[i], row(out.face_normal, i), row(out.to_viewer, i)
+        )
+        base, alpha = _base_color(triangles.colors, materials, textures, triangle, material, weights, uv, footprint)
+        out.alpha[i] = alpha
+        if alpha > 0.0:
+            _fill_shape(triangles, materials, textures, triangle, weights, facing, uv, footprint, i, out)
+            _fill_material(materials, textures, material, base, uv, footprint, i, out)
+
+
+@compiled
+def _texture_coordinates(uvs: np.ndarray, triangle: int, w: Vector) -> Texel:
+    """Both sets of texture coordinates inside a triangle."""
+    return (
+        w[0] * uvs[triangle, 0, 0] + w[1] * uvs[triangle, 1, 0] + w[2] * uvs[triangle, 2, 0],
+        w[0] * uvs[triangle, 0, 1] + w[1] * uvs[triangle, 1, 1] + w[2] * uvs[triangle, 2, 1],
+        w[0] * uvs[triangle, 0, 2] + w[1] * uvs[triangle, 1, 2] + w[2] * uvs[triangle, 2, 2],
+        w[0] * uvs[triangle, 0, 3] + w[1] * uvs[triangle, 1, 3] + w[2] * uvs[triangle, 2, 3],
+    )
+
+
+@compiled
+def _footprint(uv_density: np.ndarray, triangle: int, width_m: float, face: Vector, to_viewer: Vector) -> tuple[float, float]:
+    """Width of a pixel on the surface in texture coordinates: the mean of its two axes (ray cones, Akenine-Moeller 2021)."""
+    width_m = width_m / sqrt(max(dot(face, to_viewer), 0.05))
+    return (width_m * uv_density[triangle, 0], width_m * uv_density[triangle, 1])
+
+
+@compiled
+def _base_color(
+    colors: np.ndarray,
+    materials: PackedMaterials,
+    textures: PackedTextures,
+    triangle: int,
+    material: int,
+    w: Vector,
+    uv: Texel,
+    footprint: tuple[float, float],
+) -> tuple[Vector, float]:
+    """Factor times texture times vertex colour, and how much it covers under the material's alpha mode."""
+    tint = mixed(corner(colors, triangle, 0), corner(colors, triangle, 1), corner(colors, triangle, 2), w)
+    factor = materials.base_color
+    base = (factor[material, 0] * tint[0], factor[material, 1] * tint[1], factor[material, 2] * tint[2])
+    alpha = factor[material, 3] * (w[0] * colors[triangle, 0, 3] + w[1] * colors[triangle, 1, 3] + w[2] * colors[triangle, 2, 3])
+    texture = materials.textures[material, 0]
+    if texture >= 0:
+        texel = read_texture(textures, texture, uv, footprint)
+        base = (base[0] * texel[0], base[1] * texel[1], base[2] * texel[2])
+        alpha = alpha * texel[3]
+    if materials.alpha_mode[material] == OPAQUE:
+        alpha = 1.0
+    elif materials.alpha_mode[material] == MASK:
+        alpha = 1.0 if alpha >= materials.alpha_cutoff[material] else 0.0
+    return base, min(max(alpha, 0.0), 1.0)
+
+
+@compiled
+def _fill_shape(
+    triangles: PackedTriangles,
+    materials: PackedMaterials,
+    textures: PackedTextures,
+    triangle: int,
+    w: Vector,
+    facing: float,
+    uv: Texel,
+    footprint: tuple[float, float],
+    i: int,
+    out: Surfaces,
+) -> None:
+    """Normals and the start of shadow rays."""
+    a, b, c = corner(triangles.corners_m, triangle, 0), corner(triangles.corners_m, triangle, 1), corner(triangles.corners_m, triangle, 2)
+    n0, n1, n2 = corner(triangles.normals, triangle, 0), corner(triangles.normals, triangle, 1), corner(triangles.normals, triangle, 2)
+    smooth = scaled(unit3(mixed(n0, n1, n2, w)), facing)
+    write(out.smooth_normal, i, smooth)
+    write(out.normal, i, _mapped_normal(materials, textures, triangles, triangle, smooth, facing, w, uv, footprint))
+    # Shadow rays start on the smooth surface that the triangles stand for (Hanika 2021, "Hacking the Shadow Terminator").
+    point = mixed(a, b, c, w)
+    below_a, below_b = min(0.0, facing * dot(sub(point, a), n0)), min(0.0, facing * dot(sub(point, b), n1))
+    below_c = min(0.0, facing * dot(sub(point, c), n2))
+    lift = mixed(n0, n1, n2, (w[0] * below_a, w[1] * below_b, w[2] * below_c))
+    write(out.shadow_origin, i, sub(point, scaled(lift, facing)))
+
+
+@compiled
+def _mapped_normal(
+    materials: PackedMaterials,
+    textures: PackedTextures,
+    triangles: PackedTriangles,
+    triangle: int,
+    smooth: Vector,
+    facing: float,
+    w: Vector,
+    uv: Texel,
+    footprint: tuple[float, float],
+) -> Vector:
+    """The smooth normal tilted by the normal map (glTF 2.0, section 3.9.3)."""
+    material, tangents = triangles.material[triangle], triangles.tangents
+    texture = materials.textures[material, 3]
+    along = mixed(corner(tangents, triangle, 0), corner(tangents, triangle, 1), corner(tangents, triangle, 2), w)
+    along = sub(along, scaled(smooth, dot(smooth, along)))
+    if texture < 0 or dot(along, along) < 1e-20:
+        return smooth
+    red, green, blue, _ = read_texture(textures, texture, uv, footprint)
+    # `smooth` is already on the viewer's side, while the tangent frame belongs to the front.
+    tilt = materials.normal_scale[material] * facing
+    along = unit3(along)
+    across = scaled(cross(smooth, along), tangents[triangle, 0, 3] * facing)
+    return unit3(mixed(along, across, smooth, ((2.0 * red - 1.0) * tilt, (2.0 * green - 1.0) * tilt, 2.0 * blue - 1.0)))
+
+
+@compiled
+def _fill_material(
+    materials: PackedMaterials,
+    textures: PackedTextures,
+    material: int,
+    base: Vector,
+    uv: Texel,
+    footprint: tuple[float, float],
+    i: int,
+    out: Surfaces,
+) -> None:
+    """Reflection and emission (glTF 2.0, sections 3.9.2 and 3.9.3)."""
+    slots = materials.textures
+    metallic, roughness = float(materials.metallic_roughness[material, 0]), float(materials.metallic_roughness[material, 1])
+    if slots[material, 1] >= 0:
+        texel = read_texture(textures, slots[material, 1], uv, footprint)
+        metallic, roughness = metallic * texel[2], roughness * texel[1]
+    emissive = row(materials.emissive, material)
+    if slots[material, 2] >= 0:
+        texel = read_texture(textures, slots[material, 2], uv, footprint)
+        emissive = (emissive[0] * texel[0], emissive[1] * texel[1], emissive[2] * texel[2])
+    out.occlusion[i] = 1.0
+    if slots[material, 4] >= 0:
+        texel = read_texture(textures, slots[material, 4], uv, footprint)
+        out.occlusion[i] = 1.0 + materials.occlusion_strength[material] * (texel[0] - 1.0)
+    write(out.base, i, base)
+    write(out.emissive, i, emissive)
+    write(out.diffuse, i, scaled(base, 1.0 - metallic))
+    f0 = row(materials.f0, material)
+    write(out.f0, i, mixed(f0, base, base, (1.0 - metallic, metallic, 0.0)))
+    out.f90[i] = materials.f90[material] + metallic * (1.0 - materials.f90[material])
+    out.roughness[i] = -1.0 if materials.unlit[material] else min(max(roughness, 0.0), 1.0)

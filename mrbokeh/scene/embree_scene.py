@@ -1,0 +1,215 @@
+"""PreparedScene: packed triangles with their Embree hierarchies, and the tracing of rays through them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float, Float32, Float64, Int32
+
+from mrbokeh.color import luminance
+from mrbokeh.scene._lighting_numba import add_emission, add_environment, add_light
+from mrbokeh.scene._surface_numba import Surfaces, empty_surfaces, fill_surfaces
+from mrbokeh.scene.environment_filter import LightingMaps, reflected_share_table
+from mrbokeh.scene.light import Light
+from mrbokeh.scene.mesh import Mesh
+from mrbokeh.scene.packed_scene import OPAQUE, PackedMaterials, PackedTextures, PackedTriangles, packed
+from mrbokeh.scene.silhouettes import MeshEdges, mesh_edges
+
+_STEP = 2.0**-18
+"""Relative step past a surface, 32 float32 roundings: what keeps a ray from meeting again where it starts."""
+_MOST_SHADOW_LAYERS = 16
+_NOTHING_LEFT = 1.0 / 1024
+"""Once less than this shines through, what lies behind is not followed."""
+
+
+@dataclass(frozen=True, eq=False)
+class RaySamples:
+    """What N rays see. rgb is premultiplied; mesh, normal and lit (the mean share of the lights that is not in shadow, 1 where
+    there are none) belong to the first surface that covers anything."""
+
+    rgb: Float32[np.ndarray, "rays 3"]
+    alpha: Float32[np.ndarray, " rays"]
+    depth_m: Float64[np.ndarray, " rays"]
+    mesh: Int32[np.ndarray, " rays"]
+    normal: Float32[np.ndarray, "rays 3"]
+    lit: Float32[np.ndarray, " rays"]
+
+    @staticmethod
+    def joined(parts: Sequence["RaySamples"]) -> "RaySamples":
+        names = ("rgb", "alpha", "depth_m", "mesh", "normal", "lit")
+        return RaySamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedScene:
+    """Triangles relative to centre_m. all_rays sees every triangle; for shadows opaque_rays and see_through_rays part them."""
+
+    centre_m: Float64[np.ndarray, "3"]
+    reach_m: float
+    triangles: PackedTriangles
+    materials: PackedMaterials
+    textures: PackedTextures
+    edges: MeshEdges
+    all_rays: EmbreeScene
+    opaque_rays: EmbreeScene | None
+    see_through_rays: EmbreeScene | None
+    see_through: Int32[np.ndarray, " see_through_triangles"]
+
+    def shaded(
+        self,
+        eye_m: Float[np.ndarray, "3"],
+        directions: Float[np.ndarray, "rays 3"],
+        footprint: float,
+        lights: Sequence[Light],
+        maps: LightingMaps | None,
+        most_layers: int,
+    ) -> RaySamples:
+        """Follow rays front to back through see-through and cut-out surfaces; directions are 1 long along the optical axis."""
+        count, eye = len(directions), eye_m - self.centre_m
+        rgb, shines_through = np.zeros((count, 3), np.float32), np.ones(count, np.float32)
+        lit = np.ones(count, np.float32)
+        depth_m, mesh, normal = np.full(count, np.inf), np.full(count, -1, np.int32), np.zeros((count, 3), np.float32)
+        active, start = np.arange(count), np.zeros(count)
+        for _ in range(most_layers):
+            rays = directions[active]
+            hits = _closest(self.all_rays, eye + start[:, None] * rays, rays)
+            met = np.flatnonzero(hits >= 0)
+            if not len(met):
+                break
+            active, start, hits = active[met], start[met], hits[met]
+            surfaces = self._surfaces(eye, rays[met], hits, footprint)
+            light, not_shadowed = self._radiance(surfaces, lights, maps)
+            covers = surfaces.alpha * shines_through[active]
+            rgb[active] += covers[:, None] * light
+            seen = surfaces.alpha > 0
+            # The depth of what one mostly sees: the surface at which half of the view is covered, or else the first.
+            decides = seen & ((mesh[active] < 0) | (shines_through[active] > 0.5))
+            depth_m[active[decides]] = surfaces.depth[decides]
+            first = np.flatnonzero(seen & (mesh[active] < 0))
+            normal[active[first]], mesh[active[first]] = surfaces.face_normal[first], surfaces.mesh[first]
+            lit[active[first]] = not_shadowed[first]
+            shines_through[active] -= covers
+            goes_on = shines_through[active] > _NOTHING_LEFT
+            length = np.sqrt(np.einsum("rk,rk->r", directions[active], directions[active]))
+            start = np.maximum(surfaces.depth, start) + _STEP * (self.reach_m + np.abs(eye).max()) / length
+            active, start = active[goes_on], start[goes_on]
+        alpha = np.where(shines_through <= _NOTHING_LEFT, 1.0, 1.0 - shines_through).astype(np.float32)
+        return RaySamples(rgb, alpha, depth_m, mesh, normal, lit)
+
+    def lit_share(
+        self, ground: "PreparedScene", lights: Sequence[Light], eye_m: Float[np.ndarray, "3"], directions: Float[np.ndarray, "rays 3"]
+    ) -> Float32[np.ndarray, " rays"]:
+        """Share of the lights' irradiance that reaches the ground where rays from the eye meet it; 1 where they do not."""
+        eye = eye_m - ground.centre_m
+        hits = _closest(ground.all_rays, np.broadcast_to(eye, directions.shape), directions)
+        surfaces = ground._surfaces(eye, np.ascontiguousarray(directions), hits, 0.0)
+        points_m = surfaces.shadow_origin + ground.centre_m
+        arriving, unobstructed = np.zeros(len(hits)), np.zeros(len(hits))
+        for light in lights:
+            towards, distance_m, irradiance = light.arriving_at(points_m)
+            cosine = np.maximum(np.einsum("rk,rk->r", surfaces.normal, towards), 0.0)
+            amount = cosine * luminance(np.asarray(irradiance, np.float64)) * surfaces.alpha
+            lit = np.flatnonzero(amount > 0)
+            unobstructed[lit] += amount[lit]
+            visible = self._visible(points_m[lit] - self.centre_m, towards[lit], distance_m[lit]) if light.casts_shadow else 1.0
+            arriving[lit] += amount[lit] * visible
+        return np.where(unobstructed > 0, arriving / np.maximum(unobstructed, 1e-30), 1.0).astype(np.float32)
+
+    def _surfaces(
+        self, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "rays 3"], hits: Int32[np.ndarray, " rays"], footprint: float
+    ) -> Surfaces:
+        surfaces = empty_surfaces(len(hits))
+        fill_surfaces(self.triangles, self.materials, self.textures, eye[None], directions, hits, footprint, False, surfaces)
+        return surfaces
+
+    def _radiance(
+        self, surfaces: Surfaces, lights: Sequence[Light], maps: LightingMaps | None
+    ) -> tuple[Float32[np.ndarray, "rays 3"], Float32[np.ndarray, " rays"]]:
+        """(light that leaves the shading points towards the camera, mean share of the lights that is not in shadow)."""
+        rgb = np.zeros((len(surfaces.alpha), 3), np.float32)
+        not_shadowed = np.ones(len(surfaces.alpha), np.float32)
+        add_emission(surfaces, rgb)
+        if maps is not None:
+            table = reflected_share_table()
+            add_environment(surfaces, maps.peaks, maps.irradiance, maps.reflections, table, maps.environment_from_world, rgb)
+        for light in lights:
+            towards, distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + self.centre_m)
+            arriving = np.array(irradiance, np.float32)
+            if light.casts_shadow:
+                facing = np.einsum("rk,rk->r", surfaces.normal, towards) > 0
+                lit = np.flatnonzero(facing & (surfaces.alpha > 0) & (surfaces.roughness >= 0) & (arriving > 0).any(1))
+                origins = surfaces.shadow_origin[lit] + 2 * _STEP * self.reach_m * surfaces.face_normal[lit]
+                visible = self._visible(origins, towards[lit], distance_m[lit])
+                arriving[lit] *= visible[:, None]
+                not_shadowed[lit] -= (1.0 - visible) / len(lights)
+            add_light(surfaces, np.ascontiguousarray(towards), arriving, rgb)
+        return rgb, not_shadowed
+
+    def _visible(
+        self, origins: Float[np.ndarray, "points 3"], towards: Float[np.ndarray, "points 3"], distance_m: Float[np.ndarray, " points"]
+    ) -> Float32[np.ndarray, " points"]:
+        """How much of a light's rays reach the origins: 0 behind opaque surfaces, the product of 1 - alpha behind others."""
+        visible = np.ones(len(origins), np.float32)
+        if self.opaque_rays is not None and len(origins):
+            blocked = self.opaque_rays.run(*_float32(origins, towards), np.minimum(distance_m, 1e37).astype(np.float32), query="OCCLUDED")
+            visible[blocked >= 0] = 0.0
+        if self.see_through_rays is None:
+            return visible
+        active, start = np.flatnonzero(visible), np.zeros(np.count_nonzero(visible))
+        for _ in range(_MOST_SHADOW_LAYERS):
+            rays = towards[active]
+            hits = _closest(self.see_through_rays, origins[active] + start[:, None] * rays, rays)
+            met = np.flatnonzero(hits >= 0)
+            if not len(met):
+                break
+            active, start, veils = active[met], start[met], self.see_through[hits[met]]
+            surfaces = empty_surfaces(len(active))
+            fill_surfaces(self.triangles, self.materials, self.textures, origins[active], rays[met], veils, 0.0, True, surfaces)
+            before_light = surfaces.depth < distance_m[active]
+            visible[active] *= np.where(before_light, 1.0 - surfaces.alpha, 1.0)
+            start = np.maximum(surfaces.depth, start) + 2 * _STEP * self.reach_m
+            goes_on = before_light & (visible[active] > _NOTHING_LEFT)
+            active, start = active[goes_on], start[goes_on]
+        return visible
+
+
+def prepared(meshes: Sequence[Mesh]) -> PreparedScene:
+    """Pack meshes (at least one triangle) and build their hierarchies."""
+    points = np.concatenate([mesh.positions_m[mesh.triangles].reshape(-1, 3) for mesh in meshes])
+    centre_m = (points.min(0) + points.max(0)) / 2
+    triangles, materials, textures = packed(meshes, centre_m)
+    is_opaque = materials.alpha_mode[triangles.material] == OPAQUE
+    all_rays = _hierarchy(triangles.corners_m)
+    return PreparedScene(
+        centre_m=centre_m,
+        reach_m=float(np.abs(triangles.corners_m).max()),
+        triangles=triangles,
+        materials=materials,
+        textures=textures,
+        edges=mesh_edges(triangles.corners_m),
+        all_rays=all_rays,
+        opaque_rays=all_rays if is_opaque.all() else _hierarchy(triangles.corners_m[is_opaque]),
+        see_through_rays=_hierarchy(triangles.corners_m[~is_opaque]),
+        see_through=np.flatnonzero(~is_opaque).astype(np.int32),
+    )
+
+
+def _hierarchy(corners_m: Float64[np.ndarray, "triangles 3 3"]) -> EmbreeScene | None:
+    if not len(corners_m):
+        return None
+    rays = EmbreeScene(robust=True)  # watertight along shared edges
+    TriangleMesh(rays, corners_m.astype(np.float32))
+    return rays
+
+
+def _closest(
+    rays: EmbreeScene, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
+) -> Int32[np.ndarray, " rays"]:
+    """Index of the first triangle that each ray meets, or -1."""
+    return rays.run(*_float32(origins, directions), query="INTERSECT")
+
+
+def _float32(*arrays: Float[np.ndarray, "rays 3"]) -> tuple[Float32[np.ndarray, "rays 3"], ...]:
+    return tuple(np.ascontiguousarray(array, dtype=np.float32) for array in arrays)

@@ -1,0 +1,88 @@
+"""How long a virtual object takes: `python -m tests.bench_scene`.
+
+640x360 with the sun's shadow and a panorama. The yardstick in the same run is trimesh's own ray caster (its Embree wrapper)
+with shading in numpy: first hit, interpolated normal, Lambert and one shadow ray per pixel; no textures, no edges, no panorama.
+"""
+
+import resource
+import time
+from collections.abc import Callable
+
+import numpy as np
+import trimesh
+
+from mrbokeh.camera import Camera
+from mrbokeh.scene import Environment, Material, Scene, matte, rectangle, shadow_catcher, sphere, sun
+from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.environment import directions
+
+CAMERA = Camera(640, 360, (520.0, 515.0), (320.0, 180.0))
+SUN = sun((0.5, 1.0, 0.3), 3.0)
+
+
+def balls_on_a_floor() -> Scene:
+    """Nine glossy and matte balls on a floor that fills half of the picture: about 75 000 triangles."""
+    floor = rectangle((-10, 0.6, 12), (20, 0, 0), (0, 0, -11), matte(0.5, 0.5, 0.5))
+    balls = [
+        sphere((x, 0.25, z), 0.35, Material(base_color=(0.8, 0.5, 0.3, 1.0), metallic=metallic, roughness=0.1 + 0.1 * z), rows=46)
+        for x, metallic in ((-1.0, 0.0), (0.0, 0.5), (1.0, 1.0))
+        for z in (2.0, 3.0, 4.0)
+    ]
+    return Scene((floor, *balls), (SUN,), Environment(sky()))
+
+
+def sky() -> np.ndarray:
+    """A panorama of 512x1024 with a gradient and a wide lamp."""
+    towards = directions(512, 1024)
+    lamp = 20.0 * np.exp(60 * (towards @ np.array([0.6, -0.64, -0.48]) - 1))
+    return (np.stack([0.4 + 0.3 * -towards[..., 1]] * 3, axis=-1) + lamp[..., None]).astype(np.float32)
+
+
+def trimesh_lambert(scene: Scene, camera: Camera) -> np.ndarray:
+    """The yardstick: trimesh's intersector, Lambert under the sun with hard shadow."""
+    world = trimesh.util.concatenate(
+        [trimesh.Trimesh(mesh.positions_m, mesh.triangles, vertex_normals=mesh.normals, process=False) for mesh in scene.meshes]
+    )
+    eye = camera.world_from_camera[:3, 3]
+    rays = camera.unproject(camera.pixel_centres_px().reshape(-1, 2), np.ones(camera.height_px * camera.width_px)) - eye
+    place, ray, triangle = world.ray.intersects_location(np.broadcast_to(eye, rays.shape), rays, multiple_hits=False)
+    weights = trimesh.triangles.points_to_barycentric(world.triangles[triangle], place)
+    normal = np.einsum("ij,ijk->ik", weights, world.vertex_normals[world.faces[triangle]])
+    towards = -np.asarray(SUN.direction)
+    lit = ~world.ray.intersects_any(place + 1e-4 * normal, np.broadcast_to(towards, place.shape))
+    shade = np.zeros(len(rays))
+    shade[ray] = 0.5 / np.pi * SUN.rgb[0] * np.maximum(normal @ towards, 0.0) * lit
+    return shade
+
+
+def best_of(work: Callable[[], object], times: int = 5) -> tuple[float, float]:
+    """(wall ms, processor ms) of the fastest run."""
+    runs = []
+    for _ in range(times):
+        wall_s, processor_s = time.perf_counter(), time.process_time()
+        work()
+        runs.append((time.perf_counter() - wall_s, time.process_time() - processor_s))
+    return 1e3 * min(run[0] for run in runs), 1e3 * min(run[1] for run in runs)
+
+
+def main() -> None:
+    scene, backend = balls_on_a_floor(), EmbreeRaycaster()
+    catcher = shadow_catcher(0.6, (0.0, 5.0), 10.0)
+    before_s = time.perf_counter()
+    layer = backend.render(scene, CAMERA)
+    first_s = time.perf_counter() - before_s
+    wall_ms, processor_ms = best_of(lambda: backend.render(scene, CAMERA))
+    mask_wall_ms, mask_processor_ms = best_of(lambda: backend.render_shadow_mask(scene, CAMERA, catcher))
+    yard_wall_ms, yard_processor_ms = best_of(lambda: trimesh_lambert(scene, CAMERA), times=2)
+    count = sum(len(mesh.triangles) for mesh in scene.meshes)
+    print(f"scene: {count} triangles, {layer.alpha.mean():.0%} of 640x360 covered, sun and panorama")
+    print(f"first picture (compiling or loading kernels, hierarchy, panorama): {first_s:.2f} s")
+    print(f"picture with shadows: {wall_ms:.0f} ms, {processor_ms:.0f} ms of processor time")
+    print(f"shadow mask on a catcher: {mask_wall_ms:.0f} ms, {mask_processor_ms:.0f} ms of processor time")
+    print(f"yardstick trimesh + numpy Lambert: {yard_wall_ms:.0f} ms, {yard_processor_ms:.0f} ms of processor time")
+    print(f"yardstick / picture: {yard_wall_ms / wall_ms:.2f} (wall), {yard_processor_ms / processor_ms:.2f} (processor)")
+    print(f"largest memory of the process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()

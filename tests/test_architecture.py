@@ -1,0 +1,127 @@
+"""Who may import whom (ARCHITECTURE.md), read from the syntax tree; imports inside functions count like any other."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
+
+# The rows of the house, top first: a module imports from lower rows only. A name ending in a dot is a whole folder.
+ROWS = (
+    ("cli",),
+    ("commands.",),
+    ("demo.",),
+    ("plate", "object_layers", "lens_drawing", "contact_sheet"),
+    ("compositing", "overlay"),
+    ("renderers.choose",),
+    ("renderers.",),
+    ("renderers.base",),
+    ("focal_stack", "video_io", "scene."),
+    ("lens_file", "camera_file"),
+    ("image_io",),
+    ("exr_io",),
+    ("lens",),
+    ("aperture",),
+    ("psf", "_polygon_coverage_numba"),
+    ("layer", "camera", "color", "image_metrics"),
+    ("atomic_files", "progress"),
+    ("errors",),
+)
+ALLOWED_ACROSS = {"capture": {"mrbokeh"}, "training": {"mrbokeh"}, "viewfinder": {"mrbokeh"}, "datasets_scripts": {"mrbokeh"}, "mrbokeh": set()}
+
+
+def modules() -> dict[str, Path]:
+    files = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+    return {name.removesuffix(".__init__"): path for name, path in names.items()}
+
+
+MODULES = modules()
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Dotted names of our own modules that a file imports."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names = [f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in MODULES else str(node.module) for alias in node.names]
+        else:
+            continue
+        yield from (name for name in names if name.split(".")[0] in PACKAGES)
+
+
+def row_of(module: str) -> int:
+    """The row of a module of mrbokeh; an exact name goes before its folder."""
+    name = module.removeprefix("mrbokeh.")
+    for exact in (True, False):
+        for row, entries in enumerate(ROWS):
+            if any(name == entry if exact else entry.endswith(".") and (name + ".").startswith(entry) for entry in entries):
+                return row
+    raise AssertionError(f"{module} has no row in ROWS: say where in the house it belongs")
+
+
+def arrows() -> list[tuple[str, str]]:
+    return sorted({(module, target) for module, path in MODULES.items() for target in imported(path) if target != module})
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_meet_in_files_only(package: str) -> None:
+    allowed = ALLOWED_ACROSS[package] | {package}
+    wrong = [f"{a} -> {b}" for a, b in arrows() if a.split(".")[0] == package and b.split(".")[0] not in allowed]
+    assert not wrong
+
+
+def test_arrows_in_mrbokeh_point_downwards() -> None:
+    inner = [(a, b) for a, b in arrows() if a.startswith("mrbokeh.") and b.startswith("mrbokeh.")]
+    wrong = [f"{a} -> {b}" for a, b in inner if row_of(a) > row_of(b) or (row_of(a) == row_of(b) and not _same_folder(a, b))]
+    assert not wrong
+
+
+def _same_folder(a: str, b: str) -> bool:
+    return a.count(".") >= 2 and a.rsplit(".", 1)[0].startswith(b.rsplit(".", 1)[0])
+
+
+def test_renderers_do_not_import_their_siblings() -> None:
+    public = {name for name in MODULES if name.startswith("mrbokeh.renderers.") and not name.split(".")[-1].startswith("_")}
+    siblings = public - {"mrbokeh.renderers.base", "mrbokeh.renderers.choose"}
+    assert not [f"{a} -> {b}" for a, b in arrows() if a in siblings and b in siblings]
+
+
+def test_no_cycles() -> None:
+    graph: dict[str, set[str]] = {}
+    for source, target in arrows():
+        graph.setdefault(source, set()).add(target)
+    done: set[str] = set()
+
+    def visit(module: str, trail: tuple[str, ...]) -> None:
+        assert module not in trail, " -> ".join((*trail, module))
+        if module not in done:
+            for target in graph.get(module, ()):
+                visit(target, (*trail, module))
+            done.add(module)
+
+    for module in list(graph):
+        visit(module, ())
+
+
+@pytest.mark.parametrize(("library", "home"), [("torch", "training"), ("rawpy", "capture"), ("aiohttp", "viewfinder"), ("pyexiv2", "capture")])
+def test_heavy_libraries_live_in_one_package(library: str, home: str) -> None:
+    """commands/doctor.py may ask torch for a GPU; data sets may write metadata."""
+    asking = {"mrbokeh.commands.doctor", "datasets_scripts.dng_writer"}
+    users = {
+        module
+        for module, path in MODULES.items()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, (ast.Import, ast.ImportFrom))
+        and library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
+    }
+    assert {user.split(".")[0] for user in users - asking} <= {home}
+
+
+def test_no_drawers_for_anything() -> None:
+    assert not {Path(path).stem for path in MODULES.values()} & {"utils", "util", "helpers", "common", "misc"}

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+
+from mrbokeh.compositing import composite, lay_over, occlusion_matte
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.renderers.scatter_reference import ScatterReference
+
+LENS = Lens(50.0, 2.0, 1.0, 36.0)
+SIZE = (48, 64)
+
+
+def card(depth_m: float, colour: tuple[float, float, float] = (0.8, 0.1, 0.1)) -> Layer:
+    alpha = np.zeros(SIZE, np.float32)
+    alpha[12:36, 20:44] = 1.0
+    return Layer(alpha[..., None] * np.array(colour, np.float32), alpha, np.where(alpha > 0, depth_m, np.inf).astype(np.float32))
+
+
+def photo() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0, 1, (*SIZE, 3)).astype(np.float32)
+
+
+def test_pixels_that_the_object_does_not_touch_are_those_of_the_photograph() -> None:
+    picture, blurred = composite(photo(), [card(1.3)], LENS, ScatterReference())
+    untouched = blurred.alpha == 0
+    assert untouched.mean() > 0.3
+    np.testing.assert_array_equal(picture[untouched], photo()[untouched])
+
+
+def test_a_sharp_object_replaces_the_photograph() -> None:
+    picture, _ = composite(photo(), [card(1.0)], LENS, ScatterReference())
+    np.testing.assert_allclose(picture[13:35, 21:43], np.broadcast_to(np.float32([0.8, 0.1, 0.1]), (22, 22, 3)), atol=1e-6)
+
+
+def test_the_photographed_scene_hides_what_is_behind_it() -> None:
+    scene_m = np.full(SIZE, 0.5, np.float32)
+    picture, _ = composite(photo(), [card(1.3)], LENS, ScatterReference(), scene_m)
+    np.testing.assert_array_equal(picture, photo())
+
+
+def test_half_hidden_by_a_nearer_wall() -> None:
+    scene_m = np.full(SIZE, 3.0, np.float32)
+    scene_m[:, :32] = 0.5
+    _, blurred = composite(photo(), [card(1.0)], LENS, ScatterReference(), scene_m)
+    assert blurred.alpha[20, 21:32].max() == 0.0 and blurred.alpha[20, 32:43].min() == pytest.approx(1.0)
+
+
+def test_matte_goes_over_smoothly_within_its_softness() -> None:
+    virtual_m = (2.0 * np.linspace(1.01, 1.05, 41)[None]).astype(np.float32)
+    matte = occlusion_matte(virtual_m, np.full_like(virtual_m, 2.0), tolerance=0.03, softness=0.02)[0]
+    assert matte[0] == 1 and matte[-1] == 0 and matte[20] == pytest.approx(0.5, abs=1e-4)
+    assert (np.diff(matte) <= 0).all()
+
+
+def test_what_touches_the_photographed_surface_does_not_sink_into_it() -> None:
+    noisy_m = np.random.default_rng(0).normal(1.0, 0.005, (8, 8)).astype(np.float32)
+    assert (occlusion_matte(np.ones((8, 8), np.float32), noisy_m) == 1).all()
+
+
+def test_background_of_a_virtual_layer_hides_nothing() -> None:
+    matte = occlusion_matte(np.full((2, 2), np.inf, np.float32), np.full((2, 2), 2.0, np.float32))
+    assert (matte == 0).all()
+
+
+def test_over_keeps_light_premultiplied() -> None:
+    alpha = np.full(SIZE, 0.5, np.float32)
+    layer = Layer(np.full((*SIZE, 3), 0.5, np.float32), alpha, np.ones(SIZE, np.float32))
+    np.testing.assert_allclose(lay_over(np.full((*SIZE, 3), 0.02, np.float32), layer), 0.51, rtol=1e-6)
+
+
+def test_another_size_is_refused() -> None:
+    with pytest.raises(InputError, match="virtual layer is 64x48 px but the photograph is 10x10 px"):
+        composite(np.zeros((10, 10, 3), np.float32), [card(1.0)], LENS, ScatterReference())

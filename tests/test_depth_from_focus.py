@@ -1,0 +1,108 @@
+import itertools
+
+import cv2
+import numpy as np
+
+from capture._semi_global_numba import aggregate_costs
+from capture.all_in_focus import all_in_focus, slice_weight
+from capture.depth_from_focus import FocusMap, depth_from_focus, peak_parabola
+from mrbokeh.aperture import Aperture
+from mrbokeh.image_metrics import psnr
+from mrbokeh.layer import opaque
+from mrbokeh.renderers.scatter_reference import blur_layer
+
+SLICES = 5
+COC_STEP_PX = 2.5
+
+
+def texture(size: tuple[int, int] = (96, 128), seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).uniform(0, 1, (*size, 3)).astype(np.float32)
+    return np.clip(0.4 + 2.0 * (cv2.GaussianBlur(noise, (0, 0), 0.8) - 0.5), 0.02, 1.5)
+
+
+def stack_of(rgb: np.ndarray, true_index: np.ndarray) -> list[np.ndarray]:
+    """Slices blurred by discs whose diameter grows with the distance from the focus; borders padded, then cut off."""
+    padded, index = np.pad(rgb, ((16, 16), (16, 16), (0, 0)), "reflect"), np.pad(true_index, 16, "edge")
+    layer = opaque(padded, np.ones(index.shape, np.float32))
+    blurred = [blur_layer(layer, COC_STEP_PX * (index - i), Aperture.disc(24)) for i in range(SLICES)]
+    return [(each.rgb / each.alpha[..., None])[16:-16, 16:-16] for each in blurred]
+
+
+def focus_of(slices: list[np.ndarray]) -> FocusMap:
+    return depth_from_focus(lambda: slices)
+
+
+def test_a_flat_textured_plane_is_found_between_slices() -> None:
+    for true_index in (1.0, 1.3, 2.5):
+        focus = focus_of(stack_of(texture(), np.full((96, 128), true_index, np.float32)))
+        # A circle of confusion below 1 px blurs nothing, so 0.5 px of it (0.2 of a step) is as near as texture can tell.
+        assert abs(np.median(focus.focus_index) - true_index) * COC_STEP_PX < 0.5
+        assert np.median(focus.confidence) > 0.5
+
+
+def test_a_slanted_plane_is_followed() -> None:
+    truth = np.tile(np.linspace(0.3, 3.7, 128, dtype=np.float32), (96, 1))
+    focus = focus_of(stack_of(texture(), truth))
+    assert np.abs(focus.focus_index - truth)[8:-8, 8:-8].mean() < 0.15
+
+
+def test_nothing_is_claimed_where_there_is_no_texture() -> None:
+    rgb = texture()
+    rgb[:, 64:] = 0.4
+    focus = focus_of(stack_of(rgb, np.full((96, 128), 2.0, np.float32)))
+    assert focus.confidence[:, 80:].max() < 0.2 < focus.confidence[10:-10, 10:50].mean()
+
+
+def test_the_all_in_focus_picture_of_two_planes() -> None:
+    truth = np.ones((96, 128), np.float32)
+    truth[:, 64:] = 3.0
+    slices, rgb = stack_of(texture(), truth), texture()
+    merged = all_in_focus(slices, focus_of(slices).merge_index)
+    away_from_edge = np.abs(np.arange(128) - 64) > 8
+    assert psnr(merged[:, away_from_edge], rgb[:, away_from_edge]) > 45
+    assert max(psnr(each, rgb) for each in slices) < 35, "no slice alone does it"
+
+
+def test_weights_of_all_slices_sum_to_one() -> None:
+    index = np.linspace(0, 4, 101, dtype=np.float32)[None]
+    total = sum(slice_weight(index, i) for i in range(5))
+    np.testing.assert_allclose(total, 1.0, atol=1e-6)
+
+
+def test_parabola_through_a_parabola() -> None:
+    centres = np.array([[1.7, 2.0, 2.4]])
+    volume = -((np.arange(5)[:, None, None] - centres) ** 2).astype(np.float32)
+    offset, curvature = peak_parabola(volume, volume.argmax(axis=0))
+    np.testing.assert_allclose(volume.argmax(axis=0) + offset, centres, atol=1e-5)
+    np.testing.assert_allclose(curvature, 2.0, atol=1e-5)
+
+
+def test_semi_global_costs_of_a_row_are_those_of_all_paths() -> None:
+    """On a single row two of the eight directions have neighbours; their costs are minima over all labelings."""
+    rng = np.random.default_rng(0)
+    costs = rng.uniform(0, 3, (3, 1, 4)).astype(np.float32)
+    small, large = 0.3, 1.0
+
+    def step(a: int, b: int) -> float:
+        return 0.0 if a == b else small if abs(a - b) == 1 else large
+
+    def cheapest(row: np.ndarray) -> np.ndarray:
+        """(labels, W): the cheapest labeling of the row up to each pixel that ends in each label."""
+        result = np.zeros_like(row)
+        for x in range(row.shape[1]):
+            for last in range(row.shape[0]):
+                paths = [(*path, last) for path in itertools.product(range(row.shape[0]), repeat=x)]
+                result[last, x] = min(
+                    sum(row[label, i] for i, label in enumerate(path)) + sum(step(a, b) for a, b in itertools.pairwise(path)) for path in paths
+                )
+        return result
+
+    def normalised(total: np.ndarray) -> np.ndarray:
+        """Each path cost less the cheapest of the pixel before, as Hirschmueller's Eq. 13 subtracts it."""
+        before = np.concatenate([np.zeros(1), total.min(axis=0)[:-1]])
+        return total - before
+
+    row = costs[:, 0].astype(np.float64)
+    there, back = normalised(cheapest(row)), normalised(cheapest(row[:, ::-1]))[:, ::-1]
+    expected = there + back + 6 * row  # the other six directions start anew at every pixel
+    np.testing.assert_allclose(aggregate_costs(costs, small, large)[:, 0], expected, rtol=1e-5)

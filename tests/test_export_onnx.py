@@ -1,0 +1,133 @@
+"""Export: ONNX Runtime computes what PyTorch does, the file says which lens it is, and nothing is written when it would lie."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.lens import Lens
+from mrbokeh.renderers import onnx_network
+from mrbokeh.renderers.onnx_network import METADATA_KEY, OnnxNetwork
+from training import export_onnx
+from training.cli import app
+from training.export_onnx import LARGEST_DIFFERENCE, export_network, largest_difference
+from training.network import BlurNetwork
+from training.run_folder import RunFacts, build_network, save_network, write_facts
+from training.settings import NetworkSettings, TrainSettings, demo_settings, write_settings
+
+FACTS = RunFacts(
+    lens=Lens(35.0, 2.8, 1.25, 23.5, Aperture.blades(6)),
+    width_px=60,
+    height_px=40,
+    largest_coc_px=6.5,
+    radiance_scale=12.0,
+    trained_on=("attic/view_0", "attic/view_1"),
+    held_out=("attic/view_2",),
+    commit="0123abc",
+)
+FORMS = {
+    "published": NetworkSettings(tile_px=24, overlap_px=8),
+    "published, one tile": NetworkSettings(tile_px=0, overlap_px=0, width=2, mixing="tile"),
+    "gated": demo_settings().network,
+    "gated, tiles, unsigned": replace(demo_settings().network, tile_px=32, overlap_px=6, signed_coc=False),
+}
+
+
+def _network(settings: NetworkSettings, seed: int = 0) -> BlurNetwork:
+    """Weights as training might leave them: away from their start, so that parity is of the whole computation."""
+    network = build_network(TrainSettings(network=settings), FACTS)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    return network.eval()
+
+
+@pytest.fixture(scope="module", params=FORMS.values(), ids=FORMS)
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[BlurNetwork, NetworkSettings, Path]:
+    path = tmp_path_factory.mktemp("onnx") / "lens.onnx"
+    network = _network(request.param)
+    export_network(network, request.param, FACTS, path)
+    return network, request.param, path
+
+
+def test_parity(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+    """The product promises 1e-4."""
+    network, _, path = exported
+    assert largest_difference(network, OnnxNetwork(path)) < 1e-4
+    onnx.checker.check_model(str(path))
+
+
+def test_facts_survive_in_the_file(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+    _, settings, path = exported
+    facts = OnnxNetwork(path).facts
+    assert (facts.width_px, facts.height_px, facts.largest_coc_px, facts.radiance_scale) == (60, 40, 6.5, 12.0)
+    assert (facts.signed_coc, facts.tiled) == (settings.signed_coc, settings.tile_px > 0)
+    assert facts.linear_in_radiance == (settings.form == "gated")
+    assert (facts.trained_on, facts.commit) == (FACTS.trained_on, "0123abc")
+    assert (facts.lens.focal_length_mm, facts.lens.f_number, facts.lens.focus_distance_m, facts.lens.sensor_width_mm) == (35.0, 2.8, 1.25, 23.5)
+    assert np.allclose(facts.lens.aperture.outlines[0], FACTS.lens.aperture.outlines[0])
+
+
+def test_size_is_free_without_tiles_only(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+    network, settings, path = exported
+    rgb, coc_px = np.full((33, 47, 3), 0.3, np.float32), np.full((33, 47), 4.0, np.float32)
+    if settings.tile_px:
+        with pytest.raises(InputError, match="60x40 px, but came 47x33 px"):
+            OnnxNetwork(path).blur(rgb, coc_px)
+        return
+    expected = network(torch.from_numpy(rgb).permute(2, 0, 1)[None], torch.from_numpy(coc_px)[None, None])[0].permute(1, 2, 0)
+    assert np.allclose(OnnxNetwork(path).blur(rgb, coc_px), expected.detach().numpy(), atol=1e-4)
+
+
+def test_a_network_that_computes_something_else_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(export_onnx, "largest_difference", lambda network, exported: 2 * LARGEST_DIFFERENCE)
+    with pytest.raises(InputError, match="nothing was written"):
+        export_network(_network(FORMS["gated"]), FORMS["gated"], FACTS, tmp_path / "lens.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_difference_is_noticed(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+    """Other weights than those exported are far off, so the check can fail."""
+    _, settings, path = exported
+    assert largest_difference(_network(settings, seed=1), OnnxNetwork(path)) > 1e-3
+
+
+def test_command(tmp_path: Path) -> None:
+    run, out = tmp_path / "run", tmp_path / "lens.onnx"
+    run.mkdir()
+    settings = TrainSettings(network=NetworkSettings(tile_px=0, overlap_px=0, blocks=1))
+    write_settings(run, settings)
+    write_facts(run, FACTS)
+    with pytest.raises(InputError, match="no finished network"):
+        CliRunner().invoke(app, ["export", str(run), "--out", str(out)], catch_exceptions=False)
+    save_network(run, build_network(settings, FACTS))
+    result = CliRunner().invoke(app, ["export", str(run), "--out", str(out)], catch_exceptions=False)
+    assert result.exit_code == 0 and "any size" in result.output
+    with pytest.raises(InputError, match="--overwrite"):
+        CliRunner().invoke(app, ["export", str(run), "--out", str(out)], catch_exceptions=False)
+
+
+def test_foreign_and_damaged_files_are_refused(tmp_path: Path, exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+    damaged = tmp_path / "damaged.onnx"
+    damaged.write_bytes(exported[2].read_bytes()[:100])
+    with pytest.raises(InputError, match="cannot be opened as an ONNX network"):
+        OnnxNetwork(damaged)
+    with pytest.raises(InputError, match="there is no such file"):
+        OnnxNetwork(tmp_path / "absent.onnx")
+    foreign = onnx.load(exported[2])
+    del foreign.metadata_props[:]
+    onnx.save(foreign, tmp_path / "foreign.onnx")
+    with pytest.raises(InputError, match="does not say which lens"):
+        OnnxNetwork(tmp_path / "foreign.onnx")
+    foreign.metadata_props.add(key=METADATA_KEY, value=json.dumps({"format": onnx_network.FORMAT, "version": 99}))
+    onnx.save(foreign, tmp_path / "newer.onnx")
+    with pytest.raises(InputError, match="export it again"):
+        OnnxNetwork(tmp_path / "newer.onnx")

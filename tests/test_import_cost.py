@@ -1,0 +1,45 @@
+"""`import mrbokeh` is cheap and pulls in nothing heavy; asking for one thing loads that thing."""
+
+import json
+import subprocess
+import sys
+
+HEAVY = ("torch", "onnxruntime", "rawpy", "pycolmap", "av", "aiortc", "aiohttp", "numba", "cv2", "OpenEXR", "matplotlib", "scipy", "embreex")
+
+
+def run_python(code: str) -> dict[str, object]:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_importing_the_package() -> None:
+    code = f"""
+import json, sys, time
+start = time.process_time()
+import mrbokeh
+seconds = time.process_time() - start
+print(json.dumps({{"seconds": seconds, "heavy": [name for name in {HEAVY} if name in sys.modules]}}))
+"""
+    # The best of three: other tests share the processor.
+    results = [run_python(code) for _ in range(3)]
+    assert results[0]["heavy"] == []
+    assert min(float(str(result["seconds"])) for result in results) < 0.5
+
+
+def test_the_help_of_the_command_line_loads_no_sub_command() -> None:
+    code = f"""
+import json, sys
+from contextlib import suppress
+sys.argv = ["mrbokeh", "--help"]
+from mrbokeh.cli import app
+with suppress(SystemExit):
+    app()
+ours = [name for name in ("capture", "training", "viewfinder", "mrbokeh.commands.demo") if name in sys.modules]
+print(json.dumps({{"loaded": ours + [name for name in {HEAVY} if name in sys.modules]}}))
+"""
+    assert run_python(code)["loaded"] == []
+
+
+def test_every_public_name_can_be_had() -> None:
+    code = "import json, mrbokeh; print(json.dumps({'names': [str(getattr(mrbokeh, name)) for name in mrbokeh.__all__]}))"
+    assert len(run_python(code)["names"]) >= 15  # type: ignore[arg-type]

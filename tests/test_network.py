@@ -1,0 +1,193 @@
+"""The networks: parameter counts by hand from Section 3.1 of Mandl et al. 2024, independence of tiles, and the laws of light that
+the gated form holds by construction."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mrbokeh.errors import InputError
+from training.gated_network import GatedTiles, bins_px, blocks_for_gates, disc_kernel, hat_lines
+from training.network import BlurNetwork, PublishedTiles, blocks_for
+from training.settings import NetworkSettings, TrainSettings, demo_settings, settings_from_json, settings_to_json
+from training.tiling import TileGrid
+
+ONE_TILE = NetworkSettings(tile_px=0, overlap_px=0)
+GATED = demo_settings().network
+
+
+def _pictures(height: int = 24, width: int = 40, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    rgb = torch.rand(1, 3, height, width, generator=generator)
+    return rgb, torch.rand(1, 1, height, width, generator=generator) * 14.0 - 7.0
+
+
+def _count(module: torch.nn.Module) -> int:
+    return sum(each.numel() for each in module.parameters())
+
+
+@pytest.mark.parametrize(("coc_px", "blocks"), [(0.5, 1), (3.0, 1), (3.1, 2), (-13.0, 6), (13.5, 7), (50.0, 25), (81.0, 40)])
+def test_the_largest_kernel_covers_the_largest_circle_of_confusion(coc_px: float, blocks: int) -> None:
+    """N is the smallest number with 2N + 1 >= |CoC|; 81 px is the largest lens of the paper's Table 2."""
+    assert blocks_for(coc_px) == blocks
+
+
+def test_published_default_has_the_parameters_of_the_paper() -> None:
+    """Per tile: C1 is 4 -> 3 (12 + 3), C2 is 3 + 3 -> 3 (18 + 3), and R_n has two convolutions of 3 kernels (2n+1)^2 with 3 biases.
+
+    N = 4: 2 * 3 * (9 + 25 + 49 + 81) + 4 * 2 * 3 = 1008, and 36 more; a picture of 40 x 24 px has 2 * 1 tiles of 24 px with overlap 8.
+    """
+    assert _count(PublishedTiles(NetworkSettings(), blocks=4, tiles=1)) == 1008 + 36
+    grid = TileGrid(24, 40, 24, 8)
+    assert len(grid) == 2
+    assert _count(BlurNetwork(NetworkSettings(), 9.0, 1.0, grid)) == 2 * (1008 + 36)
+
+
+@pytest.mark.parametrize(
+    ("mixing", "expected"),
+    [("none", 2 * 6 * 34 + 24), ("colour", 2 * 12 * 34 + 24), ("tile", 2 * 6 * 34 + 24 + 2 * (36 + 6))],
+)
+def test_width_and_mixing(mixing: str, expected: int) -> None:
+    """Width 2 makes 6 features; N = 2 has kernels of 9 + 25 = 34. Depthwise: 6 of them per convolution; per colour: 6 * 2 (two inputs
+    each); 2 convolutions and 2 * 2 * 6 = 24 biases. "tile" adds a 6 x 6 mixture with 6 biases per block."""
+    tiles = PublishedTiles(replace(ONE_TILE, width=2, mixing=mixing), blocks=2, tiles=1)
+    assert _count(tiles.blocks) == expected
+
+
+def test_kernels_grow_and_receptive_field_is_their_sum() -> None:
+    """Two convolutions of radius n per block reach 2 (1 + ... + N) = N (N + 1) px; N = 3 gives 12."""
+    network = BlurNetwork(replace(ONE_TILE, activation="identity", initialisation="default"), 7.0, 1.0)
+    assert network.reach_px == 12
+    assert [block.first.kernel_size for block in network.tiles.blocks] == [(3, 3), (5, 5), (7, 7)]
+    for block in network.tiles.blocks:
+        for parameter in block.parameters():
+            torch.nn.init.constant_(parameter, 0.01)
+    rgb = torch.zeros(1, 3, 41, 41, requires_grad=True)
+    network(rgb, torch.zeros(1, 1, 41, 41))[0, 0, 20, 20].backward()
+    touched = torch.nonzero(rgb.grad[0, 0])
+    assert touched.amin(0).tolist() == [8, 8] and touched.amax(0).tolist() == [32, 32]
+
+
+@pytest.mark.parametrize("settings", [NetworkSettings(), GATED], ids=["published", "gated"])
+def test_tiles_do_not_see_each_other(settings: NetworkSettings) -> None:
+    """Without overlap, what changes in the left tile leaves the right one exactly as it was."""
+    network = BlurNetwork(settings, 5.0, 1.0, TileGrid(16, 32, 16, 0))
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    rgb, coc_px = _pictures(16, 32)
+    changed = rgb.clone()
+    changed[..., :16] += 0.5
+    before, after = network(rgb, coc_px), network(changed, coc_px)
+    assert torch.equal(before[..., 16:], after[..., 16:])
+    assert not torch.allclose(before[..., :16], after[..., :16])
+
+
+@pytest.mark.parametrize("settings", [ONE_TILE, replace(ONE_TILE, width=2, mixing="tile"), GATED, replace(GATED, width=2, signed_coc=False)])
+def test_output_keeps_the_size_and_every_parameter_learns(settings: NetworkSettings) -> None:
+    network = BlurNetwork(settings, 7.0, 1.0)
+    optimizer = torch.optim.SGD(network.parameters(), 1e-3)
+    for seed in range(2):  # the first step wakes up what starts at zero
+        rgb, coc_px = _pictures(seed=seed)
+        optimizer.zero_grad()
+        result = network(rgb, coc_px)
+        (result - rgb.roll(1, -1)).square().mean().backward()
+        optimizer.step()
+    assert result.shape == rgb.shape
+    assert all(each.grad is not None and each.grad.abs().sum() > 0 for each in network.parameters())
+
+
+def test_output_of_the_published_form_stays_in_its_range() -> None:
+    """tanh in [-1, 1] is [0, radiance scale] outside, whatever comes in."""
+    network = BlurNetwork(ONE_TILE, 7.0, radiance_scale=8.0)
+    rgb, coc_px = _pictures()
+    result = network(rgb * 100.0, coc_px)
+    assert result.min() >= 0.0 and result.max() <= 8.0
+
+
+def test_unsigned_circle_of_confusion_cannot_tell_near_from_far() -> None:
+    rgb, coc_px = _pictures()
+    unsigned, signed = BlurNetwork(ONE_TILE, 7.0, 1.0), BlurNetwork(replace(ONE_TILE, signed_coc=True), 7.0, 1.0)
+    assert torch.equal(unsigned(rgb, coc_px), unsigned(rgb, -coc_px))
+    assert not torch.allclose(signed(rgb, coc_px), signed(rgb, -coc_px))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_gates_share_every_pixel_out(signed: bool) -> None:
+    """Hats sum to 1 everywhere; at its own peak a gate is 1. N = 3: peaks at 1 (0 when signed), 3 and 5 px, both signs."""
+    knots, radii = bins_px(3, 1, signed)
+    assert (knots, radii) == (([0.0, -3.0, 3.0, -5.0, 5.0], [1, 2, 2, 3, 3]) if signed else ([1.0, 3.0, 5.0], [1, 2, 3]))
+    tiles = GatedTiles(replace(GATED, signed_coc=signed), blocks=3, largest_coc_px=5.0, tiles=1)
+    coc = torch.linspace(-1, 1, 101).reshape(1, 1, 1, 1, 101)
+    gates = tiles.gates(coc)[0, 0, :, 0]
+    assert torch.allclose(gates.sum(0), torch.ones(101), atol=1e-5)
+    assert gates[knots.index(5.0), -1] == pytest.approx(1.0)
+
+
+def test_hat_lines_meet_at_the_peaks() -> None:
+    rise, rise_0, fall, fall_0 = hat_lines([0.0, 2.0, 6.0])
+    assert (rise * torch.tensor([0.0, 2.0, 6.0]) + rise_0).tolist() == pytest.approx([1.0, 1.0, 1.0])
+    assert (fall[1] * 6.0 + fall_0[1]).item() == pytest.approx(0.0)
+
+
+@torch.no_grad()
+def test_gated_form_blurs_a_light_to_the_disc_it_starts_with() -> None:
+    """All pixels at 5 px blur: the gate of n = 3 alone is open, so a light becomes its kernel of 7 px, 95 % a disc and 5 % flat, and
+    keeps its energy."""
+    network = BlurNetwork(GATED, largest_coc_px=5.0, radiance_scale=1.0)
+    rgb = torch.zeros(1, 3, 21, 21)
+    rgb[..., 10, 10] = 40.0
+    result = network(rgb, torch.full((1, 1, 21, 21), 5.0))[0, 0, 7:14, 7:14] / 40.0
+    expected = 0.95 * disc_kernel(7, 5.0) + 0.05 / 49.0
+    assert torch.allclose(result, expected, atol=1e-5)
+    assert result.sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_gated_kernels_cover_the_largest_circle_of_confusion_and_a_pixel_around_it() -> None:
+    """2N - 1 >= |CoC|: 5 px need N = 3, 5.1 px N = 4; without blur one size is left."""
+    assert [blocks_for_gates(each) for each in (0.0, 1.0, -5.0, 5.1, 13.0)] == [1, 1, 3, 4, 7]
+
+
+@torch.no_grad()
+def test_gated_form_is_linear_in_radiance_and_keeps_a_uniform_picture() -> None:
+    """The weights come from the circles of confusion alone; they are divided by their sum."""
+    network = BlurNetwork(GATED, 7.0, 3.0)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    rgb, coc_px = _pictures()
+    assert torch.allclose(network(rgb * 1000.0, coc_px), network(rgb, coc_px) * 1000.0, rtol=1e-3, atol=1e-2)
+    grey = torch.full_like(rgb, 0.18)
+    assert torch.allclose(network(grey, coc_px), grey, atol=1e-4)
+
+
+@torch.no_grad()
+def test_leaving_out_unused_bins_changes_nothing() -> None:
+    """A picture wholly behind the focus uses half of the bins; computing all of them gives the same."""
+    network = BlurNetwork(GATED, 7.0, 1.0)
+    torch.nn.init.normal_(network.tiles.hide_out.weight)
+    rgb, coc_px = _pictures()
+    few = network(rgb, coc_px.abs())
+    network.tiles._used_bins = lambda gates: list(range(len(network.tiles.knots)))
+    assert torch.allclose(few, network(rgb, coc_px.abs()), atol=1e-6)
+
+
+def test_settings_survive_json_and_reject_what_they_do_not_know() -> None:
+    for settings in (TrainSettings(), demo_settings(1.5)):
+        assert settings_from_json(settings_to_json(settings)) == settings
+    with pytest.raises(InputError, match="unknown settings \\['depth'\\]"):
+        settings_from_json(settings_to_json(TrainSettings()) | {"depth": 3})
+
+
+def test_the_published_form_is_the_default() -> None:
+    """Section 3: tiles of 200 px with 60 px overlap, three channels, tanh, unsigned circle of confusion, unweighted MSE."""
+    network = TrainSettings().network
+    assert (network.form, network.tile_px, network.overlap_px, network.width, network.mixing) == ("published", 200, 60, 1, "none")
+    assert (network.activation, network.signed_coc, TrainSettings().loss_weighting, TrainSettings().crop_px) == ("tanh", False, "uniform", 0)
+
+
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(InputError, match="overlap_px < tile_px"):
+        NetworkSettings(tile_px=50, overlap_px=60)
+    with pytest.raises(InputError, match="set crop_px to 0, or tile_px to 0"):
+        TrainSettings(crop_px=64)
+    with pytest.raises(InputError, match="either in minutes or in epochs"):
+        TrainSettings(minutes=1.0, epochs=3)

@@ -1,0 +1,174 @@
+"""A network as a Renderer. The network here is the gated form as it starts, its kernels discs with a flat floor: a known blur.
+
+So expected numbers are those of light itself (coverage, support, linearity); what a trained network adds is tested in test_train.py.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer, opaque
+from mrbokeh.lens import Lens
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.renderers.onnx_network import OnnxNetwork
+from training.export_onnx import export_network
+from training.run_folder import RunFacts, build_network
+from training.settings import NetworkSettings, TrainSettings, demo_settings
+
+LENS = Lens(35.0, 2.8, 0.5, 5.0)
+SIZE = (64, 96)
+LARGEST_COC_PX = 7.0
+FACTS = RunFacts(LENS, SIZE[1], SIZE[0], LARGEST_COC_PX, 4.0, ("a/view_0",), (), None)
+
+
+def _exported(settings: NetworkSettings, folder: Path, jitter: float = 0.0) -> OnnxNetwork:
+    network = build_network(TrainSettings(network=settings), FACTS).eval()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(jitter * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
+    export_network(network, settings, FACTS, folder / "lens.onnx")
+    return OnnxNetwork(folder / "lens.onnx", threads=1)
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> OnnxNetwork:
+    return _exported(demo_settings().network, tmp_path_factory.mktemp("gated"))
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> OnnxNetwork:
+    """The published form, which has a range (tanh), jittered so that black does not come out black."""
+    return _exported(NetworkSettings(tile_px=0, overlap_px=0), tmp_path_factory.mktemp("published"), jitter=0.02)
+
+
+def depth_for(coc_px: float) -> float:
+    """The depth at which a point has this signed circle of confusion, from the lens equation in dioptres."""
+    return 1.0 / (1.0 / LENS.focus_distance_m - coc_px / LENS.coc_px_per_dioptre(SIZE[1]))
+
+
+def card(coc_px: float, rgb: tuple[float, float, float] = (0.5, 0.25, 1.0), half_px: int = 10) -> Layer:
+    """A rectangle in the middle of an otherwise empty layer, at the depth with this blur."""
+    alpha = np.zeros(SIZE, np.float32)
+    alpha[SIZE[0] // 2 - half_px : SIZE[0] // 2 + half_px, SIZE[1] // 2 - half_px : SIZE[1] // 2 + half_px] = 1.0
+    colour = (alpha[..., None] * np.float32(rgb)).astype(np.float32)
+    return Layer(colour, alpha, np.where(alpha > 0, depth_for(coc_px), np.inf).astype(np.float32))
+
+
+def test_it_is_a_renderer_and_knows_its_lens(network: OnnxNetwork) -> None:
+    assert isinstance(network, Renderer)
+    assert network.lens.focal_length_mm == 35.0
+
+
+@pytest.mark.parametrize("coc_px", [-6.5, -3.0, 0.5, 4.0, 6.9])
+def test_light_and_coverage_are_kept_and_agree(network: OnnxNetwork, coc_px: float) -> None:
+    """A card of one depth loses nothing but the corners of the square that the floor of an untrained kernel fills, where light is not
+    allowed to reach: less than 1 %. Colour and coverage go through the same weights, so their ratio is the card's colour."""
+    layer = card(coc_px)
+    result = network.render([layer], LENS)
+    assert result.alpha.sum() == pytest.approx(layer.alpha.sum(), rel=0.01)
+    assert result.rgb.sum() == pytest.approx(layer.rgb.sum(), rel=0.01)
+    assert np.allclose(result.rgb, result.alpha[..., None] * np.float32((0.5, 0.25, 1.0)), atol=1e-4)
+    assert result.alpha.min() >= 0.0 and result.alpha.max() <= 1.0
+
+
+def test_blur_spreads_beyond_the_silhouette_by_its_radius_and_no_farther(network: OnnxNetwork) -> None:
+    """6 px of blur reach 3 px, and one more is left to the sensor: the edge between columns 57 and 58 shows from 4 px before to 4 px after."""
+    row = network.render([card(6.0)], LENS).alpha[32]
+    assert row[59] > 0.05 and row[56] < 0.95
+    assert row[52] == pytest.approx(1.0, abs=1e-3)
+    assert row[60] > 0.01 and (row[62:] == 0.0).all()
+
+
+def test_what_is_in_focus_stays(network: OnnxNetwork) -> None:
+    """Up to the floor of the untrained 3 px kernel: of 0.5 % of the light, 5 ninths leave through the corner pixel of the card."""
+    layer = card(0.0)
+    result = network.render([layer], LENS)
+    assert np.allclose(result.rgb, layer.rgb, atol=0.003) and np.allclose(result.alpha, layer.alpha, atol=0.003)
+    assert np.array_equal(result.depth_m, layer.depth_m)
+
+
+def test_front_covers_what_is_behind(network: OnnxNetwork) -> None:
+    behind = opaque(np.full((*SIZE, 3), 0.5, np.float32), np.full(SIZE, depth_for(5.0), np.float32))
+    result = network.render([card(-4.0, rgb=(0.0, 0.0, 0.0)), behind], LENS)
+    assert np.allclose(result.rgb[32, 48], 0.0, atol=1e-3)
+    assert np.allclose(result.rgb[5, 5], 0.5, atol=1e-3)
+    assert np.allclose(result.alpha, 1.0, atol=1e-4)
+
+
+def test_empty_layers_change_nothing(network: OnnxNetwork) -> None:
+    empty = Layer(np.zeros((*SIZE, 3), np.float32), np.zeros(SIZE, np.float32), np.full(SIZE, np.inf, np.float32))
+    assert np.array_equal(network.render([empty, card(3.0)], LENS).rgb, network.render([card(3.0)], LENS).rgb)
+
+
+def test_cropping_to_the_object_changes_nothing(network: OnnxNetwork) -> None:
+    """A card beside nothing and the whole picture by hand agree."""
+    layer = card(5.0)
+    whole = network.blur(layer.rgb, np.full(SIZE, 5.0, np.float32))
+    assert np.allclose(network.render([layer], LENS).rgb, whole, atol=1e-5)
+
+
+def test_highlights_far_above_the_range_are_not_clipped(network: OnnxNetwork) -> None:
+    """The gated form is linear in radiance: a light of 4000, a thousand times its scale, is blurred like any other."""
+    rgb = np.zeros((*SIZE, 3), np.float32)
+    rgb[32, 48] = 4000.0
+    coc_px = np.full(SIZE, 6.0, np.float32)
+    assert network.blur(rgb, coc_px).sum() == pytest.approx(3 * 4000.0, rel=1e-3)
+    assert np.allclose(network.blur(rgb, coc_px), 1000.0 * network.blur(rgb / 1000.0, coc_px), rtol=1e-3, atol=1e-2)
+
+
+def test_highlights_of_a_network_with_a_range_are_added_as_their_own_exposure(published: OnnxNetwork) -> None:
+    """tanh ends at the radiance scale, 4: without the split nothing brighter could come out. What is black in the excess adds nothing."""
+    rgb = np.full((*SIZE, 3), 0.2, np.float32)
+    coc_px = np.full(SIZE, 2.0, np.float32)
+    plain = published.blur(rgb, coc_px)
+    lit = rgb.copy()
+    lit[32, 48] = 400.0
+    result = published.blur(lit, coc_px)
+    assert not published.facts.linear_in_radiance
+    assert result.max() > 40.0
+    assert np.allclose(result[:8, :8], plain[:8, :8], atol=1e-3)
+    assert np.array_equal(published.blur(rgb, coc_px), plain)
+
+
+def test_empty_regions_stay_empty_even_where_black_does_not_come_out_black(published: OnnxNetwork) -> None:
+    result = published.render([card(4.0)], LENS)
+    assert (result.alpha[:10] == 0).all() and (result.rgb[:10] == 0).all()
+
+
+@pytest.mark.parametrize(("name", "value"), [("focal_length_mm", 50.0), ("f_number", 4.0), ("sensor_width_mm", 36.0)])
+def test_another_lens_is_refused(network: OnnxNetwork, name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"trained for a lens with {name} .* train again"):
+        network.render([card(1.0)], replace(LENS, **{name: value}))
+
+
+def test_another_focus_is_welcome(network: OnnxNetwork) -> None:
+    """Focused on the card, it stays sharp (up to the floor of the kernel, as above)."""
+    layer = card(5.0)
+    result = network.render([layer], LENS.focused_at(depth_for(5.0)))
+    assert np.allclose(result.alpha, layer.alpha, atol=0.003)
+
+
+def test_more_blur_than_trained_is_refused_with_what_to_do(network: OnnxNetwork) -> None:
+    """9 px against 7: at 7/9 of 96 px, 74 px, it would fit."""
+    with pytest.raises(InputError, match=r"up to 7\.0 px.*9\.0 px at a width of 96 px.*at most 74 px wide, or train again"):
+        network.render([card(9.0)], LENS)
+
+
+def test_other_widths_work_while_the_blur_fits(network: OnnxNetwork) -> None:
+    """Twice the width doubles the circle of confusion: 3 px become 6, 5 become 10."""
+    large = [np.kron(each, np.ones((2, 2, 1) if each.ndim == 3 else (2, 2))).astype(np.float32) for each in vars(card(3.0)).values()]
+    assert network.render([Layer(*large)], LENS).alpha.sum() == pytest.approx(4 * 400.0, rel=0.01)
+    wide = replace(Layer(*large), depth_m=np.where(large[1] > 0, depth_for(5.0), np.inf).astype(np.float32))
+    with pytest.raises(InputError, match="at a width of 192 px"):
+        network.render([wide], LENS)
+
+
+def test_tiles_belong_to_one_size(tmp_path: Path) -> None:
+    tiled = _exported(replace(demo_settings().network, tile_px=40, overlap_px=10), tmp_path)
+    assert tiled.render([card(3.0)], LENS).alpha.sum() == pytest.approx(400.0, rel=0.01)
+    with pytest.raises(InputError, match="resize the picture, or train with tile_px 0"):
+        tiled.blur(np.zeros((32, 32, 3), np.float32), np.zeros((32, 32), np.float32))

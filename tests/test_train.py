@@ -1,0 +1,241 @@
+"""Training on a tiny stack made here: it learns, it stops and goes on, it keeps viewpoints apart."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.image_io import write_image
+from mrbokeh.image_metrics import psnr
+from mrbokeh.lens import Lens
+from training import train
+from training.baselines import gaussian_gather, gaussian_scatter, scatter_reference, sigma_per_coc
+from training.batches import draw_batch
+from training.blur_functions import blur_of
+from training.cli import app
+from training.dataset import PairSet, gather_facts, read_pair, split_stacks, stacks_of
+from training.evaluate import GATHERED, NETWORK, NO_BLUR, REFERENCE, SCATTERED, evaluate, unseen
+from training.run_folder import load_run
+from training.settings import NetworkSettings, TrainSettings, demo_settings
+
+SIZE = (48, 72)
+LENS = Lens(35.0, 2.8, 1.0, 3.5, Aperture.blades(6, 0.2))
+FOCUS_M = (0.5, 0.6, 0.8)
+DEMO_LIKE = dataclasses.replace(demo_settings(), minutes=None, epochs=30, crop_px=0, threads=1, validate_every_s=0.0)
+PUBLISHED = TrainSettings(network=NetworkSettings(tile_px=32, overlap_px=8), epochs=4, threads=1, validate_every_s=0.0)
+
+
+def make_stack(folder: Path, seed: int, size: tuple[int, int] = SIZE) -> FocalStack:
+    """A textured wall, slanted from 0.5 m to 0.8 m, with three lights of radiance 20, photographed by the reference renderer.
+
+    The wall has no depth edges, so that the reference renderer is exact up to its pixels.
+    """
+    rng = np.random.default_rng(seed)
+    height, width = size
+    coarse = np.kron(rng.random((height // 4, width // 4, 3)), np.ones((4, 4, 1)))
+    rgb = (0.6 * coarse + 0.2 * rng.random((height, width, 3))).astype(np.float32)
+    rgb[rng.integers(4, height - 4, 3), rng.integers(4, width - 4, 3)] = 20.0
+    depth_m = np.broadcast_to(1.0 / np.linspace(1 / 0.5, 1 / 0.8, width), size).astype(np.float32)
+    stack = FocalStack(folder, tuple(Slice(f"slice_{i}.exr", each) for i, each in enumerate(FOCUS_M)), LENS, registered=True, merged=True)
+    folder.mkdir(parents=True)
+    write_merged(folder, rgb, np.zeros_like(depth_m), np.ones_like(depth_m), depth_m)
+    for i in range(len(FOCUS_M)):
+        write_image(folder / f"slice_{i}.exr", scatter_reference(rgb, stack.coc_px(i, depth_m), LENS.aperture), half=False)
+    write_focal_stack(stack)
+    return stack
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("training") / "wall"
+    for seed in range(3):
+        make_stack(folder / f"view_{seed}", seed)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "demo_like"
+    train.fit(stacks_of([scene]), folder, DEMO_LIKE, ["view_2"])
+    return folder
+
+
+def test_facts_come_from_the_data(scene: Path) -> None:
+    """The largest CoC is that of the wall's end farthest (in dioptres) from a focus: 0.5 m seen at a focus of 0.8 m, or 0.8 m at 0.5 m."""
+    facts = gather_facts(PairSet(stacks_of([scene])))
+    far_px, near_px = abs(LENS.focused_at(0.5).coc_px(0.8, SIZE[1])), abs(LENS.focused_at(0.8).coc_px(0.5, SIZE[1]))
+    assert facts.largest_coc_px == pytest.approx(max(far_px, near_px), rel=1e-4)
+    assert facts.radiance_scale == pytest.approx(20.0, rel=1e-3)
+    assert (facts.height_px, facts.width_px) == SIZE
+
+
+def test_the_network_learns_the_lens(scene: Path, run: Path, tmp_path: Path) -> None:
+    """On a viewpoint it has not seen it beats no blur and both Gaussians by the 3 dB that the product promises."""
+    blur, trained_on = blur_of(run)
+    held_out = unseen(stacks_of([scene]), trained_on)
+    assert [stack.folder.name for stack in held_out] == ["view_2"]
+    result = evaluate(blur, held_out, tmp_path)
+    assert result.gain_over_no_blur_db > 3.0
+    assert result.gain_over_gaussian_db > 3.0
+    assert set(result.methods) == {NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE}
+    assert len(result.scores) == len(FOCUS_M) * 5
+    assert {each.name for each in tmp_path.iterdir()} == {"evaluation.md", "evaluation.csv", "evaluation.png"}
+
+
+def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
+    """With tiles, over the reassembled picture: the error falls clearly below that of the network's start, which copies the picture."""
+    settings = dataclasses.replace(PUBLISHED, epochs=40, learning_rate=5e-3, loss_weighting="relative")
+    progress = train.fit(stacks_of([scene]), tmp_path / "run", settings, ["view_2"])
+    pairs = PairSet(stacks_of([scene])[:2])
+    copied = np.mean([_relative_error(pairs[i].all_in_focus, pairs[i].target, 20.0) for i in range(len(pairs))])
+    assert progress.smoothed_loss < 0.6 * copied
+    assert load_run(tmp_path / "run")[0].grid is not None
+
+
+def _relative_error(result: np.ndarray, truth: np.ndarray, scale: float) -> float:
+    weight = np.maximum(truth.max(axis=2, keepdims=True), 1.0) ** -2
+    return float((weight * (2 * (result - truth) / scale) ** 2).sum() / (3 * weight.sum()))
+
+
+@pytest.mark.parametrize("settings", [dataclasses.replace(DEMO_LIKE, epochs=4), PUBLISHED], ids=["gated", "published"])
+def test_a_killed_run_goes_on_as_if_never_stopped(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: TrainSettings) -> None:
+    """Killed after a checkpoint and a few more steps, which are lost: the same weights, to the last bit."""
+    settings = dataclasses.replace(settings, checkpoint_every_s=0.0)
+    stacks = stacks_of([scene])
+    train.fit(stacks, tmp_path / "whole", settings, ["view_2"])
+    step, steps = train._Run._step, []
+
+    def dying_step(run: "train._Run", rate_factor: float) -> None:
+        steps.append(1)
+        if len(steps) == 4:
+            run._save = lambda: None  # a kill leaves no time to save
+        if len(steps) == 6:
+            raise RuntimeError("killed")
+        step(run, rate_factor)
+
+    monkeypatch.setattr(train._Run, "_step", dying_step)
+    with pytest.raises(RuntimeError, match="killed"):
+        train.fit(stacks, tmp_path / "killed", settings, ["view_2"])
+    assert not (tmp_path / "killed" / "network.pt").exists()
+    monkeypatch.setattr(train._Run, "_step", step)
+    train.fit(stacks, tmp_path / "killed", settings, ["view_2"])
+    whole, resumed = (load_run(tmp_path / name)[0].state_dict() for name in ("whole", "killed"))
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = train._Run._step
+
+    def interrupted(run: "train._Run", rate_factor: float) -> None:
+        if run.progress.step == 3:
+            raise KeyboardInterrupt
+        step(run, rate_factor)
+
+    arguments = ["fit", str(scene), "--preset", "demo", "--epochs", "4", "--threads", "1", "--held-out", "view_2", "--out", str(tmp_path / "run")]
+    monkeypatch.setattr(train._Run, "_step", interrupted)
+    stopped = CliRunner().invoke(app, arguments)
+    assert stopped.exit_code == 130 and "go on" in stopped.output
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["progress"]["step"] == 3
+    monkeypatch.setattr(train._Run, "_step", step)
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert (tmp_path / "run" / "network.pt").exists()
+
+
+def test_a_finished_run_is_left_alone_and_another_needs_its_own_folder(scene: Path, run: Path) -> None:
+    before = (run / "network.pt").read_bytes()
+    assert train.fit(stacks_of([scene]), run, DEMO_LIKE, ["view_2"]).finished
+    assert (run / "network.pt").read_bytes() == before
+    with pytest.raises(InputError, match="other settings \\(seed\\)"):
+        train.fit(stacks_of([scene]), run, dataclasses.replace(DEMO_LIKE, seed=1), ["view_2"])
+
+
+def test_a_time_budget_is_kept(scene: Path, tmp_path: Path) -> None:
+    """0.05 minutes are 3 s; one step of this size takes well under half a second."""
+    settings = dataclasses.replace(DEMO_LIKE, epochs=None, minutes=0.05)
+    progress = train.fit(stacks_of([scene]), tmp_path / "run", settings, ["view_2"])
+    assert 3.0 <= progress.elapsed_s < 4.5
+
+
+def test_learning_rate_rises_then_falls_to_zero() -> None:
+    assert train.learning_rate_factor(0.025, 0.05) == pytest.approx(0.5)
+    assert train.learning_rate_factor(0.05, 0.05) == pytest.approx(1.0)
+    assert train.learning_rate_factor(0.525, 0.05) == pytest.approx(0.5)
+    assert train.learning_rate_factor(1.0, 0.05) == pytest.approx(0.0)
+
+
+def test_viewpoints_are_held_out_whole(scene: Path) -> None:
+    stacks = stacks_of([scene])
+    kept, apart = split_stacks(stacks, ["wall/view_1"], 0.2, 0)
+    assert [each.folder.name for each in kept] == ["view_0", "view_2"] and [each.folder.name for each in apart] == ["view_1"]
+    kept, apart = split_stacks(stacks, [], 0.34, seed=5)
+    assert len(kept) == 2 and len(apart) == 1
+    with pytest.raises(InputError, match="names of stacks among"):
+        split_stacks(stacks, ["view_9"], 0.2, 0)
+    with pytest.raises(InputError, match="none is left"):
+        split_stacks(stacks, ["view_0", "view_1", "view_2"], 0.2, 0)
+
+
+def test_untrusted_and_saturated_pixels_do_not_count(tmp_path: Path) -> None:
+    stack = make_stack(tmp_path / "view", 0)
+    depth_m, confidence = stack.depth_m(), np.ones(SIZE, np.float32)
+    confidence[:, :10] = 0.0
+    write_merged(stack.folder, stack.all_in_focus(), np.zeros(SIZE, np.float32), confidence, depth_m)
+    pair = read_pair(stack, 0, least_confidence=0.1, saturation=0.5)
+    bright = pair.target.max(axis=2) >= 0.5
+    assert (pair.weight[:, :10] == 0).all() and (pair.weight[bright] == 0).all()
+    assert (pair.weight[:, 10:][~bright[:, 10:]] == 1).all()
+
+
+def test_the_inside_of_a_crop_has_no_weight_where_light_is_missing(scene: Path) -> None:
+    """Crops of 20 px with a halo of 4: only sides on the border of the picture count to their edge."""
+    pairs, rng = PairSet(stacks_of([scene])), np.random.default_rng(0)
+    for _ in range(20):
+        weight = draw_batch(pairs, 1, 20, 4, rng).weight[0, 0]
+        assert weight.shape == (20, 20)
+        rows, columns = weight.amax(dim=1), weight.amax(dim=0)
+        assert all(line[:4].sum() in (0, 4) and line[4:16].sum() == 12 and line[16:].sum() in (0, 4) for line in (rows, columns))
+
+
+def test_memory_is_bounded(scene: Path) -> None:
+    """A pair of 48 x 72 px is 8 floats a pixel: 110 592 bytes; a cache smaller than that keeps only the last one."""
+    pairs = PairSet(stacks_of([scene]), cache_mib=0)
+    for index in range(len(pairs)):
+        assert pairs[index].bytes == 48 * 72 * 8 * 4
+    assert len(pairs._cache) == 1
+
+
+def test_stacks_of_two_lenses_are_refused(scene: Path, tmp_path: Path) -> None:
+    other = dataclasses.replace(make_stack(tmp_path / "other", 3), lens=dataclasses.replace(LENS, f_number=4.0))
+    write_focal_stack(other)
+    with pytest.raises(InputError, match="one network learns one lens"):
+        gather_facts(PairSet([*stacks_of([scene]), read_focal_stack(other.folder)]))
+
+
+def test_right_size_gaussian_has_the_second_moment_of_the_aperture() -> None:
+    """Per axis: a disc of diameter d has variance d^2/16; a regular hexagon of circumradius R has 5 R^2/24."""
+    assert sigma_per_coc(Aperture.disc()) == pytest.approx(0.25, rel=2e-3)
+    assert sigma_per_coc(Aperture.blades(6)) == pytest.approx(np.sqrt(5 / 24) / 2, rel=2e-3)
+
+
+def test_gaussian_baselines_keep_light_and_sharpness() -> None:
+    """A light of 100 blurred by 8 px everywhere keeps its energy; with no circle of confusion nothing changes."""
+    rgb = np.zeros((41, 41, 3), np.float32)
+    rgb[20, 20] = 100.0
+    for gaussian in (gaussian_scatter, gaussian_gather):
+        blurred = gaussian(rgb, np.full((41, 41), -8.0, np.float32))
+        assert blurred.sum() == pytest.approx(300.0, rel=1e-3)
+        assert np.array_equal(gaussian(rgb, np.zeros((41, 41), np.float32)), rgb)
+        offsets = np.arange(41) - 20
+        assert (blurred[..., 0].sum(axis=0) @ offsets**2) / 100.0 == pytest.approx(2.0**2, rel=0.02)
+
+
+def test_the_reference_beats_gaussians_where_it_is_the_truth(scene: Path) -> None:
+    pairs = PairSet(stacks_of([scene]))
+    pair = pairs[0]
+    assert psnr(scatter_reference(pair.all_in_focus, pair.coc_px, LENS.aperture), pair.target) > 60.0

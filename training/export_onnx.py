@@ -1,0 +1,106 @@
+"""A trained network as an ONNX file that says which lens it is, written only if it computes what the trained one does."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mrbokeh.atomic_files import atomic_path
+from mrbokeh.errors import InputError
+from mrbokeh.renderers.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
+from training.network import BlurNetwork
+from training.run_folder import RunFacts, load_run
+from training.settings import NetworkSettings
+
+LARGEST_DIFFERENCE = 1e-4
+OPSET = 18
+
+
+@dataclass(frozen=True)
+class Exported:
+    """The facts in the file, and how far ONNX Runtime is from PyTorch (see `largest_difference`)."""
+
+    facts: NetworkFacts
+    difference: float
+
+
+def export_run(run_folder: Path, path: Path) -> Exported:
+    """The finished network of a run as `path`. Raises InputError, and leaves no file, where the two do not agree."""
+    network, settings, facts = load_run(run_folder)
+    return export_network(network, settings.network, facts, path)
+
+
+def export_network(network: BlurNetwork, settings: NetworkSettings, facts: RunFacts, path: Path) -> Exported:
+    """Without tiles height and width of the graph are free; with tiles they are those of the training pictures."""
+    network_facts = network_facts_of(network, settings, facts)
+    with atomic_path(path) as temporary:
+        _write(network, network_facts, temporary)
+        difference = largest_difference(network, OnnxNetwork(temporary))
+        if not difference < LARGEST_DIFFERENCE:
+            raise InputError(
+                f"the exported network differs from the trained one by {difference:.1e}, more than {LARGEST_DIFFERENCE:.0e}: "
+                f"nothing was written; try another version of onnxruntime or torch"
+            )
+    return Exported(network_facts, difference)
+
+
+def network_facts_of(network: BlurNetwork, settings: NetworkSettings, facts: RunFacts) -> NetworkFacts:
+    return NetworkFacts(
+        lens=facts.lens,
+        width_px=facts.width_px,
+        height_px=facts.height_px,
+        largest_coc_px=facts.largest_coc_px,
+        radiance_scale=facts.radiance_scale,
+        signed_coc=settings.signed_coc,
+        tiled=network.grid is not None,
+        linear_in_radiance=network.linear_in_radiance,
+        reach_px=network.reach_px,
+        trained_on=facts.trained_on,
+        commit=facts.commit,
+    )
+
+
+def _write(network: BlurNetwork, facts: NetworkFacts, path: Path) -> None:
+    rgb, coc_px = picture_for_parity(facts)
+    free = torch.export.Dim.DYNAMIC
+    sizes = {} if facts.tiled else {2: free, 3: free}
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            network.eval(),
+            (rgb, coc_px),
+            input_names=["rgb", "coc_px"],
+            output_names=["blurred"],
+            dynamic_shapes={"rgb": sizes, "coc_px": sizes},
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    program.model.metadata_props[METADATA_KEY] = facts.to_json()
+    program.save(str(path))
+
+
+def picture_for_parity(facts: NetworkFacts, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Noise with lights up to the radiance scale and every circle of confusion that the network was trained for."""
+    rng = np.random.default_rng(seed)
+    height, width = (facts.height_px, facts.width_px) if facts.tiled else (96 + 2 * seed, 128 + 4 * seed)
+    rgb = rng.random((1, 3, height, width), dtype=np.float32)
+    rgb[rng.random(rgb.shape) < 0.01] = facts.radiance_scale
+    coc_px = np.linspace(-facts.largest_coc_px, facts.largest_coc_px, width, dtype=np.float32)
+    return torch.from_numpy(rgb), torch.from_numpy(np.ascontiguousarray(np.broadcast_to(coc_px, (1, 1, height, width))))
+
+
+@torch.no_grad()
+def largest_difference(network: BlurNetwork, exported: OnnxNetwork) -> float:
+    """The largest difference between PyTorch and ONNX Runtime over two pictures: absolute up to white (1.0), relative above."""
+    differences = []
+    for seed in (0, 1):
+        rgb, coc_px = picture_for_parity(exported.facts, seed)
+        expected = network(rgb, coc_px)[0].permute(1, 2, 0).numpy()
+        got = exported.blur(np.ascontiguousarray(rgb[0].permute(1, 2, 0).numpy()), coc_px[0, 0].numpy())
+        differences.append(float((np.abs(got - expected) / np.maximum(1.0, np.abs(expected))).max()))
+    return max(differences)

@@ -1,0 +1,139 @@
+"""The Neural Bokeh network (Mandl et al. 2024, Section 3): a sharp picture and its circles of confusion in, a blurred picture out.
+
+Our reading of what the paper leaves open:
+- "Per-channel convolutions" are depthwise: C1 makes a three-channel tensor per tile, and each of its channels has its own kernels.
+- A block is the basic block of He et al. 2016, which the paper cites: R(x) = ReLU(x + conv(ReLU(conv(x)))).
+- Every convolution pads its input, so that a block keeps the size of a tile (replicated border unless set otherwise).
+- The circle of confusion enters as a fraction of the largest one, mapped to [-1, 1] as the colours are.
+
+Shapes are in words here, not in annotations: exporting traces with sizes that are symbols, which a shape check would freeze.
+"""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from training.gated_network import GatedTiles, blocks_for_gates, disc_kernel
+from training.settings import NetworkSettings
+from training.tiling import TileGrid, assemble, split
+
+
+def blocks_for(largest_coc_px: float) -> int:
+    """The smallest N, at least 1, whose largest kernel 2N+1 covers this circle of confusion (diameter)."""
+    return max(1, math.ceil((abs(largest_coc_px) - 1.0) / 2.0))
+
+
+class BlurNetwork(nn.Module):
+    """Linear radiance and circles of confusion in, linear radiance out; tiling and the mapping to [-1, 1] are inside.
+
+    radiance_scale: the radiance that becomes +1 inside; 0 becomes -1.
+    grid: the tiles, for one size of picture; None takes the whole picture as one tile of any size.
+    linear_in_radiance: doubled light gives a doubled result. reach_px: how far from a pixel the network looks.
+    """
+
+    def __init__(self, settings: NetworkSettings, largest_coc_px: float, radiance_scale: float, grid: TileGrid | None = None) -> None:
+        super().__init__()
+        self.signed_coc, self.largest_coc_px, self.radiance_scale, self.grid = settings.signed_coc, largest_coc_px, radiance_scale, grid
+        blocks = settings.blocks or (blocks_for_gates if settings.form == "gated" else blocks_for)(largest_coc_px)
+        self.linear_in_radiance = settings.form == "gated" and settings.activation == "identity"
+        self.reach_px = blocks if settings.form == "gated" else blocks * (blocks + 1)
+        tiles = 1 if grid is None else len(grid)
+        if settings.form == "gated":
+            self.tiles: nn.Module = GatedTiles(settings, blocks, largest_coc_px, tiles)
+        else:
+            self.tiles = PublishedTiles(settings, blocks, tiles)
+
+    def forward(self, rgb: Tensor, coc_px: Tensor) -> Tensor:
+        """rgb (B, 3, H, W) linear; coc_px (B, 1, H, W) signed diameters; the result is (B, 3, H, W) linear."""
+        x = self.encode(rgb, coc_px)
+        y = self.tiles(x) if self.grid is None else assemble(self.tiles(split(x, self.grid)), self.grid)
+        return (y + 1.0) * (0.5 * self.radiance_scale)
+
+    def encode(self, rgb: Tensor, coc_px: Tensor) -> Tensor:
+        """The network's input (B, 4, H, W): R, G, B and circle of confusion in [-1, 1]."""
+        fraction = coc_px / self.largest_coc_px
+        coc = fraction.clamp(-1.0, 1.0) if self.signed_coc else 2.0 * fraction.abs().clamp(max=1.0) - 1.0
+        return torch.cat([rgb * (2.0 / self.radiance_scale) - 1.0, coc], dim=1)
+
+
+class PublishedTiles(nn.Module):
+    """F(x) = tanh(C2(R_N(... R_1(C1(x)) ...) + x_RGB)) of Eq. 2, "+" being concatenation, for all tiles at once.
+
+    Input (B, 4 tiles, t, t), output (B, 3 tiles, t, t). All convolutions are grouped, so no tile sees another.
+    """
+
+    def __init__(self, settings: NetworkSettings, blocks: int, tiles: int) -> None:
+        super().__init__()
+        features = 3 * settings.width
+        self.tile_count, self.activation = tiles, settings.activation
+        self.c1 = nn.Conv2d(4 * tiles, features * tiles, 1, groups=tiles)
+        self.blocks = nn.ModuleList(ResidualBlock(n, tiles, settings) for n in range(1, blocks + 1))
+        self.c2 = nn.Conv2d((features + 3) * tiles, 3 * tiles, 1, groups=tiles)
+        if settings.initialisation != "default":
+            self._start_as_identity(features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        batch, _, height, width = x.shape
+        state = self.c1(x)
+        for block in self.blocks:
+            state = block(state)
+        per_tile = (batch, self.tile_count, -1, height, width)
+        joined = torch.cat([state.reshape(per_tile), x.reshape(per_tile)[:, :, :3]], dim=2)
+        y = self.c2(joined.reshape(batch, -1, height, width))
+        return torch.tanh(y) if self.activation == "tanh" else y
+
+    @torch.no_grad()
+    def _start_as_identity(self, features: int) -> None:
+        """C1 copies the colours, lifted above the ReLU; C2 takes half of its answer from the blocks and half from the skip."""
+        colour = torch.arange(features) % 3
+        c1 = self.c1.weight.view(self.tile_count, features, 4)
+        c1.mul_(0.1)
+        c1[:, torch.arange(features), colour] = 1.0
+        self.c1.bias.fill_(1.0)
+        c2 = self.c2.weight.view(self.tile_count, 3, features + 3)
+        c2.zero_()
+        copies = features // 3
+        for channel in range(3):
+            c2[:, channel, :features][:, colour == channel] = 0.5 / copies
+            c2[:, channel, features + channel] = 0.5
+        self.c2.bias.fill_(-0.5)
+
+
+class ResidualBlock(nn.Module):
+    """R_n: two per-channel convolutions of size 2n+1, each followed by a ReLU, the second after the residual sum."""
+
+    def __init__(self, n: int, tiles: int, settings: NetworkSettings) -> None:
+        super().__init__()
+        features, size = 3 * settings.width, 2 * n + 1
+        groups = tiles * (3 if settings.mixing == "colour" else features)
+        self.radius, self.padding = n, settings.padding
+        self.first = nn.Conv2d(features * tiles, features * tiles, size, groups=groups)
+        self.second = nn.Conv2d(features * tiles, features * tiles, size, groups=groups)
+        self.mix = nn.Conv2d(features * tiles, features * tiles, 1, groups=tiles) if settings.mixing == "tile" else nn.Identity()
+        self._initialise(settings.initialisation, features, tiles)
+
+    def forward(self, x: Tensor) -> Tensor:
+        change = self.second(self._padded(torch.relu(self.first(self._padded(x)))))
+        return self.mix(torch.relu(x + change))
+
+    def _padded(self, x: Tensor) -> Tensor:
+        mode: Literal["constant", "replicate", "reflect"] = "constant" if self.padding == "zeros" else self.padding  # type: ignore[assignment]
+        return functional.pad(x, (self.radius,) * 4, mode=mode)
+
+    @torch.no_grad()
+    def _initialise(self, initialisation: str, features: int, tiles: int) -> None:
+        if initialisation == "default":
+            return
+        if initialisation == "disc":
+            self.first.weight.zero_()
+            self.first.weight[:, 0] = disc_kernel(2 * self.radius + 1, 2.0 * self.radius + 1.0)
+            self.first.bias.zero_()
+        self.second.weight.mul_(0.1)
+        self.second.bias.zero_()
+        if isinstance(self.mix, nn.Conv2d):
+            self.mix.weight.zero_()
+            self.mix.weight.view(tiles, features, features).diagonal(dim1=1, dim2=2).fill_(1.0)
+            self.mix.bias.zero_()

@@ -1,0 +1,103 @@
+"""The folder of a training run: settings, what it was trained on, checkpoint, curve and the finished network."""
+
+import csv
+import subprocess
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mrbokeh.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.errors import InputError
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import lens_from_json, lens_to_json
+from training.network import BlurNetwork
+from training.settings import TrainSettings, read_settings
+from training.tiling import TileGrid
+
+FORMAT = "mrbokeh-training-run"
+VERSION = 1
+FILE_NAME = "run.json"
+NETWORK_NAME = "network.pt"
+CURVE_NAME = "curve.csv"
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What a trained network holds for, and where it came from.
+
+    largest_coc_px: diameter; radiance_scale: the radiance at the upper end of the network's range;
+    trained_on, held_out: names of stacks; commit: of the source, or None where git is absent.
+    """
+
+    lens: Lens
+    width_px: int
+    height_px: int
+    largest_coc_px: float
+    radiance_scale: float
+    trained_on: tuple[str, ...]
+    held_out: tuple[str, ...]
+    commit: str | None
+
+    def to_json(self) -> dict[str, Any]:
+        return {"format": FORMAT, "version": VERSION, **vars(self), "lens": lens_to_json(self.lens)}
+
+
+def facts_from_json(document: dict[str, Any], where: str) -> RunFacts:
+    if document.get("format") != FORMAT or document.get("version") != VERSION:
+        raise InputError(f"{where}: expected format {FORMAT!r} version {VERSION}, got {document.get('format')!r}: train again")
+    values = {name: value for name, value in document.items() if name not in ("format", "version")}
+    lens = lens_from_json(values.pop("lens"), where)
+    names = {name: tuple(values.pop(name)) for name in ("trained_on", "held_out")}
+    return RunFacts(lens=lens, **names, **values)
+
+
+def write_facts(folder: Path, facts: RunFacts) -> None:
+    write_json(folder / FILE_NAME, facts.to_json())
+
+
+def read_facts(folder: Path) -> RunFacts:
+    return facts_from_json(read_json(folder / FILE_NAME, "a training run (RUN/run.json)"), str(folder / FILE_NAME))
+
+
+def build_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
+    """A fresh network for these data, weights drawn from the seed."""
+    tile = settings.network
+    grid = TileGrid(facts.height_px, facts.width_px, tile.tile_px, tile.overlap_px) if tile.tile_px else None
+    with torch.random.fork_rng():
+        torch.manual_seed(settings.seed)
+        return BlurNetwork(tile, facts.largest_coc_px, facts.radiance_scale, grid)
+
+
+def save_network(folder: Path, network: BlurNetwork) -> None:
+    with atomic_path(folder / NETWORK_NAME) as temporary:
+        torch.save(network.state_dict(), temporary)
+
+
+def load_run(folder: Path) -> tuple[BlurNetwork, TrainSettings, RunFacts]:
+    """The finished network of a run, in evaluation mode on the CPU."""
+    settings, facts = read_settings(folder), read_facts(folder)
+    if not (folder / NETWORK_NAME).is_file():
+        raise InputError(f"{folder} has no finished network ({NETWORK_NAME}): run the same `mrbokeh train fit` again, it goes on where it stopped")
+    network = build_network(settings, facts)
+    network.load_state_dict(torch.load(folder / NETWORK_NAME, map_location="cpu", weights_only=True))
+    return network.eval(), settings, facts
+
+
+def write_curve(folder: Path, curve: Iterable[tuple[int, float, float, float]]) -> None:
+    with atomic_path(folder / CURVE_NAME) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(["step", "elapsed_s", "loss", "held_out_psnr_db"])
+        rows.writerows(curve)
+
+
+def source_commit() -> str | None:
+    """The git commit of the source, with "-dirty" where files differ from it; None outside a checkout."""
+    folder = Path(__file__).resolve().parent
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip() or None
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,201 @@
+"""Fit a network to focal stacks. Reads top to bottom; every choice is in settings.py."""
+
+import copy
+import math
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FocalStack
+from mrbokeh.progress import progress_bars
+from training.batches import Batch, draw_batch, stack_pairs
+from training.checkpoint import FILE_NAME as CHECKPOINT_NAME
+from training.checkpoint import Progress, load_checkpoint, save_checkpoint
+from training.dataset import PairSet, gather_facts, split_stacks, stack_name
+from training.network import BlurNetwork
+from training.run_folder import RunFacts, build_network, save_network, source_commit, write_curve, write_facts
+from training.settings import FILE_NAME as SETTINGS_NAME
+from training.settings import TrainSettings, read_settings, write_settings
+
+VALIDATION_SLICES = 4
+
+
+def fit(stacks: Sequence[FocalStack], run_folder: Path, settings: TrainSettings, held_out: Sequence[str] = ()) -> Progress:
+    """Train, or go on training, into run_folder; a finished run is left as it is.
+
+    Interrupting (KeyboardInterrupt) leaves a checkpoint, and the same call goes on from it.
+    """
+    _require_same_settings(run_folder, settings)
+    train_stacks, test_stacks = split_stacks(stacks, held_out, settings.test_fraction, settings.seed)
+    pairs = PairSet(train_stacks, settings.least_confidence, settings.saturation, settings.cache_mib)
+    facts = _facts_of(pairs, test_stacks, settings)
+    write_settings(run_folder, settings)
+    write_facts(run_folder, facts)
+    return _Run(run_folder, settings, pairs, _validation_batch(test_stacks, settings), facts).train()
+
+
+def _require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
+    """A longer budget may go on from an older run; anything else that differs needs a folder of its own."""
+    if not (run_folder / CHECKPOINT_NAME).exists() or not (run_folder / SETTINGS_NAME).exists():
+        return
+    before = vars(read_settings(run_folder))
+    differing = [name for name, value in vars(settings).items() if before[name] != value and name not in ("threads", "device", "cache_mib")]
+    if differing:
+        raise InputError(f"{run_folder} holds a run with other settings ({', '.join(differing)}): give another --out, or --overwrite to start again")
+
+
+def _facts_of(pairs: PairSet, test_stacks: Sequence[FocalStack], settings: TrainSettings) -> RunFacts:
+    data = gather_facts(pairs)
+    return RunFacts(
+        lens=data.lens,
+        width_px=data.width_px,
+        height_px=data.height_px,
+        largest_coc_px=data.largest_coc_px,
+        radiance_scale=settings.radiance_scale or data.radiance_scale,
+        trained_on=tuple(stack_name(stack) for stack in pairs.stacks),
+        held_out=tuple(stack_name(stack) for stack in test_stacks),
+        commit=source_commit(),
+    )
+
+
+def _validation_batch(test_stacks: Sequence[FocalStack], settings: TrainSettings) -> list[Batch]:
+    """A few held-out slices spread over the focus range; whole pictures."""
+    pairs = PairSet(test_stacks, settings.least_confidence, settings.saturation, cache_mib=0)
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(VALIDATION_SLICES, len(pairs))).astype(int)) if len(pairs) else []
+    return [stack_pairs([pairs[int(index)]]) for index in chosen]
+
+
+def mean_square_error(result: Tensor, batch: Batch, radiance_scale: float, settings: TrainSettings) -> Tensor:
+    """Eq. 3 over the reassembled pictures, in the units of the network, [-1, 1]; pixels without weight do not count."""
+    weight, target = batch.weight.expand_as(batch.target), batch.target
+    if settings.loss_weighting == "relative":
+        weight = weight / target.amax(dim=1, keepdim=True).clamp(min=1.0).square()
+    if settings.sensor_white is not None:
+        result, target = result.clamp(max=settings.sensor_white), target.clamp(max=settings.sensor_white)
+    error = (result - target) * (2.0 / radiance_scale)
+    return (weight * error.square()).sum() / weight.sum().clamp(min=1e-6)
+
+
+def learning_rate_factor(done: float, warm_up: float) -> float:
+    """Of the peak, after this fraction of the budget: a linear rise, then half a cosine to zero."""
+    if done < warm_up:
+        return max(done / warm_up, 0.02)
+    return 0.5 * (1.0 + math.cos(math.pi * min(1.0, (done - warm_up) / (1.0 - warm_up))))
+
+
+class _Run:
+    """One run in memory. The constructor restores a checkpoint where there is one."""
+
+    def __init__(self, folder: Path, settings: TrainSettings, pairs: PairSet, validation: list[Batch], facts: RunFacts) -> None:
+        self.folder, self.settings, self.pairs, self.validation, self.facts = folder, settings, pairs, validation, facts
+        self.device = _device(settings.device)
+        torch.set_num_threads(settings.threads or os.cpu_count() or 1)
+        self.network = build_network(settings, facts).to(self.device)
+        self.average = copy.deepcopy(self.network)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), settings.learning_rate, betas=(0.9, 0.99))
+        self.rng = np.random.default_rng(settings.seed)
+        self.progress = Progress()
+        if self._checkpoint.exists():
+            self.progress = load_checkpoint(self._checkpoint, self.network, self.average, self.optimizer, self.rng)
+        self._started_s = time.monotonic() - self.progress.elapsed_s
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self.folder / CHECKPOINT_NAME
+
+    @property
+    def _steps(self) -> int | None:
+        """The budget in steps, where it is given in epochs."""
+        return None if self.settings.epochs is None else math.ceil(self.settings.epochs * len(self.pairs) / self.settings.batch)
+
+    def _done(self) -> float:
+        """How much of the budget is used, in [0, 1]."""
+        if self._steps is not None:
+            return min(1.0, self.progress.step / max(self._steps, 1))
+        return min(1.0, self.progress.elapsed_s / (60.0 * (self.settings.minutes or 0.0) + 1e-9))
+
+    def train(self) -> Progress:
+        if self.progress.finished:
+            return self.progress
+        try:
+            self._loop()
+        except KeyboardInterrupt:
+            self._save()
+            raise
+        self._finish()
+        return self.progress
+
+    def _loop(self) -> None:
+        last_saved_s = last_checked_s = self.progress.elapsed_s
+        with progress_bars() as bars:
+            bar = bars.add_task("train", total=1000)
+            while (done := self._done()) < 1.0:
+                self._step(learning_rate_factor(done, self.settings.warm_up))
+                self.progress.elapsed_s = time.monotonic() - self._started_s
+                bars.update(bar, completed=1000 * self._done(), description=f"train, loss {self.progress.smoothed_loss:.2e}")
+                if self.settings.validate_every_s and self.progress.elapsed_s - last_checked_s >= self.settings.validate_every_s:
+                    self._note_curve()
+                    last_checked_s = self.progress.elapsed_s
+                if self.progress.elapsed_s - last_saved_s >= self.settings.checkpoint_every_s:
+                    self._save()
+                    last_saved_s = self.progress.elapsed_s
+
+    def _step(self, rate_factor: float) -> None:
+        settings = self.settings
+        halo_px = math.ceil(self.facts.largest_coc_px / 2.0)
+        batch = draw_batch(self.pairs, settings.batch, settings.crop_px, halo_px, self.rng).to(self.device)
+        for group in self.optimizer.param_groups:
+            group["lr"] = settings.learning_rate * rate_factor
+        self.optimizer.zero_grad(set_to_none=True)
+        loss = mean_square_error(self.network(batch.rgb, batch.coc_px), batch, self.facts.radiance_scale, settings)
+        loss.backward()
+        self.optimizer.step()
+        self._follow()
+        self.progress.step += 1
+        before = self.progress.smoothed_loss
+        self.progress.smoothed_loss = loss.item() if math.isnan(before) else 0.98 * before + 0.02 * loss.item()
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        """The averaged weights follow the trained ones, faster while they are young."""
+        decay = min(self.settings.ema_decay, (1.0 + self.progress.step) / (10.0 + self.progress.step))
+        for mean, now in zip(self.average.parameters(), self.network.parameters(), strict=True):
+            mean.lerp_(now, 1.0 - decay)
+
+    def _note_curve(self) -> None:
+        psnr_db = held_out_psnr_db(self.average, self.validation, self.device) if self.validation else float("nan")
+        self.progress.curve.append((self.progress.step, round(self.progress.elapsed_s, 2), self.progress.smoothed_loss, psnr_db))
+
+    def _save(self) -> None:
+        save_checkpoint(self._checkpoint, self.progress, self.network, self.average, self.optimizer, self.rng)
+        write_curve(self.folder, self.progress.curve)
+
+    def _finish(self) -> None:
+        self._note_curve()
+        save_network(self.folder, self.average.cpu())
+        self.progress = replace(self.progress, finished=True)
+        self._save()
+
+
+@torch.no_grad()
+def held_out_psnr_db(network: BlurNetwork, batches: Sequence[Batch], device: torch.device) -> float:
+    """Mean PSNR over slices, linear radiance clipped to [0, 1]."""
+    values = []
+    for batch in batches:
+        on_device = batch.to(device)
+        error = network(on_device.rgb, on_device.coc_px).clamp(0, 1) - on_device.target.clamp(0, 1)
+        values.append(-10.0 * math.log10(max(float(error.square().mean()), 1e-12)))
+    return float(np.mean(values))
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
