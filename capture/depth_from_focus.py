@@ -42,8 +42,7 @@ def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
 
 def depth_from_focus(registered: Callable[[], Iterable[Rgb]]) -> FocusMap:
     """The focus map of slices in the order of their focus. registered: gives a fresh pass over them; four are made."""
-    energies = np.stack([focus_energy(rgb) for rgb in registered()])
-    return focus_map(energies, find_lights(registered))
+    return focus_map(np.stack([focus_energy(rgb) for rgb in registered()]), find_lights(registered))
 
 
 def focus_map(energies: Volume, lights: Lights) -> FocusMap:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
+PerLight = Float[np.ndarray, " lights"]
 
 OVER_RANGE = 0.9
 TIMES_SURROUNDINGS = 3.0
@@ -47,9 +48,10 @@ def find_lights(slices: Callable[[], Iterable[Rgb]]) -> Lights:
     nearest, distance_px = _nearest_spot(spots)
     count = int(nearest.max(initial=0))
     near = np.where(distance_px <= reach_px, nearest, 0)
-    spreads = [_spread(_brightness(rgb) - surroundings - CLEARLY_BRIGHTER, near, count) for rgb in slices()]
-    light, areas_px = (np.array(each) for each in zip(*spreads, strict=True))
-    seen = light >= LEAST_SHARE_OF_LIGHT * light.max(axis=0)
+    spreads = [_spread(_brightness(rgb), surroundings + CLEARLY_BRIGHTER, near, count) for rgb in slices()]
+    light, areas_px, peaks = (np.array(each) for each in zip(*spreads, strict=True))
+    # Far out of focus a light drowns in its surroundings; in focus most of it may be lost, but its peak is not.
+    seen = (light >= LEAST_SHARE_OF_LIGHT * light.max(axis=0)) | (peaks > OVER_RANGE)
     sharpest = np.where(seen, areas_px, np.inf).argmin(axis=0)
     radius_px = np.concatenate([[0.0], 1.3 * np.sqrt(np.where(seen, areas_px, 0.0).max(axis=0) / np.pi) + 2.0])
     zone = np.where(distance_px <= np.minimum(radius_px, reach_px)[near], near, 0)
@@ -88,11 +90,11 @@ def _nearest_spot(spots: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarr
     return labels[rows, columns].astype(np.int64), distance_px
 
 
-def _spread(
-    excess: Plane, near: Int[np.ndarray, "height width"], count: int
-) -> tuple[Float[np.ndarray, " lights"], Float[np.ndarray, " lights"]]:
-    """For each light (how much of it is seen, over how many pixels): the area is (sum)^2 / sum of squares, that of an even disc."""
-    excess = np.maximum(excess, 0.0)
+def _spread(brightness: Plane, surroundings: Plane, near: Int[np.ndarray, "height width"], count: int) -> tuple[PerLight, PerLight, PerLight]:
+    """For each light (how much of it is seen, over how many pixels, its peak); the area is (sum)^2 / sum of squares, that of an even disc."""
+    excess = np.maximum(brightness - surroundings, 0.0)
     total = np.bincount(near.ravel(), excess.ravel(), count + 1)[1:]
     squares = np.bincount(near.ravel(), (excess * excess).ravel(), count + 1)[1:]
-    return total, total**2 / np.maximum(squares, 1e-12)
+    peaks = np.zeros(count + 1)
+    np.maximum.at(peaks, near.ravel(), brightness.ravel())
+    return total, total**2 / np.maximum(squares, 1e-12), peaks[1:]

@@ -1,5 +1,6 @@
 """`mrbokeh capture merge`: registered slices, all-in-focus picture and depth for every stack of a scene."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,9 @@ from jaxtyping import Float32
 
 from capture.alignment import Registration, register_stack, warp
 from capture.all_in_focus import all_in_focus
-from capture.depth_from_focus import FocusMap, depth_from_focus
+from capture.depth_from_focus import FocusMap, focus_energy, focus_map
+from capture.light_energy import with_light_energy
+from capture.lights import find_lights
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack, Slice, find_focal_stacks, write_focal_stack, write_merged
@@ -19,6 +22,7 @@ from mrbokeh.progress import track
 REGISTERED_FOLDER = "registered"
 FEWEST_SLICES = 3
 
+Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 
@@ -34,8 +38,13 @@ def merge_stack(stack: FocalStack) -> FocalStack:
     registration = _register(stack)
     slices = _write_registered(stack, registration)
     registered = _with_registration(stack, slices, registration)
-    focus = depth_from_focus(lambda: track(registered.iter_rgb(), f"{stack.folder.name}: focus", len(stack)))
-    picture = all_in_focus(track(registered.iter_rgb(), f"{stack.folder.name}: all in focus", len(stack)), focus.merge_index)
+    def passes(purpose: str) -> Iterator[Rgb]:
+        return track(registered.iter_rgb(), f"{stack.folder.name}: {purpose}", len(stack))
+
+    lights = find_lights(lambda: passes("lights"))
+    focus = focus_map(np.stack([focus_energy(rgb) for rgb in passes("focus")]), lights)
+    sharp = all_in_focus(passes("all in focus"), focus.merge_index)
+    picture = with_light_energy(sharp, passes("energy of lights"), lights)
     write_merged(stack.folder, picture, focus.focus_index, focus.confidence, depth_m_of(registered, focus))
     merged = replace(registered, merged=True)
     write_focal_stack(merged)
@@ -57,7 +66,7 @@ def source_path(each: Slice) -> str:
 
 
 def _register(stack: FocalStack) -> Registration:
-    def read(index: int) -> Float32[np.ndarray, "height width 3"]:
+    def read(index: int) -> Rgb:
         return read_image(stack.folder / source_path(stack.slices[index]))
 
     knows_lens = stack.lens is not None and stack.is_metric

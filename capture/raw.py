@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from capture.clipped_highlights import neutral_where_full
 from capture.libraw import MAX_16_BIT, WhiteBalance, matrix_used_by_libraw, opened_raw, processed, rec709_from_balanced_camera
 from capture.photo_metadata import PhotoMetadata
 from capture.whole_file import require_whole_tiff
@@ -62,7 +63,7 @@ def decode_raw(path: Path, white_balance: WhiteBalance | None = None, *, half_si
         multipliers = _normalised(white_balance) if white_balance is not None else _camera_white_balance(raw)
         matrix = rec709_from_balanced_camera(np.array(raw.color_matrix), np.array(raw.rgb_xyz_matrix))
         saturated = _saturated(raw)
-        camera_rgb = _balanced_camera_rgb(raw, multipliers, half_size)
+        camera_rgb = neutral_where_full(_balanced_camera_rgb(raw, multipliers, half_size), multipliers)
         if matrix is None:
             matrix = matrix_used_by_libraw(raw)
             remarks += ["LibRaw has no colour matrix for this camera: its own primaries are kept"] if np.allclose(matrix, np.eye(3)) else []

@@ -7,9 +7,7 @@ from datasets_scripts._traced_bodies_numba import FAST, PackedScene, nearest_hit
 
 
 @njit(cache=True, fastmath=FAST, parallel=True)
-def open_sky_and_sun(
-    s: PackedScene, points: np.ndarray, sky: np.ndarray, sun: np.ndarray, reach_m: float
-) -> tuple[np.ndarray, np.ndarray]:
+def open_sky_and_sun(s: PackedScene, points: np.ndarray, sky: np.ndarray, sun: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
     """(P,) the share of sky rays that are free for reach_m (near hits count more), and the share of sun rays that are free."""
     everything = np.arange(s.quad_corner.shape[0] + s.sphere_centre.shape[0])
     sky_open, sun_open = np.empty(points.shape[0]), np.empty(points.shape[0])

@@ -17,7 +17,9 @@ _UNIT_DISC_BOX = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
 _UNIT_QUAD = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
-def pack_view(camera: Camera, aperture: Aperture, pupil_radius_m: float, inverse_focus_per_m: float, footprint_px: float = 1.0) -> PackedView:
+def pack_view(
+    camera: Camera, aperture: Aperture, pupil_radius_m: float, inverse_focus_per_m: float, footprint_px: float = 1.0
+) -> PackedView:
     """A camera behind a pupil; inverse_focus_per_m is the focus distance in dioptres (0 = infinity)."""
     vertices, starts, weights = aperture.packed()
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
@@ -39,7 +41,8 @@ def pack_scene(scene: Scene, camera: Camera, view: PackedView) -> PackedScene:
     light_radii = np.array([light.radius_m for light in scene.lights])
     normals = np.cross(edges_u, edges_v)
     squared = np.maximum((normals**2).sum(axis=1, keepdims=True), 1e-300)
-    texels, texture_map, texture_of = _packed_textures([body.texture for body in (*scene.quads, *scene.spheres)])
+    worn = [quad.texture for quad in scene.quads] + [sphere.texture for sphere in scene.spheres]
+    texels, texture_map, texture_of = _packed_textures(worn)
     lightmap_values, lightmap = _packed_lightmaps(scene)
     quad_points = corners[:, None] + _UNIT_QUAD[:, :1] * edges_u[:, None] + _UNIT_QUAD[:, 1:] * edges_v[:, None]
     sphere_points = centres[:, None] + _UNIT_BOX * radii[:, None, None]
@@ -96,7 +99,8 @@ def _packed_textures(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarra
 
 
 def _packed_lightmaps(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    maps = [np.full((1, 1), scene.unshadowed_gain(quad)) if quad.lightmap is None else quad.lightmap for quad in scene.quads] or [np.ones((1, 1))]
+    maps = [np.full((1, 1), scene.unshadowed_gain(quad)) if quad.lightmap is None else quad.lightmap for quad in scene.quads]
+    maps = maps or [np.ones((1, 1))]
     return np.concatenate([each.ravel() for each in maps]).astype(np.float32), _map_of([each.shape for each in maps])
 
 
@@ -106,7 +110,9 @@ def _map_of(shapes: Sequence[tuple[int, ...]]) -> np.ndarray:
     return np.column_stack([starts, sizes]).astype(np.int64)
 
 
-def _light_gains(depth_m: Float[np.ndarray, " lights"], radius_m: Float[np.ndarray, " lights"], view: PackedView) -> Float[np.ndarray, " lights"]:
+def _light_gains(
+    depth_m: Float[np.ndarray, " lights"], radius_m: Float[np.ndarray, " lights"], view: PackedView
+) -> Float[np.ndarray, " lights"]:
     """Share of the pupil per point on the light where its blur is larger than the light, else 0: the lens rays find it well enough."""
     weighted_area = float(np.dot(view.weights, pupil_areas(view)))
     pupil_on_light = weighted_area * (view.pupil_radius * (1.0 - depth_m * view.inverse_focus)) ** 2
@@ -122,7 +128,7 @@ def _bounds_px(points_m: Float[np.ndarray, "bodies points 3"], view: PackedView)
     if len(points_m) == 0:
         return np.empty((0, 4))
     depth_m = np.maximum(points_m[..., 2], _NEAREST_M)
-    centre = np.stack([points_m[..., 0] / depth_m * view.focal_x + view.principal_x, points_m[..., 1] / depth_m * view.focal_y + view.principal_y], -1)
+    centre = points_m[..., :2] / depth_m[..., None] * (view.focal_x, view.focal_y) + (view.principal_x, view.principal_y)
     defocus = np.abs(1.0 / depth_m - view.inverse_focus).max(axis=1)
     reach = 0.5 * view.footprint + 0.5 + max(view.focal_x, view.focal_y) * view.pupil_radius * view.pupil_extent * defocus[:, None]
     bounds = np.concatenate([centre.min(axis=1) - reach, centre.max(axis=1) + reach], axis=1)

@@ -67,7 +67,15 @@ def pupil_weight(view: PackedView, x: float, y: float) -> float:
 
 @njit(cache=True, fastmath=FAST)
 def _light_share(
-    s: PackedScene, view: PackedView, members: np.ndarray, count: int, light: int, column: int, row: int, shift: np.ndarray, points: np.ndarray
+    s: PackedScene,
+    view: PackedView,
+    members: np.ndarray,
+    count: int,
+    light: int,
+    column: int,
+    row: int,
+    shift: np.ndarray,
+    points: np.ndarray,
 ) -> float:
     """Share of the pupil through which a pixel sees one strongly blurred light: points on the light instead of on the lens."""
     body = s.quad_corner.shape[0] + s.sphere_centre.shape[0] + light
@@ -93,7 +101,15 @@ def _light_share(
 
 @njit(cache=True, fastmath=FAST)
 def _shade_pixel(
-    s: PackedScene, view: PackedView, members: np.ndarray, count: int, column: int, row: int, shift: np.ndarray, points: np.ndarray, rgb: np.ndarray
+    s: PackedScene,
+    view: PackedView,
+    members: np.ndarray,
+    count: int,
+    column: int,
+    row: int,
+    shift: np.ndarray,
+    points: np.ndarray,
+    rgb: np.ndarray,
 ) -> None:
     """Mean radiance over the pixel's area and the pupil, divided by the weight that the pupil really gave (ratio estimator)."""
     red, green, blue, total = 0.0, 0.0, 0.0, 0.0
@@ -135,7 +151,8 @@ def _shade_tile(
     for row in range(y0, min(y0 + TILE_PX, view.height)):
         for column in range(x0, min(x0 + TILE_PX, view.width)):
             for axis in range(4):
-                shift[axis] = _fraction_hash(np.uint32(((row * view.width + column) * 4 + axis) * 0x9E3779B1 + seed * 0x7FEB352D + 0x165667B1))
+                number = (row * view.width + column) * 4 + axis
+                shift[axis] = _fraction_hash(np.uint32(number * 0x9E3779B1 + seed * 0x7FEB352D + 0x165667B1))
             _shade_pixel(s, view, members, count, column, row, shift, points, rgb[row, column])
             for m in range(count):
                 light = members[m] - first_light
@@ -146,14 +163,12 @@ def _shade_tile(
 
 
 @njit(cache=True, parallel=True)
-def shade_rows(
-    s: PackedScene, view: PackedView, first_row: int, last_row: int, points: np.ndarray, light_points: np.ndarray, seed: int, rgb: np.ndarray
-) -> None:
-    """Fill rgb[first_row:last_row] (H, W, 3); the rows must start at a multiple of TILE_PX."""
+def shade_picture(s: PackedScene, view: PackedView, points: np.ndarray, light_points: np.ndarray, seed: int, rgb: np.ndarray) -> None:
+    """Fill rgb (H, W, 3), tile by tile."""
     tiles_x = (view.width + TILE_PX - 1) // TILE_PX
-    tiles_y = (last_row - first_row + TILE_PX - 1) // TILE_PX
+    tiles_y = (view.height + TILE_PX - 1) // TILE_PX
     for tile in prange(tiles_x * tiles_y):
-        _shade_tile(s, view, tile % tiles_x * TILE_PX, first_row + tile // tiles_x * TILE_PX, points, light_points, seed, rgb)
+        _shade_tile(s, view, tile % tiles_x * TILE_PX, tile // tiles_x * TILE_PX, points, light_points, seed, rgb)
 
 
 @njit(cache=True, parallel=True)

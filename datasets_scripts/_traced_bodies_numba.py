@@ -111,7 +111,7 @@ def _texture_rgb(s: PackedScene, texture: int, u: float, v: float) -> tuple[floa
     """Bilinear, repeating; texel (0, 0)'s centre is half a texel from the corner."""
     start, height, width = s.texture_map[texture, 0], s.texture_map[texture, 1], s.texture_map[texture, 2]
     x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
-    x0, y0 = int(math.floor(x)), int(math.floor(y))
+    x0, y0 = math.floor(x), math.floor(y)
     fx, fy = x - x0, y - y0
     left, right = (x0 if x0 >= 0 else width - 1), (x0 + 1 if x0 + 1 < width else 0)
     top = start + (y0 if y0 >= 0 else height - 1) * width
@@ -156,9 +156,7 @@ def _sphere_rgb(s: PackedScene, i: int, px: float, py: float, pz: float) -> tupl
 
 
 @njit(cache=True, fastmath=FAST)
-def radiance(
-    s: PackedScene, members: np.ndarray, count: int, ox: float, oy: float, dx: float, dy: float
-) -> tuple[float, float, float]:
+def radiance(s: PackedScene, members: np.ndarray, count: int, ox: float, oy: float, dx: float, dy: float) -> tuple[float, float, float]:
     """Linear RGB that comes back along a ray from the lens point (ox, oy, 0)."""
     quads, spheres = s.quad_corner.shape[0], s.sphere_centre.shape[0]
     body, t, u, v = nearest_hit(s, members, count, ox, oy, 0.0, dx, dy, 1.0)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32
 
 from datasets_scripts._baked_lighting_numba import open_sky_and_sun
 from datasets_scripts._scene_packing import pack_scene, pack_view
+from datasets_scripts._traced_bodies_numba import PackedScene
 from datasets_scripts.traced_scene import Quad, Scene
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera import Camera
@@ -38,7 +39,13 @@ def bake_lighting(
 
 
 def _lightmap(
-    scene: Scene, quad: Quad, packed: tuple, directions: Float[np.ndarray, "2 rays 3"], texel_m: float, sun_radius_rad: float, reach_m: float
+    scene: Scene,
+    quad: Quad,
+    packed: PackedScene,
+    directions: Float[np.ndarray, "2 rays 3"],
+    texel_m: float,
+    sun_radius_rad: float,
+    reach_m: float,
 ) -> Float32[np.ndarray, "lightmap_height lightmap_width"]:
     edge_u, edge_v, normal = np.asarray(quad.edge_u_m), np.asarray(quad.edge_v_m), quad.normal
     width, height = (int(np.clip(np.linalg.norm(edge) / texel_m, 2, 256)) for edge in (edge_u, edge_v))

@@ -50,7 +50,9 @@ def focus_distance_from_film_plane_m(film_plane_m: float, focal_length_mm: float
     """The d_f with d_f + f d_f / (d_f - f) = film_plane_m; of the two solutions the one farther from the lens."""
     focal_m = focal_length_mm / MM_PER_M
     if film_plane_m < 4.0 * focal_m:
-        raise InputError(f"a thin lens of {focal_length_mm} mm focuses no nearer than {4 * focal_m} m from the film plane, got {film_plane_m} m")
+        raise InputError(
+            f"a thin lens of {focal_length_mm} mm has its focus at least {4 * focal_m} m from the film plane, got {film_plane_m} m"
+        )
     return 0.5 * (film_plane_m + float(np.sqrt(film_plane_m * (film_plane_m - 4.0 * focal_m))))
 
 

@@ -9,6 +9,7 @@ Finished files are kept, so an interrupted run goes on where it stopped.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -42,8 +43,8 @@ class _Job:
         return all(path.is_file() for path in self.paths)
 
 
-def make_raw_stack(out: Path, plan: StackPlan, *, force: bool = False, progress: Callable[[int, int], None] = lambda done, total: None) -> int:
-    """Write all that is missing of the plan into `out`; returns how many jobs ran. `progress` hears (done, total).
+def make_raw_stack(out: Path, plan: StackPlan, *, force: bool = False, progress: Callable[[int, int], None] | None = None) -> int:
+    """Write all that is missing of the plan into `out`; returns how many jobs ran. `progress` hears (files done, files in all).
 
     Raises InputError where `out` holds something else, unless `force` says to replace it.
     """
@@ -53,10 +54,12 @@ def make_raw_stack(out: Path, plan: StackPlan, *, force: bool = False, progress:
     _claim_folder(out, plan, [path for job in jobs for path in job.paths], force)
     waiting = [job for job in jobs if not job.done]
     scene = desk_scene(plan.seed) if waiting else Scene()
-    progress(len(jobs) - len(waiting), len(jobs))
     for index, job in enumerate(waiting):
+        if progress:
+            progress(len(jobs) - len(waiting) + index, len(jobs))
         job.make(scene)
-        progress(len(jobs) - len(waiting) + index + 1, len(jobs))
+    if progress:
+        progress(len(jobs), len(jobs))
     return len(waiting)
 
 
@@ -79,16 +82,17 @@ def _jobs(out: Path, plan: StackPlan) -> Iterator[_Job]:
     for view in range(plan.viewpoints):
         folder = out / "truth" / f"view_{view}"
         aif_path, depth_path = folder / "all_in_focus.exr", folder / "depth.exr"
-        yield _Job((aif_path, depth_path), lambda scene, view=view, a=aif_path, d=depth_path: _make_truth(scene, plan, view, a, d))
+        yield _Job((aif_path, depth_path), partial(_make_truth, plan=plan, view=view, aif_path=aif_path, depth_path=depth_path))
         for index in range(plan.slices):
             path = out / f"view_{view}" / f"slice_{index:02d}.dng"
-            yield _Job((path,), lambda scene, view=view, index=index, path=path: _make_slice(scene, plan, view, index, path))
+            yield _Job((path,), partial(_make_slice, plan=plan, view=view, index=index, path=path))
 
 
 def _make_truth(scene: Scene, plan: StackPlan, view: int, aif_path: Path, depth_path: Path) -> None:
     camera = desk_camera(view, plan.width_px, plan.height_px, plan.lens_at(0))
     rgb, depth_m = trace_pinhole(scene, camera, plan.samples, plan.seed, plan.sensor.footprint_px)
-    write_exr(depth_path, ExrPart({"Z": depth_m.astype(np.float16)}, attributes={"comments": "metres along the optical axis at pixel centres"}))
+    comment = "metres along the optical axis at pixel centres"
+    write_exr(depth_path, ExrPart({"Z": depth_m.astype(np.float16)}, attributes={"comments": comment}))
     write_image(aif_path, rgb, half=True)
 
 

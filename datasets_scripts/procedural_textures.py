@@ -13,7 +13,13 @@ _GLYPH_ROWS, _GLYPH_COLUMNS = 7, 5
 
 
 def fractal_noise(
-    height: int, width: int, rng: np.random.Generator, finest: float = 4.0, coarsest: float = 128.0, slope: float = 1.0, stretch: float = 1.0
+    height: int,
+    width: int,
+    rng: np.random.Generator,
+    finest: float = 4.0,
+    coarsest: float = 128.0,
+    slope: float = 1.0,
+    stretch: float = 1.0,
 ) -> Float[np.ndarray, "height width"]:
     """(H, W) noise of mean 0 and standard deviation 1 with amplitude ~ frequency^-slope per octave, between two wavelengths.
 
@@ -34,7 +40,9 @@ def coloured(shade: Float[np.ndarray, "height width"], dark: Vector, light: Vect
     return np.clip(mixed, 0.01, 0.95).astype(np.float32)
 
 
-def mottled(size: int, rng: np.random.Generator, dark: Vector, light: Vector, finest: float = 4.0, slope: float = 0.8, contrast: float = 0.22) -> Texture:
+def mottled(
+    size: int, rng: np.random.Generator, dark: Vector, light: Vector, finest: float = 4.0, slope: float = 0.8, contrast: float = 0.22
+) -> Texture:
     """Plaster, stone, felt: noise of all scales, with a slow drift of the hue."""
     shade = 0.5 + contrast * fractal_noise(size, size, rng, finest, size / 3.0, slope)
     hue = 1.0 + 0.06 * np.stack([fractal_noise(size, size, rng, 12.0, size / 2.0) for _ in range(3)], axis=-1)
@@ -46,11 +54,19 @@ def wood(size: int, rng: np.random.Generator, dark: Vector, light: Vector, plank
     grain = fractal_noise(size, size, rng, 4.0, size / 4.0, 0.7, stretch=8.0) * 0.17 + fractal_noise(size, size, rng, 4.0, 64.0, 0.1) * 0.1
     plank = np.arange(size) * planks // size
     joint = np.abs((np.arange(size) + 0.5) * planks / size % 1.0 - 0.5) > 0.5 - 2.5 * planks / size
-    shade = 0.5 + grain + rng.normal(0.0, 0.1, planks)[plank][:, None] - 0.45 * ndimage.gaussian_filter1d(joint.astype(float), 1.2, mode="wrap")[:, None]
+    soft_joint = ndimage.gaussian_filter1d(joint.astype(float), 1.2, mode="wrap")
+    shade = 0.5 + grain + rng.normal(0.0, 0.1, planks)[plank][:, None] - 0.45 * soft_joint[:, None]
     return coloured(shade, dark, light)
 
 
-def bricks(size: int, rng: np.random.Generator, rows: int = 8, columns: int = 4, brick: Vector = (0.42, 0.17, 0.11), mortar: Vector = (0.5, 0.47, 0.42)) -> Texture:
+def bricks(
+    size: int,
+    rng: np.random.Generator,
+    rows: int = 8,
+    columns: int = 4,
+    brick: Vector = (0.42, 0.17, 0.11),
+    mortar: Vector = (0.5, 0.47, 0.42),
+) -> Texture:
     """Running bond: every second row is shifted by half a brick; each brick has its own tone."""
     y, x = np.mgrid[:size, :size] + 0.5
     row = (y * rows / size).astype(int)
@@ -59,7 +75,8 @@ def bricks(size: int, rng: np.random.Generator, rows: int = 8, columns: int = 4,
     face = ndimage.gaussian_filter((edge > 0.05).astype(float), 1.5, mode="wrap")[..., None]
     tone = rng.uniform(0.65, 1.3, (rows, columns))[row, along.astype(int) % columns]
     rough = 1.0 + 0.2 * fractal_noise(size, size, rng, 4.0, size / 6.0, 0.6)
-    return np.clip((face * np.asarray(brick) * tone[..., None] + (1 - face) * np.asarray(mortar)) * rough[..., None], 0.01, 0.95).astype(np.float32)
+    wall = face * np.asarray(brick) * tone[..., None] + (1 - face) * np.asarray(mortar)
+    return np.clip(wall * rough[..., None], 0.01, 0.95).astype(np.float32)
 
 
 def checks(size: int, rng: np.random.Generator, first: Vector, second: Vector, count: int = 8) -> Texture:
@@ -70,9 +87,18 @@ def checks(size: int, rng: np.random.Generator, first: Vector, second: Vector, c
     return coloured(shade, first, second)
 
 
-def spots(size: int, rng: np.random.Generator, ground: Vector, colours: tuple[Vector, ...], count: int = 70, radius: tuple[float, float] = (4.0, 22.0)) -> Texture:
+def spots(
+    size: int,
+    rng: np.random.Generator,
+    ground: Vector,
+    colours: tuple[Vector, ...],
+    count: int = 70,
+    radius: tuple[float, float] = (4.0, 22.0),
+) -> Texture:
     """Round spots of several colours and sizes on a mottled ground, soft-edged over four texels."""
-    picture = mottled(size, rng, tuple(0.8 * c for c in ground), tuple(1.2 * c for c in ground)).astype(float)
+    red, green, blue = ground
+    dark, light = (0.8 * red, 0.8 * green, 0.8 * blue), (1.2 * red, 1.2 * green, 1.2 * blue)
+    picture = mottled(size, rng, dark, light).astype(float)
     y, x = np.mgrid[:size, :size] + 0.5
     for index in range(count):
         (cy, cx), r = rng.uniform(0, size, 2), rng.uniform(*radius)
@@ -83,7 +109,9 @@ def spots(size: int, rng: np.random.Generator, ground: Vector, colours: tuple[Ve
     return np.clip(picture * rough[..., None], 0.01, 0.95).astype(np.float32)
 
 
-def page_of_text(height: int, width: int, rng: np.random.Generator, ink: Vector, paper: Vector, cell: int = 4, headline: bool = True) -> Texture:
+def page_of_text(
+    height: int, width: int, rng: np.random.Generator, ink: Vector, paper: Vector, cell: int = 4, headline: bool = True
+) -> Texture:
     """Words of invented letters (symmetric 5x7 dot patterns), `cell` texels a dot, with a headline of doubled size."""
     page = np.zeros((height, width))
     top = 3 * cell

@@ -1,6 +1,6 @@
 """What is known exactly about a made RAW stack, as the JSON file beside it."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,15 @@ FORMAT = "mrbokeh-raw-stack-truth"
 VERSION = 1
 
 _RELATION = (
-    "raw share = (raw - black_level) / (white_level - black_level) at each photosite = camera_from_rec709 @ rgb of the colour under it, times exposure, "
-    "plus noise, clipped at 1. A reader that divides by as_shot_neutral (white balance, raw white of green = 1.0) and applies "
-    "rec709_from_balanced_camera gets exposure * rgb of the traced slice; exposure is 2^-BaselineExposure."
+    "raw share = (raw - black_level) / (white_level - black_level) at each photosite = camera_from_rec709 @ rgb of the colour "
+    "under it, times exposure, plus noise, clipped at 1. A reader that divides by as_shot_neutral (white balance, raw white of "
+    "green = 1.0) and applies rec709_from_balanced_camera gets exposure * rgb of the traced slice; exposure is "
+    "2^-BaselineExposure."
 )
 _REFERENCE = (
-    "all_in_focus.exr and depth.exr are seen by a pinhole in the middle of the lens with reference_camera: the focal length in pixels of slice 0, the "
-    "nearest focus, which sees the narrowest field. Slice i maps onto it by scaling about principal_px by focal_px(reference) / focal_px(slice i)."
+    "all_in_focus.exr and depth.exr are seen by a pinhole in the middle of the lens with reference_camera: the focal length in "
+    "pixels of slice 0, the nearest focus, which sees the narrowest field. Slice i maps onto it by scaling about principal_px by "
+    "focal_px(reference) / focal_px(slice i)."
 )
 
 
@@ -41,7 +43,7 @@ class StackPlan:
     height_px: int = 384
     seed: int = 1
     samples: int = 512
-    sensor: SensorModel = SensorModel()
+    sensor: SensorModel = field(default_factory=SensorModel)
 
     def lens_at(self, slice_index: int) -> Lens:
         """Hexagonal iris on purpose: it is point-symmetric, so that front and back blur look alike to a network fed with |CoC|."""
@@ -67,13 +69,18 @@ def truth_document(plan: StackPlan) -> dict[str, Any]:
         "focus_distances_m": plan.focus_distances_m.tolist(),
         "film_plane_distances_m": [film_plane_distance_m(plan.lens_at(i)) for i in range(plan.slices)],
         "focal_px": [plan.lens_at(i).focal_px(plan.width_px) for i in range(plan.slices)],
-        "distances": "focus_distances_m count from the lens, film_plane_distances_m = d_f + d_s from the sensor (thin lens), as in EXIF SubjectDistance",
+        "distances": "focus_distances_m count from the lens, film_plane_distances_m = d_f + d_s from the sensor (thin lens), "
+        "as in EXIF SubjectDistance",
         "step_dioptre": abs(step_dioptre),
         "largest_residual_coc_px": abs(step_dioptre) / 2.0 * reference.coc_px_per_dioptre(plan.width_px),
         "reference_slice": 0,
         "reference": _REFERENCE,
-        "views": [{"reference_camera": camera_to_json(desk_camera(view, plan.width_px, plan.height_px, reference))} for view in range(plan.viewpoints)],
-        "truth_units": "scene-linear Rec.709 RGB, 1.0 = raw white of green at exposure 1; Z in metres along the optical axis at pixel centres",
+        "views": [
+            {"reference_camera": camera_to_json(desk_camera(view, plan.width_px, plan.height_px, reference))}
+            for view in range(plan.viewpoints)
+        ],
+        "truth_units": "scene-linear Rec.709 RGB, 1.0 = raw white of green at exposure 1; Z in metres along the optical axis at pixel "
+        "centres",
         "sensor": _sensor_document(sensor),
         "relation": _RELATION,
     }

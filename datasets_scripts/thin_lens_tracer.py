@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from datasets_scripts._scene_packing import pack_scene, pack_view, pupil_areas
-from datasets_scripts._thin_lens_tracer_numba import PackedView, shade_rows, trace_depth
+from datasets_scripts._thin_lens_tracer_numba import PackedView, shade_picture, trace_depth
 from datasets_scripts.traced_scene import Scene
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera import Camera
@@ -50,8 +50,8 @@ def trace(
     expected_px = lens.focal_px(camera.width_px)
     if max(abs(focal / expected_px - 1.0) for focal in camera.focal_px) > _LENS_DIFFERS:
         raise InputError(
-            f"the camera has a focal length of {camera.focal_px} px, but the lens focused at {lens.focus_distance_m} m has {expected_px:.3f} px: "
-            f"use camera_for_lens(camera, lens)"
+            f"the camera has a focal length of {camera.focal_px} px, but the lens focused at {lens.focus_distance_m} m "
+            f"has {expected_px:.3f} px: use camera_for_lens(camera, lens)"
         )
     view = pack_view(camera, lens.aperture, 0.5e-3 * lens.aperture_diameter_mm, 1.0 / lens.focus_distance_m, footprint_px)
     return _shaded(scene, camera, view, samples, seed)
@@ -73,7 +73,7 @@ def _shaded(scene: Scene, camera: Camera, view: PackedView, samples: int, seed: 
     packed = pack_scene(scene, camera, view)
     drawn = _draw_samples(view, samples, seed)
     rgb = np.empty((view.height, view.width, 3), np.float32)
-    shade_rows(packed, view, 0, view.height, drawn.points, drawn.light_points, seed, rgb)
+    shade_picture(packed, view, drawn.points, drawn.light_points, seed, rgb)
     return rgb
 
 
@@ -89,4 +89,3 @@ def _draw_samples(view: PackedView, samples: int, seed: int) -> _Samples:
     sobol = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(seed))
     points = sobol.random_base2(int(np.ceil(np.log2(count))))
     return _Samples(points[:count], points[: max(samples // 4, 16)])
-

@@ -78,7 +78,9 @@ class Scene:
         return self.ambient + self.sun * max(float(np.dot(quad.normal, self.sun_direction)), 0.0)
 
 
-def emissive_quad(corner_m: Vector, edge_u_m: Vector, edge_v_m: Vector, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)) -> Quad:
+def emissive_quad(
+    corner_m: Vector, edge_u_m: Vector, edge_v_m: Vector, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)
+) -> Quad:
     """A quad whose texture is the radiance that it sends out, whatever the scene's light is."""
     return Quad(corner_m, edge_u_m, edge_v_m, texture, repeats, np.ones((1, 1), np.float32))
 

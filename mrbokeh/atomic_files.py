@@ -11,7 +11,7 @@ from mrbokeh.errors import InputError
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path | str) -> Iterator[Path]:
     """A temporary path beside `path` with its suffix; renamed to `path` when the block ends well, else removed."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -23,12 +23,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_json(path: Path, document: Any) -> None:
+def write_json(path: Path | str, document: Any) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
 
 
-def read_json(path: Path, expected: str) -> Any:
+def read_json(path: Path | str, expected: str) -> Any:
     """A JSON document; `expected` says in the error message what the file should have been."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
@@ -38,7 +38,7 @@ def read_json(path: Path, expected: str) -> Any:
         raise InputError(f"expected {expected} at {path}, but it is not JSON: {error}") from None
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
+def refuse_existing(path: Path | str, overwrite: bool) -> None:
     """Existing results are kept unless the user asked to overwrite them."""
     if Path(path).exists() and not overwrite:
         raise InputError(f"{path} exists already: give another name, or --overwrite to replace it")

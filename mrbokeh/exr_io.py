@@ -34,7 +34,7 @@ class ExrPart:
         return np.stack([self.channels[name] for name in names], axis=-1).astype(np.float32)
 
 
-def read_exr(path: Path) -> list[ExrPart]:
+def read_exr(path: Path | str) -> list[ExrPart]:
     """All flat parts of an EXR file; data windows are placed into their display windows, with 0 outside.
 
     Raises InputError when the file is not EXR, is damaged or holds only deep parts.
@@ -54,7 +54,7 @@ def read_exr(path: Path) -> list[ExrPart]:
     return parts
 
 
-def write_exr(path: Path, parts: Sequence[ExrPart] | ExrPart) -> None:
+def write_exr(path: Path | str, parts: Sequence[ExrPart] | ExrPart) -> None:
     """Write one or more parts with ZIP compression; float16 channels are stored as half, float32 as float."""
     import OpenEXR
 

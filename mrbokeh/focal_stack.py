@@ -156,7 +156,7 @@ def write_focal_stack(stack: FocalStack) -> None:
     write_json(stack.folder / FILE_NAME, document)
 
 
-def read_focal_stack(folder: Path) -> FocalStack:
+def read_focal_stack(folder: Path | str) -> FocalStack:
     """The stack in a folder; pictures are not opened. Raises InputError where the folder is not one."""
     folder = Path(folder)
     document = read_json(folder / FILE_NAME, "a focal stack")

@@ -20,7 +20,7 @@ _DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z")
 _INTEGER_RANGE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
 
-def read_image(path: Path, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
+def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
     """A picture as scene-linear RGB (H, W, 3); transparent pictures lose their alpha (see `read_layer`).
 
     encoding: what the numbers of an integer file (PNG, TIFF, JPEG) mean; EXR, HDR and float TIFF are linear already.
@@ -28,7 +28,7 @@ def read_image(path: Path, encoding: Encoding = "srgb") -> Float32[np.ndarray, "
     return _read_rgba(Path(path), encoding)[..., :3]
 
 
-def write_image(path: Path, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
+def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
     """Write scene-linear RGB. EXR keeps it (half or float); PNG and TIFF store 16 bit, JPEG 8 bit, clipped to [0, 1]."""
     path = Path(path)
     if path.suffix.lower() == ".exr":
@@ -37,7 +37,7 @@ def write_image(path: Path, rgb: Float[np.ndarray, "height width 3"], encoding: 
     _write_integer_image(path, np.asarray(rgb, np.float32), encoding)
 
 
-def read_layer(path: Path) -> Layer:
+def read_layer(path: Path | str) -> Layer:
     """A layer from an EXR with R, G, B and, where present, A and Z (or depth.Z), in one part or several.
 
     Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf.
@@ -49,7 +49,7 @@ def read_layer(path: Path) -> Layer:
     return Layer(rgb, alpha, np.where((depth > 0) & (alpha > 0), depth, np.inf).astype(np.float32))
 
 
-def write_layer(path: Path, layer: Layer, *, half: bool = True) -> None:
+def write_layer(path: Path | str, layer: Layer, *, half: bool = True) -> None:
     """A layer as EXR: R, G, B, A in half or float and Z (metres along the optical axis, not antialiased) in float."""
     colour = np.float16 if half else np.float32
     channels = {name: layer.rgb[..., i].astype(colour) for i, name in enumerate("RGB")}
@@ -106,7 +106,7 @@ def _write_integer_image(path: Path, rgb: Float32[np.ndarray, "height width 3"],
         data.tofile(temporary)
 
 
-def write_preview(path: Path, rgb: Float32[np.ndarray, "height width 3"], exposure_stops: float = 0.0) -> None:
+def write_preview(path: Path | str, rgb: Float32[np.ndarray, "height width 3"], exposure_stops: float = 0.0) -> None:
     """An 8-bit tone-mapped sRGB picture for people to look at."""
     import cv2
 

@@ -47,9 +47,9 @@ def lens_from_json(document: dict[str, Any], where: str = "lens") -> Lens:
         raise InputError(f"{where}: the lens is incomplete or malformed ({error!r}); compare with one of `mrbokeh lens new`") from None
 
 
-def read_lens(path: Path) -> Lens:
+def read_lens(path: Path | str) -> Lens:
     return lens_from_json(read_json(path, "a lens file (LENS.json)"), str(path))
 
 
-def write_lens(path: Path, lens: Lens) -> None:
+def write_lens(path: Path | str, lens: Lens) -> None:
     write_json(path, lens_to_json(lens))

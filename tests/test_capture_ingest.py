@@ -43,7 +43,7 @@ DEMO_STACK = Path(__file__).resolve().parent.parent / "mrbokeh" / "demo_data" / 
 
 
 def scene_rgb(height: int, width: int, seed: int = 0) -> Picture:
-    """Blobs of all sizes (a 1/f spectrum, like photographs, softened as by a lens) in three colours, between 0.02 and 0.6, and two lamps above white."""
+    """Soft blobs of all sizes (a 1/f spectrum, like photographs) in three colours, 0.02 to 0.6, and two lamps above white."""
     rng = np.random.default_rng(seed)
     fy, fx = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]
     spectrum = 1.0 / np.maximum(np.hypot(fy, fx), 1.0 / width)
@@ -121,14 +121,17 @@ def test_slices_come_nearest_first_with_lens_and_camera(shoot: Path, tmp_path: P
 
 
 def test_slices_hold_the_light_of_the_scene(shoot: Path, tmp_path: Path) -> None:
-    """Demosaicing errs at edges; the mean over areas of 9x9 px away from the lamps must be right to a percent of white."""
+    """Demosaicing errs at edges and along the border, but not on average: away from lamps and border, areas of 9x9 px must be
+    right to a percent of white, and all of them together to a thousandth."""
     stack = only_stack(ingest([shoot], tmp_path / "scene"))
     truth = scene_rgb(72, 96)
     quiet = uniform_filter((truth.max(axis=-1) > 1.0).astype(np.float32), 25) < 1e-6
-    assert quiet.mean() > 0.5
+    quiet[:8], quiet[-8:], quiet[:, :8], quiet[:, -8:] = False, False, False, False
+    assert quiet.mean() > 0.3
     for index in range(len(stack)):
         error = uniform_filter(stack.slice_rgb(index), (9, 9, 0)) - uniform_filter(truth, (9, 9, 0))
         assert np.abs(error[quiet]).max() < 0.01
+        assert np.abs(error[quiet].mean(axis=0)).max() < 0.001
     metadata = stack.slices[0].metadata
     # Two lamps of 36 photosites.
     assert metadata["saturated_fraction"] == pytest.approx(72 / (72 * 96))

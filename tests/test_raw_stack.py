@@ -112,7 +112,7 @@ def test_film_plane_distance_is_the_focus_distance_plus_the_image_distance(dista
 
 
 def test_a_film_plane_distance_below_four_focal_lengths_is_refused() -> None:
-    with pytest.raises(InputError, match="0.14 m"):
+    with pytest.raises(InputError, match=r"0\.14 m"):
         focus_distance_from_film_plane_m(0.13, 35.0)
 
 
@@ -136,7 +136,7 @@ def test_light_beyond_the_full_well_is_clipped_at_white() -> None:
 
 
 def test_a_flat_colour_comes_back_at_its_own_scale(tmp_path: Path) -> None:
-    """The relation that truth.json states, without demosaicing errors: half a step of 14 bit (3.3e-5) times white balance and matrix (< 5)."""
+    """The relation that truth.json states, nothing to demosaic: half a step of 14 bit (3.3e-5) times white balance and matrix (< 5)."""
     plan = StackPlan(sensor=SensorModel(**NOISE_FREE))
     colour = np.array([0.3, 0.2, 0.4], np.float32)
     mosaic = plan.sensor.photograph(np.tile(colour, (64, 64, 1)), np.random.default_rng(0))

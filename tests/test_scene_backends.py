@@ -220,8 +220,8 @@ class TestLight:
         # The blocker's shadow is shifted by +1 m in x: it spans x from 0.75 to 1.25 on the wall, columns 136 to 174.
         assert layer.rgb[60, 150].max() == 0.0
         assert layer.rgb[60, 120, 0] == pytest.approx(0.5 * 3 * np.sqrt(0.5) / np.pi, rel=1e-3)
-        # Columns 135 to 137 hold the shadow's left border: x = 0.75 lies at 80 + 150 * 0.375 = 136.25, a quarter into one.
-        assert layer.rgb[60, 136, 0] == pytest.approx(0.25 * layer.rgb[60, 120, 0], abs=0.08 * layer.rgb[60, 120, 0])
+        # The shadow's left border at x = 0.75 lies at column 80 + 150 * 0.375 = 136.25: a quarter of pixel 136 is lit.
+        assert layer.rgb[60, 136, 0] / layer.rgb[60, 120, 0] == pytest.approx(0.25, abs=0.08)
         unshadowed = backend.render(Scene((blocker, wall), (replace(sun((1, 0, 1), 3.0), casts_shadow=False),)), camera)
         assert unshadowed.rgb[60, 150, 0] == pytest.approx(0.5 * 3 * np.sqrt(0.5) / np.pi, rel=1e-3)
 
@@ -285,10 +285,15 @@ class TestEnvironment:
         mirrored = ray * [1, 1, -1] / np.linalg.norm(ray, axis=-1, keepdims=True)
         assert np.abs(layer.rgb - (mirrored * 0.5 + 0.5)).max() < 0.01
 
-    @pytest.mark.parametrize(("roughness", "metallic"), [(0.5, 0.0), (1.0, 0.0), (0.3, 1.0), (0.6, 1.0)])
-    def test_glossy_surface_near_the_full_integral(self, backend: SceneRenderer, roughness: float, metallic: float) -> None:
-        # The specification's BRDF integrated over the panorama by brute force. The split sum assumes the view along the normal,
-        # which holds here; 6 % is its known error where light is uneven, plus the light between facets that the BRDF lacks.
+    @pytest.mark.parametrize(
+        ("roughness", "metallic", "tolerance"), [(0.5, 0.0, 0.01), (1.0, 0.0, 0.035), (0.3, 1.0, 0.06), (0.6, 1.0, 0.08)]
+    )
+    def test_glossy_surface_near_the_full_integral(
+        self, backend: SceneRenderer, roughness: float, metallic: float, tolerance: float
+    ) -> None:
+        # The specification's BRDF integrated over the panorama by brute force. The tolerances are what the split sum is off where
+        # light is uneven, and the light passed on between facets, which the BRDF alone loses (of a white metal 1 % at roughness
+        # 0.3 and 17 % at 0.6; here less, as this metal is coloured) and a backend may give back.
         panorama = colourful_panorama()
         base = np.array([0.7, 0.5, 0.3])
         towards, weight = directions(128, 256).reshape(-1, 3), solid_angles_sr(128, 256).ravel()
@@ -304,8 +309,6 @@ class TestEnvironment:
         material = Material(base_color=(*base, 1.0), roughness=roughness, metallic=metallic)
         camera = Camera(3, 3, (300.0, 300.0), (1.5, 1.5))
         seen = backend.render(Scene((facing_square(material),), environment=Environment(panorama)), camera).rgb[1, 1]
-        # A metal of single scattering alone is darker by what the facets pass on: up to 1 - (share of f0 + f90), 14 % at 0.6.
-        tolerance = 0.06 if metallic == 0.0 or roughness < 0.5 else 0.12
         assert np.allclose(seen, truth, rtol=tolerance)
 
 

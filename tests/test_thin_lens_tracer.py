@@ -45,7 +45,7 @@ def test_a_lamp_keeps_its_energy_however_blurred(z_m: float) -> None:
 
 @pytest.mark.parametrize("z_m", [0.85, 1.25])
 def test_a_point_light_is_as_wide_as_the_lens_says(z_m: float) -> None:
-    """The blur of a tiny lamp through a disc: its diameter, from the lit area 4 A / pi, and its width equal |coc_px| within half a pixel."""
+    """A tiny lamp through a disc: the diameter of the lit area (4 A / pi) and the width equal |coc_px| within half a pixel."""
     picture = trace(lamp(0.0, 0.0, z_m, 2e-5, 1e4), camera(LENS), LENS, 256)[..., 0]
     coc_px = abs(float(LENS.coc_px(z_m, SIZE_PX)))
     lit = picture / np.median(picture[picture > 0.5 * picture.max()])

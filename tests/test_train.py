@@ -89,18 +89,17 @@ def test_the_network_learns_the_lens(scene: Path, run: Path, tmp_path: Path) -> 
 
 
 def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
-    """With tiles, over the reassembled picture: the error falls clearly below that of the network's start, which copies the picture."""
-    settings = dataclasses.replace(PUBLISHED, epochs=40, learning_rate=5e-3, loss_weighting="relative")
-    progress = train.fit(stacks_of([scene]), tmp_path / "run", settings, ["view_2"])
-    pairs = PairSet(stacks_of([scene])[:2])
-    copied = np.mean([_relative_error(pairs[i].all_in_focus, pairs[i].target, 20.0) for i in range(len(pairs))])
-    assert progress.smoothed_loss < 0.6 * copied
+    """With tiles, over the reassembled picture, lights out of its range left out: it ends clearly nearer to the truth than the sharp
+    picture is. (How far it comes with the published size of data is not for a test to show.)"""
+    settings = dataclasses.replace(PUBLISHED, epochs=60, learning_rate=5e-3, radiance_scale=1.2, saturation=1.0)
+    train.fit(stacks_of([scene]), tmp_path / "run", settings, ["view_2"])
+    blur, trained_on = blur_of(tmp_path / "run")
+    pairs = PairSet(unseen(stacks_of([scene]), trained_on))
     assert load_run(tmp_path / "run")[0].grid is not None
-
-
-def _relative_error(result: np.ndarray, truth: np.ndarray, scale: float) -> float:
-    weight = np.maximum(truth.max(axis=2, keepdims=True), 1.0) ** -2
-    return float((weight * (2 * (result - truth) / scale) ** 2).sum() / (3 * weight.sum()))
+    for pair in (pairs[0], pairs[2]):
+        counted = pair.target.max(axis=2) < 1.0
+        sharp = np.minimum(pair.all_in_focus, 1.0)
+        assert psnr(blur(sharp, pair.coc_px), pair.target, mask=counted) > psnr(sharp, pair.target, mask=counted) + 1.0
 
 
 @pytest.mark.parametrize("settings", [dataclasses.replace(DEMO_LIKE, epochs=4), PUBLISHED], ids=["gated", "published"])

@@ -70,7 +70,7 @@ def test_every_frame_is_the_composite_of_the_library(clip: Path, settings: list[
         assert after.time_s == before.time_s
         expected, blurred = composite(before.rgb, [layer], LENS, ScatterReference())
         np.testing.assert_allclose(after.rgb, expected, atol=STEP)
-    # 25 mm of aperture, 51.3 mm to the sensor of 16 px per mm and half a dioptre make a blur of 10.3 px: it reaches half of that, no farther.
+    # 25 mm of aperture, 51.3 mm to the sensor of 16 px per mm and half a dioptre make a blur of 10.3 px, which reaches half as far.
     reach = 25 * 51.282 * 16 * 0.5 / 1000 / 2
     rows = np.flatnonzero((blurred.alpha > 0).any(axis=1))
     assert (21 - rows[0], rows[-1] - 31) == pytest.approx((reach, reach), abs=1.0)

@@ -296,11 +296,10 @@ def test_what_cannot_be_shown_rightly_is_refused(tmp_path: Path) -> None:
 
 
 def test_stretched_pixels_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "wide.mkv"
+    path = tmp_path / "wide.mp4"
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=25)
+        stream = container.add_stream("libx264", rate=25, options={"x264-params": "sar=4/3"})
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
         container.mux(stream.encode(av.VideoFrame(64, 48, "yuv420p")))
         container.mux(stream.encode(None))
     with pytest.raises(InputError, match="not square"):

@@ -148,19 +148,23 @@ class _Run:
                     last_saved_s = self.progress.elapsed_s
 
     def _step(self, rate_factor: float) -> None:
+        """One update from `batch` pictures, one after the other: a picture uses few of the network's bins, all together most of them."""
         settings = self.settings
         halo_px = math.ceil(self.facts.largest_coc_px / 2.0)
-        batch = draw_batch(self.pairs, settings.batch, settings.crop_px, halo_px, self.rng).to(self.device)
         for group in self.optimizer.param_groups:
             group["lr"] = settings.learning_rate * rate_factor
         self.optimizer.zero_grad(set_to_none=True)
-        loss = mean_square_error(self.network(batch.rgb, batch.coc_px), batch, self.facts.radiance_scale, settings)
-        loss.backward()
+        mean_loss = 0.0
+        for _ in range(settings.batch):
+            batch = draw_batch(self.pairs, 1, settings.crop_px, halo_px, self.rng).to(self.device)
+            loss = mean_square_error(self.network(batch.rgb, batch.coc_px), batch, self.facts.radiance_scale, settings) / settings.batch
+            loss.backward()
+            mean_loss += loss.item()
         self.optimizer.step()
         self._follow()
         self.progress.step += 1
         before = self.progress.smoothed_loss
-        self.progress.smoothed_loss = loss.item() if math.isnan(before) else 0.98 * before + 0.02 * loss.item()
+        self.progress.smoothed_loss = mean_loss if math.isnan(before) else 0.98 * before + 0.02 * mean_loss
 
     @torch.no_grad()
     def _follow(self) -> None:

@@ -8,7 +8,7 @@ from numba import njit
 from mrbokeh._polygon_coverage_numba import fill_psf
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def scatter_pixels(
     values: np.ndarray, coc_px: np.ndarray, margin_px: int, unit_radius: float, vertices: np.ndarray, starts: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:

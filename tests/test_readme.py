@@ -1,0 +1,61 @@
+"""What the README promises: its commands exist with those options, its files exist, its Python runs."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrbokeh.image_io import write_layer
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import write_lens
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def shell_lines() -> list[str]:
+    return [line.split("#")[0].strip() for block in blocks("sh") for line in block.splitlines() if line.split("#")[0].strip()]
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = {line.split()[1] for line in shell_lines() if line.startswith("make ")} | set(re.findall(r"`make ([\w-]+)`", README))
+    assert {"demo", "test"} <= targets
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
+
+
+def test_the_ci_runs_the_test_command_of_the_readme() -> None:
+    assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("line", sorted({line for line in shell_lines() if line.startswith("mrbokeh ")}))
+def test_every_command_and_option_exists(line: str) -> None:
+    words = line.split()[1:]
+    command = [word for word in words[:2] if re.fullmatch(r"[a-z]+", word)]
+    help_of = subprocess.run([sys.executable, "-m", "mrbokeh.cli", *command, "--help"], capture_output=True, text=True, env={"COLUMNS": "200"})
+    assert help_of.returncode == 0, help_of.stderr
+    shown = set(re.findall(r"--[a-z][a-z-]*", help_of.stdout))
+    assert {word for word in words if word.startswith("--")} <= shown
+
+
+def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    alpha = np.zeros((16, 24), np.float32)
+    alpha[4:12, 6:18] = 1.0
+    write_layer(tmp_path / "object.exr", Layer(np.repeat(alpha[..., None], 3, 2), alpha, np.where(alpha > 0, 2.0, np.inf).astype(np.float32)))
+    write_lens(tmp_path / "lens.json", Lens(50.0, 2.0, 1.0, 36.0))
+    variables: dict[str, object] = {}
+    exec(blocks("python")[0], variables)
+    assert isinstance(variables["blurred"], Layer)
+
+
+def test_linked_files_exist() -> None:
+    assert all((ROOT / target).exists() for target in re.findall(r"\]\(([\w./]+)\)", README))
