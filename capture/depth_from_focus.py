@@ -59,9 +59,10 @@ def focus_map(energies: Volume, lights: Lights) -> FocusMap:
     costs[:, lights.core] = LARGEST_COST * (np.arange(len(energies))[:, None] != by_light[lights.core])
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     offset, curvature = peak_parabola(log_energies, labels)
-    index = np.where(by_light >= 0, labels, labels + offset).astype(np.float32)
+    index = np.where(by_light >= 0, labels, labels + offset)
+    index[lights.core] = lights.focus_index[lights.zone[lights.core] - 1]
     confidence = np.where(by_light >= 0, 0.0, confidence_of(log_energies, labels, curvature)).astype(np.float32)
-    return FocusMap(index, confidence, np.where(by_light >= 0, by_light, index).astype(np.float32))
+    return FocusMap(index.astype(np.float32), confidence, np.where(by_light >= 0, by_light, index).astype(np.float32))
 
 
 def noise_floor(energies: Volume) -> float:

@@ -28,11 +28,18 @@ class Lights:
     """zone (H, W): the light whose spread reaches a pixel, 0 for none; core (H, W): the lights themselves.
 
     sharpest: for light 1, 2, ... the index of the slice in which it is most concentrated.
+    focus_index: the fractional index at which each is in focus, from the growth of its disc.
+    widest: the slice in which each is spread widest and still seen.
     """
 
     zone: Int[np.ndarray, "height width"]
     core: Bool[np.ndarray, "height width"]
     sharpest: Int[np.ndarray, " lights"]
+    focus_index: Float[np.ndarray, " lights"]
+    widest: Int[np.ndarray, " lights"]
+
+    def __len__(self) -> int:
+        return len(self.sharpest)
 
     def slice_index(self) -> Int[np.ndarray, "height width"]:
         """(H, W): the sharpest slice of the light that reaches a pixel, -1 where none does."""
@@ -59,7 +66,22 @@ def find_lights(slices: Callable[[], Iterable[Rgb]]) -> Lights:
     for index, rgb in enumerate(slices()):
         mine = np.concatenate([[-1], sharpest])[zone] == index
         core |= mine & (_brightness(rgb) > OVER_RANGE)
-    return Lights(zone, core, sharpest)
+    return Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), np.where(seen, areas_px, -1.0).argmax(axis=0))
+
+
+def _between_slices(areas_px: np.ndarray, seen: np.ndarray, sharpest: Int[np.ndarray, " lights"]) -> PerLight:
+    """Where each light is in focus: the diameter grows evenly with the distance from there, so the area is a parabola of the index.
+
+    Fitted to the slices within two of the sharpest one; kept within half a step of it.
+    """
+    result = sharpest.astype(np.float64)
+    for light, index in enumerate(sharpest):
+        near = np.flatnonzero(seen[:, light] & (np.abs(np.arange(len(seen)) - index) <= 2))
+        if len(near) >= 4:
+            curvature, slope, _ = np.polyfit(near, areas_px[near, light], 2)
+            if curvature > 0:
+                result[light] = np.clip(-slope / (2.0 * curvature), index - 0.5, index + 0.5)
+    return result
 
 
 def _brightness(rgb: Rgb) -> Plane:

@@ -514,7 +514,7 @@ def test_the_shipped_raw_stack_matches_its_truth(tmp_path: Path) -> None:
         assert stack.lens.sensor_width_mm == pytest.approx(truth["lens"]["sensor_width_mm"], rel=1e-6)
         sharp = read_image(DEMO_STACK / "truth" / stack.folder.name / "all_in_focus.exr")
         ratios = [mean_ratio(stack.slice_rgb(index), sharp, truth["focal_px"][0] / truth["focal_px"][index]) for index in range(len(stack))]
-        assert np.mean(ratios, axis=0) == pytest.approx([1.0] * 3, abs=0.005)
+        assert np.abs(np.array(ratios) - 1.0).max() < 0.005
         assert [each.metadata["exposure_gain"] for each in stack.slices] == [1.0] * len(stack)
         assert [each.metadata["exposure_gain_measured"] for each in stack.slices[1:]] == pytest.approx([1.0] * (len(stack) - 1), abs=0.002)
 

@@ -45,6 +45,7 @@ def test_the_light_is_found_in_its_sharp_slice() -> None:
     stack = slices(scene())
     lights = find_lights(lambda: stack)
     assert lights.sharpest.tolist() == [SHARP_SLICE]
+    assert lights.focus_index[0] == pytest.approx(SHARP_SLICE, abs=0.1)
     assert lights.core[LIGHT_AT] and lights.zone[LIGHT_AT] == 1
     # Its largest disc, 12 px wide in slice 4, lies within the zone.
     assert all(lights.zone[LIGHT_AT[0] + dy, LIGHT_AT[1] + dx] == 1 for dy, dx in ((0, 6), (0, -6), (5, 0), (-5, 0)))

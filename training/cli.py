@@ -4,11 +4,14 @@ import shutil
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mrbokeh.errors import InputError
+
+if TYPE_CHECKING:
+    from training.settings import TrainSettings
 
 app = typer.Typer(no_args_is_help=True, help="Focal stacks become a network that blurs like this very lens.")
 
@@ -98,7 +101,7 @@ def evaluate(
     typer.echo(f"written to {folder}: evaluation.md, evaluation.csv, evaluation.png")
 
 
-def _settings(preset: Preset, settings_file: Path | None):  # noqa: ANN202 - the type would import torch-free but heavy modules for --help
+def _settings(preset: Preset, settings_file: Path | None) -> "TrainSettings":
     from training.settings import PRESETS, load_settings
 
     return PRESETS[preset.value]() if settings_file is None else load_settings(settings_file)

@@ -77,7 +77,8 @@ class PublishedTiles(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         batch, _, height, width = x.shape
-        state = self.c1(x)
+        # Depthwise convolutions on the CPU are many times faster with the channels of a pixel side by side.
+        state = self.c1(x if torch.compiler.is_exporting() else x.contiguous(memory_format=torch.channels_last))
         for block in self.blocks:
             state = block(state)
         per_tile = (batch, self.tile_count, -1, height, width)
