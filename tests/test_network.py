@@ -82,7 +82,7 @@ def test_tiles_do_not_see_each_other(settings: NetworkSettings) -> None:
     assert not torch.allclose(before[..., :16], after[..., :16])
 
 
-@pytest.mark.parametrize("settings", [ONE_TILE, replace(ONE_TILE, width=2, mixing="tile"), GATED, replace(GATED, width=2, signed_coc=False)])
+@pytest.mark.parametrize("settings", [ONE_TILE, replace(ONE_TILE, width=2, mixing="tile"), GATED, replace(GATED, width=1, signed_coc=False, kernels_per_colour=True)])
 def test_output_keeps_the_size_and_every_parameter_learns(settings: NetworkSettings) -> None:
     network = BlurNetwork(settings, 7.0, 1.0)
     optimizer = torch.optim.SGD(network.parameters(), 1e-3)
@@ -116,7 +116,7 @@ def test_gates_share_every_pixel_out(signed: bool) -> None:
     """Hats sum to 1 everywhere; at its own peak a gate is 1. N = 3: peaks at 1 (0 when signed), 3 and 5 px, both signs."""
     knots, radii = bins_px(3, 1, signed)
     assert (knots, radii) == (([0.0, -3.0, 3.0, -5.0, 5.0], [1, 2, 2, 3, 3]) if signed else ([1.0, 3.0, 5.0], [1, 2, 3]))
-    tiles = GatedTiles(replace(GATED, signed_coc=signed), blocks=3, largest_coc_px=5.0, tiles=1)
+    tiles = GatedTiles(replace(GATED, width=1, signed_coc=signed), blocks=3, largest_coc_px=5.0, tiles=1)
     coc = torch.linspace(-1, 1, 101).reshape(1, 1, 1, 1, 101)
     gates = tiles.gates(coc)[0, 0, :, 0]
     assert torch.allclose(gates.sum(0), torch.ones(101), atol=1e-5)
