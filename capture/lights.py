@@ -17,7 +17,7 @@ Plane = Float32[np.ndarray, "height width"]
 PerLight = Float[np.ndarray, " lights"]
 
 OVER_RANGE = 0.9
-TIMES_SURROUNDINGS = 3.0
+TIMES_SURROUNDINGS = 5.0
 WIDEST_SHARE = 0.03
 CLEARLY_BRIGHTER = 0.15
 LEAST_SHARE_OF_LIGHT = 0.1

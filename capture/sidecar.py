@@ -5,6 +5,7 @@
     sensor_width_mm = 23.5          # of the whole photograph as it is stored, left to right
     blades = 7                      # a straight-bladed iris; without it the opening is round
     blade_rotation_rad = 0.2        # angle of its first corner, 0 = right, turning towards down
+    obstruction = 0.5               # diameter of the stop in the middle of a mirror lens over that of its opening
     focus_origin = "lens"           # where focus distances count from: "lens" (default) or "film_plane"
     focus_distances_m = [0.5, 0.6, inf]     # in the order of the file names, one for each photograph of the folder
 
@@ -39,13 +40,15 @@ class Sidecar:
     sensor_width_mm: float | None = None
     blades: int | None = None
     blade_rotation_rad: float = 0.0
+    obstruction: float = 0.0
     focus_origin: str = "lens"
     focus_distances_m: tuple[float, ...] | dict[str, float] = ()
     where: str = field(default="", metadata={"key": False})
 
     @property
     def aperture(self) -> Aperture:
-        return Aperture.disc() if self.blades is None else Aperture.blades(self.blades, self.blade_rotation_rad)
+        opening = Aperture.disc() if self.blades is None else Aperture.blades(self.blades, self.blade_rotation_rad)
+        return opening.obstructed(self.obstruction)
 
     def applied(self, names: Sequence[str], metadata: Sequence[PhotoMetadata]) -> list[PhotoMetadata]:
         """The metadata of all photographs of a folder (in the order of their names), with what the sidecar says instead."""
@@ -115,6 +118,11 @@ def _checked(key: str, value: Any, path: Path) -> Any:
         raise InputError(f"{path}: focus_distances_m must be a list of metres or a table of file names, got {value!r}")
     if key == "blade_rotation_rad":
         return _number(key, value, path)
+    if key == "obstruction":
+        share = _number(key, value, path)
+        if not 0.0 <= share < 1.0:
+            raise InputError(f"{path}: obstruction must be from 0 to below 1, got {value!r}")
+        return share
     return _positive(key, value, path)
 
 

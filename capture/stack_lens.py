@@ -76,4 +76,5 @@ def lens_text(lens: Lens | None) -> str:
         return "unknown"
     sides = [len(outline) for outline in lens_to_json(lens)["aperture"]["outlines"]]
     blades = f", {sides[0]} blades" if len(sides) == 1 and sides[0] < 32 else ""
+    blades += ", central obstruction" if min(lens.aperture.weights) < 0 else ""
     return f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}{blades}, sensor {lens.sensor_width_mm:.4g} mm"

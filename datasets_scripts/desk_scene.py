@@ -1,17 +1,14 @@
 """A made-up still life for focal stacks: books, boxes, balls and fairy lights on a table before a wall, 0.6 m to 2 m away."""
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
-from scipy import ndimage
+from jaxtyping import Float
 
 from datasets_scripts.baked_lighting import bake_lighting
+from datasets_scripts.fairy_lights import fairy_lights
 from datasets_scripts.procedural_textures import bricks, checks, mottled, page_of_text, spots, wood
-from datasets_scripts.thin_lens_tracer import trace_pinhole
-from datasets_scripts.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector
+from datasets_scripts.traced_scene import Quad, Scene, Sphere, Texture, Vector
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
@@ -20,14 +17,9 @@ TABLE_Y_M = 0.24
 WALL_Z_M = 1.95
 NEAR_FOCUS_M = 0.65
 FAR_FOCUS_M = 2.05
-LIGHTS_PER_VIEW = 5
 
 _SUN_TOWARDS = (-0.52, -0.72, -0.46)
-_LIGHT_TINTS = ((1.0, 0.72, 0.36), (1.0, 0.86, 0.62), (0.55, 0.75, 1.0), (1.0, 0.45, 0.3), (0.6, 1.0, 0.55))
 _LIT_VIEWPOINTS = 3
-_LIGHT_GAP_M = 0.008
-_STAR_RADIANCE = 30.0
-_SMOOTH_DIOPTRES = 0.12
 _PITCH_RAD = np.deg2rad(10.0)
 
 
@@ -69,7 +61,8 @@ def desk_scene(seed: int) -> Scene:
     sun = np.asarray(_SUN_TOWARDS) / np.linalg.norm(_SUN_TOWARDS)
     quads = (*_room(rng), *_books(rng), *_boxes(rng), *_cards(rng))
     scene = bake_lighting(Scene(quads, _balls(rng), (), _vector(sun), 0.46, 0.3, (0.05, 0.05, 0.06)), seed=seed)
-    return replace(scene, lights=tuple(_fairy_lights(scene, rng)))
+    cameras = [desk_camera(view, 144, 96, Lens(35.0, 2.8, NEAR_FOCUS_M, 23.5)) for view in range(_LIT_VIEWPOINTS)]
+    return replace(scene, lights=tuple(fairy_lights(scene, cameras, rng)))
 
 
 def _room(rng: np.random.Generator) -> tuple[Quad, ...]:
@@ -199,40 +192,3 @@ def _balls(rng: np.random.Generator) -> tuple[Sphere, ...]:
         Sphere((x_m, TABLE_Y_M - base_m - radius_m, z_m), radius_m, skin, (2.0, 1.0))
         for (x_m, z_m, radius_m, base_m), skin in zip(places, skins, strict=True)
     )
-
-
-def _fairy_lights(scene: Scene, rng: np.random.Generator) -> Iterator[DiscLight]:
-    """Small lamps of different brightness just before the surfaces that the viewpoints see, spread evenly over the depths.
-
-    A lamp far in front of what it is seen against would hide it in every slice, and no merge could bring it back; a lamp that
-    lies on something is sharp together with it.
-    """
-    for view in range(_LIT_VIEWPOINTS):
-        camera = desk_camera(view, 144, 96, Lens(35.0, 2.8, NEAR_FOCUS_M, 23.5))
-        depth_m = trace_pinhole(scene, camera, 1)[1]
-        points_m = camera.unproject(camera.pixel_centres_px(), depth_m)
-        for index, (row, column) in enumerate(_spread_pixels(depth_m, rng)):
-            point_m = points_m[row, column]
-            towards_camera = camera.world_from_camera[:3, 3] - point_m
-            point_m = point_m + _LIGHT_GAP_M * towards_camera / np.linalg.norm(towards_camera)
-            is_star = index == 3
-            radiance = np.asarray(_LIGHT_TINTS[(index + view) % len(_LIGHT_TINTS)]) * (_STAR_RADIANCE if is_star else rng.uniform(3.0, 8.0))
-            radius_m = (0.9e-3 if is_star else rng.uniform(1.3e-3, 1.9e-3)) * max(depth_m[row, column], 0.8)
-            yield DiscLight(_vector(point_m), float(radius_m), _vector(radiance))
-
-
-def _spread_pixels(depth_m: Float32[np.ndarray, "height width"], rng: np.random.Generator) -> list[tuple[int, int]]:
-    """One pixel for each of LIGHTS_PER_VIEW equal ranges of dioptres, away from depth edges and from the border."""
-    dioptres = 1.0 / depth_m
-    span = ndimage.maximum_filter(dioptres, 5) - ndimage.minimum_filter(dioptres, 5)
-    inner = np.zeros_like(dioptres, bool)
-    inner[6:-6, 6:-6] = True
-    rows, columns = np.nonzero(inner & (span < _SMOOTH_DIOPTRES))
-    edges = np.linspace(dioptres[rows, columns].min(), dioptres[rows, columns].max() + 1e-6, LIGHTS_PER_VIEW + 1)
-    chosen = []
-    for low, high in itertools.pairwise(edges):
-        members = np.nonzero((dioptres[rows, columns] >= low) & (dioptres[rows, columns] < high))[0]
-        if len(members):
-            pick = rng.choice(members)
-            chosen.append((int(rows[pick]), int(columns[pick])))
-    return chosen

@@ -47,7 +47,7 @@ class StackPlan:
 
     def lens_at(self, slice_index: int) -> Lens:
         """Hexagonal iris on purpose: it is point-symmetric, so that front and back blur look alike to a network fed with |CoC|."""
-        return Lens(35.0, 2.5, float(self.focus_distances_m[slice_index]), 23.5, Aperture.blades(6))
+        return Lens(35.0, 2.0, float(self.focus_distances_m[slice_index]), 23.5, Aperture.disc().obstructed(0.5))
 
     @property
     def focus_distances_m(self) -> Float[np.ndarray, " slices"]:

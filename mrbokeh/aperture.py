@@ -19,7 +19,7 @@ class Aperture:
     the origin: follow the ray through lens point u, it is displaced by u times half the signed circle of confusion.
     """
 
-    outlines: tuple[Float64[np.ndarray, "vertices 2"], ...]
+    outlines: tuple[Float64[np.ndarray, "_ 2"], ...]
     weights: tuple[float, ...]
 
     def __post_init__(self) -> None:
@@ -40,6 +40,15 @@ class Aperture:
         if count < 3:
             raise InputError(f"an iris needs at least 3 blades, got {count}")
         return cls((_regular_polygon(count, rotation_rad),), (1.0,))
+
+    def obstructed(self, share: float) -> "Aperture":
+        """With a round stop in the middle, as the mirror of a catadioptric lens leaves it: points blur to rings.
+
+        share: diameter of the stop over that of the unit pupil, 0 to below 1 (and within the outline).
+        """
+        if not 0.0 <= share < 1.0:
+            raise InputError(f"a central obstruction is a share of the diameter from 0 to below 1, got {share}")
+        return self if share == 0.0 else Aperture((*self.outlines, share * Aperture.disc().outlines[0]), (*self.weights, -1.0))
 
     @property
     def unit_radius(self) -> float:

@@ -26,8 +26,7 @@ def test_rasterized_areas_are_exact(name: str, diameter_px: float) -> None:
 
 
 def test_a_ring_is_its_outer_less_its_inner_outline() -> None:
-    outer, inner = Aperture.disc(48).outlines[0], 0.5 * Aperture.disc(48).outlines[0]
-    ring = Aperture((outer, inner), (1.0, -1.0))
+    ring = Aperture.disc(48).obstructed(0.5)
     kernel = ring.rasterize(20.0).kernel
     np.testing.assert_allclose(kernel, coverage_by_clipping(ring, 20.0), atol=1e-12)
     assert abs(kernel[10, 10]) < 1e-15 and kernel[10, 2] > 0, "dark in the middle, light on the rim"
@@ -65,3 +64,5 @@ def test_malformed_apertures_are_refused() -> None:
         Aperture((np.zeros((2, 2)),), (1.0,))
     with pytest.raises(InputError, match="3 blades"):
         Aperture.blades(2)
+    with pytest.raises(InputError, match="below 1"):
+        Aperture.disc().obstructed(1.0)
