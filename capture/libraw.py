@@ -3,8 +3,9 @@
 The recipe: one white balance handed in from outside; adjust_maximum_thr=0, else LibRaw rescales each frame by its own
 brightest pixel, and defocused slices drift by up to a third; HighlightMode.Ignore with the largest multiplier taken
 back out, else a white-balanced red clips at half its range; no auto-brightening, no gamma, no rotation; AAHD
-demosaicing, then one median over the colour differences, which takes the coloured fringes off small bright lights (the merged
-picture of the shipped desk gains 0.4 dB, the defocused slices a full 1 dB against what they were traced from). LibRaw cuts off below the black level, so the noise of black areas is one-sided.
+demosaicing, then one median over the colour differences, which takes the coloured fringes off small bright lights (0.4 dB
+for the merged picture of a traced desk with lamps). LibRaw cuts off below the black level, so the noise of black areas is
+one-sided.
 """
 
 from collections.abc import Iterator
@@ -54,7 +55,8 @@ def processed(raw: "rawpy.RawPy", multipliers: tuple[float, float, float], space
 
     red, green, blue = multipliers
     return raw.postprocess(
-        user_wb=[red, green, blue, green], output_color=space, gamma=(1, 1), output_bps=16, no_auto_bright=True, bright=1.0, median_filter_passes=1,
+        user_wb=[red, green, blue, green], output_color=space, gamma=(1, 1), output_bps=16, no_auto_bright=True, bright=1.0,
+        median_filter_passes=1,
         adjust_maximum_thr=0.0, highlight_mode=rawpy.HighlightMode.Ignore, user_flip=0,
         demosaic_algorithm=rawpy.DemosaicAlgorithm.AAHD, half_size=half_size,
     )  # fmt: skip

@@ -38,6 +38,7 @@ def merge_stack(stack: FocalStack) -> FocalStack:
     registration = _register(stack)
     slices = _write_registered(stack, registration)
     registered = _with_registration(stack, slices, registration)
+
     def passes(purpose: str) -> Iterator[Rgb]:
         return track(registered.iter_rgb(), f"{stack.folder.name}: {purpose}", len(stack))
 
@@ -81,7 +82,10 @@ def _write_registered(stack: FocalStack, registration: Registration) -> tuple[Sl
         path = f"{REGISTERED_FOLDER}/{index:02d}.exr"
         rgb = read_image(stack.folder / source_path(each))
         write_image(stack.folder / path, warp(rgb, registration.reference_from_slice[index]))
-        metadata = each.metadata | {"ingested": source_path(each), "reference_from_slice": registration.reference_from_slice[index].tolist()}
+        metadata = each.metadata | {
+            "ingested": source_path(each),
+            "reference_from_slice": registration.reference_from_slice[index].tolist(),
+        }
         written.append(replace(each, path=path, scale=registration.scales[index], metadata=metadata))
     return tuple(written)
 

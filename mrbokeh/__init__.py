@@ -24,7 +24,7 @@ _PUBLIC = {
     "write_layer": "mrbokeh.image_io",
     "write_lens": "mrbokeh.lens_file",
 }
-__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+__all__ = sorted(_PUBLIC)
 
 try:
     __version__ = version("mrbokeh")

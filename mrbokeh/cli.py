@@ -62,7 +62,9 @@ class LazyGroup(TyperGroup):
         return name, command, rest
 
 
-app = typer.Typer(cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]})
+app = typer.Typer(
+    cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
+)
 
 
 def _print_version(wanted: bool | None) -> None:
@@ -74,7 +76,9 @@ def _print_version(wanted: bool | None) -> None:
 
 
 @app.callback()
-def _root(version: bool | None = typer.Option(None, "--version", callback=_print_version, is_eager=True, help="Print the version and leave.")) -> None:
+def _root(
+    version: bool | None = typer.Option(None, "--version", callback=_print_version, is_eager=True, help="Print the version and leave."),
+) -> None:
     """Rendered 3D objects in real photographs, videos and a live viewfinder, with the blur of the real lens.
 
     Example: mrbokeh demo --out demo_out

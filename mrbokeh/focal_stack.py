@@ -89,7 +89,9 @@ class FocalStack:
     def depth_m(self) -> Float32[np.ndarray, "height width"]:
         """(H, W) metres along the optical axis. Raises InputError where focus distances are unknown."""
         if not self.is_metric:
-            raise InputError(f"{self.folder} has no depth in metres because its focus distances are unknown: add them to lens.toml and ingest again")
+            raise InputError(
+                f"{self.folder} has no depth in metres because its focus distances are unknown: add them to lens.toml and ingest again"
+            )
         return self._depth_channel("Z")
 
     def focus_index(self) -> Float32[np.ndarray, "height width"]:
@@ -150,7 +152,7 @@ def write_focal_stack(stack: FocalStack) -> None:
         "merged": stack.merged,
         "lens": None if stack.lens is None else lens_to_json(stack.lens),
         "camera": None if stack.camera is None else camera_to_json(stack.camera),
-        "slices": [vars(each) for each in stack.slices],
+        "slices": [vars(each) | {"focus_distance_m": _json_number(each.focus_distance_m)} for each in stack.slices],
         "metadata": stack.metadata,
     }
     write_json(stack.folder / FILE_NAME, document)
@@ -168,7 +170,7 @@ def read_focal_stack(folder: Path | str) -> FocalStack:
     try:
         return FocalStack(
             folder=folder,
-            slices=tuple(Slice(**each) for each in document["slices"]),
+            slices=tuple(Slice(**each | {"focus_distance_m": _number(each["focus_distance_m"])}) for each in document["slices"]),
             lens=None if document["lens"] is None else lens_from_json(document["lens"], str(folder)),
             camera=None if document["camera"] is None else camera_from_json(document["camera"]),
             reference=document["reference"],
@@ -178,6 +180,15 @@ def read_focal_stack(folder: Path | str) -> FocalStack:
         )
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder / FILE_NAME} is incomplete ({error!r}): ingest the photographs again") from None
+
+
+def _json_number(value: float | None) -> float | str | None:
+    """JSON has no infinity; a focus there is written as the word."""
+    return "inf" if value == float("inf") else value
+
+
+def _number(value: float | str | None) -> float | None:
+    return None if value is None else float(value)
 
 
 def find_focal_stacks(scene: Path) -> list[FocalStack]:

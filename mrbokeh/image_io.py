@@ -33,8 +33,9 @@ def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], enco
     path = Path(path)
     if path.suffix.lower() == ".exr":
         dtype = np.float16 if half else np.float32
-        return write_exr(path, ExrPart({name: rgb[..., i].astype(dtype) for i, name in enumerate("RGB")}))
-    _write_integer_image(path, np.asarray(rgb, np.float32), encoding)
+        write_exr(path, ExrPart({name: rgb[..., i].astype(dtype) for i, name in enumerate("RGB")}))
+    else:
+        _write_integer_image(path, np.asarray(rgb, np.float32), encoding)
 
 
 def read_layer(path: Path | str) -> Layer:
@@ -65,7 +66,9 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
         layer = read_layer(path)
         return np.dstack([layer.rgb, layer.alpha])
     if suffix not in INTEGER_SUFFIXES + LINEAR_SUFFIXES:
-        raise InputError(f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
+        raise InputError(
+            f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}"
+        )
     pixels = _decode(path)
     if pixels.dtype.kind == "f":
         return pixels.astype(np.float32)

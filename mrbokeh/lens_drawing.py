@@ -17,12 +17,13 @@ def draw_lens(lens: Lens, image_width_px: int) -> "Figure":
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1, 2))
-    for axes, coc_px in zip(top.subplots(1, len(KERNEL_COC_PX)), KERNEL_COC_PX, strict=True):
+    grid = figure.add_gridspec(2, len(KERNEL_COC_PX), height_ratios=(1, 2))
+    for column, coc_px in enumerate(KERNEL_COC_PX):
+        axes = figure.add_subplot(grid[0, column])
         axes.imshow(lens.aperture.rasterize(coc_px).kernel, cmap="inferno")
         axes.set_title(f"{coc_px:+.0f} px " + ("behind" if coc_px > 0 else "in front"), fontsize=9)
         axes.axis("off")
-    axes = bottom.subplots()
+    axes = figure.add_subplot(grid[1, :])
     dioptres = np.linspace(1.0 / 50.0, min(3.0 / lens.focus_distance_m if np.isfinite(lens.focus_distance_m) else 2.0, 20.0), 400)
     axes.semilogx(1.0 / dioptres, lens.coc_px(1.0 / dioptres, image_width_px))
     axes.axhline(0.0, color="grey", lw=0.5)

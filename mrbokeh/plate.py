@@ -28,7 +28,9 @@ class Plate:
     def point_under_pixel_m(self, x_px: float, y_px: float) -> tuple[float, float, float]:
         """Where in the scene (camera axes, metres) the photograph shows at a pixel."""
         if self.depth_m is None:
-            raise InputError("to stand an object on a pixel the photograph needs depth: give --depth, a focal stack, or --at X,Y,Z in metres")
+            raise InputError(
+                "to stand an object on a pixel the photograph needs depth: give --depth, a focal stack, or --at X,Y,Z in metres"
+            )
         height, width = self.depth_m.shape
         if not (0 <= x_px < width and 0 <= y_px < height):
             raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px")
@@ -66,7 +68,9 @@ def read_depth_m(path: Path) -> Float32[np.ndarray, "height width"]:
 def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus_m: float | None) -> Plate:
     stack = read_focal_stack(folder)
     if slice_index is None or not 0 <= slice_index < len(stack):
-        raise InputError(f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, got {slice_index}")
+        raise InputError(
+            f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, got {slice_index}"
+        )
     focused = stack.lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)
     rgb = stack.slice_rgb(slice_index)

@@ -5,7 +5,12 @@ from shapely import Polygon, box
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 
-APERTURES = {"disc": Aperture.disc(), "triangle": Aperture.blades(3, 0.1), "hexagon": Aperture.blades(6), "heptagon": Aperture.blades(7, 0.5)}
+APERTURES = {
+    "disc": Aperture.disc(),
+    "triangle": Aperture.blades(3, 0.1),
+    "hexagon": Aperture.blades(6),
+    "heptagon": Aperture.blades(7, 0.5),
+}
 
 
 def coverage_by_clipping(aperture: Aperture, diameter_px: float) -> np.ndarray:

@@ -32,7 +32,13 @@ ROWS = (
     ("atomic_files", "progress"),
     ("errors",),
 )
-ALLOWED_ACROSS = {"capture": {"mrbokeh"}, "training": {"mrbokeh"}, "viewfinder": {"mrbokeh"}, "datasets_scripts": {"mrbokeh"}, "mrbokeh": set()}
+ALLOWED_ACROSS = {
+    "capture": {"mrbokeh"},
+    "training": {"mrbokeh"},
+    "viewfinder": {"mrbokeh"},
+    "datasets_scripts": {"mrbokeh"},
+    "mrbokeh": set(),
+}
 
 
 def modules() -> dict[str, Path]:
@@ -51,7 +57,9 @@ def imported(path: Path) -> Iterator[str]:
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            names = [f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in MODULES else str(node.module) for alias in node.names]
+            names = [
+                f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in MODULES else str(node.module) for alias in node.names
+            ]
         else:
             continue
         yield from (name for name in names if name.split(".")[0] in PACKAGES)
@@ -113,7 +121,9 @@ def test_no_cycles() -> None:
         visit(module, ())
 
 
-@pytest.mark.parametrize(("library", "home"), [("torch", "training"), ("rawpy", "capture"), ("aiohttp", "viewfinder"), ("pyexiv2", "capture")])
+@pytest.mark.parametrize(
+    ("library", "home"), [("torch", "training"), ("rawpy", "capture"), ("aiohttp", "viewfinder"), ("pyexiv2", "capture")]
+)
 def test_heavy_libraries_live_in_one_package(library: str, home: str) -> None:
     """commands/doctor.py may ask torch for a GPU; data sets may write metadata."""
     asking = {"mrbokeh.commands.doctor", "datasets_scripts.dng_writer"}

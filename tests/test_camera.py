@@ -22,7 +22,7 @@ def test_a_point_on_the_axis_lands_on_the_principal_point() -> None:
 
 def test_unproject_undoes_project() -> None:
     camera = turned_camera()
-    points_m = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)) + [0, 0, 3.0]
+    points_m = np.random.default_rng(0).uniform((-0.5, -0.5, 2.5), (0.5, 0.5, 3.5), (50, 3))
     np.testing.assert_allclose(camera.unproject(*camera.project(points_m)), points_m, atol=1e-12)
 
 

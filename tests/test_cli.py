@@ -14,7 +14,8 @@ from mrbokeh.layer import Layer
 
 COMMANDS = [
     ["capture"], ["capture", "ingest"], ["capture", "merge"], ["train"], ["train", "fit"], ["train", "evaluate"], ["train", "export"],
-    ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["render"], ["composite"], ["video"], ["viewfinder"], ["demo"], ["doctor"],
+    ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["render"], ["composite"], ["video"],
+    ["viewfinder"], ["viewfinder", "serve"], ["demo"], ["doctor"],
 ]  # fmt: skip
 
 

@@ -93,7 +93,8 @@ def test_semi_global_costs_of_a_row_are_those_of_all_paths() -> None:
             for last in range(row.shape[0]):
                 paths = [(*path, last) for path in itertools.product(range(row.shape[0]), repeat=x)]
                 result[last, x] = min(
-                    sum(row[label, i] for i, label in enumerate(path)) + sum(step(a, b) for a, b in itertools.pairwise(path)) for path in paths
+                    sum(row[label, i] for i, label in enumerate(path)) + sum(step(a, b) for a, b in itertools.pairwise(path))
+                    for path in paths
                 )
         return result
 

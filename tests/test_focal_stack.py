@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,12 @@ def test_round_trip(tmp_path: Path) -> None:
     assert again.lens is not None and again.lens.focal_length_mm == 35.0
     assert again.camera is not None and again.camera.focal_px == (9.0, 9.0)
     assert [float(rgb.max()) for rgb in again.iter_rgb()] == [0.0, 1.0, 2.0]
+
+
+def test_focus_at_infinity_is_written_in_plain_json(tmp_path: Path) -> None:
+    stack_in(tmp_path, (0.6, 0.9, float("inf")))
+    json.loads((tmp_path / "stack.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert read_focal_stack(tmp_path).focus_distances_m[-1] == float("inf")
 
 
 def test_slices_are_read_only_when_asked_for(tmp_path: Path) -> None:

@@ -4,7 +4,21 @@ import json
 import subprocess
 import sys
 
-HEAVY = ("torch", "onnxruntime", "rawpy", "pycolmap", "av", "aiortc", "aiohttp", "numba", "cv2", "OpenEXR", "matplotlib", "scipy", "embreex")
+HEAVY = (
+    "torch",
+    "onnxruntime",
+    "rawpy",
+    "pycolmap",
+    "av",
+    "aiortc",
+    "aiohttp",
+    "numba",
+    "cv2",
+    "OpenEXR",
+    "matplotlib",
+    "scipy",
+    "embreex",
+)
 
 
 def run_python(code: str) -> dict[str, object]:

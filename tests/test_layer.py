@@ -43,7 +43,9 @@ def test_flatten_of_nothing_says_what_it_wants() -> None:
 
 def test_sizes_must_agree() -> None:
     with pytest.raises(InputError, match="resize them to one size"):
-        Layer.__post_init__(SimpleNamespace(rgb=np.zeros((2, 3, 3)), alpha=np.zeros((2, 3)), depth_m=np.zeros((3, 2))))  # past the shape checker
+        Layer.__post_init__(
+            SimpleNamespace(rgb=np.zeros((2, 3, 3)), alpha=np.zeros((2, 3)), depth_m=np.zeros((3, 2)))
+        )  # past the shape checker
 
 
 def test_opaque_covers_everything() -> None:

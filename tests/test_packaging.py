@@ -15,7 +15,18 @@ COMMANDS = ("capture", "train", "lens", "render", "composite", "video", "viewfin
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(out), str(_copy(out))]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--wheel-dir",
+        str(out),
+        str(_copy(out)),
+    ]
     subprocess.run(command, check=True, capture_output=True, text=True)
     return next(out.glob("mrbokeh-*.whl"))
 
@@ -53,7 +64,8 @@ def test_every_command_runs_from_the_installed_wheel(wheel: Path, tmp_path: Path
     install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(site), str(wheel)]
     subprocess.run(install, check=True, capture_output=True)
     environment = os.environ | {"PYTHONPATH": str(site), "PYTHONSAFEPATH": "1", "NO_COLOR": "1"}
-    script = "import mrbokeh, sys; assert mrbokeh.__file__.startswith(sys.argv.pop(1)); from mrbokeh.cli import main; sys.argv[0] = 'mrbokeh'; main()"
+    check = "import mrbokeh, sys; assert mrbokeh.__file__.startswith(sys.argv.pop(1))"
+    script = f"{check}; from mrbokeh.cli import main; sys.argv[0] = 'mrbokeh'; main()"
     for command in COMMANDS:
         done = subprocess.run(
             [sys.executable, "-c", script, str(site), command, "--help"], cwd=tmp_path, env=environment, capture_output=True, text=True

@@ -40,7 +40,9 @@ def test_the_ci_runs_the_test_command_of_the_readme() -> None:
 def test_every_command_and_option_exists(line: str) -> None:
     words = line.split()[1:]
     command = [word for word in words[:2] if re.fullmatch(r"[a-z]+", word)]
-    help_of = subprocess.run([sys.executable, "-m", "mrbokeh.cli", *command, "--help"], capture_output=True, text=True, env={"COLUMNS": "200"})
+    help_of = subprocess.run(
+        [sys.executable, "-m", "mrbokeh.cli", *command, "--help"], capture_output=True, text=True, env={"COLUMNS": "200"}
+    )
     assert help_of.returncode == 0, help_of.stderr
     shown = set(re.findall(r"--[a-z][a-z-]*", help_of.stdout))
     assert {word for word in words if word.startswith("--")} <= shown
@@ -50,7 +52,9 @@ def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
     alpha = np.zeros((16, 24), np.float32)
     alpha[4:12, 6:18] = 1.0
-    write_layer(tmp_path / "object.exr", Layer(np.repeat(alpha[..., None], 3, 2), alpha, np.where(alpha > 0, 2.0, np.inf).astype(np.float32)))
+    write_layer(
+        tmp_path / "object.exr", Layer(np.repeat(alpha[..., None], 3, 2), alpha, np.where(alpha > 0, 2.0, np.inf).astype(np.float32))
+    )
     write_lens(tmp_path / "lens.json", Lens(50.0, 2.0, 1.0, 36.0))
     variables: dict[str, object] = {}
     exec(blocks("python")[0], variables)

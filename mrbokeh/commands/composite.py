@@ -16,10 +16,16 @@ def composite(
     out: Annotated[Path, typer.Option(help="Where the picture goes: .exr stays linear, .png and .tif are 16-bit sRGB, .jpg is 8-bit.")],
     layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with R, G, B, A, Z; may be given several times, front first.")] = None,
     object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None,
-    lens: Annotated[Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. A stack brings its own.")] = None,
-    renderer: Annotated[str | None, typer.Option(help="reference, or a network (.onnx). Default: the network of --lens, else reference.")] = None,
+    lens: Annotated[
+        Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. A stack brings its own.")
+    ] = None,
+    renderer: Annotated[
+        str | None, typer.Option(help="reference, or a network (.onnx). Default: the network of --lens, else reference.")
+    ] = None,
     slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.")] = None,
-    depth: Annotated[Path | None, typer.Option(help="Depth of the photograph in metres (EXR with Z): real things hide virtual ones.")] = None,
+    depth: Annotated[
+        Path | None, typer.Option(help="Depth of the photograph in metres (EXR with Z): real things hide virtual ones.")
+    ] = None,
     focus: Annotated[float | None, typer.Option(help="Focus distance of the photograph in metres.")] = None,
     at: Annotated[str | None, typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens.")] = None,
     at_pixel: Annotated[str | None, typer.Option(help="X,Y of the pixel on which the object stands; needs depth.")] = None,
@@ -52,7 +58,7 @@ def composite(
     plate = open_plate(photo, slice_, depth, used_lens, focus)
     layers = [read_layer(path) for path in layer or ()]
     if object_ is not None:
-        foot_m = _numbers(at, 3, "--at") if at else plate.point_under_pixel_m(*_numbers(_required_pixel(at_pixel), 2, "--at-pixel"))
+        foot_m = _triple(at) if at else plate.point_under_pixel_m(*_pair(at_pixel))
         staging = Staging(foot_m, height, math.radians(turn), math.radians(tilt), environment, exposure, shadow)
         layers += object_layers(object_, staging, plate.camera)
     if not layers:
@@ -64,10 +70,16 @@ def composite(
     typer.echo(f"wrote {out}")
 
 
-def _required_pixel(at_pixel: str | None) -> str:
+def _triple(text: str) -> tuple[float, float, float]:
+    x_m, y_m, z_m = _numbers(text, 3, "--at")
+    return x_m, y_m, z_m
+
+
+def _pair(at_pixel: str | None) -> tuple[float, float]:
     if at_pixel is None:
         raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y on a photograph with depth")
-    return at_pixel
+    x_px, y_px = _numbers(at_pixel, 2, "--at-pixel")
+    return x_px, y_px
 
 
 def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:

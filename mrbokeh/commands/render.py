@@ -31,7 +31,9 @@ def render(
     refuse_existing(out, overwrite)
     sharp = [read_layer(path) for path in layers]
     if len({layer.alpha.shape for layer in sharp}) > 1:
-        raise InputError("the layers differ in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in zip(layers, sharp, strict=True)))
+        raise InputError(
+            "the layers differ in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in zip(layers, sharp, strict=True))
+        )
     used = read_lens(lens) if focus is None else read_lens(lens).focused_at(focus)
     blurred = make_renderer(renderer).render(sharp, used)
     if out.suffix.lower() == ".exr":

@@ -84,7 +84,9 @@ def _network(folder: Path, minutes: float, held_out: str | None) -> list[Stage]:
     if held_out:
         evaluate = ("train", "evaluate", str(network), str(scene), "--out", str(folder / "evaluation"))
         outputs = (folder / "evaluation" / "evaluation.csv", folder / "evaluation" / "evaluation.png")
-        stages.append(Stage(f"{folder.name}_evaluate", f"Compare the network with photographs it has not seen ({held_out})", evaluate, outputs))
+        stages.append(
+            Stage(f"{folder.name}_evaluate", f"Compare the network with photographs it has not seen ({held_out})", evaluate, outputs)
+        )
     return stages
 
 

@@ -37,7 +37,8 @@ def write_report(path: Path, measurements: Sequence[Measurement], sections: Sequ
             section("Versions", "", [_versions()]),
         ]
     )
-    page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>mrbokeh demo</title><style>{_STYLE}</style><body>{body}</body></html>\n'
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>mrbokeh demo</title><style>{_STYLE}</style>'
+    page = f"{head}<body>{body}</body></html>\n"
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 

@@ -17,14 +17,12 @@ def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
     """report.html, numbers.json and previews in `out`; returns the measurements."""
     desk, board, page = out / "desk", out / "board", out / "report.html"
     measurements = [
-        measurement
-        for view in VIEWS
-        for measurement in merge_measurements(desk / "scene" / view, DATA / "raw_stack" / "truth" / view)
+        measurement for view in VIEWS for measurement in merge_measurements(desk / "scene" / view, DATA / "raw_stack" / "truth" / view)
     ] + network_measurements(desk / "evaluation")
     sections = [
         section(
             "1. Capture: RAW files to a registered stack, an all-in-focus picture and depth",
-            "The desk was ray-traced through a thin lens with six blades and written as noisy 14-bit Bayer DNG files.",
+            "The desk was ray-traced through a thin lens with a central obstruction, as mirror lenses have, and written as noisy 14-bit Bayer DNG files.",
             _stack_figures(desk / "scene" / HELD_OUT_VIEW, page),
         ),
         section(

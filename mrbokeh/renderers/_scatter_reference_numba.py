@@ -10,7 +10,13 @@ from mrbokeh._polygon_coverage_numba import fill_psf
 
 @njit(cache=True, nogil=True)
 def scatter_pixels(
-    values: np.ndarray, coc_px: np.ndarray, margin_px: int, unit_radius: float, vertices: np.ndarray, starts: np.ndarray, weights: np.ndarray
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    margin_px: int,
+    unit_radius: float,
+    vertices: np.ndarray,
+    starts: np.ndarray,
+    weights: np.ndarray,
 ) -> np.ndarray:
     """Spread values (H, W, C) by the PSF of each pixel; `margin_px` is the radius of the largest kernel."""
     height, width, channels = values.shape

@@ -74,7 +74,9 @@ class OnnxNetwork:
         import onnxruntime
 
         if not Path(path).is_file():
-            raise InputError(f"expected a network at {path}, but there is no such file: make one with `mrbokeh train export RUN --out {path}`")
+            raise InputError(
+                f"expected a network at {path}, but there is no such file: make one with `mrbokeh train export RUN --out {path}`"
+            )
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
