@@ -12,6 +12,8 @@ LEAST_CORRELATION = 0.6
 # How far the scale between neighbours may be from what the lens predicts, or from 1 where the lens is unknown.
 LARGEST_STEP_FROM_PRIOR = 0.02
 LARGEST_STEP = 0.15
+# Blur that differs at depth edges moves ECC by about this much between neighbours; less is no movement of the camera.
+LEAST_MOVEMENT_PX = 0.25
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -65,7 +67,10 @@ def structure(rgb: Rgb) -> Plane:
 
 
 def register_pair(target: Plane, source: Plane, expected_scale: float | None = None) -> tuple[Similarity, float]:
-    """(target_from_source, correlation). Falls back to the expected scale about the centre where ECC does not hold."""
+    """(target_from_source, correlation). Falls back to the expected scale about the centre where ECC does not hold.
+
+    A known lens on a tripod needs nothing but the expected scale: what ECC finds beyond it counts from LEAST_MOVEMENT_PX on.
+    """
     height, width = target.shape
     start_scale, largest_step = (1.0, LARGEST_STEP) if expected_scale is None else (expected_scale, LARGEST_STEP_FROM_PRIOR)
     transform = about_centre(start_scale, width, height)
@@ -77,6 +82,9 @@ def register_pair(target: Plane, source: Plane, expected_scale: float | None = N
         candidate = _at_level(as_similarity(refined), -level)
         if abs(scale_of(candidate) / start_scale - 1.0) <= largest_step:
             transform = candidate
+    predicted = about_centre(start_scale, width, height)
+    if expected_scale is not None and farthest_corner_px(transform, predicted, width, height) < LEAST_MOVEMENT_PX:
+        return predicted, correlation
     return transform, correlation
 
 
@@ -100,6 +108,12 @@ def warp(rgb: Rgb, reference_from_slice: Similarity) -> Rgb:
 
 def scale_of(similarity: Similarity) -> float:
     return float(np.hypot(similarity[0, 0], similarity[1, 0]))
+
+
+def farthest_corner_px(a: Similarity, b: Similarity, width_px: int, height_px: int) -> float:
+    """How far apart two transforms take a corner of the picture."""
+    corners = np.array([[x, y, 1.0] for x in (0, width_px) for y in (0, height_px)])
+    return float(np.hypot(*((a - b) @ corners.T)).max())
 
 
 def about_centre(scale: float, width_px: int, height_px: int) -> Similarity:

@@ -71,7 +71,7 @@ def _register(stack: FocalStack) -> Registration:
         return read_image(stack.folder / source_path(stack.slices[index]))
 
     knows_lens = stack.lens is not None and stack.is_metric
-    prior = [1.0 / stack.lens_of(i).image_distance_mm for i in range(len(stack))] if knows_lens else None
+    prior = [stack.lens_of(i).image_distance_mm for i in range(len(stack))] if knows_lens else None
     return register_stack(read, len(stack), prior)
 
 

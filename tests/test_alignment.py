@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.alignment import about_centre, chained, inverse, register_pair, register_stack, scale_of, structure, warp
+from capture.alignment import about_centre, chained, farthest_corner_px, inverse, register_pair, register_stack, scale_of, structure, warp
 from mrbokeh.image_io import read_image
 
 
@@ -24,8 +24,7 @@ def similarity(scale: float, angle_rad: float, shift_px: tuple[float, float]) ->
 
 
 def corner_error_px(a: np.ndarray, b: np.ndarray) -> float:
-    corners = np.array([[0, 0, 1], [400, 0, 1], [0, 300, 1], [400, 300, 1.0]])
-    return float(np.hypot(*((a - b) @ corners.T)).max())
+    return farthest_corner_px(a, b, 400, 300)
 
 
 @pytest.mark.parametrize("truth", [
@@ -91,3 +90,11 @@ def test_breathing_of_real_stacks(shared_data: Path, stack: str, first: int, mid
 
 def test_scale_of_a_turned_similarity() -> None:
     assert scale_of(similarity(1.07, 0.3, (5, 5))) == pytest.approx(1.07)
+
+
+def test_a_known_lens_on_a_tripod_keeps_its_prior_and_a_moved_camera_does_not() -> None:
+    target = scene()
+    still, moved = similarity(1.02, 0.0, (0.1, 0.1)), similarity(1.02, 0.0, (1.2, -0.6))
+    for truth, allowed_px in ((still, 0.15), (moved, 0.3)):
+        found, _ = register_pair(structure(target), structure(warp(target, inverse(truth))), expected_scale=1.02)
+        assert corner_error_px(found, truth) < allowed_px

@@ -72,7 +72,12 @@ def test_facts_survive_in_the_file(exported: tuple[BlurNetwork, NetworkSettings,
     assert (facts.signed_coc, facts.tiled) == (settings.signed_coc, settings.tile_px > 0)
     assert facts.linear_in_radiance == (settings.form == "gated")
     assert (facts.trained_on, facts.commit) == (FACTS.trained_on, "0123abc")
-    assert (facts.lens.focal_length_mm, facts.lens.f_number, facts.lens.focus_distance_m, facts.lens.sensor_width_mm) == (35.0, 2.8, 1.25, 23.5)
+    assert (facts.lens.focal_length_mm, facts.lens.f_number, facts.lens.focus_distance_m, facts.lens.sensor_width_mm) == (
+        35.0,
+        2.8,
+        1.25,
+        23.5,
+    )
     assert np.allclose(facts.lens.aperture.outlines[0], FACTS.lens.aperture.outlines[0])
 
 
@@ -88,7 +93,7 @@ def test_size_is_free_without_tiles_only(exported: tuple[BlurNetwork, NetworkSet
 
 
 def test_a_network_that_computes_something_else_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(export_onnx, "largest_difference", lambda network, exported: 2 * LARGEST_DIFFERENCE)
+    monkeypatch.setattr(export_onnx, "largest_difference", lambda *_: 2 * LARGEST_DIFFERENCE)
     with pytest.raises(InputError, match="nothing was written"):
         export_network(_network(FORMS["gated"]), FORMS["gated"], FACTS, tmp_path / "lens.onnx")
     assert list(tmp_path.iterdir()) == []

@@ -82,7 +82,10 @@ def test_tiles_do_not_see_each_other(settings: NetworkSettings) -> None:
     assert not torch.allclose(before[..., :16], after[..., :16])
 
 
-@pytest.mark.parametrize("settings", [ONE_TILE, replace(ONE_TILE, width=2, mixing="tile"), GATED, replace(GATED, width=1, signed_coc=False, kernels_per_colour=True)])
+@pytest.mark.parametrize(
+    "settings",
+    [ONE_TILE, replace(ONE_TILE, width=2, mixing="tile"), GATED, replace(GATED, width=1, signed_coc=False, kernels_per_colour=True)],
+)
 def test_output_keeps_the_size_and_every_parameter_learns(settings: NetworkSettings) -> None:
     network = BlurNetwork(settings, 7.0, 1.0)
     optimizer = torch.optim.SGD(network.parameters(), 1e-3)
@@ -166,7 +169,7 @@ def test_leaving_out_unused_bins_changes_nothing() -> None:
     torch.nn.init.normal_(network.tiles.hide_out.weight)
     rgb, coc_px = _pictures()
     few = network(rgb, coc_px.abs())
-    network.tiles._used_bins = lambda gates: list(range(len(network.tiles.knots)))
+    network.tiles._used_bins = lambda _: list(range(len(network.tiles.knots)))
     assert torch.allclose(few, network(rgb, coc_px.abs()), atol=1e-6)
 
 
@@ -181,7 +184,12 @@ def test_the_published_form_is_the_default() -> None:
     """Section 3: tiles of 200 px with 60 px overlap, three channels, tanh, unsigned circle of confusion, unweighted MSE."""
     network = TrainSettings().network
     assert (network.form, network.tile_px, network.overlap_px, network.width, network.mixing) == ("published", 200, 60, 1, "none")
-    assert (network.activation, network.signed_coc, TrainSettings().loss_weighting, TrainSettings().crop_px) == ("tanh", False, "uniform", 0)
+    assert (network.activation, network.signed_coc, TrainSettings().loss_weighting, TrainSettings().crop_px) == (
+        "tanh",
+        False,
+        "uniform",
+        0,
+    )
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:

@@ -76,7 +76,7 @@ def test_light_and_coverage_are_kept_and_agree(network: OnnxNetwork, coc_px: flo
 
 
 def test_blur_spreads_beyond_the_silhouette_by_its_radius_and_no_farther(network: OnnxNetwork) -> None:
-    """6 px of blur reach 3 px, and one more is left to the sensor: the edge between columns 57 and 58 shows from 4 px before to 4 px after."""
+    """6 px of blur reach 3 px, one more is left to the sensor: the edge between columns 57 and 58 shows from 4 px before to 4 px after."""
     row = network.render([card(6.0)], LENS).alpha[32]
     assert row[59] > 0.05 and row[56] < 0.95
     assert row[52] == pytest.approx(1.0, abs=1e-3)

@@ -53,7 +53,7 @@ def test_data_travels_with_its_licences(wheel: Path) -> None:
     assert "mrbokeh/py.typed" in names
     for folder in ("raw_stack", "pcb_oblique", "objects"):
         assert f"mrbokeh/demo_data/{folder}/LICENSE.txt" in names
-    assert {f"mrbokeh/demo_data/raw_stack/view_{v}/slice_{i:02d}.dng" for v in range(3) for i in range(7)} <= names
+    assert {f"mrbokeh/demo_data/raw_stack/view_{v}/slice_{i:02d}.dng" for v in range(3) for i in range(9)} <= names
     assert any(name.startswith("viewfinder/page/") for name in names)
     assert wheel.stat().st_size < 20e6
 

@@ -21,6 +21,7 @@ from training.blur_functions import blur_of
 from training.cli import app
 from training.dataset import PairSet, gather_facts, read_pair, split_stacks, stacks_of
 from training.evaluate import GATHERED, NETWORK, NO_BLUR, REFERENCE, SCATTERED, evaluate, unseen
+from training.objective import learning_rate_factor
 from training.run_folder import load_run
 from training.settings import NetworkSettings, TrainSettings, demo_settings
 
@@ -103,7 +104,9 @@ def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("settings", [dataclasses.replace(DEMO_LIKE, epochs=4), PUBLISHED], ids=["gated", "published"])
-def test_a_killed_run_goes_on_as_if_never_stopped(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: TrainSettings) -> None:
+def test_a_killed_run_goes_on_as_if_never_stopped(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: TrainSettings
+) -> None:
     """Killed after a checkpoint and a few more steps, which are lost: the same weights, to the last bit."""
     settings = dataclasses.replace(settings, checkpoint_every_s=0.0)
     stacks = stacks_of([scene])
@@ -136,7 +139,20 @@ def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, 
             raise KeyboardInterrupt
         step(run, rate_factor)
 
-    arguments = ["fit", str(scene), "--preset", "demo", "--epochs", "4", "--threads", "1", "--held-out", "view_2", "--out", str(tmp_path / "run")]
+    arguments = [
+        "fit",
+        str(scene),
+        "--preset",
+        "demo",
+        "--epochs",
+        "4",
+        "--threads",
+        "1",
+        "--held-out",
+        "view_2",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     monkeypatch.setattr(train._Run, "_step", interrupted)
     stopped = CliRunner().invoke(app, arguments)
     assert stopped.exit_code == 130 and "go on" in stopped.output
@@ -162,10 +178,10 @@ def test_a_time_budget_is_kept(scene: Path, tmp_path: Path) -> None:
 
 
 def test_learning_rate_rises_then_falls_to_zero() -> None:
-    assert train.learning_rate_factor(0.025, 0.05) == pytest.approx(0.5)
-    assert train.learning_rate_factor(0.05, 0.05) == pytest.approx(1.0)
-    assert train.learning_rate_factor(0.525, 0.05) == pytest.approx(0.5)
-    assert train.learning_rate_factor(1.0, 0.05) == pytest.approx(0.0)
+    assert learning_rate_factor(0.025, 0.05) == pytest.approx(0.5)
+    assert learning_rate_factor(0.05, 0.05) == pytest.approx(1.0)
+    assert learning_rate_factor(0.525, 0.05) == pytest.approx(0.5)
+    assert learning_rate_factor(1.0, 0.05) == pytest.approx(0.0)
 
 
 def test_viewpoints_are_held_out_whole(scene: Path) -> None:

@@ -27,7 +27,10 @@ def gaussian_scatter(
     """Every pixel spreads its light as a Gaussian of its own size; the sum is divided by the weight that arrived."""
     light = np.dstack([rgb, np.ones(coc_px.shape, np.float32)])
     levels, shares = _levels(np.abs(coc_px) * sigma_over_coc)
-    spread = sum(_blurred(light * share[..., None], sigma) for sigma, share in zip(levels, shares, strict=True) if share.any())
+    spread = np.zeros_like(light)
+    for sigma, share in zip(levels, shares, strict=True):
+        if share.any():
+            spread += _blurred(light * share[..., None], sigma)
     return (spread[..., :3] / np.maximum(spread[..., 3:], 1e-6)).astype(np.float32)
 
 
@@ -36,8 +39,11 @@ def gaussian_gather(
 ) -> Float32[np.ndarray, "height width 3"]:
     """Every pixel is the mean of its surroundings under a Gaussian of its own size."""
     levels, shares = _levels(np.abs(coc_px) * sigma_over_coc)
-    gathered = sum(_blurred(rgb, sigma) * share[..., None] for sigma, share in zip(levels, shares, strict=True) if share.any())
-    return np.asarray(gathered, np.float32)
+    gathered = np.zeros_like(rgb)
+    for sigma, share in zip(levels, shares, strict=True):
+        if share.any():
+            gathered += _blurred(rgb, sigma) * share[..., None]
+    return gathered
 
 
 def _levels(sigma_px: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:

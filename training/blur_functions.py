@@ -21,7 +21,9 @@ def blur_of(network: Path) -> tuple[Blur, tuple[str, ...]]:
     model, _, facts = load_run(network)
 
     @torch.no_grad()
-    def blur(rgb: Float32[np.ndarray, "height width 3"], coc_px: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width 3"]:
+    def blur(
+        rgb: Float32[np.ndarray, "height width 3"], coc_px: Float32[np.ndarray, "height width"]
+    ) -> Float32[np.ndarray, "height width 3"]:
         result = model(torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))[None], torch.from_numpy(coc_px)[None, None])
         return result[0].permute(1, 2, 0).contiguous().numpy()
 

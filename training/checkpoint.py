@@ -28,7 +28,12 @@ class Progress:
 
 
 def save_checkpoint(
-    path: Path, progress: Progress, network: torch.nn.Module, average: torch.nn.Module, optimizer: torch.optim.Optimizer, rng: np.random.Generator
+    path: Path,
+    progress: Progress,
+    network: torch.nn.Module,
+    average: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+    rng: np.random.Generator,
 ) -> None:
     state = {
         "progress": dict(vars(progress)),

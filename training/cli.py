@@ -1,5 +1,6 @@
 """`mrbokeh train`: fit, evaluate, export."""
 
+import os
 import shutil
 from dataclasses import replace
 from enum import StrEnum
@@ -27,7 +28,9 @@ class Preset(StrEnum):
 def fit(
     scenes: Scenes,
     out: Annotated[Path, typer.Option(help="Folder of the run: settings, checkpoint, curve, network.")],
-    preset: Annotated[Preset, typer.Option(help="paper: as published; demo: our gated form, learns in minutes on two cores.")] = Preset.paper,
+    preset: Annotated[
+        Preset, typer.Option(help="paper: as published; demo: our gated form, learns in minutes on two cores.")
+    ] = Preset.paper,
     minutes: Annotated[float | None, typer.Option(min=0.01, help="Budget in minutes; the learning rate follows it.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Budget in epochs, instead of minutes.")] = None,
     held_out: Annotated[list[str] | None, typer.Option(help="Stack to keep for testing (repeat for more); else a fifth is drawn.")] = None,
@@ -41,6 +44,8 @@ def fit(
 
     Example: mrbokeh train fit scenes/attic --preset demo --minutes 2.5 --held-out view_3 --out runs/attic
     """
+    # Threads that wait for one another in a busy loop make training many times slower as soon as anything else uses a core.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read by OpenMP when torch is loaded, in the next lines
     from training.dataset import stacks_of
     from training.train import fit as fit_network
 
@@ -97,14 +102,16 @@ def evaluate(
     result = evaluation.evaluate(blur, evaluation.unseen(stacks_of(scenes), trained_on), folder, reference=reference)
     for name, decibel, similarity in evaluation.table(result):
         typer.echo(f"{name:22s} {decibel:>7s} dB   SSIM {similarity}")
-    typer.echo(f"network over no blur {result.gain_over_no_blur_db:+.2f} dB, over the better Gaussian {result.gain_over_gaussian_db:+.2f} dB")
+    typer.echo(
+        f"network over no blur {result.gain_over_no_blur_db:+.2f} dB, over the better Gaussian {result.gain_over_gaussian_db:+.2f} dB"
+    )
     typer.echo(f"written to {folder}: evaluation.md, evaluation.csv, evaluation.png")
 
 
 def _settings(preset: Preset, settings_file: Path | None) -> "TrainSettings":
     from training.settings import PRESETS, load_settings
 
-    return PRESETS[preset.value]() if settings_file is None else load_settings(settings_file)
+    return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
 
 
 def _remove_run(out: Path) -> None:

@@ -103,7 +103,7 @@ def gather_facts(pairs: PairSet) -> DataFacts:
 
 def _require_same(stack: FocalStack, lens: Lens, other: Lens, size: tuple[int, ...], other_size: tuple[int, ...]) -> None:
     numbers = [(each.focal_length_mm, each.f_number, each.sensor_width_mm) for each in (lens, other)]
-    if not np.allclose(*numbers, rtol=_SAME) or size != other_size:
+    if not np.allclose(numbers[0], numbers[1], rtol=_SAME) or size != other_size:
         raise InputError(
             f"one network learns one lens at one size: expected (focal length, f-number, sensor width) {numbers[0]} and pictures of "
             f"{size[1]}x{size[0]} px as in the first stack, but {stack.folder} has {numbers[1]} and {other_size[1]}x{other_size[0]} px; "

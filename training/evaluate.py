@@ -85,7 +85,9 @@ def unseen(stacks: Sequence[FocalStack], trained_on: Sequence[str]) -> list[Foca
     """The stacks that a network was not trained on; raises InputError where none is left."""
     left = [stack for stack in stacks if stack_name(stack) not in trained_on]
     if not left:
-        raise InputError(f"the network was trained on all of these stacks ({', '.join(trained_on)}): give a scene with a stack it has not seen")
+        raise InputError(
+            f"the network was trained on all of these stacks ({', '.join(trained_on)}): give a scene with a stack it has not seen"
+        )
     return left
 
 

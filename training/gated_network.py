@@ -8,9 +8,10 @@ the residual blocks stand side by side instead of in a row, and the circle of co
     weight_n(p)    exp of a pointwise network of gate(p) and coverage(p): who hides whom
     y(p)           sum of weight_n colour_n over sum of weight_n coverage_n
 
-n = 1 serves what is in focus; it starts as a copy, the paper's skip connection, and learns how sharp the camera is. With signed circles of confusion a lens has kernels of its own
-in front of the focus and behind it. The weights depend on the circles of confusion alone, so the result is linear in radiance, as
-light is: a highlight beyond anything seen in training is blurred like any other, and alpha like colour.
+n = 1 serves what is in focus; it starts as a copy, the paper's skip connection, and learns how sharp the camera is. With signed
+circles of confusion a lens has kernels of its own in front of the focus and behind it. The weights depend on the circles of
+confusion alone, so the result is linear in radiance, as light is: a highlight beyond anything seen in training is blurred like any
+other, and alpha like colour.
 """
 
 import math
@@ -76,6 +77,8 @@ def disc_kernel(size: int, diameter_px: float) -> Tensor:
 class GatedTiles(nn.Module):
     """The gated network for all tiles at once: input (B, 4 tiles, t, t) in [-1, 1], output (B, 3 tiles, t, t)."""
 
+    hats: Tensor
+
     def __init__(self, settings: NetworkSettings, blocks: int, largest_coc_px: float, tiles: int) -> None:
         super().__init__()
         self.tile_count, self.signed, self.largest_coc_px = tiles, settings.signed_coc, largest_coc_px
@@ -86,8 +89,8 @@ class GatedTiles(nn.Module):
         self.kernels = nn.ParameterList(self._fresh_kernels(n, settings.initialisation) for n in range(1, blocks + 1))
         self.hide_in = nn.Conv2d(2 * bins * tiles, settings.hidden * tiles, 1, groups=tiles)
         self.hide_out = nn.Conv2d(settings.hidden * tiles, bins * tiles, 1, groups=tiles)
-        nn.init.zeros_(self.hide_out.weight)
-        nn.init.zeros_(self.hide_out.bias)
+        for parameter in self.hide_out.parameters():
+            nn.init.zeros_(parameter)
 
     def _fresh_kernels(self, n: int, initialisation: str) -> nn.Parameter:
         """(tiles, bins of this size, colours, 2n+1, 2n+1): a kernel is their magnitude over its sum; a typical one is 1."""

@@ -93,14 +93,14 @@ class PublishedTiles(nn.Module):
         c1 = self.c1.weight.view(self.tile_count, features, 4)
         c1.mul_(0.1)
         c1[:, torch.arange(features), colour] = 1.0
-        self.c1.bias.fill_(1.0)
+        _bias(self.c1).fill_(1.0)
         c2 = self.c2.weight.view(self.tile_count, 3, features + 3)
         c2.zero_()
         copies = features // 3
         for channel in range(3):
             c2[:, channel, :features][:, colour == channel] = 0.5 / copies
             c2[:, channel, features + channel] = 0.5
-        self.c2.bias.fill_(-0.5)
+        _bias(self.c2).fill_(-0.5)
 
 
 class ResidualBlock(nn.Module):
@@ -131,10 +131,15 @@ class ResidualBlock(nn.Module):
         if initialisation == "disc":
             self.first.weight.zero_()
             self.first.weight[:, 0] = disc_kernel(2 * self.radius + 1, 2.0 * self.radius + 1.0)
-            self.first.bias.zero_()
+            _bias(self.first).zero_()
         self.second.weight.mul_(0.1)
-        self.second.bias.zero_()
+        _bias(self.second).zero_()
         if isinstance(self.mix, nn.Conv2d):
             self.mix.weight.zero_()
             self.mix.weight.view(tiles, features, features).diagonal(dim1=1, dim2=2).fill_(1.0)
-            self.mix.bias.zero_()
+            _bias(self.mix).zero_()
+
+
+def _bias(convolution: nn.Conv2d) -> Tensor:
+    assert convolution.bias is not None
+    return convolution.bias

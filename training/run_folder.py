@@ -50,8 +50,7 @@ def facts_from_json(document: dict[str, Any], where: str) -> RunFacts:
         raise InputError(f"{where}: expected format {FORMAT!r} version {VERSION}, got {document.get('format')!r}: train again")
     values = {name: value for name, value in document.items() if name not in ("format", "version")}
     lens = lens_from_json(values.pop("lens"), where)
-    names = {name: tuple(values.pop(name)) for name in ("trained_on", "held_out")}
-    return RunFacts(lens=lens, **names, **values)
+    return RunFacts(lens=lens, trained_on=tuple(values.pop("trained_on")), held_out=tuple(values.pop("held_out")), **values)
 
 
 def write_facts(folder: Path, facts: RunFacts) -> None:
@@ -80,7 +79,9 @@ def load_run(folder: Path) -> tuple[BlurNetwork, TrainSettings, RunFacts]:
     """The finished network of a run, in evaluation mode on the CPU."""
     settings, facts = read_settings(folder), read_facts(folder)
     if not (folder / NETWORK_NAME).is_file():
-        raise InputError(f"{folder} has no finished network ({NETWORK_NAME}): run the same `mrbokeh train fit` again, it goes on where it stopped")
+        raise InputError(
+            f"{folder} has no finished network ({NETWORK_NAME}): run the same `mrbokeh train fit` again, it goes on where it was"
+        )
     network = build_network(settings, facts)
     network.load_state_dict(torch.load(folder / NETWORK_NAME, map_location="cpu", weights_only=True))
     return network.eval(), settings, facts

@@ -1,5 +1,6 @@
 """Every choice of a training run in one frozen dataclass, saved as JSON beside the result."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -49,7 +50,9 @@ class NetworkSettings:
 
     def __post_init__(self) -> None:
         if self.tile_px and not 0 <= self.overlap_px < self.tile_px:
-            raise InputError(f"tiles need 0 <= overlap_px < tile_px, got an overlap of {self.overlap_px} px with tiles of {self.tile_px} px")
+            raise InputError(
+                f"tiles need 0 <= overlap_px < tile_px, got an overlap of {self.overlap_px} px with tiles of {self.tile_px} px"
+            )
         if self.width < 1 or self.hidden < 1 or (self.blocks is not None and self.blocks < 1):
             raise InputError(f"expected width, hidden and blocks of at least 1, got {self.width}, {self.hidden}, {self.blocks}")
 
@@ -107,7 +110,14 @@ class TrainSettings:
 def demo_settings(minutes: float = 2.5) -> TrainSettings:
     """The preset of the demo: the gated form without tiles, which learns a lens in minutes on two cores."""
     network = NetworkSettings(
-        form="gated", width=2, tile_px=0, overlap_px=0, signed_coc=True, activation="identity", initialisation="disc", kernels_per_colour=False
+        form="gated",
+        width=2,
+        tile_px=0,
+        overlap_px=0,
+        signed_coc=True,
+        activation="identity",
+        initialisation="disc",
+        kernels_per_colour=False,
     )
     return TrainSettings(
         network=network,
@@ -121,7 +131,7 @@ def demo_settings(minutes: float = 2.5) -> TrainSettings:
     )
 
 
-PRESETS = {"paper": TrainSettings, "demo": demo_settings}
+PRESETS: dict[str, Callable[[], TrainSettings]] = {"paper": TrainSettings, "demo": demo_settings}
 
 
 def settings_to_json(settings: TrainSettings) -> dict[str, Any]:

@@ -4,6 +4,8 @@ Annotations are plain tensors with shapes in words: exporting traces these funct
 shape check would freeze.
 """
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -52,14 +54,17 @@ def split(picture: Tensor, grid: TileGrid) -> Tensor:
 
 def assemble(tiles: Tensor, grid: TileGrid) -> Tensor:
     """(B, tiles * C, t, t) to (B, C, H, W): every tile at its place, the mean where they overlap."""
-    placed = sum(_placed(each, origin, grid) for each, origin in zip(tiles.chunk(len(grid), dim=1), grid.origins_px, strict=True))
-    return placed / tile_count(grid).to(tiles)
+    return _sum_placed(tiles.chunk(len(grid), dim=1), grid) / tile_count(grid).to(tiles)
 
 
 def tile_count(grid: TileGrid) -> Tensor:
     """(H, W): how many tiles cover each pixel."""
-    one = torch.ones(1, 1, *grid.tile_size_px)
-    return sum(_placed(one, origin, grid) for origin in grid.origins_px)[0, 0]
+    return _sum_placed([torch.ones(1, 1, *grid.tile_size_px)] * len(grid), grid)[0, 0]
+
+
+def _sum_placed(tiles: Sequence[Tensor], grid: TileGrid) -> Tensor:
+    placed = [_placed(tile, origin, grid) for tile, origin in zip(tiles, grid.origins_px, strict=True)]
+    return functools.reduce(torch.add, placed)
 
 
 def _placed(tile: Tensor, origin_px: tuple[int, int], grid: TileGrid) -> Tensor:

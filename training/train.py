@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack
@@ -19,7 +18,7 @@ from training.batches import Batch, draw_batch, stack_pairs
 from training.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from training.dataset import PairSet, gather_facts, split_stacks, stack_name
-from training.network import BlurNetwork
+from training.objective import held_out_psnr_db, learning_rate_factor, mean_square_error
 from training.run_folder import RunFacts, build_network, save_network, source_commit, write_curve, write_facts
 from training.settings import FILE_NAME as SETTINGS_NAME
 from training.settings import TrainSettings, read_settings, write_settings
@@ -42,13 +41,15 @@ def fit(stacks: Sequence[FocalStack], run_folder: Path, settings: TrainSettings,
 
 
 def _require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
-    """A longer budget may go on from an older run; anything else that differs needs a folder of its own."""
+    """A run goes on with the settings it began with; where and how fast it computes may differ."""
     if not (run_folder / CHECKPOINT_NAME).exists() or not (run_folder / SETTINGS_NAME).exists():
         return
     before = vars(read_settings(run_folder))
     differing = [name for name, value in vars(settings).items() if before[name] != value and name not in ("threads", "device", "cache_mib")]
     if differing:
-        raise InputError(f"{run_folder} holds a run with other settings ({', '.join(differing)}): give another --out, or --overwrite to start again")
+        raise InputError(
+            f"{run_folder} holds a run with other settings ({', '.join(differing)}): give another --out, or --overwrite to start again"
+        )
 
 
 def _facts_of(pairs: PairSet, test_stacks: Sequence[FocalStack], settings: TrainSettings) -> RunFacts:
@@ -68,26 +69,10 @@ def _facts_of(pairs: PairSet, test_stacks: Sequence[FocalStack], settings: Train
 def _validation_batch(test_stacks: Sequence[FocalStack], settings: TrainSettings) -> list[Batch]:
     """A few held-out slices spread over the focus range; whole pictures."""
     pairs = PairSet(test_stacks, settings.least_confidence, settings.saturation, cache_mib=0)
-    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(VALIDATION_SLICES, len(pairs))).astype(int)) if len(pairs) else []
+    if not len(pairs):
+        return []
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, VALIDATION_SLICES).round().astype(int))
     return [stack_pairs([pairs[int(index)]]) for index in chosen]
-
-
-def mean_square_error(result: Tensor, batch: Batch, radiance_scale: float, settings: TrainSettings) -> Tensor:
-    """Eq. 3 over the reassembled pictures, in the units of the network, [-1, 1]; pixels without weight do not count."""
-    weight, target = batch.weight.expand_as(batch.target), batch.target
-    if settings.loss_weighting == "relative":
-        weight = weight / target.amax(dim=1, keepdim=True).clamp(min=1.0).square()
-    if settings.sensor_white is not None:
-        result, target = result.clamp(max=settings.sensor_white), target.clamp(max=settings.sensor_white)
-    error = (result - target) * (2.0 / radiance_scale)
-    return (weight * error.square()).sum() / weight.sum().clamp(min=1e-6)
-
-
-def learning_rate_factor(done: float, warm_up: float) -> float:
-    """Of the peak, after this fraction of the budget: a linear rise, then half a cosine to zero."""
-    if done < warm_up:
-        return max(done / warm_up, 0.02)
-    return 0.5 * (1.0 + math.cos(math.pi * min(1.0, (done - warm_up) / (1.0 - warm_up))))
 
 
 class _Run:
@@ -186,17 +171,6 @@ class _Run:
         save_network(self.folder, self.average.cpu())
         self.progress = replace(self.progress, finished=True)
         self._save()
-
-
-@torch.no_grad()
-def held_out_psnr_db(network: BlurNetwork, batches: Sequence[Batch], device: torch.device) -> float:
-    """Mean PSNR over slices, linear radiance clipped to [0, 1]."""
-    values = []
-    for batch in batches:
-        on_device = batch.to(device)
-        error = network(on_device.rgb, on_device.coc_px).clamp(0, 1) - on_device.target.clamp(0, 1)
-        values.append(-10.0 * math.log10(max(float(error.square().mean()), 1e-12)))
-    return float(np.mean(values))
 
 
 def _device(name: str) -> torch.device:

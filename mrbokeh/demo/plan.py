@@ -6,6 +6,7 @@ from pathlib import Path
 from mrbokeh.demo.stages import Stage
 
 DATA = Path(__file__).resolve().parent.parent / "demo_data"
+VIEWS = ("view_0", "view_1", "view_2")
 HELD_OUT_VIEW = "view_2"
 
 
@@ -36,21 +37,20 @@ BOARD = (
 def demo_stages(out: Path, minutes: float) -> list[Stage]:
     """Both stacks the whole way. minutes: training time of the desk's network; the board's takes a third of it."""
     desk, board = out / "desk", out / "board"
-    views = [DATA / "raw_stack" / f"view_{i}" for i in range(3)]
     return [
-        *_capture(desk, "RAW photographs of a desk (simulated camera, known truth)", views, []),
+        *_capture(desk, "RAW photographs of a desk (simulated camera, known truth)", DATA / "raw_stack", VIEWS, []),
         *_network(desk, minutes, HELD_OUT_VIEW),
         *_composites(desk, desk / "scene" / HELD_OUT_VIEW, DESK),
-        *_capture(board, "photographs of a circuit board", [DATA / "pcb_oblique"], ["--max-width", "512"]),
+        *_capture(board, "photographs of a circuit board", DATA / "pcb_oblique", ("pcb_oblique",), ["--max-width", "512"]),
         *_network(board, minutes / 3.0, None),
         *_composites(board, board / "scene" / "pcb_oblique", BOARD),
     ]
 
 
-def _capture(folder: Path, what: str, sources: list[Path], options: list[str]) -> list[Stage]:
+def _capture(folder: Path, what: str, source: Path, names: tuple[str, ...], options: list[str]) -> list[Stage]:
     scene = folder / "scene"
-    stacks = [scene / source.name for source in sources]
-    ingest = ("capture", "ingest", *map(str, sources), "--out", str(scene), *options)
+    stacks = [scene / name for name in names]
+    ingest = ("capture", "ingest", str(source), "--out", str(scene), *options)
     return [
         Stage(f"{folder.name}_ingest", f"Develop {what}", ingest, tuple(stack / "stack.json" for stack in stacks)),
         Stage(

@@ -6,11 +6,9 @@ from pathlib import Path
 from mrbokeh.atomic_files import write_json
 from mrbokeh.demo.measurements import Measurement, merge_measurements, network_measurements
 from mrbokeh.demo.pictures import stack_pictures
-from mrbokeh.demo.plan import BOARD, DATA, DESK, HELD_OUT_VIEW, Placement
+from mrbokeh.demo.plan import BOARD, DATA, DESK, HELD_OUT_VIEW, VIEWS, Placement
 from mrbokeh.demo.report import figure, section, write_report
 from mrbokeh.demo.stages import Done
-
-VIEWS = ("view_0", "view_1", "view_2")
 
 
 def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:

@@ -144,24 +144,25 @@ class OnnxNetwork:
             expected, got = getattr(trained, name), getattr(lens, name)
             if abs(got / expected - 1.0) > _SAME_LENS:
                 raise InputError(
-                    f"this network was trained for a lens with {name} {expected:g}, but came with {got:g}: use the lens it was trained for, "
-                    f"or train again on focal stacks of the other one"
+                    f"this network was trained for a lens with {name} {expected:g}, but came with {got:g}: use the lens it was "
+                    f"trained for, or train again on focal stacks of the other one"
                 )
 
     def _require_trained_coc(self, largest_px: float, width_px: int) -> None:
         limit_px = self.facts.largest_coc_px
         if largest_px > limit_px * _COC_SLACK:
+            fitting_width_px = int(width_px * limit_px / largest_px)
             raise InputError(
-                f"this network was trained for circles of confusion up to {limit_px:.1f} px, but this scene has {largest_px:.1f} px at a width of "
-                f"{width_px} px: focus nearer to the object, work at most {int(width_px * limit_px / largest_px)} px wide, or train again with a "
-                f"wider focus range"
+                f"this network was trained for circles of confusion up to {limit_px:.1f} px, but this scene has {largest_px:.1f} px at a "
+                f"width of {width_px} px: focus nearer to the object, work at most {fitting_width_px} px wide, or train again with a wider "
+                f"focus range"
             )
 
     def _require_trained_size(self, height_px: int, width_px: int) -> None:
         if self.facts.tiled and (height_px, width_px) != (self.facts.height_px, self.facts.width_px):
             raise InputError(
-                f"this network has tiles for pictures of {self.facts.width_px}x{self.facts.height_px} px, but came {width_px}x{height_px} px: "
-                f"resize the picture, or train with tile_px 0 or at that size"
+                f"this network has tiles for pictures of {self.facts.width_px}x{self.facts.height_px} px, but came "
+                f"{width_px}x{height_px} px: resize the picture, or train with tile_px 0 or at that size"
             )
 
 
