@@ -1,6 +1,9 @@
 """A trained network as an ONNX file that says which lens it is, written only if it computes what the trained one does."""
 
+import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,8 +70,7 @@ def _write(network: BlurNetwork, facts: NetworkFacts, path: Path) -> None:
     rgb, coc_px = picture_for_parity(facts)
     free = torch.export.Dim.DYNAMIC
     sizes = {} if facts.tiled else {2: free, 3: free}
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")
+    with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             network.eval(),
             (rgb, coc_px),
@@ -82,6 +84,20 @@ def _write(network: BlurNetwork, facts: NetworkFacts, path: Path) -> None:
     assert program is not None
     program.model.metadata_props[METADATA_KEY] = facts.to_json()
     program.save(str(path))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporter speaks of packages that are not installed and not needed."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logger.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            logger.setLevel(level)
 
 
 def picture_for_parity(facts: NetworkFacts, seed: int = 0) -> tuple[Tensor, Tensor]:
