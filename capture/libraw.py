@@ -56,7 +56,7 @@ def processed(raw: "rawpy.RawPy", multipliers: tuple[float, float, float], space
     red, green, blue = multipliers
     return raw.postprocess(
         user_wb=[red, green, blue, green], output_color=space, gamma=(1, 1), output_bps=16, no_auto_bright=True, bright=1.0,
-        median_filter_passes=1,
+        median_filter_passes=0 if half_size else 1,
         adjust_maximum_thr=0.0, highlight_mode=rawpy.HighlightMode.Ignore, user_flip=0,
         demosaic_algorithm=rawpy.DemosaicAlgorithm.AAHD, half_size=half_size,
     )  # fmt: skip

@@ -114,9 +114,9 @@ def traced_slice(scene: Scene, plan: StackPlan, view: int, index: int) -> np.nda
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the stack.")],
     viewpoints: Annotated[int, typer.Option(help=f"1 to {len(VIEWPOINTS)}.")] = 3,
-    slices: int = 7,
-    width: int = 576,
-    height: int = 384,
+    slices: int = 9,
+    width: int = 544,
+    height: int = 360,
     seed: Annotated[int, typer.Option(help="Textures, lights, sampling and noise.")] = 1,
     samples: Annotated[int, typer.Option(help="Lens rays per pixel.")] = 512,
     bits: Annotated[int, typer.Option(help="12 to 16.")] = 14,

