@@ -63,8 +63,11 @@ def merge_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="merge again what is merged already")] = False,
 ) -> None:
     from capture.merge import merge_scene
+    from mrbokeh.stack_pictures import SHEET_NAME
 
-    merge_scene(scene, overwrite)
+    for stack in merge_scene(scene, overwrite):
+        depth = "depth in metres" if stack.is_metric else "focus distances unknown: depth is the index of the sharpest slice, not metres"
+        typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {SHEET_NAME}")
 
 
 def parse_white_balance(text: str) -> tuple[float, float, float] | None:

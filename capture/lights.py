@@ -115,7 +115,7 @@ def _nearest_spot(spots: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarr
 def _spread(
     brightness: Plane, surroundings: Plane, near: Int[np.ndarray, "height width"], count: int
 ) -> tuple[PerLight, PerLight, PerLight]:
-    """For each light (how much is seen of it, over how many pixels, its peak); the area is that of an even disc: (sum)^2 / sum of squares."""
+    """For each light (how much is seen of it, over how many pixels, its peak); the area of an even disc is (sum)^2 / sum of squares."""
     excess = np.maximum(brightness - surroundings, 0.0)
     total = np.bincount(near.ravel(), excess.ravel(), count + 1)[1:]
     squares = np.bincount(near.ravel(), (excess * excess).ravel(), count + 1)[1:]

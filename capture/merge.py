@@ -18,6 +18,7 @@ from mrbokeh.focal_stack import FocalStack, Slice, find_focal_stacks, write_foca
 from mrbokeh.image_io import read_image, write_image
 from mrbokeh.lens import Lens
 from mrbokeh.progress import track
+from mrbokeh.stack_pictures import write_merge_sheet
 
 REGISTERED_FOLDER = "registered"
 FEWEST_SLICES = 3
@@ -49,6 +50,7 @@ def merge_stack(stack: FocalStack) -> FocalStack:
     write_merged(stack.folder, picture, focus.focus_index, focus.confidence, depth_m_of(registered, focus))
     merged = replace(registered, merged=True)
     write_focal_stack(merged)
+    write_merge_sheet(merged)
     return merged
 
 

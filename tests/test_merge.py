@@ -84,6 +84,13 @@ def test_photographs_without_distances_give_an_index(tmp_path: Path) -> None:
     assert sharpness[-1] > max(sharpness[:-1]), "sharper than every slice"
 
 
+def test_a_sheet_shows_what_came_out(desk: FocalStack) -> None:
+    sheet = read_image(desk.folder / "merge.png")
+    # Five pictures of 320 px with gaps; the last shows depth in colours, so red and blue differ there.
+    assert sheet.shape[1] == 5 * 324
+    assert np.abs(sheet[30:200, 4 * 324 : -8, 0] - sheet[30:200, 4 * 324 : -8, 2]).mean() > 0.1
+
+
 def test_two_slices_are_no_stack(tmp_path: Path) -> None:
     for i in range(2):
         write_image(tmp_path / f"slices/{i}.exr", np.ones((64, 64, 3), np.float32))

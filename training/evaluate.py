@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.atomic_files import atomic_path
+from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack
 from mrbokeh.image_metrics import psnr, ssim
 from mrbokeh.progress import track
 from training.baselines import gaussian_gather, gaussian_scatter, scatter_reference, sigma_per_coc
-from training.contact_sheet import SheetRow, write_contact_sheet
 from training.dataset import Pair, PairSet, stack_name
 
 NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE = "network", "no blur", "Gaussian, scattered", "Gaussian, gathered", "scatter reference"

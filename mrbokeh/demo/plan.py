@@ -71,7 +71,7 @@ def _network(folder: Path, minutes: float, held_out: str | None) -> list[Stage]:
             f"{folder.name}_fit",
             "Train a network that blurs like this lens",
             (*fit, *(["--held-out", held_out] if held_out else [])),
-            (run / "settings.json",),
+            (run / "network.pt",),
             when_stale=("--overwrite",),
         ),
         Stage(

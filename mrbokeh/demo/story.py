@@ -5,10 +5,11 @@ from pathlib import Path
 
 from mrbokeh.atomic_files import write_json
 from mrbokeh.demo.measurements import Measurement, merge_measurements, network_measurements
-from mrbokeh.demo.pictures import stack_pictures
 from mrbokeh.demo.plan import BOARD, DATA, DESK, HELD_OUT_VIEW, VIEWS, Placement
 from mrbokeh.demo.report import figure, section, write_report
 from mrbokeh.demo.stages import Done
+from mrbokeh.focal_stack import read_focal_stack
+from mrbokeh.stack_pictures import write_stack_pictures
 
 
 def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
@@ -20,7 +21,7 @@ def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
     sections = [
         section(
             "1. Capture: RAW files to a registered stack, an all-in-focus picture and depth",
-            "The desk was ray-traced through a thin lens with a central obstruction, as mirror lenses have, and written as noisy 14-bit Bayer DNG files.",
+            "The desk was ray-traced through a thin lens with a stop in its middle, as mirror lenses have, and written as noisy Bayer DNG.",
             _stack_figures(desk / "scene" / HELD_OUT_VIEW, page),
         ),
         section(
@@ -45,7 +46,8 @@ def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
 
 
 def _stack_figures(stack: Path, page: Path) -> list[str]:
-    return [figure(path, page, caption) for path, caption in stack_pictures(stack, page.parent / "pictures")]
+    pictures = write_stack_pictures(read_focal_stack(stack), page.parent / "pictures")
+    return [figure(path, page, caption) for path, caption in pictures]
 
 
 def _composite_figures(folder: Path, placements: tuple[Placement, ...], page: Path) -> list[str]:
