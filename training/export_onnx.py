@@ -1,5 +1,6 @@
 """A trained network as an ONNX file that says which lens it is, written only if it computes what the trained one does."""
 
+import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mrbokeh.atomic_files import atomic_path
+from mrbokeh.atomic_files import atomic_path, write_json
 from mrbokeh.errors import InputError
 from mrbokeh.renderers.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
 from training.network import BlurNetwork
@@ -47,7 +48,15 @@ def export_network(network: BlurNetwork, settings: NetworkSettings, facts: RunFa
                 f"the exported network differs from the trained one by {difference:.1e}, more than {LARGEST_DIFFERENCE:.0e}: "
                 f"nothing was written; try another version of onnxruntime or torch"
             )
+    write_json(
+        record_path(path), {"parity_difference": difference, "largest_allowed": LARGEST_DIFFERENCE, **json.loads(network_facts.to_json())}
+    )
     return Exported(network_facts, difference)
+
+
+def record_path(path: Path) -> Path:
+    """Beside the network, for people and programs that do not open ONNX: its facts and the measured parity."""
+    return path.with_name(path.name + ".json")
 
 
 def network_facts_of(network: BlurNetwork, settings: NetworkSettings, facts: RunFacts) -> NetworkFacts:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mrbokeh.atomic_files import read_json
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import read_focal_stack
 from mrbokeh.image_io import read_image
@@ -52,6 +53,14 @@ def merge_measurements(stack_folder: Path, truth_folder: Path) -> list[Measureme
             error < LARGEST_DEPTH_ERROR,
         ),
     ]
+
+
+def parity_measurement(network: Path) -> Measurement:
+    """ONNX Runtime against PyTorch, as `mrbokeh train export` measured it."""
+    record = read_json(network.with_name(network.name + ".json"), "the record of an exported network")
+    difference, allowed = float(record["parity_difference"]), float(record["largest_allowed"])
+    what = f"{network.parent.name}: ONNX Runtime against PyTorch, largest difference of radiance"
+    return Measurement(what, f"{difference:.1e}", f"below {allowed:.0e}", difference < allowed)
 
 
 def network_measurements(evaluation_folder: Path) -> list[Measurement]:

@@ -78,7 +78,7 @@ def _network(folder: Path, minutes: float, held_out: str | None) -> list[Stage]:
             f"{folder.name}_export",
             "Write the network as ONNX",
             ("train", "export", str(run), "--out", str(network), "--overwrite"),
-            (network,),
+            (network, network.with_name(network.name + ".json")),
         ),
     ]
     if held_out:

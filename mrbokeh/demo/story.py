@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mrbokeh.atomic_files import write_json
-from mrbokeh.demo.measurements import Measurement, merge_measurements, network_measurements
+from mrbokeh.demo.measurements import Measurement, merge_measurements, network_measurements, parity_measurement
 from mrbokeh.demo.plan import BOARD, DATA, DESK, HELD_OUT_VIEW, VIEWS, Placement
 from mrbokeh.demo.report import figure, section, write_report
 from mrbokeh.demo.stages import Done
@@ -16,8 +16,11 @@ def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
     """report.html, numbers.json and previews in `out`; returns the measurements."""
     desk, board, page = out / "desk", out / "board", out / "report.html"
     measurements = [
-        measurement for view in VIEWS for measurement in merge_measurements(desk / "scene" / view, DATA / "raw_stack" / "truth" / view)
-    ] + network_measurements(desk / "evaluation")
+        *(each for view in VIEWS for each in merge_measurements(desk / "scene" / view, DATA / "raw_stack" / "truth" / view)),
+        *network_measurements(desk / "evaluation"),
+        parity_measurement(desk / "lens.onnx"),
+        parity_measurement(board / "lens.onnx"),
+    ]
     sections = [
         section(
             "1. Capture: RAW files to a registered stack, an all-in-focus picture and depth",
