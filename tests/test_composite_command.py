@@ -1,0 +1,120 @@
+"""`mrbokeh composite` as a user meets it: a layer or an object into a photograph or a slice, and what it refuses."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrbokeh.camera import Camera
+from mrbokeh.demo.plan import DATA
+from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import write_lens
+
+HEIGHT, WIDTH = 96, 144
+LENS = Lens(35.0, 2.0, 1.0, 23.5)
+CAKE = DATA / "objects" / "cakeBirthday.glb"
+
+
+def mrbokeh(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "mrbokeh.cli", *map(str, arguments)], capture_output=True, text=True)
+
+
+def plate_rgb() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 0.5, (HEIGHT, WIDTH, 3)).astype(np.float32)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A photograph of a wall 2 m away with a post at 0.8 m in its left third, its depth, a lens and a card at 1.3 m."""
+    write_image(tmp_path / "photo.exr", plate_rgb(), half=False)
+    depth_m = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    depth_m[:, : WIDTH // 3] = 0.8
+    write_layer(tmp_path / "depth.exr", Layer(plate_rgb(), np.ones_like(depth_m), depth_m))
+    write_lens(tmp_path / "lens.json", LENS)
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[30:70, 30:90] = 1.0
+    card = Layer(alpha[..., None] * np.float32([0.9, 0.2, 0.1]), alpha, np.where(alpha > 0, 1.3, np.inf).astype(np.float32))
+    write_layer(tmp_path / "card.exr", card, half=False)
+    return tmp_path
+
+
+def test_a_layer_goes_behind_the_post_and_before_the_wall(files: Path) -> None:
+    out, layer = files / "out.exr", files / "blurred.exr"
+    arguments = ("--layer", files / "card.exr", "--lens", files / "lens.json", "--depth", files / "depth.exr")
+    done = mrbokeh("composite", files / "photo.exr", *arguments, "--out", out, "--save-layer", layer)
+    assert done.returncode == 0, done.stderr
+    picture, blurred = read_image(out), read_layer(layer)
+    # The blur reaches half a circle of confusion beyond the visible part of the card, which begins at the post's edge.
+    reach_px = int(np.ceil(float(LENS.coc_px(1.3, WIDTH)) / 2)) + 1
+    assert blurred.alpha[:, : WIDTH // 3 - reach_px].max() == 0.0
+    np.testing.assert_allclose(picture[50, 70], [0.9, 0.2, 0.1], rtol=2e-3)  # half float
+    untouched = blurred.alpha == 0
+    np.testing.assert_allclose(picture[untouched], plate_rgb()[untouched], rtol=2**-11)
+
+
+def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path) -> None:
+    out, layer = files / "out.png", files / "cake.exr"
+    arguments = ("--object", CAKE, "--at-pixel", "100,70", "--height", 0.1, "--shadow", 0.6)
+    done = mrbokeh(
+        *("composite", files / "photo.exr", "--lens", files / "lens.json", "--focus", 2.0, "--depth", files / "depth.exr"),
+        *(*arguments, "--out", out, "--save-layer", layer),
+    )
+    assert done.returncode == 0, done.stderr
+    rows, columns = np.nonzero(read_layer(layer).alpha > 0.5)
+    # 0.1 m at 2 m through 35 mm on 23.5 mm is 10.9 px of 144; it stands on row 70 and is wider than high.
+    assert 68 <= rows.max() <= 76 and 8 <= 70 - rows.min() <= 16
+    assert abs(columns.mean() - 100) < 4
+    assert read_image(out).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path) -> None:
+    stack_folder = files / "stack"
+    for i in range(3):
+        write_image(stack_folder / f"{i}.exr", plate_rgb())
+    camera = Camera(WIDTH, HEIGHT, (LENS.focal_px(WIDTH),) * 2, (WIDTH / 2, HEIGHT / 2))
+    stack = FocalStack(stack_folder, tuple(Slice(f"{i}.exr", d) for i, d in enumerate((0.6, 1.3, 3.0))), LENS, camera, registered=True)
+    plane = np.ones((HEIGHT, WIDTH), np.float32)
+    write_merged(stack_folder, plate_rgb(), plane, plane, 2 * plane)
+    write_focal_stack(replace(stack, merged=True))
+    spread = []
+    for index in range(3):
+        layer = files / f"layer_{index}.exr"
+        done = mrbokeh(
+            *("composite", stack_folder, "--slice", index, "--layer", files / "card.exr"),
+            *("--out", files / f"{index}.png", "--save-layer", layer),
+        )
+        assert done.returncode == 0, done.stderr
+        spread.append(int((read_layer(layer).alpha > 0).sum()))
+    assert spread[1] == 40 * 60, "slice 1 is focused on the card"
+    assert spread[0] > spread[1] < spread[2]
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({}, "nothing to put into the photograph"),
+    ({"--layer": "card.exr", "--lens": None}, "does not tell its lens"),
+    ({"--layer": "none.exr"}, "none.exr"),
+    ({"--object": "cake"}, "where does the object stand"),
+    ({"--object": "cake", "--at-pixel": "10,10"}, "needs depth"),
+    ({"--object": "cake", "--at": "1,2"}, "--at expects 3 numbers"),
+    ({"--layer": "card.exr", "--renderer": "magic"}, "expected a renderer"),
+    ({"--layer": "card.exr", "--out": "photo.exr"}, "--overwrite"),
+    ({"--layer": "card.exr", "--slice": "1"}, "not a folder"),
+    ({"--layer": "card.exr", "--out": "out.gif"}, "cannot write"),
+])  # fmt: skip
+def test_mistakes_end_in_one_sentence(files: Path, change: dict[str, str | None], message: str) -> None:
+    options = {"--lens": "lens.json", "--out": "out.exr"} | change
+    words: list[object] = []
+    for option, value in options.items():
+        if value is not None:
+            path = CAKE if value == "cake" else files / value if "." in value and "," not in value else value
+            words += [option, path]
+    done = mrbokeh("composite", files / "photo.exr", *words)
+    assert done.returncode == 2
+    assert message in " ".join(done.stderr.split()) and "Traceback" not in done.stderr
+    assert not (files / "out.exr").exists() and not (files / "out.gif").exists()
