@@ -14,9 +14,12 @@ Plane = Float32[np.ndarray, "height width"]
 Volume = Float32[np.ndarray, "slices height width"]
 
 # A jump of the depth by more than one slice costs as much as this many e-folds of focus energy.
-SMALL_STEP_COST = 0.15
-LARGE_STEP_COST = 1.2
+SMALL_STEP_COST = 0.3
+LARGE_STEP_COST = 3.0
 LARGEST_COST = 4.0
+# Detail has half its say in the labelling, and half its confidence, where its energy is this many times that of the noise.
+LABELLING_NOISE_FLOORS = 100.0
+CONFIDENCE_NOISE_FLOORS = 10.0
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,10 @@ def focus_map(energies: Volume, lights: Lights) -> FocusMap:
     """
     from capture._semi_global_numba import aggregate_costs
 
-    log_energies = np.log(energies + noise_floor(energies))
-    costs = np.minimum(log_energies.max(axis=0) - log_energies, np.float32(LARGEST_COST)).astype(np.float32)
+    floor = noise_floor(energies)
+    log_energies = np.log(energies + floor)
+    say = share_above(energies.max(axis=0), LABELLING_NOISE_FLOORS * floor)
+    costs = say * np.minimum(log_energies.max(axis=0) - log_energies, np.float32(LARGEST_COST))
     by_light = lights.slice_index()
     costs[:, by_light >= 0] = 0.0
     costs[:, lights.core] = LARGEST_COST * (np.arange(len(energies))[:, None] != by_light[lights.core])
@@ -61,8 +66,14 @@ def focus_map(energies: Volume, lights: Lights) -> FocusMap:
     offset, curvature = peak_parabola(log_energies, labels)
     index = np.where(by_light >= 0, labels, labels + offset)
     index[lights.core] = lights.focus_index[lights.zone[lights.core] - 1]
-    confidence = np.where(by_light >= 0, 0.0, confidence_of(log_energies, labels, curvature)).astype(np.float32)
+    trusted = share_above(energies.max(axis=0), CONFIDENCE_NOISE_FLOORS * floor) * confidence_of(log_energies, labels, curvature)
+    confidence = np.where(by_light >= 0, 0.0, trusted).astype(np.float32)
     return FocusMap(index.astype(np.float32), confidence, np.where(by_light >= 0, by_light, index).astype(np.float32))
+
+
+def share_above(energy: Plane, half_at: float) -> Plane:
+    """From 0 to 1 with the energy, one half at `half_at`."""
+    return (energy / (energy + np.float32(half_at))).astype(np.float32)
 
 
 def noise_floor(energies: Volume) -> float:
