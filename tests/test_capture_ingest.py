@@ -5,7 +5,6 @@ import math
 import os
 import shutil
 import struct
-from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
 from fractions import Fraction
@@ -20,12 +19,8 @@ from typer.testing import CliRunner
 import capture.stack_ingest
 from capture.cli import app, parse_white_balance
 from capture.exposure import ExposureGain, evened_out, low_frequency, measure_gain
-from capture.focus_metadata import FocusReading
-from capture.grouping import Grouping, Photo, group_photos, of_one_camera
+from capture.grouping import Grouping
 from capture.ingest import IngestReport, IngestSettings, ingest
-from capture.photo_files import find_photos
-from capture.photo_metadata import PhotoMetadata
-from capture.sidecar import Sidecar
 from capture.slice_files import find_slices
 from capture.stack_ingest import Development
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
@@ -269,63 +264,6 @@ def test_one_white_balance_for_the_stack(shoot: Path, tmp_path: Path) -> None:
     assert only_stack(ingest([shoot], tmp_path / "given", given)).slices[0].metadata["white_balance"] == [1.5, 1.0, 1.2]
 
 
-# --- grouping ------------------------------------------------------------------------------------------------------
-
-
-def photo(name: str, seconds: float | None = None, focus_m: float | None = None, camera: str | None = "A") -> Photo:
-    taken_at = None if seconds is None else datetime(2025, 1, 1) + timedelta(seconds=seconds)
-    focus = None if focus_m is None else FocusReading(focus_m, focus_m, focus_m, "lens", "test")
-    return Photo(Path(name), PhotoMetadata(taken_at=taken_at, focus=focus, camera_model=camera), Sidecar())
-
-
-def names(photos: Sequence[Photo]) -> list[str]:
-    return [each.path.name for each in photos]
-
-
-def test_group_by_time_splits_at_long_pauses() -> None:
-    """Shots 3 s apart with pauses of two minutes; names not in the order of time."""
-    seconds = {"b": 0, "a": 3, "c": 6, "d": 126, "e": 129, "f": 250}
-    groups = group_photos([("shoot", [photo(name, seconds=seconds[name]) for name in "abcdef"])], Grouping.time)
-    assert [(group.name, names(group.photos)) for group in groups] == [
-        ("shoot_00", ["b", "a", "c"]),
-        ("shoot_01", ["d", "e"]),
-        ("shoot_02", ["f"]),
-    ]
-
-
-def test_group_by_focus_splits_where_the_focus_turns() -> None:
-    """Two sweeps near to far (the second from the start again), one back; equal distances are no turn."""
-    distances_m = [0.5, 0.7, 0.7, 2.0, math.inf, 0.5, 0.7, 2.0, 1.0, 0.5]
-    photos = [photo(f"{index}", focus_m=distance) for index, distance in enumerate(distances_m)]
-    assert [names(group.photos) for group in group_photos([("s", photos)], Grouping.focus)] == [list("01234"), list("567"), list("89")]
-
-
-def test_group_by_folder_and_none() -> None:
-    folders = [("x", [photo("0")]), ("y", [photo("1")]), ("x", [photo("2")])]
-    assert [group.name for group in group_photos(folders, Grouping.folder)] == ["x", "y", "x_2"]
-    assert [names(group.photos) for group in group_photos(folders, Grouping.none)] == [["0", "1", "2"]]
-
-
-def test_grouping_needs_what_it_goes_by() -> None:
-    with pytest.raises(InputError, match="needs the time of each photograph, but b do not state it"):
-        group_photos([("s", [photo("a", seconds=0), photo("b")])], Grouping.time)
-    with pytest.raises(InputError, match="needs the focus distance of each photograph"):
-        group_photos([("s", [photo("a"), photo("b", focus_m=1.0)])], Grouping.focus)
-
-
-def test_pictures_of_other_cameras_are_left_out() -> None:
-    photos = [
-        photo("a.jpg"),
-        photo("b.jpg"),
-        photo("other.jpg", camera="B"),
-        photo("fused.jpg", camera=None),
-        photo("bad.dng", camera=None),
-    ]
-    kept, skipped = of_one_camera(photos)
-    assert names(kept) == ["a.jpg", "b.jpg", "bad.dng"]
-    assert [each.path.name for each in skipped] == ["other.jpg", "fused.jpg"]
-
-
 def test_folders_of_a_scene_become_stacks(tmp_path: Path) -> None:
     for view in ("view_0", "view_1"):
         for index in range(2):
@@ -335,19 +273,6 @@ def test_folders_of_a_scene_become_stacks(tmp_path: Path) -> None:
     # Its own results are no photographs, although they lie within the folder that was named.
     again = ingest([tmp_path / "shoot"], tmp_path / "shoot" / "scene")
     assert [(each.name, each.kept) for each in again.stacks] == [("view_0", 2), ("view_1", 2)]
-
-
-def test_which_files_are_photographs(tmp_path: Path) -> None:
-    for name in ("b10.jpg", "b9.jpg", "a.CR2", "a.jpg", ".hidden.jpg", "notes.txt", "depth.exr"):
-        (tmp_path / name).write_text("")
-    (folder,), skipped = find_photos([tmp_path], tmp_path / "scene")
-    assert [path.name for path in folder.paths] == ["a.CR2", "b9.jpg", "b10.jpg"]
-    assert {each.path.name for each in skipped} == {"a.jpg", "depth.exr"}
-    (folder,), skipped = find_photos([tmp_path / "depth.exr", tmp_path / "notes.txt"], tmp_path / "scene")
-    assert [path.name for path in folder.paths] == ["depth.exr"]
-    assert [each.path.name for each in skipped] == ["notes.txt"]
-    with pytest.raises(InputError, match="there is nothing at"):
-        find_photos([tmp_path / "absent"], tmp_path / "scene")
 
 
 # --- damaged files, odd sizes, reruns ------------------------------------------------------------------------------
