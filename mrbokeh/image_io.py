@@ -41,9 +41,13 @@ def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], enco
 def read_layer(path: Path | str) -> Layer:
     """A layer from an EXR with R, G, B and, where present, A and Z (or depth.Z), in one part or several.
 
-    Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf.
+    Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf. Of several views (stereo)
+    it is the first that has colour, with its own depth.
     """
-    channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
+    parts = read_exr(path)
+    colour = next((part for part in parts if set("RGB") <= part.channels.keys()), parts[0])
+    of_one_view = [part for part in parts if part.attributes.get("view") == colour.attributes.get("view")]
+    channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
     rgb = ExrPart(channels).stacked("RGB")
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
     depth = next((channels[name] for name in _DEPTH_NAMES if name in channels), np.zeros(rgb.shape[:2])).astype(np.float32)

@@ -1,6 +1,7 @@
 """How long the networks take: `python -m tests.bench_network`.
 
-One training step and one picture of 576x384 px with circles of confusion up to 13 px, by PyTorch and by ONNX Runtime.
+One training step and one picture of 576x384 px with circles of confusion up to 13 px, by PyTorch and by ONNX Runtime;
+the yardstick is OpenCV's Gaussian blur of the same picture at the size of the largest circle of confusion.
 """
 
 import tempfile
@@ -9,11 +10,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
 from mrbokeh.lens import Lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
+from tests.machine import machine_line, memory_line
 from training.export_onnx import export_network
 from training.run_folder import RunFacts, build_network
 from training.settings import NetworkSettings, TrainSettings, demo_settings
@@ -55,11 +58,16 @@ def _times_ms(settings: NetworkSettings) -> tuple[float, float, float]:
 
 def main() -> None:
     print(f"{WIDTH_PX}x{HEIGHT_PX} px, circles of confusion up to {LARGEST_COC_PX:g} px, {torch.get_num_threads()} threads")
-    print("| network | parameters | training step ms | PyTorch ms | ONNX Runtime ms |\n|---|---|---|---|---|")
+    picture = np.ascontiguousarray(_slanted_scene()[0][0].permute(1, 2, 0).numpy())
+    yardstick_ms = _milliseconds(lambda: cv2.GaussianBlur(picture, (0, 0), LARGEST_COC_PX / 4), repeats=30)
+    print(f"yardstick, OpenCV Gaussian blur: {yardstick_ms:.2f} ms")
+    print("| network | parameters | training step ms | PyTorch ms | ONNX Runtime ms | over yardstick |\n|---|---|---|---|---|---|")
     for name, settings in FORMS.items():
         count = sum(each.numel() for each in build_network(TrainSettings(network=settings), FACTS).parameters())
         step, plain, exported = _times_ms(settings)
-        print(f"| {name} | {count} | {step:.0f} | {plain:.0f} | {exported:.0f} |")
+        print(f"| {name} | {count} | {step:.0f} | {plain:.0f} | {exported:.0f} | {exported / yardstick_ms:.0f} |")
+    print(memory_line())
+    print(machine_line())
 
 
 if __name__ == "__main__":

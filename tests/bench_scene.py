@@ -4,7 +4,6 @@
 with shading in numpy: first hit, interpolated normal, Lambert and one shadow ray per pixel; no textures, no edges, no panorama.
 """
 
-import resource
 import time
 from collections.abc import Callable
 
@@ -15,6 +14,7 @@ from mrbokeh.camera import Camera
 from mrbokeh.scene import Environment, Material, Scene, matte, rectangle, shadow_catcher, sphere, sun
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions
+from tests.machine import machine_line, memory_line
 
 CAMERA = Camera(640, 360, (520.0, 515.0), (320.0, 180.0))
 SUN = sun((0.5, 1.0, 0.3), 3.0)
@@ -81,7 +81,8 @@ def main() -> None:
     print(f"shadow mask on a catcher: {mask_wall_ms:.0f} ms, {mask_processor_ms:.0f} ms of processor time")
     print(f"yardstick trimesh + numpy Lambert: {yard_wall_ms:.0f} ms, {yard_processor_ms:.0f} ms of processor time")
     print(f"yardstick / picture: {yard_wall_ms / wall_ms:.2f} (wall), {yard_processor_ms / processor_ms:.2f} (processor)")
-    print(f"largest memory of the process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    print(memory_line())
+    print(machine_line())
 
 
 if __name__ == "__main__":

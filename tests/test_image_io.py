@@ -80,6 +80,15 @@ def test_real_single_part_layer(shared_data: Path) -> None:
     assert layer.depth_m.min() > 1.0
 
 
+def test_a_layer_of_a_stereo_file_keeps_to_one_view(shared_data: Path) -> None:
+    path = shared_data / "rgbd" / "beachball_multi.0001.exr"
+    layer = read_layer(path)
+    right = next(part for part in read_exr(path) if part.name == "depth_right").channels["Z"].astype(np.float32)
+    seen = np.isfinite(layer.depth_m)
+    assert seen.mean() > 0.1
+    np.testing.assert_array_equal(layer.depth_m[seen], right[seen])
+
+
 def test_highlights_of_real_files(shared_data: Path) -> None:
     assert read_image(shared_data / "hdr" / "golden_gate.exr").max() == pytest.approx(685.5, rel=1e-3)
     assert read_image(shared_data / "hdri" / "spiaggia_di_mondello_1k.hdr").max() == pytest.approx(72704.0)
