@@ -1,13 +1,13 @@
 """Depth from focus: in which slice, and between which two, every pixel is sharp, and how sure that is."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.lights import Lights, find_lights
+from capture.lights import Lights
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -43,9 +43,9 @@ def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
     return cv2.GaussianBlur((detail * detail).sum(axis=2), (0, 0), window_px)
 
 
-def depth_from_focus(registered: Callable[[], Iterable[Rgb]]) -> FocusMap:
-    """The focus map of slices in the order of their focus. registered: gives a fresh pass over them; four are made."""
-    return focus_map(np.stack([focus_energy(rgb) for rgb in registered()]), find_lights(registered))
+def depth_from_focus(registered: Iterable[Rgb], lights: Lights) -> FocusMap:
+    """The focus map of registered slices in the order of their focus; slices are read once."""
+    return focus_map(np.stack([focus_energy(rgb) for rgb in registered]), lights)
 
 
 def focus_map(energies: Volume, lights: Lights) -> FocusMap:

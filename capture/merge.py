@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from capture.alignment import Registration, register_stack, warp
 from capture.all_in_focus import all_in_focus
-from capture.depth_from_focus import FocusMap, focus_energy, focus_map
+from capture.depth_from_focus import FocusMap, depth_from_focus
 from capture.light_energy import with_light_energy
 from capture.lights import find_lights
 from mrbokeh.camera import Camera
@@ -44,7 +44,7 @@ def merge_stack(stack: FocalStack) -> FocalStack:
         return track(registered.iter_rgb(), f"{stack.folder.name}: {purpose}", len(stack))
 
     lights = find_lights(lambda: passes("lights"))
-    focus = focus_map(np.stack([focus_energy(rgb) for rgb in passes("focus")]), lights)
+    focus = depth_from_focus(passes("focus"), lights)
     sharp = all_in_focus(passes("all in focus"), focus.merge_index)
     picture = with_light_energy(sharp, passes("energy of lights"), lights)
     write_merged(stack.folder, picture, focus.focus_index, focus.confidence, depth_m_of(registered, focus))

@@ -6,6 +6,7 @@ import numpy as np
 from capture._semi_global_numba import aggregate_costs
 from capture.all_in_focus import all_in_focus, slice_weight
 from capture.depth_from_focus import FocusMap, depth_from_focus, peak_parabola
+from capture.lights import find_lights
 from mrbokeh.aperture import Aperture
 from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import opaque
@@ -29,7 +30,7 @@ def stack_of(rgb: np.ndarray, true_index: np.ndarray) -> list[np.ndarray]:
 
 
 def focus_of(slices: list[np.ndarray]) -> FocusMap:
-    return depth_from_focus(lambda: slices)
+    return depth_from_focus(slices, find_lights(lambda: slices))
 
 
 def test_a_flat_textured_plane_is_found_between_slices() -> None:

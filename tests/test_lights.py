@@ -68,7 +68,7 @@ def test_white_paper_is_not_a_light() -> None:
 
 def test_the_merged_picture_has_no_ghost_ring() -> None:
     stack = slices(scene())
-    focus = depth_from_focus(lambda: stack)
+    focus = depth_from_focus(stack, find_lights(lambda: stack))
     ring = np.s_[LIGHT_AT[0] - 5 : LIGHT_AT[0] + 6, LIGHT_AT[1] + 2 : LIGHT_AT[1] + 7]
     # Every slice but the light's own has light thrown on the ring; the texture alone never exceeds 0.3.
     assert max(each[ring].max() for each in stack) > 0.8
@@ -78,7 +78,7 @@ def test_the_merged_picture_has_no_ghost_ring() -> None:
 def test_energy_lost_to_saturation_is_found_in_the_discs() -> None:
     stack = slices(scene())
     lights = find_lights(lambda: stack)
-    merged = all_in_focus(stack, depth_from_focus(lambda: stack).merge_index)
+    merged = all_in_focus(stack, depth_from_focus(stack, find_lights(lambda: stack)).merge_index)
     assert merged.max() <= FULL
     restored = with_light_energy(merged, stack, lights)
     # In slice 4 the disc of 12 px spreads the light over 94 px, 0.95 above the wall: nothing is full there.
@@ -91,7 +91,7 @@ def test_a_light_that_fits_the_sensor_is_left_alone() -> None:
     dim = np.array([1.8, 1.7, 1.6], np.float32)
     stack = slices(scene(dim))
     lights = find_lights(lambda: stack)
-    merged = all_in_focus(stack, depth_from_focus(lambda: stack).merge_index)
+    merged = all_in_focus(stack, depth_from_focus(stack, find_lights(lambda: stack)).merge_index)
     np.testing.assert_allclose(with_light_energy(merged, stack, lights)[LIGHT_AT], dim, rtol=0.15)
 
 
