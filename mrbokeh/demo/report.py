@@ -54,28 +54,35 @@ def figure(picture: Path, page: Path, caption: str) -> str:
 
 
 def numbers_table(measurements: Sequence[Measurement]) -> str:
-    rows = [
-        f'<tr><td>{html.escape(each.what)}</td><td class="number">{html.escape(each.text)}</td>'
-        f'<td class="{"met" if each.met else "missed"}">{html.escape(each.wanted)}</td></tr>'
-        for each in measurements
-    ]
-    return "<table><tr><th>what</th><th>measured</th><th>wanted</th></tr>" + "".join(rows) + "</table>"
+    rows = [(_cell(each.what), _cell(each.text, "number"), _cell(each.wanted, "met" if each.met else "missed")) for each in measurements]
+    return _table(("what", "measured", "wanted"), rows)
 
 
 def _stage_table(done: Sequence[Done]) -> str:
     rows = [
-        f'<tr><td>{html.escape(each.stage.purpose)}</td><td class="number">{each.seconds:.1f} s</td>'
-        f"<td><code>{html.escape(each.stage.command_line)}</code></td></tr>"
+        (
+            _cell(each.stage.purpose),
+            _cell(f"{each.seconds:.1f} s", "number"),
+            f"<td><code>{html.escape(each.stage.command_line)}</code></td>",
+        )
         for each in done
     ]
-    return "<table><tr><th>stage</th><th>time</th><th>command</th></tr>" + "".join(rows) + "</table>"
+    return _table(("stage", "time", "command"), rows)
 
 
 def _versions() -> str:
-    rows = [("mrbokeh", __version__), ("Python", platform.python_version()), *((name, _version(name)) for name in PACKAGES)]
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    cells = [f"<tr><td>{html.escape(name)}</td><td>{html.escape(number)}</td></tr>" for name, number in (*rows, ("machine", machine))]
-    return "<table>" + "".join(cells) + "</table>"
+    numbers = [("mrbokeh", __version__), ("Python", platform.python_version()), *((name, _version(name)) for name in PACKAGES)]
+    return _table(("what", "version"), [(_cell(name), _cell(number)) for name, number in (*numbers, ("machine", machine))])
+
+
+def _cell(text: str, kind: str = "text") -> str:
+    return f'<td class="{kind}">{html.escape(text)}</td>'
+
+
+def _table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
+    return f"<table><tr>{head}</tr>" + "".join(f"<tr>{''.join(cells)}</tr>" for cells in rows) + "</table>"
 
 
 def _version(package: str) -> str:
