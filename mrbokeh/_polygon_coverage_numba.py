@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mean_ramp(t: float, low: float, high: float) -> float:
     """Mean of max(0, t - x) for x spread evenly over [low, high]."""
     if t <= low:
@@ -16,7 +16,7 @@ def _mean_ramp(t: float, low: float, high: float) -> float:
     return (t - low) ** 2 / (2.0 * (high - low))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_edge(steps: np.ndarray, x0: float, y0: float, x1: float, y1: float) -> None:
     """Add one directed edge; the running sum of `steps` along a row is the area to the right of the edge."""
     if y0 == y1:
@@ -34,7 +34,7 @@ def _add_edge(steps: np.ndarray, x0: float, y0: float, x1: float, y1: float) -> 
             steps[row, column] += weight * ramp_change
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def add_polygon_coverage(kernel: np.ndarray, steps: np.ndarray, outline: np.ndarray, scale_px: float, weight: float) -> None:
     """Add `weight` times the coverage of `outline * scale_px`, centred in `kernel` (K, K), K odd, large enough to hold it.
 
@@ -60,15 +60,31 @@ def add_polygon_coverage(kernel: np.ndarray, steps: np.ndarray, outline: np.ndar
             kernel[row, column] += signed_weight * coverage
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
+def _shown_diameter_px(diameter_px: float, unit_radius: float) -> float:
+    """`mrbokeh.psf.shown_diameter_px` for one number."""
+    size = abs(diameter_px)
+    if size <= 1.0:
+        return 0.0
+    full = 1.0 + 4.0 * (unit_radius - 1.0)
+    if size >= full:
+        return diameter_px
+    size = 1.0 / unit_radius + (size - 1.0) * (full - 1.0 / unit_radius) / (full - 1.0)
+    return size if diameter_px > 0.0 else -size
+
+
+@njit(cache=True, nogil=True)
 def fill_psf(kernel: np.ndarray, steps: np.ndarray, vertices: np.ndarray, starts: np.ndarray, weights: np.ndarray, coc_px: float) -> None:
-    """Overwrite `kernel` with the normalised PSF of weighted polygons at a signed diameter.
+    """Overwrite `kernel` with the normalised PSF of weighted polygons at a signed diameter; up to one pixel it is the identity.
 
     vertices: (V, 2) of all outlines one after the other; outline i is vertices[starts[i]:starts[i + 1]].
     """
     kernel[:] = 0.0
-    radius_px = 0.5 * coc_px
-    if abs(radius_px) < 1e-6:
+    reach = 0.0
+    for i in range(vertices.shape[0]):
+        reach = max(reach, vertices[i, 0] ** 2 + vertices[i, 1] ** 2)
+    radius_px = 0.5 * _shown_diameter_px(coc_px, math.sqrt(reach))
+    if radius_px == 0.0:
         kernel[kernel.shape[0] // 2, kernel.shape[1] // 2] = 1.0
         return
     for i in range(weights.shape[0]):

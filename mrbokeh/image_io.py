@@ -17,6 +17,7 @@ Encoding = Literal["srgb", "linear"]
 INTEGER_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 LINEAR_SUFFIXES = (".exr", ".hdr")
 _DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z")
+_LONE_DEPTH_NAMES = (*_DEPTH_NAMES, "Y")
 _INTEGER_RANGE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
 
@@ -38,11 +39,37 @@ def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], enco
         _write_integer_image(path, np.asarray(rgb, np.float32), encoding)
 
 
-def read_layer(path: Path | str) -> Layer:
+def read_linear(path: Path | str) -> Float32[np.ndarray, "height width 3"]:
+    """A picture that is scene-linear as stored (EXR, HDR, float TIFF); a file of integers is refused, for it is encoded for display."""
+    path = Path(path)
+    if path.is_file() and path.suffix.lower() in INTEGER_SUFFIXES and _decode(path).dtype.kind != "f":
+        raise InputError(
+            f"{path}: expected scene-linear values (EXR, HDR or float TIFF), but it stores {_decode(path).dtype} made for display, without "
+            f"highlights: develop the RAW file to EXR, or say that it is sRGB if that is all there is"
+        )
+    rgb = read_image(path)
+    if not np.isfinite(rgb).all():
+        raise InputError(f"{path}: {int((~np.isfinite(rgb)).any(axis=2).sum())} pixels are NaN or infinite: mend them first")
+    return rgb
+
+
+def read_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
+    """Depth along the optical axis in metres from an EXR with Z, depth.Z or Y; inf and what is not above 0 is background (inf)."""
+    channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
+    name = next((name for name in _LONE_DEPTH_NAMES if name in channels), None)
+    if name is None:
+        raise InputError(f"{path}: expected depth in a channel {', '.join(_LONE_DEPTH_NAMES)}, but it has {', '.join(sorted(channels))}")
+    depth_m = channels[name].astype(np.float32)
+    if np.isnan(depth_m).any():
+        raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of {name} are NaN: write inf (or 0) where there is background")
+    return np.where(depth_m > 0, depth_m, np.float32(np.inf))
+
+
+def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     """A layer from an EXR with R, G, B and, where present, A and Z (or depth.Z), in one part or several.
 
     Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf. Of several views (stereo)
-    it is the first that has colour, with its own depth.
+    it is the first that has colour, with its own depth. extra: keep all other channels too, each under its own name.
     """
     parts = read_exr(path)
     colour = next((part for part in parts if set("RGB") <= part.channels.keys()), parts[0])
@@ -51,14 +78,21 @@ def read_layer(path: Path | str) -> Layer:
     rgb = ExrPart(channels).stacked("RGB")
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
     depth = next((channels[name] for name in _DEPTH_NAMES if name in channels), np.zeros(rgb.shape[:2])).astype(np.float32)
-    return Layer(rgb, alpha, np.where((depth > 0) & (alpha > 0), depth, np.inf).astype(np.float32))
+    others = sorted(channels.keys() - set("RGBA") - set(_DEPTH_NAMES)) if extra else []
+    depth_m = np.where((depth > 0) & (alpha > 0), depth, np.inf).astype(np.float32)
+    return Layer(rgb, alpha, depth_m, {name: channels[name].astype(np.float32)[..., None] for name in others})
 
 
 def write_layer(path: Path | str, layer: Layer, *, half: bool = True) -> None:
-    """A layer as EXR: R, G, B, A in half or float and Z (metres along the optical axis, not antialiased) in float."""
+    """A layer as EXR: R, G, B, A in half or float; Z (metres along the optical axis, not antialiased) and extra channels in float.
+
+    An extra channel of one component keeps its name, others become NAME.0, NAME.1 and so on.
+    """
     colour = np.float16 if half else np.float32
     channels = {name: layer.rgb[..., i].astype(colour) for i, name in enumerate("RGB")}
     channels |= {"A": layer.alpha.astype(colour), "Z": layer.depth_m.astype(np.float32)}
+    for name, values in layer.extra.items():
+        channels |= {name if values.shape[2] == 1 else f"{name}.{i}": values[..., i] for i in range(values.shape[2])}
     write_exr(path, ExrPart(channels, attributes={"comments": "premultiplied alpha; Z in metres along the optical axis, not antialiased"}))
 
 

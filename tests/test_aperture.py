@@ -2,14 +2,29 @@ import numpy as np
 import pytest
 from shapely import Polygon, box
 
+from mrbokeh._polygon_coverage_numba import _shown_diameter_px
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
+from mrbokeh.psf import shown_diameter_px
 
+SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 APERTURES = {
     "disc": Aperture.disc(),
     "triangle": Aperture.blades(3, 0.1),
     "hexagon": Aperture.blades(6),
     "heptagon": Aperture.blades(7, 0.5),
+    "curved": Aperture.blades(5, 0.3, curvature=0.5),
+    "hollow": Aperture.blades(5, 0.3, curvature=-0.8),
+    "ring": Aperture.ring(0.6),
+    "star": Aperture.star(5, 0.4),
+    "heart": Aperture.heart(),
+    "anamorphic": Aperture.blades(6).squeezed(2.0),
+}
+REACHING_OUT = {
+    "square": Aperture((SQUARE,), (1.0,)),
+    "displaced disc": Aperture((Aperture.disc().outlines[0] + [0.3, -0.1],), (1.0,)),
+    "wide": Aperture.disc().squeezed(0.5),
+    "disc": Aperture.disc(),
 }
 
 
@@ -30,6 +45,12 @@ def test_rasterized_areas_are_exact(name: str, diameter_px: float) -> None:
     np.testing.assert_allclose(kernel, coverage_by_clipping(APERTURES[name], diameter_px), atol=1e-12)
 
 
+@pytest.mark.parametrize("name", APERTURES)
+def test_in_front_of_the_focus_it_is_mirrored(name: str) -> None:
+    behind, in_front = (APERTURES[name].rasterize(diameter_px).kernel for diameter_px in (17.3, -17.3))
+    np.testing.assert_allclose(in_front, behind[::-1, ::-1], atol=1e-15)
+
+
 def test_a_ring_is_its_outer_less_its_inner_outline() -> None:
     ring = Aperture.disc(48).obstructed(0.5)
     kernel = ring.rasterize(20.0).kernel
@@ -38,17 +59,35 @@ def test_a_ring_is_its_outer_less_its_inner_outline() -> None:
 
 
 @pytest.mark.parametrize("diameter_px", [-14.0, 0.0, 0.3, 0.99, 1.4, 25.7])
-def test_the_sum_is_one(diameter_px: float) -> None:
-    for aperture in APERTURES.values():
-        np.testing.assert_allclose(aperture.rasterize(diameter_px).kernel.sum(), 1.0, rtol=1e-12)
+def test_the_sum_is_one_and_no_light_is_negative(diameter_px: float) -> None:
+    for aperture in (APERTURES | REACHING_OUT).values():
+        kernel = aperture.rasterize(diameter_px).kernel
+        np.testing.assert_allclose(kernel.sum(), 1.0, rtol=1e-12)
+        assert kernel.min() > -1e-15
 
 
-def test_below_one_pixel_it_is_the_identity_and_grows_smoothly_from_there() -> None:
-    blades = Aperture.blades(6)
-    assert blades.rasterize(0.0).kernel.tolist() == [[1.0]]
-    assert blades.rasterize(0.999).kernel.tolist() == [[1.0]]
-    centres = [blades.rasterize(diameter_px).kernel.max() for diameter_px in np.arange(0.9, 2.0, 0.01)]
-    assert np.abs(np.diff(centres)).max() < 0.02
+@pytest.mark.parametrize("name", APERTURES | REACHING_OUT)
+def test_up_to_one_pixel_it_is_the_identity_and_grows_smoothly_from_there(name: str) -> None:
+    aperture = (APERTURES | REACHING_OUT)[name]
+    for diameter_px in (0.0, 0.5, -0.999, 1.0):
+        assert aperture.rasterize(diameter_px).kernel.tolist() == [[1.0]]
+    kernels = [aperture.rasterize(diameter_px).kernel for diameter_px in np.arange(0.9, 3.5, 0.01)]
+    padded = [np.pad(kernel, (9 - len(kernel)) // 2) for kernel in kernels]
+    # Where the edges of the opening sweep over pixels, light moves by at most its change of area, about 2 diameter_step / diameter.
+    assert np.abs(np.diff(padded, axis=0)).sum(axis=(1, 2)).max() < 0.06
+
+
+@pytest.mark.parametrize("unit_radius", [0.5, 1.0, 1.0016, 1.2, 1.5])
+def test_the_diameter_that_is_drawn(unit_radius: float) -> None:
+    """Continuous where it starts (filling the pixel) and where it ends, growing throughout; numpy and numba agree."""
+    diameters_px = np.linspace(-6.0, 6.0, 1201)
+    drawn_px = shown_diameter_px(diameters_px, unit_radius)
+    np.testing.assert_allclose(drawn_px, [_shown_diameter_px(d, unit_radius) for d in diameters_px], rtol=1e-14)
+    true_size = np.abs(diameters_px) >= max(1 + 4 * (unit_radius - 1), 1.0) + 1e-9
+    np.testing.assert_array_equal(drawn_px[true_size], diameters_px[true_size])
+    assert float(shown_diameter_px(1.0 + 1e-9, unit_radius)) * max(unit_radius, 1.0) == pytest.approx(1.0, abs=1e-6)
+    above = drawn_px[diameters_px > 1.0]
+    assert np.diff(above).min() > 0.0 and np.diff(above).max() < 0.0126, "at most 1.25 times as fast as without"
 
 
 def test_the_disc_has_the_area_of_the_disc() -> None:
@@ -71,3 +110,13 @@ def test_malformed_apertures_are_refused() -> None:
         Aperture.blades(2)
     with pytest.raises(InputError, match="below 1"):
         Aperture.disc().obstructed(1.0)
+    with pytest.raises(InputError, match="finite numbers"):
+        Aperture((SQUARE * np.nan,), (1.0,))
+    with pytest.raises(InputError, match="finite diameter"):
+        Aperture.disc().rasterize(np.nan)
+
+
+@pytest.mark.parametrize("weights", [(1.0, -1.0), (1.0, -2.0), (-1.0, 0.5), (0.0, 0.0)])
+def test_without_light_there_is_no_aperture(weights: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match="must let light through"):
+        Aperture((SQUARE, SQUARE), weights)

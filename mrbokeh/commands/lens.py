@@ -1,13 +1,26 @@
 """`mrbokeh lens`: make, inspect and draw lens files."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from mrbokeh.errors import InputError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="Make, inspect and draw lens files.")
+
+SHAPES = {
+    "disc": (),
+    "polygon": ("blades", "curvature"),
+    "ring": ("inner",),
+    "star": ("blades", "inner"),
+    "heart": (),
+    "image": ("image", "levels"),
+    "outline": ("path",),
+}
+"""What each shape of an aperture is made from, in the words of the lens file."""
+
+NO_COLOUR = (0.0, 0.0, 0.0)
 
 
 @app.command()
@@ -17,25 +30,65 @@ def new(
     f_number: Annotated[float, typer.Option(help="f-number.")],
     focus: Annotated[float, typer.Option(help="Focus distance from the lens in metres; inf is allowed.")],
     sensor_width: Annotated[float, typer.Option(help="Sensor width in mm (36 for full frame, 23.5 for APS-C).")] = 36.0,
-    blades: Annotated[int, typer.Option(help="Blades of the iris; 0 is a round opening.")] = 0,
-    rotation: Annotated[float, typer.Option(help="Rotation of the blades in degrees.")] = 0.0,
+    shape: Annotated[
+        str, typer.Option(help=f"Shape of the opening: {', '.join(SHAPES)}. (disc where none is given, polygon where --blades is.)")
+    ] = "",
+    blades: Annotated[int, typer.Option(help="Blades of the iris, or points of a star; 0 is a round opening.")] = 0,
+    rotation: Annotated[float, typer.Option(help="Rotation of the opening in degrees.")] = 0.0,
+    curvature: Annotated[float, typer.Option(help="Curvature of the blades: 0 straight, 1 round, negative inwards.")] = 0.0,
+    inner: Annotated[float | None, typer.Option(help="Inner share of the radius of a ring or star, 0 to 1.")] = None,
+    image: Annotated[Path | None, typer.Option(help="Picture of the opening, light where open (shape image).")] = None,
+    levels: Annotated[int, typer.Option(help="Steps of grey in that picture; 1 is open or closed.")] = 1,
+    path: Annotated[str | None, typer.Option(help="d attribute of an SVG path (shape outline).")] = None,
+    squeeze: Annotated[float, typer.Option(help="Anamorphic squeeze, e.g. 1.33 or 2; 1 is none.")] = 1.0,
+    cat_eye: Annotated[float, typer.Option(help="How far the rim is off the pupil in the corner, in pupil radii.")] = 0.0,
+    spherical_aberration: Annotated[float, typer.Option(help="-1 to 1; positive: bright rims behind the focus.")] = 0.0,
+    axial_chromatic: Annotated[tuple[float, float, float], typer.Option(help="Change of blur size of R G B behind the focus.")] = NO_COLOUR,
+    lateral_chromatic: Annotated[tuple[float, float, float], typer.Option(help="Displacement of the blur of R G B.")] = NO_COLOUR,
+    tilt: Annotated[tuple[float, float], typer.Option(help="Tilt of the lens to the right and downwards in degrees.")] = (0.0, 0.0),
+    petzval_radius: Annotated[float, typer.Option(help="Radius of the curved field in mm; inf is flat.")] = float("inf"),
     overwrite: Annotated[bool, typer.Option(help="Replace the file where it exists.")] = False,
 ) -> None:
     """Write a lens file.
 
-    Example: mrbokeh lens new lens.json --focal-length 50 --f-number 1.8 --focus 0.8 --blades 7
+    Example: mrbokeh lens new lens.json --focal-length 50 --f-number 1.8 --focus 0.8 --blades 7 --curvature 0.3
     """
-    import math
-
-    from mrbokeh.aperture import Aperture
     from mrbokeh.atomic_files import refuse_existing
-    from mrbokeh.lens import Lens
-    from mrbokeh.lens_file import write_lens
+    from mrbokeh.lens_file import lens_from_json, write_lens
 
     refuse_existing(out, overwrite)
-    aperture = Aperture.blades(blades, math.radians(rotation)) if blades else Aperture.disc()
-    write_lens(out, Lens(focal_length, f_number, focus, sensor_width, aperture))
+    parts = {"blades": blades or None, "curvature": curvature or None, "inner": inner, "path": path}
+    parts |= {"image": None if image is None else str(image), "levels": None if levels == 1 else levels}
+    document = {
+        "focal_length_mm": focal_length,
+        "f_number": f_number,
+        "focus_distance_m": focus,
+        "sensor_width_mm": sensor_width,
+        "tilt_deg": list(tilt),
+        "petzval_radius_mm": petzval_radius,
+        "aperture": {
+            **_shape_of(shape, {key: value for key, value in parts.items() if value is not None}),
+            "rotation_deg": rotation,
+            "squeeze": squeeze,
+            "cat_eye": cat_eye,
+            "spherical_aberration": spherical_aberration,
+            "axial_chromatic": list(axial_chromatic),
+            "lateral_chromatic": list(lateral_chromatic),
+        },
+    }
+    write_lens(out, lens_from_json(document, "the new lens"))
     typer.echo(f"wrote {out}")
+
+
+def _shape_of(shape: str, given: dict[str, Any]) -> dict[str, Any]:
+    """The shape with what it is made from; an option that the shape has no use for is a mistake."""
+    shape = shape or ("polygon" if "blades" in given else "disc")
+    if shape not in SHAPES:
+        raise InputError(f"expected --shape out of {', '.join(SHAPES)}, got {shape!r}")
+    if stray := [f"--{key}" for key in given if key not in SHAPES[shape]]:
+        fits = ", ".join(name for name, keys in SHAPES.items() if all(key in keys for key in given)) or "no shape"
+        raise InputError(f"{', '.join(stray)} does nothing for the shape {shape}: choose another --shape ({fits} takes what was given)")
+    return {"shape": shape, **given}
 
 
 @app.command()
@@ -44,13 +97,13 @@ def coc(
     depths: Annotated[list[float], typer.Argument(help="Depths in metres.")],
     width: Annotated[int, typer.Option(help="Image width in pixels.")] = 1920,
 ) -> None:
-    """Print the circle of confusion (diameter, pixels; negative in front of the focus) at some depths.
+    """Print the circle of confusion (diameter, pixels; negative in front of the focus) at some depths, on the axis.
 
     Example: mrbokeh lens coc lens.json 0.5 1 2 inf --width 1920
     """
     from mrbokeh.lens_file import read_lens
 
-    if min(depths) <= 0:
+    if not min(depths) > 0:
         raise InputError(f"depths must be positive metres, got {depths}")
     read = read_lens(lens)
     for depth_m in depths:
@@ -64,7 +117,7 @@ def show(
     width: Annotated[int, typer.Option(help="Image width in pixels.")] = 1920,
     overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
 ) -> None:
-    """Draw the blur of a lens: its kernels behind and in front of the focus, and the circle of confusion over depth.
+    """Draw the blur of a lens: its kernels over diameter and field, its outlines and low-rank error, and blur over depth.
 
     Example: mrbokeh lens show lens.json --out lens.png
     """
@@ -72,6 +125,8 @@ def show(
     from mrbokeh.lens_drawing import draw_lens
     from mrbokeh.lens_file import read_lens
 
+    if out.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise InputError(f"cannot draw {out}: expected .png, .pdf or .svg")
     refuse_existing(out, overwrite)
     figure = draw_lens(read_lens(lens), width)
     with atomic_path(out) as temporary:

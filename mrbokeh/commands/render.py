@@ -1,4 +1,4 @@
-"""`mrbokeh render`: blur layers as a lens does."""
+"""`mrbokeh render`: blur a picture with depth, or layers, as a lens does."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,38 +6,101 @@ from typing import Annotated
 import typer
 
 from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
 
 app = typer.Typer(add_completion=False)
 
 
 @app.command()
 def render(
-    layers: Annotated[list[Path], typer.Argument(help="EXR layers with R, G, B, A (premultiplied) and Z in metres; front first.")],
     lens: Annotated[Path, typer.Option(help="Lens file (LENS.json), see `mrbokeh lens new`.")],
-    out: Annotated[Path, typer.Option(help="Where the blurred layer goes: .exr keeps alpha; .png, .tif and .jpg lie over black.")],
-    renderer: Annotated[str, typer.Option(help="reference, or the path of a trained network (.onnx).")] = "reference",
-    focus: Annotated[float | None, typer.Option(help="Focus distance in metres in place of the lens file's.")] = None,
+    out: Annotated[Path, typer.Option(help="Where the result goes: .exr, or .png, .tif, .jpg (over black).")],
+    rgb: Annotated[Path | None, typer.Option(help="All-in-focus picture, scene-linear: .exr, .hdr or float .tif.")] = None,
+    depth: Annotated[Path | None, typer.Option(help="Its depth: EXR channel Z, depth.Z or Y in metres; inf or <= 0: background.")] = None,
+    layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with R, G, B, A (premultiplied) and Z; repeat it, front first.")] = None,
+    method: Annotated[str, typer.Option(help="polygon, low-rank, scatter (exact, slow), or a trained network (.onnx).")] = "polygon",
+    focus_distance_m: Annotated[float | None, typer.Option(help="Focus distance in place of the lens file's; inf is allowed.")] = None,
+    focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None,
+    srgb: Annotated[bool, typer.Option("--srgb", help="--rgb holds integers encoded as sRGB (highlights are lost).")] = False,
+    alpha_out: Annotated[bool, typer.Option("--alpha-out", help="Write A, Z and all extra channels of the layers beside R, G, B.")] = False,
+    slices: Annotated[int, typer.Option(help="How many slices of depth at most.", min=1)] = 16,
+    threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0)] = 0,
     overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
 ) -> None:
-    """Blur layers as a lens does.
+    """Blur a picture with depth, or layers, as a lens does. Layers lie in front of the picture.
 
-    Example: mrbokeh render object.exr --lens lens.json --focus 0.8 --out blurred.exr
+    Example: mrbokeh render --rgb aif.exr --depth z.exr --lens lens.json --focus-at 640,360 --out blurred.exr
     """
     from mrbokeh.atomic_files import refuse_existing
-    from mrbokeh.image_io import read_layer, write_image, write_layer
+    from mrbokeh.image_io import write_image, write_layer
+    from mrbokeh.layering import Layering
     from mrbokeh.lens_file import read_lens
     from mrbokeh.renderers.choose import make_renderer
 
     refuse_existing(out, overwrite)
-    sharp = [read_layer(path) for path in layers]
-    if len({layer.alpha.shape for layer in sharp}) > 1:
-        raise InputError(
-            "the layers differ in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in zip(layers, sharp, strict=True))
-        )
-    used = read_lens(lens) if focus is None else read_lens(lens).focused_at(focus)
-    blurred = make_renderer(renderer).render(sharp, used)
-    if out.suffix.lower() == ".exr":
+    if alpha_out and out.suffix.lower() != ".exr":
+        raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
+    sharp = _read(rgb, depth, layer or [], srgb)
+    used = _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
+    blurred = make_renderer(method, threads=threads, layering=Layering(slices=slices)).render(list(sharp.values()), used)
+    if alpha_out:
         write_layer(out, blurred)
     else:
         write_image(out, blurred.rgb)
     typer.echo(f"wrote {out}")
+
+
+def _read(rgb: Path | None, depth: Path | None, layers: list[Path], srgb: bool) -> dict[str, Layer]:
+    """What to blur by where it came from, front first."""
+    from mrbokeh.image_io import read_layer
+
+    sharp = {str(path): read_layer(path, extra=True) for path in layers}
+    if (rgb is None) != (depth is None):
+        raise InputError("--rgb and --depth belong together: give both, or only --layer")
+    if rgb is not None and depth is not None:
+        sharp[str(rgb)] = _picture(rgb, depth, srgb)
+    if not sharp:
+        raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
+    if len({each.alpha.shape for each in sharp.values()}) > 1:
+        raise InputError("what is to be blurred differs in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in sharp.items()))
+    return _with_all_extras(sharp)
+
+
+def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
+    from mrbokeh.image_io import read_depth, read_image, read_linear
+    from mrbokeh.layer import opaque
+
+    colour, depth_m = read_image(rgb) if srgb else read_linear(rgb), read_depth(depth)
+    if colour.shape[:2] != depth_m.shape:
+        sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
+        raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
+    return opaque(colour, depth_m)
+
+
+def _with_all_extras(sharp: dict[str, Layer]) -> dict[str, Layer]:
+    """Every layer with the extra channels of all, 0 where a layer has none of that name."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    names = sorted({name for each in sharp.values() for name in each.extra})
+    zeros = {path: np.zeros((*each.alpha.shape, 1), np.float32) for path, each in sharp.items()}
+    return {path: replace(each, extra={name: each.extra.get(name, zeros[path]) for name in names}) for path, each in sharp.items()}
+
+
+def _focused(lens: Lens, sharp: dict[str, Layer], focus_distance_m: float | None, focus_at: str | None) -> Lens:
+    """The lens at the distance that was asked for, or focused on what is frontmost at a pixel."""
+    if focus_distance_m is not None and focus_at is not None:
+        raise InputError("give either --focus-distance-m or --focus-at, not both")
+    if focus_distance_m is not None:
+        return lens.focused_at(focus_distance_m)
+    if focus_at is None:
+        return lens
+    from mrbokeh.layer import flatten
+
+    try:
+        x_px, y_px, radius_px = (*map(int, focus_at.split(",")), 0)[:3]
+    except ValueError:
+        raise InputError(f"--focus-at: expected X,Y or X,Y,RADIUS in whole pixels, got {focus_at!r}") from None
+    return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, radius_px)

@@ -9,7 +9,8 @@ from mrbokeh._polygon_coverage_numba import fill_psf
 
 
 @njit(cache=True, nogil=True)
-def scatter_pixels(
+def scatter_rows(
+    padded: np.ndarray,
     values: np.ndarray,
     coc_px: np.ndarray,
     margin_px: int,
@@ -17,12 +18,16 @@ def scatter_pixels(
     vertices: np.ndarray,
     starts: np.ndarray,
     weights: np.ndarray,
-) -> np.ndarray:
-    """Spread values (H, W, C) by the PSF of each pixel; `margin_px` is the radius of the largest kernel."""
+) -> None:
+    """Add values (H, W, C), each spread by its pixel's PSF, to padded (H + 2 margin, W + 2 margin, C); margin: the largest kernel's radius."""
     height, width, channels = values.shape
-    padded = np.zeros((height + 2 * margin_px, width + 2 * margin_px, channels))
     for y in range(height):
         for x in range(width):
+            lit = False
+            for c in range(channels):
+                lit = lit or values[y, x, c] != 0.0
+            if not lit:
+                continue
             diameter_px = coc_px[y, x]
             radius_px = max(0, int(math.ceil(abs(diameter_px) * 0.5 * unit_radius - 0.5)))
             size = 2 * radius_px + 1
@@ -33,4 +38,3 @@ def scatter_pixels(
                 for i in range(size):
                     for c in range(channels):
                         padded[top + j, left + i, c] += kernel[j, i] * values[y, x, c]
-    return padded[margin_px : margin_px + height, margin_px : margin_px + width].copy()

@@ -1,39 +1,54 @@
 """A renderer by its name on the command line; the only module that knows them all."""
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from mrbokeh.errors import InputError
+from mrbokeh.layering import Layering
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 
+DEFAULT = "polygon"
 
-def _scatter_reference() -> Renderer:
+
+def _scatter(**settings: Any) -> Renderer:
     from mrbokeh.renderers.scatter_reference import ScatterReference
 
-    return ScatterReference()
+    return ScatterReference(**settings)
 
 
-BY_NAME: dict[str, Callable[[], Renderer]] = {"reference": _scatter_reference}
+def _polygon(**settings: Any) -> Renderer:
+    from mrbokeh.renderers.polygon_differences import PolygonDifferences
+
+    return PolygonDifferences(**settings)
 
 
-def make_renderer(name: str) -> Renderer:
-    """The renderer of that name, or the network in that .onnx file."""
+def _low_rank(**settings: Any) -> Renderer:
+    from mrbokeh.renderers.low_rank_filter import LowRankFilter
+
+    return LowRankFilter(**settings)
+
+
+BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "scatter": _scatter}
+
+
+def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None) -> Renderer:
+    """The renderer of that name, or the network in that .onnx file (which takes every layer as it is, without slices)."""
     if name in BY_NAME:
-        return BY_NAME[name]()
+        return BY_NAME[name](threads=threads, layering=layering or Layering())
     if name.lower().endswith(".onnx"):
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
-        return OnnxNetwork(Path(name))
+        return OnnxNetwork(Path(name), threads)
     raise InputError(f"expected a renderer ({', '.join(BY_NAME)}) or the path of a network (.onnx), got {name!r}")
 
 
 def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | None, Renderer]:
-    """What `--lens` and `--renderer` mean together: a network brings its lens, a lens file is rendered by the reference."""
+    """What `--lens` and `--renderer` mean together: a network brings its lens, a lens file is rendered by the default."""
     if lens is not None and lens.suffix.lower() == ".onnx":
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
         network = OnnxNetwork(lens)
         return network.lens, network if renderer is None else make_renderer(renderer)
-    return None if lens is None else read_lens(lens), make_renderer(renderer or "reference")
+    return None if lens is None else read_lens(lens), make_renderer(renderer or DEFAULT)

@@ -4,47 +4,81 @@ Slow and obvious: no kernel is rounded, cached or shared; everything is summed i
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from os import cpu_count
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, flatten
+from mrbokeh.layer import Layer
+from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
 from mrbokeh.psf import kernel_radius_px
+
+_BAND_PX = 64  # rows that are summed by themselves; fixed, so that the sum does not depend on the number of threads
 
 
 @dataclass(frozen=True)
 class ScatterReference:
-    """A Renderer: within a layer the spread light of all pixels adds up, between layers "over" decides.
+    """A Renderer that spreads by exact kernels; layers, slices and hidden background as in mrbokeh.layering.
 
-    Where pixels of one layer but of different depth spread over one another their coverage can sum to more than 1;
-    it is then divided by that sum, so that an opaque layer never becomes more than opaque. Light spread beyond the
-    border is lost: pad the layers where what lies outside matters.
+    threads: 0 takes all cores.
     """
 
+    layering: Layering = Layering()
+    threads: int = 0
+
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        return flatten([blur_layer(layer, lens.coc_px(layer.depth_m, layer.width_px), lens.aperture) for layer in layers])
+        return render_layers(layers, lens, self.spread, self.layering)
+
+    def spread(
+        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+    ) -> Float32[np.ndarray, "height width channels"]:
+        """See mrbokeh.spreading.Spread."""
+        return scatter(values.astype(np.float64), coc_px, aperture, self.threads).astype(np.float32)
 
 
 def blur_layer(layer: Layer, coc_px: Float[np.ndarray, "height width"], aperture: Aperture) -> Layer:
-    """One layer through one PSF per pixel; coc_px (H, W) is the signed diameter of each pixel's blur."""
+    """One layer through one PSF per pixel and nothing else: the light of all pixels adds up, whatever their depth.
+
+    Where coverage sums to more than 1 it is divided by that sum; light that leaves the frame is lost.
+    """
     spread = scatter(np.dstack([layer.rgb, layer.alpha]).astype(np.float64), coc_px, aperture)
     spread /= np.maximum(spread[..., 3:], 1.0)
     return Layer(spread[..., :3].astype(np.float32), spread[..., 3].astype(np.float32), layer.depth_m)
 
 
 def scatter(
-    values: Float64[np.ndarray, "height width channels"], coc_px: Float[np.ndarray, "height width"], aperture: Aperture
+    values: Float64[np.ndarray, "height width channels"],
+    coc_px: Float[np.ndarray, "height width"],
+    aperture: Aperture,
+    threads: int = 0,
 ) -> Float64[np.ndarray, "height width channels"]:
     """Sum over all pixels of value times PSF; a pixel without any value has no say, whatever its circle of confusion."""
-    from mrbokeh.renderers._scatter_reference_numba import scatter_pixels
-
     diameters_px = np.where(np.any(values != 0, axis=-1), coc_px, 0.0).astype(np.float64)
     if not np.isfinite(diameters_px).all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
-    largest_px = float(np.abs(diameters_px).max(initial=0.0))
-    radius_px = kernel_radius_px(largest_px, aperture.unit_radius)
-    return scatter_pixels(values, diameters_px, radius_px, aperture.unit_radius, *aperture.packed())
+    margin_px = kernel_radius_px(float(np.abs(diameters_px).max(initial=0.0)), aperture.unit_radius)
+    height, width, channels = values.shape
+    padded = np.zeros((height + 2 * margin_px, width + 2 * margin_px, channels))
+    with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
+        bands = pool.map(lambda top: _band(values, diameters_px, top, aperture), range(0, height, _BAND_PX))
+        for top, (band, reach_px) in zip(range(0, height, _BAND_PX), bands, strict=True):
+            side = margin_px - reach_px
+            padded[top + side : top + side + band.shape[0], side : side + band.shape[1]] += band
+    return padded[margin_px : margin_px + height, margin_px : margin_px + width].copy()
+
+
+def _band(values: np.ndarray, diameters_px: np.ndarray, top: int, aperture: Aperture) -> tuple[np.ndarray, int]:
+    """The light of a band of rows with the margin it reaches, and that margin."""
+    from mrbokeh.renderers._scatter_reference_numba import scatter_rows
+
+    rows = slice(top, top + _BAND_PX)
+    reach_px = kernel_radius_px(float(np.abs(diameters_px[rows]).max(initial=0.0)), aperture.unit_radius)
+    height, width, channels = values[rows].shape
+    padded = np.zeros((height + 2 * reach_px, width + 2 * reach_px, channels))
+    scatter_rows(padded, values[rows], diameters_px[rows], reach_px, aperture.unit_radius, *aperture.packed())
+    return padded, reach_px

@@ -1,0 +1,122 @@
+"""Layering: layers with depth become slices of the circle of confusion, and slices, spread one by one, become a picture again.
+
+Shared by all renderers that spread light; they differ in the `Spread` alone.
+
+1. Every layer is continued beyond the frame by the largest blur: an opaque one mirrored, one with holes transparent.
+2. Layers are rendered one by one and laid over one another, but an opaque layer together with what is behind it, and
+   layers that interleave in depth together.
+3. Pixels are sorted into slices of equal steps of the signed circle of confusion, hard: a pixel shared between slices
+   would let light through an opaque surface. Within a slice each pixel keeps its own circle of confusion.
+4. Front to back, each slice takes what is still free of the pupil at every pixel, at most its own coverage. Slices of
+   one surface share the pupil side by side, so coverage adds up and neither seams nor slanted surfaces turn
+   translucent, as they would under "over". What the pinhole picture shows goes first. What hides there, real layers
+   before filled-in background (mrbokeh.hidden_background), gets what is left: the part of the pupil that looks past
+   the edge of the occluder.
+5. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrbokeh.errors import InputError
+from mrbokeh.hidden_background import hidden_background
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.slices import Channels, Sheet, Slicing, composited, continued, sheet_of
+from mrbokeh.spreading import FIELD_CELLS, Frame, Spread, reach_px
+
+_ONE_SURFACE_PX = 1.0
+_NOTHING_TAKEN = 1e-6
+
+
+@dataclass(frozen=True)
+class Layering:
+    """How layers are cut and put together.
+
+    slices: how many at most over the whole range of circles of confusion. fill: whether an opaque layer is continued
+    behind what is near. field_cells: columns and rows in which the aperture is taken as the same (cat-eyes).
+    """
+
+    slices: int = 16
+    fill: bool = True
+    field_cells: tuple[int, int] = FIELD_CELLS
+
+
+def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread, layering: Layering) -> Layer:
+    """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first."""
+    sheets = [sheet_of(layer, lens) for layer in _checked(layers)]
+    margin = reach_px(lens.aperture, max(float(np.abs(sheet.coc_px).max()) for sheet in sheets))
+    frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
+    slicing = Slicing(lens.aperture, spread, layering.slices, layering.field_cells, frame)
+    inside = np.s_[margin : margin + frame.height_px, margin : margin + frame.width_px]
+    groups = _groups([continued(sheet, margin) for sheet in sheets])
+    colour, taken = _rendered(groups[-1], layering, slicing, inside)
+    for group in reversed(groups[:-1]):
+        colour, taken = _over(*_rendered(group, layering, slicing, inside), colour, taken)
+    return _as_layer(colour, taken, layers)
+
+
+def _checked(layers: Sequence[Layer]) -> Sequence[Layer]:
+    if not layers:
+        raise InputError("nothing to render: expected at least one layer, got none")
+    sizes = {layer.alpha.shape for layer in layers}
+    if len(sizes) > 1:
+        raise InputError(f"layers must be of one size, but came as {sorted((w, h) for h, w in sizes)} (width, height): resize them")
+    names = {tuple((name, values.shape[2]) for name, values in layer.extra.items()) for layer in layers}
+    if len(names) > 1:
+        raise InputError(f"layers must have the same extra channels in the same order, but came with {sorted(names)}")
+    return layers
+
+
+def _groups(sheets: Sequence[Sheet]) -> list[list[Sheet]]:
+    """Sheets that must be rendered together, front first."""
+    groups = [[sheets[0]]]
+    for sheet in sheets[1:]:
+        if any(front.is_opaque or _interleave(front, sheet) for front in groups[-1]):
+            groups[-1].append(sheet)
+        else:
+            groups.append([sheet])
+    return groups
+
+
+def _interleave(front: Sheet, behind: Sheet) -> bool:
+    """Whether a sheet listed before another lies behind it anywhere."""
+    both = (front.values[..., 3] > 0) & (behind.values[..., 3] > 0)
+    return bool((both & (front.coc_px > behind.coc_px + _ONE_SURFACE_PX)).any())
+
+
+def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing, inside: tuple[slice, slice]) -> tuple[Channels, Channels]:
+    opaque = next((sheet for sheet in group if sheet.is_opaque), None)
+    filled = [Sheet(*hidden_background(opaque.values, opaque.coc_px), False)] if opaque and layering.fill else []
+    colour, taken = (each[inside] for each in composited(group, filled, slicing))
+    return (colour, taken) if opaque is None else _shared_out(colour, taken)
+
+
+def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
+    """Colour of a scene without holes: what nobody claimed belongs to those who did."""
+    return colour / np.maximum(taken[..., _kinds(colour, taken)], _NOTHING_TAKEN), np.ones_like(taken)
+
+
+def _over(front: Channels, front_taken: Channels, behind: Channels, behind_taken: Channels) -> tuple[Channels, Channels]:
+    free = 1.0 - front_taken
+    return front + free[..., _kinds(front, front_taken)] * behind, front_taken + free * behind_taken
+
+
+def _kinds(colour: Channels, taken: Channels) -> list[int]:
+    """Which channel of `taken` goes with each channel of colour: its own, or green's for extra channels."""
+    kinds = taken.shape[2]
+    return [min(c, kinds - 1) if c < 3 else kinds // 2 for c in range(colour.shape[2])]
+
+
+def _as_layer(colour: Channels, taken: Channels, layers: Sequence[Layer]) -> Layer:
+    depth_m = layers[-1].depth_m
+    for layer in reversed(layers[:-1]):
+        depth_m = np.where(layer.alpha > 0, layer.depth_m, depth_m)
+    alpha = taken[..., 0] if taken.shape[2] == 1 else taken.mean(axis=2)
+    extra, start = {}, 3
+    for name, values in layers[0].extra.items():
+        extra[name] = np.ascontiguousarray(colour[..., start : start + values.shape[2]])
+        start += values.shape[2]
+    return Layer(np.ascontiguousarray(colour[..., :3]), np.ascontiguousarray(alpha), depth_m, extra)

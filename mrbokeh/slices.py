@@ -1,0 +1,142 @@
+"""Slices: sheets of light sorted by the circle of confusion, spread one by one and put together front to back."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.spreading import Frame, Spread, reach_px, spread_light
+
+_LEAST_STEP_PX = 0.5
+
+Plane = Float32[np.ndarray, "height width"]
+Channels = Float32[np.ndarray, "height width _"]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Premultiplied light of one layer with its blur, ready to be spread.
+
+    values: (H, W, 4 + E) R, G, B, coverage, others. coc_px: (H, W) signed diameters, finite; 0 where nothing is.
+    """
+
+    values: Float32[np.ndarray, "height width channels"]
+    coc_px: Float32[np.ndarray, "height width"]
+    is_opaque: bool
+
+
+@dataclass(frozen=True)
+class Slicing:
+    """What the light goes through: the aperture, a renderer's Spread, how many slices at most, field cells, place in the frame."""
+
+    aperture: Aperture
+    spread: Spread
+    slices: int
+    field_cells: tuple[int, int]
+    frame: Frame
+
+
+def sheet_of(layer: Layer, lens: Lens) -> Sheet:
+    """Colour, coverage and extra channels side by side; a pixel that covers nothing is in focus, so that it has no say."""
+    coc_px = np.where(layer.alpha > 0, lens.coc_px(layer.depth_m, layer.width_px), 0.0).astype(np.float32)
+    if not np.isfinite(coc_px).all():
+        raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
+    values = np.concatenate([layer.rgb, layer.alpha[..., None], *layer.extra.values()], axis=2)
+    return Sheet(values, coc_px, bool((layer.alpha == 1.0).all()))
+
+
+def continued(sheet: Sheet, margin_px: int) -> Sheet:
+    """With a margin all around: mirrored where the sheet is opaque, empty where it has holes."""
+    if margin_px == 0:
+        return sheet
+    mode = "symmetric" if sheet.is_opaque else "constant"
+    around = ((margin_px, margin_px), (margin_px, margin_px))
+    return Sheet(np.pad(sheet.values, (*around, (0, 0)), mode=mode), np.pad(sheet.coc_px, around, mode=mode), sheet.is_opaque)
+
+
+def composited(sheets: Sequence[Sheet], filled: Sequence[Sheet], slicing: Slicing) -> tuple[Channels, Channels]:
+    """Sheets at any depth, those filled in by guess last: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
+
+    The pupil is counted per colour where the aperture is chromatic.
+    """
+    from mrbokeh._slices_numba import claim
+
+    height, width, channels = sheets[0].values.shape
+    colour = np.zeros((height, width, channels - 1), np.float32)
+    taken = np.zeros((height, width, 3 if slicing.aperture.is_chromatic else 1), np.float32)
+    step_px = _step_px(sheets, slicing.slices)
+    passes = [(sheets, weights) for weights in _seen_and_hidden(sheets)] + [([each], [each.values[..., 3]]) for each in filled]
+    for some, weights in passes:
+        for values, coc_px, window in _slices(some, weights, step_px, slicing.aperture):
+            frame = slicing.frame.moved(window[1].start, window[0].start)
+            light = spread_light(slicing.spread, values, coc_px, slicing.aperture, frame, slicing.field_cells)
+            claim(colour[window], taken[window], light)
+    return colour, taken
+
+
+def _step_px(sheets: Sequence[Sheet], slices: int) -> float:
+    """Width of a slice in pixels of circle of confusion."""
+    covered = [sheet.coc_px[sheet.values[..., 3] > 0] for sheet in sheets]
+    some = [each for each in covered if each.size]
+    if not some:
+        return _LEAST_STEP_PX
+    return max((max(float(each.max()) for each in some) - min(float(each.min()) for each in some)) / slices, _LEAST_STEP_PX)
+
+
+def _seen_and_hidden(sheets: Sequence[Sheet]) -> Iterator[list[Plane]]:
+    """Per sheet the share of each pixel that the pinhole picture shows, then, if there is any, the share that hides behind others."""
+    if len(sheets) == 1:
+        yield [np.ones_like(sheets[0].coc_px)]
+        return
+    seen = [_shown(i, sheets) for i in range(len(sheets))]
+    yield seen
+    yield [1.0 - each for each in seen]
+
+
+def _shown(i: int, sheets: Sequence[Sheet]) -> Plane:
+    """How much of sheet i's pixels the others leave uncovered: nearer ones cover it, and at one depth those listed before."""
+    shown = np.ones_like(sheets[i].coc_px)
+    for j, other in enumerate(sheets):
+        if j != i:
+            nearer = other.coc_px <= sheets[i].coc_px if j < i else other.coc_px < sheets[i].coc_px
+            shown *= np.where(nearer, 1.0 - other.values[..., 3], 1.0).astype(np.float32)
+    return shown
+
+
+def _slices(
+    sheets: Sequence[Sheet], weights: Sequence[Plane], step_px: float, aperture: Aperture
+) -> Iterator[tuple[Channels, Plane, tuple[slice, slice]]]:
+    """Light, circles of confusion and window of every slice that is not empty, front first; sheets of one slice in their order."""
+    from mrbokeh._slices_numba import pick_slice, slice_windows
+
+    indices = [np.floor(sheet.coc_px / step_px + 0.5).astype(np.int32) for sheet in sheets]
+    lowest, highest = min(int(index.min()) for index in indices), max(int(index.max()) for index in indices)
+    boxes = [
+        slice_windows(index, weight, sheet.values, lowest, highest) for sheet, index, weight in zip(sheets, indices, weights, strict=True)
+    ]
+    for slice_index in range(lowest, highest + 1):
+        for sheet, weight, index, box in zip(sheets, weights, indices, boxes, strict=True):
+            window = _window(box[slice_index - lowest], sheet.coc_px, index, slice_index, aperture)
+            if window is None:
+                continue
+            picked = np.empty((*index[window].shape, sheet.values.shape[2]), np.float32)
+            pick_slice(picked, sheet.values[window], weight[window], index[window], slice_index)
+            yield picked, np.ascontiguousarray(sheet.coc_px[window]), window
+
+
+def _window(
+    box: np.ndarray, coc_px: Plane, index: Int32[np.ndarray, "height width"], slice_index: int, aperture: Aperture
+) -> tuple[slice, slice] | None:
+    """The rectangle that the light of a slice can reach, or None for an empty one."""
+    top, bottom, left, right = (int(edge) for edge in box)
+    if bottom <= top:
+        return None
+    own = index[top:bottom, left:right] == slice_index
+    reach = reach_px(aperture, float(np.abs(coc_px[top:bottom, left:right][own]).max(initial=0.0)))
+    height, width = coc_px.shape
+    return slice(max(0, top - reach), min(height, bottom + reach)), slice(max(0, left - reach), min(width, right + reach))

@@ -1,0 +1,352 @@
+"""One list of laws for every renderer (see mrbokeh/renderers/base.py); a new renderer joins RENDERERS and nothing else."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.image_metrics import psnr
+from mrbokeh.layer import Layer, clear, opaque
+from mrbokeh.lens import Lens
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.renderers.scatter_reference import ScatterReference
+
+
+
+@dataclass(frozen=True)
+class Promise:
+    """A renderer and how near to the exact kernels it promises to come.
+
+    make: builds it for a number of threads. outside: share of the circle's radius by which a point's light may pass it.
+    agreement_db: least PSNR against the reference on the scenes below, with textures up to 2 and a lamp of 50.
+    straight_edge: largest error of coverage beside a straight edge.
+    """
+
+    make: Callable[[int], Renderer]
+    outside: float = 0.001  # the 64-gon that stands for a disc reaches 0.08 % beyond it
+    agreement_db: float = np.inf
+    straight_edge: float = 5e-4  # what a 64-gon lacks of a disc
+
+
+PROMISES = {
+    "scatter_reference": Promise(lambda threads: ScatterReference(threads=threads)),
+}
+RENDERERS = {name: promise.make(0) for name, promise in PROMISES.items()}
+SIZE_PX = 65
+CENTRE = SIZE_PX // 2
+LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=1.0, sensor_width_mm=36.0)
+
+
+@pytest.fixture(params=RENDERERS, name="renderer")
+def fixture_renderer(request: pytest.FixtureRequest) -> Renderer:
+    return RENDERERS[request.param]
+
+
+def name_of(renderer: Renderer) -> str:
+    return next(name for name, each in RENDERERS.items() if each is renderer)
+
+
+def depth_for_coc_m(coc_px: float, lens: Lens = LENS) -> float:
+    """The depth at which the lens makes this (signed) circle of confusion: coc = k (1 / focus - 1 / depth)."""
+    return 1.0 / (1.0 / lens.focus_distance_m - coc_px / lens.coc_px_per_dioptre(SIZE_PX))
+
+
+def flat_layer(rgb: np.ndarray, alpha: np.ndarray, coc_px: float) -> Layer:
+    depth_m = np.where(alpha > 0, depth_for_coc_m(coc_px), np.inf)
+    return Layer(rgb.astype(np.float32), alpha.astype(np.float32), depth_m.astype(np.float32))
+
+
+def point(coc_px: float, colour: tuple[float, float, float] = (4.0, 2.0, 1.0)) -> Layer:
+    alpha = np.zeros((SIZE_PX, SIZE_PX))
+    alpha[CENTRE, CENTRE] = 1.0
+    return flat_layer(alpha[..., None] * colour, alpha, coc_px)
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.0, 2.0, (SIZE_PX, SIZE_PX, 3))
+
+
+def test_it_is_a_renderer(renderer: Renderer) -> None:
+    assert isinstance(renderer, Renderer)
+
+
+@pytest.mark.parametrize("coc_px", [-11.0, -2.3, 0.0, 0.7, 3.1, 14.6])
+def test_energy_of_a_point_is_conserved(renderer: Renderer, coc_px: float) -> None:
+    result = renderer.render([point(coc_px)], LENS)
+    np.testing.assert_allclose(result.rgb.sum((0, 1)), (4.0, 2.0, 1.0), rtol=1e-5)
+    np.testing.assert_allclose(result.alpha.sum(), 1.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize("coc_px", [-0.9, 0.0, 0.9])
+@pytest.mark.parametrize("opaque_layer", [True, False])
+def test_below_one_pixel_nothing_changes(renderer: Renderer, coc_px: float, opaque_layer: bool) -> None:
+    """Bit for bit."""
+    alpha = np.ones((SIZE_PX, SIZE_PX)) if opaque_layer else np.random.default_rng(9).uniform(0.0, 1.0, (SIZE_PX, SIZE_PX))
+    layer = flat_layer(texture() * alpha[..., None], alpha, coc_px)
+    result = renderer.render([layer], LENS)
+    np.testing.assert_array_equal(result.rgb, layer.rgb)
+    np.testing.assert_array_equal(result.alpha, layer.alpha)
+
+
+@pytest.mark.parametrize("coc_px", [-12.4, 5.5, 20.2])
+def test_a_point_stays_within_its_circle_of_confusion(renderer: Renderer, coc_px: float) -> None:
+    result = renderer.render([point(coc_px)], LENS)
+    y, x = np.nonzero(result.alpha > 1e-7)
+    # A pixel is touched where its nearest corner lies inside the circle.
+    nearest_px = np.hypot(np.maximum(abs(x - CENTRE) - 0.5, 0), np.maximum(abs(y - CENTRE) - 0.5, 0))
+    assert nearest_px.max() <= abs(coc_px) / 2 * (1.0 + PROMISES[name_of(renderer)].outside)
+    assert nearest_px.max() >= abs(coc_px) / 2 - 1.5
+
+
+def test_mirrored_picture_gives_mirrored_result(renderer: Renderer) -> None:
+    rgb = texture()
+    ones = np.ones((SIZE_PX, SIZE_PX))
+    result = renderer.render([flat_layer(rgb, ones, 7.3)], LENS)
+    mirrored = renderer.render([flat_layer(rgb[:, ::-1], ones, 7.3)], LENS)
+    np.testing.assert_allclose(mirrored.rgb, result.rgb[:, ::-1], atol=1e-5)
+
+
+def test_in_front_of_the_focus_the_aperture_is_seen_mirrored(renderer: Renderer) -> None:
+    triangle = Lens(50.0, 2.0, 1.0, 36.0, Aperture.blades(3))
+    behind = renderer.render([point(12.0)], triangle).alpha
+    in_front = renderer.render([point(-12.0)], triangle).alpha
+    np.testing.assert_allclose(in_front, behind[::-1, ::-1], atol=1e-6)
+    assert behind[:, CENTRE + 4 :].sum() > 0 and behind[CENTRE, CENTRE + 5] > 0, "the corner at +x shows at +x behind the focus"
+    assert in_front[CENTRE, CENTRE - 5] > 0 and behind[CENTRE, CENTRE - 5] == 0
+
+
+def test_linearity_in_light(renderer: Renderer) -> None:
+    ones = np.ones((SIZE_PX, SIZE_PX))
+    one = renderer.render([flat_layer(texture(1), ones, 6.0)], LENS).rgb
+    doubled = renderer.render([flat_layer(2.0 * texture(1), ones, 6.0)], LENS).rgb
+    np.testing.assert_allclose(doubled, 2.0 * one, rtol=1e-5)
+
+
+def test_linearity_in_light_beside_edges_and_lamps(renderer: Renderer) -> None:
+    """What is filled in behind edges scales with the light as well: a power of two changes no bit but the exponent."""
+    rgb, depth_m = two_plane_scene()
+    one, four = (renderer.render([opaque(factor * rgb, depth_m)], LENS).rgb for factor in (np.float32(1.0), np.float32(4.0)))
+    np.testing.assert_allclose(four, 4.0 * one, rtol=1e-5, atol=1e-6)
+
+
+def test_premultiplied_white_blurs_like_its_alpha(renderer: Renderer) -> None:
+    alpha = np.zeros((SIZE_PX, SIZE_PX))
+    alpha[20:40, 25:45] = 1.0
+    result = renderer.render([flat_layer(np.repeat(alpha[..., None], 3, 2), alpha, 9.0)], LENS)
+    np.testing.assert_allclose(result.rgb, np.repeat(result.alpha[..., None], 3, 2), atol=1e-6)
+
+
+def test_an_even_field_stays_even_inside(renderer: Renderer) -> None:
+    result = renderer.render([flat_layer(np.full((SIZE_PX, SIZE_PX, 3), 0.4), np.ones((SIZE_PX, SIZE_PX)), 10.0)], LENS)
+    np.testing.assert_allclose(result.rgb, 0.4, rtol=1e-5)  # up to the border: an opaque layer goes on beyond it
+
+
+def test_a_straight_edge_blurs_to_the_integral_of_the_disc(renderer: Renderer) -> None:
+    """A half plane blurred by a disc of radius R covers 1/2 + (t sqrt(R^2 - t^2) + R^2 asin(t / R)) / (pi R^2) at distance t."""
+    alpha = np.zeros((SIZE_PX, SIZE_PX))
+    alpha[:, CENTRE:] = 1.0
+    profile = renderer.render([flat_layer(np.repeat(alpha[..., None], 3, 2), alpha, 16.0)], LENS).alpha[CENTRE]
+    # Area-exact kernels of all pixels right of the edge add up to the exact integral at each pixel's centre.
+    radius = 8.0
+    t = np.clip(np.arange(SIZE_PX) - CENTRE + 0.5, -radius, radius)
+    exact = 0.5 + (t * np.sqrt(radius**2 - t**2) + radius**2 * np.arcsin(t / radius)) / (np.pi * radius**2)
+    np.testing.assert_allclose(profile[10:-10], exact[10:-10], atol=PROMISES[name_of(renderer)].straight_edge)
+
+
+def test_an_opaque_sharp_layer_hides_what_is_behind(renderer: Renderer) -> None:
+    ones = np.ones((SIZE_PX, SIZE_PX))
+    front = flat_layer(texture(2), ones, 0.0)
+    behind = flat_layer(texture(3), ones, 9.0)
+    np.testing.assert_allclose(renderer.render([front, behind], LENS).rgb, front.rgb, atol=1e-6)
+
+
+def test_a_clear_layer_changes_nothing(renderer: Renderer) -> None:
+    behind = flat_layer(texture(4), np.ones((SIZE_PX, SIZE_PX)), 5.0)
+    alone = renderer.render([behind], LENS)
+    with_clear = renderer.render([clear(SIZE_PX, SIZE_PX), behind], LENS)
+    np.testing.assert_array_equal(with_clear.rgb, alone.rgb)
+    np.testing.assert_array_equal(with_clear.alpha, alone.alpha)
+
+
+def test_a_blurred_front_layer_lets_the_sharp_background_through(renderer: Renderer) -> None:
+    alpha = np.zeros((SIZE_PX, SIZE_PX))
+    alpha[:, :CENTRE] = 1.0
+    front = flat_layer(0.0 * alpha[..., None] + np.zeros(3), alpha, -14.0)
+    behind = opaque(np.ones((SIZE_PX, SIZE_PX, 3), np.float32), np.full((SIZE_PX, SIZE_PX), 1.0, np.float32))
+    result = renderer.render([front, behind], LENS)
+    np.testing.assert_allclose(result.alpha, 1.0, atol=1e-5)
+    front_alone = renderer.render([front], LENS)
+    np.testing.assert_allclose(result.rgb[..., 0], 1.0 - front_alone.alpha, atol=1e-5)
+
+
+def test_changing_the_focus_changes_the_picture(renderer: Renderer) -> None:
+    layer = flat_layer(texture(5), np.ones((SIZE_PX, SIZE_PX)), 0.0)
+    sharp, blurred = renderer.render([layer], LENS), renderer.render([layer], LENS.focused_at(0.6))
+    assert np.abs(sharp.rgb - blurred.rgb).max() > 0.1
+
+
+@pytest.mark.parametrize("coc_px", [-13.7, -2.0, 1.6, 4.0, 7.5, 18.3, 40.0])
+def test_a_point_stays_where_it_is(renderer: Renderer, coc_px: float) -> None:
+    """The centroid of its light; half a pixel of drift is the classic mistake."""
+    alpha = renderer.render([point(coc_px)], LENS).alpha.astype(np.float64)
+    rows, columns = np.indices(alpha.shape)
+    assert (alpha * rows).sum() / alpha.sum() == pytest.approx(CENTRE, abs=1e-3)
+    assert (alpha * columns).sum() / alpha.sum() == pytest.approx(CENTRE, abs=1e-3)
+
+
+def test_a_moved_picture_gives_a_moved_result(renderer: Renderer) -> None:
+    alpha = np.zeros((SIZE_PX, SIZE_PX))
+    alpha[20:40, 18:37] = 1.0
+    rgb = texture(6) * alpha[..., None]
+    still = renderer.render([flat_layer(rgb, alpha, 9.4)], LENS)
+    moved = renderer.render([flat_layer(np.roll(rgb, (5, 7), (0, 1)), np.roll(alpha, (5, 7), (0, 1)), 9.4)], LENS)
+    np.testing.assert_allclose(moved.rgb, np.roll(still.rgb, (5, 7), (0, 1)), atol=2e-6)
+    np.testing.assert_allclose(moved.alpha, np.roll(still.alpha, (5, 7), (0, 1)), atol=2e-6)
+
+
+def test_nothing_behind_leaks_onto_a_sharp_foreground(renderer: Renderer) -> None:
+    """One opaque picture: its left half in focus and black, its right half far behind and bright."""
+    rgb, depth_m = two_halves(0.0, 16.0)
+    result = renderer.render([opaque(rgb, depth_m)], LENS)
+    np.testing.assert_allclose(result.rgb[:, :CENTRE], 0.0, atol=1e-6)
+    np.testing.assert_allclose(result.rgb[:, CENTRE + 1 :], 1.0, atol=1e-4)  # and nothing is missing beside the edge
+
+
+def test_a_blurred_foreground_spreads_over_a_sharp_background(renderer: Renderer) -> None:
+    """One opaque picture: its left half near and black, its right half in focus and bright. Beside the edge the share of the
+    disc that passes the near half is what a straight edge leaves, on both sides of it: what hides behind is continued."""
+    rgb, depth_m = two_halves(-16.0, 0.0)
+    profile = renderer.render([opaque(rgb, depth_m)], LENS).rgb[CENTRE, :, 0]
+    t = np.clip(np.arange(SIZE_PX) - CENTRE + 0.5, -8.0, 8.0)
+    exact = 0.5 + (t * np.sqrt(64.0 - t**2) + 64.0 * np.arcsin(t / 8.0)) / (np.pi * 64.0)
+    np.testing.assert_allclose(profile[10:-10], exact[10:-10], atol=PROMISES[name_of(renderer)].straight_edge)
+
+
+@pytest.mark.parametrize("front_px", [-12.0, 12.0])
+def test_a_lamp_and_a_wire_over_far_depth_stay_where_they_are(renderer: Renderer, front_px: float) -> None:
+    """In one opaque picture, a lamp of one pixel and a wire of one pixel at another depth than the background in focus."""
+    rgb, coc_px = np.zeros((SIZE_PX, SIZE_PX, 3), np.float32), np.zeros((SIZE_PX, SIZE_PX))
+    rgb[12, 40], rgb[:, 20] = 100.0, 1.0
+    coc_px[12, 40] = coc_px[:, 20] = front_px
+    depth_m = np.vectorize(depth_for_coc_m)(coc_px).astype(np.float32)
+    light = renderer.render([opaque(rgb, depth_m)], LENS).rgb[..., 0].astype(np.float64)
+    lamp, wire = light[:26, 28:53], light[30:, 6:35].sum(axis=0)
+    rows, columns = np.indices(lamp.shape)
+    assert (lamp * rows).sum() / lamp.sum() == pytest.approx(12, abs=0.05)
+    assert (lamp * columns).sum() / lamp.sum() == pytest.approx(12, abs=0.05)
+    assert (wire * np.arange(29)).sum() / wire.sum() == pytest.approx(14, abs=0.05)
+
+
+def test_alpha_stays_a_share(renderer: Renderer) -> None:
+    rng = np.random.default_rng(7)
+    alpha = rng.uniform(0.0, 1.0, (SIZE_PX, SIZE_PX)) * (rng.uniform(0.0, 1.0, (SIZE_PX, SIZE_PX)) > 0.5)
+    depth_m = np.vectorize(depth_for_coc_m)(rng.uniform(-9.0, 9.0, alpha.shape)).astype(np.float32)
+    layer = Layer((texture(8) * alpha[..., None]).astype(np.float32), alpha.astype(np.float32), depth_m)
+    result = renderer.render([layer, flat_layer(texture(9) * alpha[..., None], alpha, 12.0)], LENS)
+    assert result.alpha.min() >= 0.0 and result.alpha.max() <= 1.0 + 1e-6
+    assert result.rgb.min() >= 0.0
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        Lens(60.0, 2.0, 1.0, 36.0),
+        Lens(50.0, 2.8, 1.0, 36.0),
+        Lens(50.0, 2.0, 0.9, 36.0),
+        Lens(50.0, 2.0, 1.0, 24.0),
+        replace(LENS, tilt_rad=(0.02, 0.0)),
+        replace(LENS, tilt_rad=(0.0, 0.02)),
+        replace(LENS, petzval_radius_mm=75.0),
+        replace(LENS, aperture=Aperture.blades(5)),
+        replace(LENS, aperture=Aperture.blades(5, 0.5)),
+        replace(LENS, aperture=Aperture.blades(5, 0.0, 0.5)),
+        replace(LENS, aperture=replace(Aperture.disc(), cat_eye=0.5)),
+        replace(LENS, aperture=replace(Aperture.disc(), spherical_aberration=0.5)),
+        replace(LENS, aperture=replace(Aperture.disc(), axial_chromatic=(0.1, 0.0, -0.1))),
+        replace(LENS, aperture=replace(Aperture.disc(), lateral_chromatic=(0.2, 0.0, -0.2))),
+    ],
+)
+def test_every_parameter_of_the_lens_changes_the_picture(renderer: Renderer, changed: Lens) -> None:
+    layer = flat_layer(texture(10), np.ones((SIZE_PX, SIZE_PX)), 11.0)
+    assert np.abs(renderer.render([layer], changed).rgb - renderer.render([layer], LENS).rgb).max() > 1e-3
+
+
+def test_neutral_parameters_change_nothing(renderer: Renderer) -> None:
+    neutral = replace(Aperture.disc(), cat_eye=0.0, spherical_aberration=0.0, axial_chromatic=(0.0, 0.0, 0.0), lateral_chromatic=(0.0, 0.0, 0.0))
+    lens = replace(LENS, aperture=neutral.rotated(0.0).squeezed(1.0).obstructed(0.0), tilt_rad=(0.0, 0.0), petzval_radius_mm=np.inf)
+    layer = flat_layer(texture(11), np.ones((SIZE_PX, SIZE_PX)), 11.0)
+    np.testing.assert_array_equal(renderer.render([layer], lens).rgb, renderer.render([layer], LENS).rgb)
+
+
+def test_colours_of_a_chromatic_lens_differ_by_the_size_of_their_blur(renderer: Renderer) -> None:
+    """Red is blurred over a circle 20 % larger behind the focus and 20 % smaller in front; the light of each colour is kept."""
+    lens = replace(LENS, aperture=replace(Aperture.disc(), axial_chromatic=(0.2, 0.0, 0.0)))
+    for coc_px, scale in ((15.0, 1.2), (-15.0, 0.8)):
+        light = renderer.render([point(coc_px, (1.0, 1.0, 1.0))], lens).rgb.astype(np.float64)
+        np.testing.assert_allclose(light.sum((0, 1)), 1.0, rtol=1e-5)
+        rows, columns = np.indices(light.shape[:2]) - CENTRE
+        spread = (light * (rows**2 + columns**2)[..., None]).sum((0, 1)) - 1.0 / 6.0  # less what pixels of their own add
+        assert spread[0] / spread[1] == pytest.approx(scale**2, rel=0.03)
+
+
+def test_extra_channels_go_the_way_of_the_light(renderer: Renderer) -> None:
+    """A matte equal to alpha comes out as alpha, signed values keep their sign, and colours do not notice."""
+    alpha = np.zeros((SIZE_PX, SIZE_PX), np.float32)
+    alpha[22:41, 15:44] = 1.0
+    plain = flat_layer(texture(12) * alpha[..., None], alpha, 8.0)
+    with_extra = replace(plain, extra={"matte": alpha[..., None], "motion": np.dstack([-3.0 * alpha, 2.0 * alpha])})
+    result, without = renderer.render([with_extra], LENS), renderer.render([plain], LENS)
+    np.testing.assert_allclose(result.extra["matte"][..., 0], result.alpha, atol=1e-6)
+    np.testing.assert_allclose(result.extra["motion"], np.dstack([-3.0 * result.alpha, 2.0 * result.alpha]), atol=1e-5)
+    np.testing.assert_allclose(result.rgb, without.rgb, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", PROMISES)
+def test_the_number_of_threads_changes_no_bit(name: str) -> None:
+    rgb, depth_m = slanted_scene()
+    one, three = (PROMISES[name].make(threads).render([opaque(rgb, depth_m)], LENS) for threads in (1, 3))
+    np.testing.assert_array_equal(one.rgb, three.rgb)
+
+
+def test_a_tile_with_its_surroundings_gives_the_same_picture(renderer: Renderer) -> None:
+    layer = flat_layer(texture(13), np.ones((SIZE_PX, SIZE_PX)), 10.0)
+    whole = renderer.render([layer], LENS)
+    tile = np.s_[10:60, 8:58]
+    lens = replace(LENS, sensor_width_mm=LENS.sensor_width_mm * 50 / SIZE_PX)  # the same pixels on a smaller sensor
+    part = renderer.render([opaque(np.ascontiguousarray(layer.rgb[tile]), np.ascontiguousarray(layer.depth_m[tile]))], lens)
+    np.testing.assert_allclose(part.rgb[7:-7, 7:-7], whole.rgb[17:53, 15:51], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("scene", ["two planes", "slanted"])
+def test_agreement_with_the_reference(renderer: Renderer, scene: str) -> None:
+    rgb, depth_m = two_plane_scene() if scene == "two planes" else slanted_scene()
+    result = renderer.render([opaque(rgb, depth_m)], LENS).rgb
+    reference = RENDERERS["scatter_reference"].render([opaque(rgb, depth_m)], LENS).rgb
+    if renderer is RENDERERS["scatter_reference"]:
+        np.testing.assert_array_equal(result, reference)
+    else:
+        assert psnr(result, reference, peak=2.0) > PROMISES[name_of(renderer)].agreement_db
+
+
+def two_halves(left_px: float, right_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Black on the left and white on the right, at these circles of confusion."""
+    rgb, depth_m = np.zeros((SIZE_PX, SIZE_PX, 3), np.float32), np.full((SIZE_PX, SIZE_PX), depth_for_coc_m(left_px), np.float32)
+    rgb[:, CENTRE:], depth_m[:, CENTRE:] = 1.0, depth_for_coc_m(right_px)
+    return rgb, depth_m
+
+
+def two_plane_scene() -> tuple[np.ndarray, np.ndarray]:
+    coc_px = np.full((SIZE_PX, SIZE_PX), 14.0)
+    coc_px[15:50, 12:40] = -9.0
+    rgb = texture(14).astype(np.float32)
+    rgb[30, 52] = 50.0
+    return rgb, np.vectorize(depth_for_coc_m)(coc_px).astype(np.float32)
+
+
+def slanted_scene() -> tuple[np.ndarray, np.ndarray]:
+    coc_px = np.broadcast_to(np.linspace(-15.0, 15.0, SIZE_PX), (SIZE_PX, SIZE_PX))
+    rgb = texture(15).astype(np.float32)
+    rgb[30, 52] = 50.0
+    return rgb, np.vectorize(depth_for_coc_m)(coc_px).astype(np.float32)
