@@ -1,7 +1,45 @@
-"""The sweeps of mrbokeh.hidden_background, compiled: for every pixel the nearest one that lies behind it."""
+"""The searches of mrbokeh.hidden_background, compiled."""
+
+import math
 
 import numpy as np
 from numba import njit
+
+_DIRECTIONS = 16
+_LARGEST_SHARE = 0.6
+
+
+@njit(cache=True, nogil=True)
+def rims(coc_px: np.ndarray, step_px: float) -> np.ndarray:
+    """(H, W) bool: pixels with something more than `step_px` nearer beside them; they may hold some of its colour."""
+    height, width = coc_px.shape
+    rim = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            for ny in range(max(0, y - 1), min(height, y + 2)):
+                for nx in range(max(0, x - 1), min(width, x + 2)):
+                    rim[y, x] |= coc_px[ny, nx] < coc_px[y, x] - step_px
+    return rim
+
+
+@njit(cache=True, nogil=True)
+def pure_neighbours(coc_px: np.ndarray, pure: np.ndarray, step_px: float, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the nearest pure pixel of the same surface, itself where it is pure; -1 where none is within `radius_px`."""
+    height, width = coc_px.shape
+    pure_y, pure_x = np.full((height, width), -1, np.int32), np.full((height, width), -1, np.int32)
+    for y in range(height):
+        for x in range(width):
+            if pure[y, x]:
+                pure_y[y, x], pure_x[y, x] = y, x
+                continue
+            least = (radius_px + 1) ** 2
+            for ny in range(max(0, y - radius_px), min(height, y + radius_px + 1)):
+                for nx in range(max(0, x - radius_px), min(width, x + radius_px + 1)):
+                    distance = (ny - y) ** 2 + (nx - x) ** 2
+                    if distance < least and pure[ny, nx] and abs(coc_px[ny, nx] - coc_px[y, x]) <= step_px:
+                        least = distance
+                        pure_y[y, x], pure_x[y, x] = ny, nx
+    return pure_y, pure_x
 
 
 @njit(cache=True, nogil=True)
@@ -18,41 +56,13 @@ def _offer(seed_y: np.ndarray, seed_x: np.ndarray, coc_px: np.ndarray, y: int, x
 
 
 @njit(cache=True, nogil=True)
-def pure_neighbours(coc_px: np.ndarray, step_px: float, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of the nearest pixel of the same surface that has nothing nearer beside it: itself, or, at a rim, one farther in.
-
-    Pixels at a rim hold some of the colour of what is in front. -1 where there is no pure one within `radius_px`.
-    """
-    height, width = coc_px.shape
-    rim = np.zeros((height, width), np.bool_)
-    for y in range(height):
-        for x in range(width):
-            for ny in range(max(0, y - 1), min(height, y + 2)):
-                for nx in range(max(0, x - 1), min(width, x + 2)):
-                    rim[y, x] |= coc_px[ny, nx] < coc_px[y, x] - step_px
-    pure_y, pure_x = np.full((height, width), -1, np.int32), np.full((height, width), -1, np.int32)
-    for y in range(height):
-        for x in range(width):
-            if not rim[y, x]:
-                pure_y[y, x], pure_x[y, x] = y, x
-                continue
-            least = (radius_px + 1) ** 2
-            for ny in range(max(0, y - radius_px), min(height, y + radius_px + 1)):
-                for nx in range(max(0, x - radius_px), min(width, x + radius_px + 1)):
-                    distance = (ny - y) ** 2 + (nx - x) ** 2
-                    if distance < least and not rim[ny, nx] and abs(coc_px[ny, nx] - coc_px[y, x]) <= step_px:
-                        least = distance
-                        pure_y[y, x], pure_x[y, x] = ny, nx
-    return pure_y, pure_x
-
-
-@njit(cache=True, nogil=True)
 def nearest_behind(coc_px: np.ndarray, pure_y: np.ndarray, pure_x: np.ndarray, step_px: float, sweeps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of the nearest pixel whose circle of confusion lies more than `step_px` behind; -1 where the lens sees none.
+    """Row and column of the nearest pure pixel that lies more than `step_px` behind; -1 where the lens sees none.
 
-    The lens sees past an edge by half the difference of the two circles of confusion. Vector distance propagation
-    (Danielsson 1980) with a condition that differs from pixel to pixel: a seed travels through pixels that it lies
-    behind as well, so it can miss a nearer seed by a pixel or two where several depths meet.
+    The lens sees past an edge by half the difference of the two circles of confusion (and a rim's width more is
+    searched). Vector distance propagation (Danielsson 1980) with a condition that differs from pixel to pixel: a seed
+    travels through pixels that it lies behind as well, so it can miss a nearer one by a pixel or two where several
+    depths meet.
     """
     height, width = coc_px.shape
     seed_y, seed_x = np.full((height, width), -1, np.int32), np.full((height, width), -1, np.int32)
@@ -79,3 +89,97 @@ def nearest_behind(coc_px: np.ndarray, pure_y: np.ndarray, pure_x: np.ndarray, s
                     _offer(seed_y, seed_x, coc_px, y, x, pure_y[y, nx], pure_x[y, nx], step_px)
                     _offer(seed_y, seed_x, coc_px, y, x, seed_y[y, nx], seed_x[y, nx], step_px)
     return seed_y, seed_x
+
+
+@njit(cache=True, nogil=True)
+def interpolate(
+    filled: np.ndarray,
+    filled_coc_px: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    pure: np.ndarray,
+    seed_y: np.ndarray,
+    seed_x: np.ndarray,
+    surface_px: float,
+) -> None:
+    """Where there is a seed, overwrite filled (H, W, C) and its circle of confusion with what lies around on the seed's surface.
+
+    The first pure pixels in 16 directions, up to twice as far as the seed, weighted by one over the squared distance: behind
+    a thin wire this interpolates between both sides, behind a broad object it continues what is beside it.
+    """
+    height, width, channels = values.shape
+    for y in range(height):
+        for x in range(width):
+            if seed_y[y, x] < 0:
+                continue
+            sy, sx = seed_y[y, x], seed_x[y, x]
+            nearest_px = math.sqrt((sy - y) ** 2 + (sx - x) ** 2)
+            total = 1.0 / max(nearest_px, 0.5) ** 2
+            coc_sum = total * coc_px[sy, sx]
+            for c in range(channels):
+                filled[y, x, c] = total * values[sy, sx, c]
+            for direction in range(_DIRECTIONS):
+                angle_rad = 2.0 * math.pi * direction / _DIRECTIONS
+                step_x, step_y = math.cos(angle_rad), math.sin(angle_rad)
+                for distance in range(1, int(2.0 * nearest_px) + 4):
+                    ny, nx = int(round(y + distance * step_y)), int(round(x + distance * step_x))
+                    if not (0 <= ny < height and 0 <= nx < width):
+                        break
+                    if pure[ny, nx] and abs(coc_px[ny, nx] - coc_px[sy, sx]) <= surface_px:
+                        weight = 1.0 / distance**2
+                        total += weight
+                        coc_sum += weight * coc_px[ny, nx]
+                        for c in range(channels):
+                            filled[y, x, c] += weight * values[ny, nx, c]
+                        break
+            filled_coc_px[y, x] = coc_sum / total
+            for c in range(channels):
+                filled[y, x, c] /= total
+
+
+@njit(cache=True, nogil=True)
+def unmix_rims(
+    front: np.ndarray,
+    front_coc_px: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    behind: np.ndarray,
+    seeded: np.ndarray,
+    lit: np.ndarray,
+    step_px: float,
+) -> None:
+    """Split the seeded rim pixels into what the nearer neighbour gave, in front, and the rest, which replaces what was filled in behind.
+
+    Of the nearer neighbours the one counts that differs most from what is filled in: it is the least mixed itself. Its share
+    explains the pixel best as a mixture of the two, is smaller the worse the mixture explains it, and at most 0.6, as the pixel's
+    own depth is that behind. Front and rest together are the pixel: no light is lost. Where the nearer one is the sharper of the
+    two nothing is gained, except beside lamps: there the pixel stays whole.
+    """
+    height, width, channels = values.shape
+    for y in range(height):
+        for x in range(width):
+            if not seeded[y, x]:
+                continue
+            fy, fx, most = -1, -1, 0.0
+            for ny in range(max(0, y - 1), min(height, y + 2)):
+                for nx in range(max(0, x - 1), min(width, x + 2)):
+                    if coc_px[ny, nx] < coc_px[y, x] - step_px:
+                        difference = 0.0
+                        for c in range(3):
+                            difference += (values[ny, nx, c] - behind[y, x, c]) ** 2
+                        if difference > most:
+                            fy, fx, most = ny, nx, difference
+            if fy < 0 or not (lit[y, x] or abs(coc_px[fy, fx]) > abs(coc_px[y, x])):
+                continue
+            along, off = 0.0, 0.0
+            for c in range(3):
+                along += (values[y, x, c] - behind[y, x, c]) * (values[fy, fx, c] - behind[y, x, c])
+                off += (values[y, x, c] - behind[y, x, c]) ** 2
+            explained = along * along / (most * off) if off > 0.0 and along > 0.0 else 0.0
+            share = min(_LARGEST_SHARE, explained * along / most)
+            front_coc_px[y, x] = coc_px[fy, fx]
+            for c in range(channels):
+                rest = (values[y, x, c] - share * values[fy, fx, c]) / (1.0 - share)
+                behind[y, x, c] = max(0.0, rest) if c < 3 else rest
+                front[y, x, c] = values[y, x, c] - (1.0 - share) * behind[y, x, c]
+            front[y, x, 3], behind[y, x, 3] = share, 1.0

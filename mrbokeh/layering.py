@@ -2,7 +2,7 @@
 
 Shared by all renderers that spread light; they differ in the `Spread` alone.
 
-1. Every layer is continued beyond the frame by the largest blur: an opaque one mirrored, one with holes transparent.
+1. Every layer is continued beyond the frame by the largest blur: the border of an opaque one outwards, one with holes not at all.
 2. Layers are rendered one by one and laid over one another, but an opaque layer together with what is behind it, and
    layers that interleave in depth together.
 3. Pixels are sorted into slices of equal steps of the signed circle of confusion, hard: a pixel shared between slices
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mrbokeh.errors import InputError
-from mrbokeh.hidden_background import hidden_background
+from mrbokeh.hidden_background import apart
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.slices import Channels, Sheet, Slicing, composited, continued, sheet_of
@@ -88,10 +88,12 @@ def _interleave(front: Sheet, behind: Sheet) -> bool:
 
 
 def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing, inside: tuple[slice, slice]) -> tuple[Channels, Channels]:
-    opaque = next((sheet for sheet in group if sheet.is_opaque), None)
-    filled = [Sheet(*hidden_background(opaque.values, opaque.coc_px), False)] if opaque and layering.fill else []
-    colour, taken = (each[inside] for each in composited(group, filled, slicing))
-    return (colour, taken) if opaque is None else _shared_out(colour, taken)
+    if layering.fill and len(group) == 1 and group[0].is_opaque:
+        sheets = [Sheet(*each, False) for each in apart(group[0].values, group[0].coc_px)]
+    else:
+        sheets = list(group)
+    colour, taken = (each[inside] for each in composited(sheets, slicing))
+    return _shared_out(colour, taken) if any(sheet.is_opaque for sheet in group) else (colour, taken)
 
 
 def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:

@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from mrbokeh.aperture import Aperture
 from mrbokeh.psf import kernel_radius_px
 
-FIELD_CELLS = (9, 6)
+FIELD_CELLS = (16, 9)
 """Columns and rows of field cells: within one, every pixel sees the opening as the cell's centre does."""
 
 

@@ -1,0 +1,407 @@
+"""Kernel rectification: the smallest polygon around an outline whose edges all run along a few given directions.
+
+Moroto, Hachisuka, Umetani, "Fast Polygonal Splatting using Directional Kernel Difference", 2021, Section 4. Their graph:
+a node is a line of an admitted direction that touches the outline at a vertex from outside; an arc is a corner of two such
+lines, its weight the area between the corner and the outline; the cheapest walk once around with at most N nodes is the
+polygon. A line touches a vertex that points outwards where it leaves the outline on one side; an edge may also end at a
+vertex that points inwards (the bottom of a notch). The result is the smallest polygon all of whose edges touch so.
+Edges that end on the middle of a slanted edge are left out, as in the paper: they would cut teeth into straight sides.
+
+Beyond the paper: the symmetry that the outline shares with the directions is kept (Section 6.1 leaves this open). The walk
+then covers one sector, from mirror axis to mirror axis or from a line to its turned image, and is unfolded: the smallest
+polygon among those with the same symmetry, not a symmetrised one.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import gcd
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+
+PAPER_DIRECTIONS = ((1, 0), (0, 1), (1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
+"""The set D of Fig. 6: the slopes whose differenced edges have few non-zero elements."""
+
+ALIKE = 1e-3
+"""An outline counts as symmetric if its mirror image stays this close to it, in its half extents."""
+
+EXACT = 1e-9
+"""Half extents below which two points are one, and sines below which an edge has a direction."""
+
+Outline = Float64[np.ndarray, "_ 2"]
+
+
+def rectify(
+    outline: Outline,
+    directions: Sequence[tuple[int, int]] = PAPER_DIRECTIONS,
+    max_edges: int = 16,
+    fit: Literal["enclosing", "area"] = "enclosing",
+    symmetry_cost: float = 0.05,
+) -> Outline:
+    """The smallest polygon (W, 2) around an outline (V, 2), with at most `max_edges` edges along `directions`.
+
+    The outline may be concave and wind either way (the result winds alike), but must not cross itself. One whose edges run
+    along the directions already comes back as it is. Where a notch narrows, the result may touch itself in a point. Time
+    grows with V squared: milliseconds for 64 vertices, up to some seconds for 1000 of a ragged outline.
+    directions: small integer steps (x, y), as the renderer sums along them.
+    fit: "enclosing" contains the outline; "area" has its area and centroid (see same_area_and_centroid).
+    symmetry_cost: the result has the largest symmetry (mirrors, half and quarter turns) shared by outline and directions
+    for which it is larger than the smallest polygon of all by at most this share of the outline's area. 0 keeps only symmetry
+    that is free, inf all there is, a negative cost none on purpose. A symmetric polygon may use fewer than `max_edges`:
+    all four mirrors and quarter turns leave multiples of four. For a given symmetry more edges never mean more area; where
+    they bring a larger one within reach, the area may rise by up to the cost.
+    """
+    steps = _unit_steps(directions, max_edges)
+    _check(outline)
+    if (ready := _already_rectified(outline, steps, max_edges)) is not None:
+        return ready
+    clockwise = _area(outline) < 0.0
+    middle = _centroid(outline)
+    extent = float(np.abs(outline - middle).max())
+    shape = _without_flat_vertices((outline[::-1] if clockwise else outline) - middle) / extent
+    polygon = _smallest(shape, steps, max_edges, symmetry_cost)
+    if polygon is None:
+        raise InputError(f"no polygon of at most {max_edges} edges along {tuple(directions)} encloses the outline: allow more of either")
+    polygon = middle + extent * (polygon[::-1] if clockwise else polygon)
+    return same_area_and_centroid(polygon, outline) if fit == "area" else polygon
+
+
+def area_excess(rectified: Outline, outline: Outline) -> float:
+    """How much larger the rectified polygon is than its outline, as a share of the outline's area (0 = equal)."""
+    return abs(_area(rectified)) / abs(_area(outline)) - 1.0
+
+
+def same_area_and_centroid(rectified: Outline, outline: Outline) -> Outline:
+    """The rectified polygon scaled and shifted to the outline's area and centroid.
+
+    The enclosing polygon is too large on all sides, so a blur with it is too wide and, for lopsided shapes, off centre. Scaled
+    about its centroid it keeps the directions of its edges; it then crosses the outline, as much inside as outside.
+    """
+    scale = np.sqrt(abs(_area(outline)) / abs(_area(rectified)))
+    return _centroid(outline) + scale * (rectified - _centroid(rectified))
+
+
+def rectify_aperture(aperture: Aperture, directions: Sequence[tuple[int, int]] = PAPER_DIRECTIONS, max_edges: int = 16) -> Aperture:
+    """The aperture with every outline rectified on its own, at most `max_edges` edges each.
+
+    Each outline keeps its area and centroid, so that every weight still means the same light in the same place. A hole
+    (negative weight) is treated like any other outline: once fitted by area, enclosing it or being enclosed is all one.
+    """
+    return replace(aperture, outlines=tuple(rectify(outline, directions, max_edges, fit="area") for outline in aperture.outlines))
+
+
+def _unit_steps(directions: Sequence[tuple[int, int]], max_edges: int) -> Float64[np.ndarray, "_ 2"]:
+    """Both senses of every direction once, as unit vectors."""
+    if max_edges < 3:
+        raise InputError(f"a polygon has at least 3 edges, but at most {max_edges} were asked for")
+    reduced = set()
+    for x, y in directions:
+        if int(x) != x or int(y) != y or (x, y) == (0, 0):
+            raise InputError(f"a direction is a step of two whole numbers, not both 0, but ({x}, {y}) came")
+        divisor = gcd(int(x), int(y))
+        reduced |= {(int(x) // divisor, int(y) // divisor), (-int(x) // divisor, -int(y) // divisor)}
+    if len(reduced) < 4:
+        raise InputError(f"edges along {tuple(directions)} cannot close: give at least two directions that are not parallel")
+    steps = np.array(sorted(reduced), np.float64)
+    return steps / np.hypot(*steps.T)[:, None]
+
+
+def _check(outline: Outline) -> None:
+    from mrbokeh._polygon_rectification_numba import crosses_itself
+
+    if outline.ndim != 2 or outline.shape[0] < 3 or outline.shape[1] != 2 or not np.isfinite(outline).all():
+        raise InputError("an outline must be (V, 2) with at least 3 vertices and finite numbers")
+    extent = np.ptp(outline, axis=0).max()
+    if abs(_area(outline)) <= EXACT * extent**2:
+        raise InputError("an outline must enclose an area, but its vertices lie on a line")
+    if crosses_itself(_without_flat_vertices(outline - outline[0]) / extent):
+        raise InputError("an outline must not cross itself; split it into simple outlines first")
+
+
+def _area(outline: Outline) -> float:
+    """Signed area: positive where x turns towards y."""
+    x, y = (outline - outline[0]).T
+    return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
+
+
+def _centroid(outline: Outline) -> Float64[np.ndarray, "2"]:
+    """The centre of the enclosed area."""
+    points = outline - outline[0]
+    following = np.roll(points, -1, axis=0)
+    swept = points[:, 0] * following[:, 1] - following[:, 0] * points[:, 1]
+    return outline[0] + (swept[:, None] * (points + following)).sum(axis=0) / (3.0 * swept.sum())
+
+
+def _without_flat_vertices(outline: Outline) -> Outline:
+    """The outline without repeated vertices and those within rounding of the line between their neighbours."""
+    extent = np.ptp(outline, axis=0).max()
+    for _ in range(2):
+        outline = outline[np.hypot(*(outline - np.roll(outline, 1, axis=0)).T) > EXACT * extent]
+        step, onwards = outline - np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0) - outline
+        aside = np.abs(step[:, 0] * onwards[:, 1] - step[:, 1] * onwards[:, 0])
+        flat = (aside <= 1e-12 * extent * np.hypot(*(step + onwards).T)) & ((step * onwards).sum(axis=1) > 0.0)
+        outline = outline[~flat]
+    return outline
+
+
+def _already_rectified(outline: Outline, steps: Outline, max_edges: int) -> Outline | None:
+    """A copy of the outline if its edges run along the steps and are few enough, with no more than its flat vertices left out."""
+    for candidate in (outline, _without_flat_vertices(outline)):
+        edges = np.roll(candidate, -1, axis=0) - candidate
+        lengths = np.hypot(*edges.T)
+        if len(candidate) > max_edges or (lengths == 0.0).any():
+            continue
+        sines = np.abs(edges[:, :1] * steps[:, 1] - edges[:, 1:] * steps[:, 0]) / lengths[:, None]
+        if (sines.min(axis=1) <= EXACT).all():
+            return candidate.copy()
+    return None
+
+
+@dataclass(frozen=True)
+class _Symmetry:
+    """Turns by 1 / `turns` of a full one and, unless `axis` is None, mirrors: one axis at `axis` times 45 degrees."""
+
+    turns: int
+    axis: int | None
+
+    @property
+    def mirrors(self) -> list[np.ndarray]:
+        """Mirror matrices, by angle of their axes."""
+        return [] if self.axis is None else [_mirror(self.axis + 4 * i // self.turns) for i in range(self.turns)]
+
+    @property
+    def elements(self) -> list[np.ndarray]:
+        return self.mirrors + [_rotation(4 * i // self.turns) for i in range(1, self.turns)]
+
+
+def _mirror(eighths: int) -> np.ndarray:
+    """Mirror at the axis through the origin at `eighths` times 45 degrees."""
+    return _rotation(eighths % 4) @ np.diag([1.0, -1.0])
+
+
+def _rotation(quarters: int) -> np.ndarray:
+    """Turn by `quarters` times 90 degrees, x towards y."""
+    return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
+
+
+NO_SYMMETRY = _Symmetry(1, None)
+SYMMETRIES = (
+    *(_Symmetry(4, 0), _Symmetry(2, 0), _Symmetry(2, 1), _Symmetry(4, None)),
+    *(_Symmetry(1, axis) for axis in range(4)),
+    _Symmetry(2, None),
+)
+"""All that a grid of pixels has, the largest first."""
+
+
+@dataclass(frozen=True)
+class _Sector:
+    """An exactly symmetric outline, whose vertices 0 to `size` lie in one sector, and what maps that onto the next one or two."""
+
+    outline: Outline
+    size: int
+    symmetry: _Symmetry
+    to_image: tuple[np.ndarray, ...]
+
+
+def _smallest(shape: Outline, steps: Outline, max_edges: int, symmetry_cost: float) -> Outline | None:
+    """The smallest polygon of the largest symmetry that is not too dear; None where nothing closes."""
+    plain = _simple_walk(_Sector(shape, len(shape), NO_SYMMETRY, (np.eye(2),)), shape, steps, max_edges)
+    if plain is None or symmetry_cost < 0.0:
+        return plain
+    for sector in _sectors(shape, steps):
+        polygon = _simple_walk(sector, shape, steps, max_edges)
+        if polygon is not None and _area(polygon) <= _area(plain) + symmetry_cost * _area(shape) + EXACT:
+            return polygon
+    return plain
+
+
+def _sectors(shape: Outline, steps: Outline) -> Iterator[_Sector]:
+    """The outline unfolded from one sector of every symmetry that it shares with the directions, the largest first."""
+    from mrbokeh._polygon_rectification_numba import farthest_from_outline
+
+    def holds(element: np.ndarray) -> bool:
+        if not all(np.abs(steps - step).max(axis=1).min() < EXACT for step in steps @ element.T):
+            return False
+        return farthest_from_outline(shape @ element.T, shape, 0) <= ALIKE
+
+    held = {tuple(element.astype(int).flat) for element in SYMMETRIES[0].elements if holds(element)}
+    for symmetry in SYMMETRIES:
+        if not {tuple(element.astype(int).flat) for element in symmetry.elements} <= held:
+            continue
+        unfolded = _unfolded_by_turns(shape, symmetry) if symmetry.axis is None else _unfolded_by_mirrors(shape, symmetry)
+        if unfolded is None:
+            continue
+        outline, size, to_image = unfolded
+        if farthest_from_outline(shape, outline, 0) <= ALIKE and farthest_from_outline(outline, shape, 0) <= ALIKE:
+            yield _Sector(outline, size, symmetry, to_image)
+
+
+Unfolded = tuple[Outline, int, tuple[np.ndarray, ...]]
+
+
+def _unfolded_by_turns(shape: Outline, symmetry: _Symmetry) -> Unfolded | None:
+    """The outline from vertex 0 to its turned image, repeated."""
+    turn = _rotation(4 // symmetry.turns)
+    image = turn @ shape[0]
+    edges = np.roll(shape, -1, axis=0) - shape
+    share = np.clip(((image - shape) * edges).sum(axis=1) / (edges**2).sum(axis=1), 0.0, 1.0)
+    nearest = int(np.hypot(*(shape + share[:, None] * edges - image).T).argmin())
+    chain = shape[: nearest + 1]
+    if np.hypot(*(chain[-1] - image)) < EXACT:
+        chain = chain[:-1]
+    if len(chain) == 0:
+        return None
+    return _repeated(chain, turn, symmetry.turns), len(chain), (turn,)
+
+
+def _unfolded_by_mirrors(shape: Outline, symmetry: _Symmetry) -> Unfolded | None:
+    """The outline from one mirror axis to the next, mirrored and repeated; None if it does not cross every axis twice."""
+    crossings = [crossing for mirror in symmetry.mirrors for crossing in _crossings(shape, mirror)]
+    if len(crossings) != 2 * symmetry.turns:
+        return None
+    (start, at_start, first), (stop, at_stop, second) = sorted(crossings, key=lambda crossing: crossing[0])[:2]
+    inner = shape[int(np.floor(start)) + 1 : int(np.ceil(stop))]
+    apart = np.minimum(np.hypot(*(inner - at_start).T), np.hypot(*(inner - at_stop).T)) > EXACT
+    chain = np.concatenate([at_start[None], inner[apart], at_stop[None]])
+    period = np.concatenate([chain, (chain[1:-1] @ second.T)[::-1]])
+    return _repeated(period, second @ first, symmetry.turns), len(chain) - 1, (first, second)
+
+
+def _crossings(shape: Outline, mirror: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """(place along the outline, point on the axis, mirror) of every vertex on a mirror axis and every edge across it."""
+    onto_axis = 0.5 * (np.eye(2) + mirror)
+    normal = np.eye(2) - onto_axis
+    normal = normal[np.abs(normal).sum(axis=1).argmax()]
+    side = shape @ normal / np.hypot(*normal)
+    side[np.abs(side) < EXACT] = 0.0
+    following = np.roll(side, -1)
+    share = np.where(side == 0.0, 0.0, side / np.where(side == following, 1.0, side - following))
+    points = (shape + share[:, None] * (np.roll(shape, -1, axis=0) - shape)) @ onto_axis.T
+    return [(i + share[i], points[i], mirror) for i in np.flatnonzero((side == 0.0) | (side * following < 0.0))]
+
+
+def _repeated(points: np.ndarray, turn: np.ndarray, times: int) -> np.ndarray:
+    return np.concatenate([points @ np.linalg.matrix_power(turn, i).T for i in range(times)])
+
+
+def _simple_walk(sector: _Sector, shape: Outline, steps: Outline, max_edges: int) -> Outline | None:
+    """The smallest polygon around `shape` of the sector's symmetry that does not cross itself.
+
+    Where two corners on either side of a narrow gap overlap, the smallest walk crosses itself; then fewer edges are tried,
+    which closes the gap. Only then the result may fail to be the smallest.
+    """
+    while max_edges >= 3:
+        lines = (_turned_walk if sector.symmetry.axis is None else _mirrored_walk)(sector, steps, max_edges // sector.symmetry.turns)
+        if len(lines) < 3:
+            return None
+        polygon = _enclosing(lines, shape)
+        if not _overlaps_itself(polygon):
+            return polygon
+        max_edges = len(lines) - 1
+    return None
+
+
+def _overlaps_itself(polygon: Outline) -> bool:
+    """Whether a polygon crosses itself. Made a little smaller first: then one that touches itself in a point does not."""
+    from mrbokeh._polygon_rectification_numba import crosses_itself
+
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    return bool(crosses_itself(_corner_points(np.column_stack([polygon, edges / np.hypot(*edges.T)[:, None]]), -1e3 * EXACT)))
+
+
+def _enclosing(lines: np.ndarray, shape: Outline) -> Outline:
+    """The polygon of lines in their order, all moved outwards by as much as the shape differs from its symmetric twin."""
+    from mrbokeh._polygon_rectification_numba import farthest_from_outline
+
+    outwards, polygon = 0.0, _without_flat_vertices(_corner_points(lines, 0.0))
+    for _ in range(8):
+        missing = max(farthest_from_outline(shape, polygon, 1), farthest_from_outline(polygon, shape, -1))
+        if missing <= EXACT:
+            break
+        outwards += missing
+        polygon = _without_flat_vertices(_corner_points(lines, outwards))
+    return polygon
+
+
+def _turned_walk(sector: _Sector, steps: Outline, most: int) -> np.ndarray:
+    """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each of the turned parts."""
+    from mrbokeh import _polygon_rectification_numba as compiled
+
+    lines, places = compiled.touching_lines(sector.outline, 0, sector.size - 1, steps)
+    turn, count = sector.to_image[0], len(lines)
+    next_period = places + np.array([sector.size, 0])
+    lines, places = np.concatenate([lines, _turned(lines, turn)]), np.concatenate([places, next_period])
+    starts, targets, areas = compiled.corners(lines, places, count, sector.size, _swept(sector.outline))
+    walk = compiled.cheapest_turn(count, _fewest_origins(starts, targets), starts, targets, areas, most)
+    return np.concatenate([_turned(lines[walk, :4], np.linalg.matrix_power(turn, i)) for i in range(sector.symmetry.turns)])
+
+
+def _fewest_origins(starts: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Lines of which every closed walk contains one: those with a corner across one cut of the outline, for the best cut."""
+    count = len(starts) - 1
+    line = np.flatnonzero(np.diff(starts))
+    farthest = targets[starts[line + 1] - 1]
+    change = np.zeros(2 * count + 1, np.int64)
+    np.add.at(change, line, 1)
+    np.add.at(change, farthest, -1)
+    across = change.cumsum()[: 2 * count].reshape(2, count).sum(axis=0)
+    cut = int(across.argmin())
+    return line[((line <= cut) & (cut < farthest)) | (cut + count < farthest)]
+
+
+def _mirrored_walk(sector: _Sector, steps: Outline, most: int) -> np.ndarray:
+    """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each pair of mirrored sectors."""
+    from mrbokeh import _polygon_rectification_numba as compiled
+
+    lines, places = compiled.touching_lines(sector.outline, 0, sector.size, steps)
+    swept, (first, second) = _swept(sector.outline), sector.to_image
+    starts, targets, areas = compiled.corners(lines, places, len(lines), sector.size, swept)
+    before, beyond = _mirrored(lines, first), _mirrored(lines, second)
+    places_before, places_beyond = _mirrored_places(places, 0), _mirrored_places(places, sector.size)
+    at_first = compiled.axis_corners(before, places_before, lines, places, swept)
+    at_second = compiled.axis_corners(lines, places, beyond, places_beyond, swept)
+    walk = compiled.cheapest_sector(at_first, at_second, starts, targets, areas, most)
+    if len(walk) == 0:
+        return np.empty((0, 4))
+    back = beyond[walk[::-1], :4]
+    starts_across, ends_across = at_first[walk[0], 1] < np.inf, at_second[walk[-1], 1] < np.inf
+    period = np.concatenate([lines[walk, :4], back[int(ends_across) : len(back) - int(starts_across)]])
+    return np.concatenate([_turned(period, np.linalg.matrix_power(second @ first, i)) for i in range(sector.symmetry.turns)])
+
+
+def _mirrored(lines: np.ndarray, mirror: np.ndarray) -> np.ndarray:
+    """The mirror images of lines (x, y, dx, dy, forward, backward), with the outline to their left as before."""
+    return np.column_stack([lines[:, :2] @ mirror.T, -lines[:, 2:4] @ mirror.T, lines[:, [5, 4]]])
+
+
+def _mirrored_places(places: np.ndarray, axis: int) -> np.ndarray:
+    """Places (place, kind) of the mirror images, where the axis lies at place `axis`: what arrives leaves, and the other way round."""
+    from mrbokeh._polygon_rectification_numba import ARRIVING, LEAVING, THROUGH
+
+    kinds = places[:, 1]
+    return np.column_stack([2 * axis - places[:, 0], np.where(kinds == THROUGH, THROUGH, ARRIVING + LEAVING - kinds)])
+
+
+def _turned(lines: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    return np.column_stack([lines[:, :2] @ turn.T, lines[:, 2:4] @ turn.T, lines[:, 4:]])
+
+
+def _corner_points(lines: np.ndarray, outwards: float) -> Outline:
+    """The polygon of lines (x, y, dx, dy) in their order, all moved `outwards`, to the right of their directions."""
+    points, along = lines[:, :2] + outwards * lines[:, 3:1:-1] * [1.0, -1.0], lines[:, 2:4]
+    offset, following = np.roll(points, -1, axis=0) - points, np.roll(along, -1, axis=0)
+    ahead = _cross(offset, following) / _cross(along, following)
+    return points + ahead[:, None] * along
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _swept(outline: Outline) -> np.ndarray:
+    """(V + 1,) twice the area swept from the origin along the outline up to each vertex, and once around."""
+    return np.concatenate([[0.0], np.cumsum(_cross(outline, np.roll(outline, -1, axis=0)))])

@@ -1,0 +1,175 @@
+"""Slices, hidden background, field cells: what all spreading renderers share."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.hidden_background import apart, lights, without_lights
+from mrbokeh.layer import Layer, opaque
+from mrbokeh.layering import Layering, render_layers
+from mrbokeh.lens import Lens
+from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.spreading import Frame, spread_light
+
+SIZE = (72, 96)
+LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)  # up to 64 px of blur at infinity
+SPREAD = ScatterReference().spread
+
+
+def depth_m(coc_px: np.ndarray | float) -> np.ndarray:
+    per_dioptre = LENS.coc_px_per_dioptre(SIZE[1])
+    return np.broadcast_to(1.0 / (1.0 / LENS.focus_distance_m - np.asarray(coc_px) / per_dioptre), SIZE).astype(np.float32)
+
+
+def picture(rgb: np.ndarray, coc_px: np.ndarray | float) -> Layer:
+    return opaque(np.broadcast_to(rgb, (*SIZE, 3)).astype(np.float32), depth_m(coc_px).copy())
+
+
+def rendered(layers: list[Layer], lens: Lens = LENS, **settings: object) -> Layer:
+    return render_layers(layers, lens, SPREAD, Layering(**settings))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("slices", [1, 4, 16, 64])
+def test_a_slanted_surface_has_no_seams_and_no_dip_of_opacity(slices: int) -> None:
+    """From 20 px in front through the focus to 20 px behind: a white surface stays white everywhere, however it is cut."""
+    slanted = picture(np.ones(3), np.linspace(-20.0, 20.0, SIZE[1]))
+    result = rendered([slanted], slices=slices)
+    np.testing.assert_allclose(result.rgb, 1.0, atol=2e-6)
+    np.testing.assert_array_equal(result.alpha, 1.0)
+
+
+def test_a_slanted_object_over_nothing_stays_opaque_inside() -> None:
+    alpha = np.zeros(SIZE, np.float32)
+    alpha[:, 20:76] = 1.0
+    card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, depth_m(np.linspace(-9.0, 9.0, SIZE[1])).copy())
+    result = rendered([card], slices=8)
+    # Where the blur shrinks from pixel to pixel a little less light arrives than leaves: 0.6 %, not the 7 % of slices under "over".
+    np.testing.assert_allclose(result.alpha[12:-12, 28:68], 1.0, atol=0.01)
+    np.testing.assert_allclose(result.rgb[..., 0], result.alpha, atol=1e-6)
+
+
+def test_the_cut_into_slices_hardly_shows() -> None:
+    """One surface, textured: the reference without any slice is a plain scatter, divided by its weights."""
+    rng = np.random.default_rng(1)
+    slanted = picture(rng.uniform(0.0, 1.0, (*SIZE, 3)), np.linspace(-10.0, 10.0, SIZE[1]))
+    one, many = rendered([slanted], slices=1, fill=False), rendered([slanted], slices=12, fill=False)
+    assert np.abs(one.rgb - many.rgb).mean() < 0.01
+
+
+def test_what_hides_behind_a_thin_wire_is_interpolated_from_both_sides() -> None:
+    """A wire of 3 px, blurred by 20 px, over a ramp in focus: where it was the ramp goes on, darkened by the wire's share of the
+    disc, which on the wire's axis is the strip of 3 px through the middle of a disc of 20 px: 3 * 20 / (100 pi) to 1 %."""
+    ramp = np.linspace(0.2, 1.0, SIZE[1])[None, :, None] * np.ones(3)
+    rgb, coc_px = np.broadcast_to(ramp, (*SIZE, 3)).copy(), np.zeros(SIZE)
+    rgb[:, 47:50], coc_px[:, 47:50] = 0.0, -20.0
+    result = rendered([picture(rgb, coc_px)])
+    np.testing.assert_allclose(result.rgb[30:40, 47:50, 0] / ramp[0, 47:50, 0], 1.0 - 60.0 / (100.0 * np.pi), atol=0.015)  # 1 % of the strip, and the inverse squares of 16 directions on a ramp
+
+
+def test_real_layers_go_before_what_is_filled_in() -> None:
+    """Behind a near card lies a second picture, green. Where the lens looks past the card's edge it is seen, not the red beside it."""
+    rgb, coc_px = np.zeros((*SIZE, 3)) + [1.0, 0.0, 0.0], np.zeros(SIZE)
+    rgb[:, :40], coc_px[:, :40] = 0.0, -24.0
+    clean = np.zeros((*SIZE, 3)) + [1.0, 0.0, 0.0]
+    clean[:, :40] = [0.0, 1.0, 0.0]
+    alone, with_plate = rendered([picture(rgb, coc_px)]), rendered([picture(rgb, coc_px), picture(clean, 0.0)])
+    assert alone.rgb[36, 36, 1] == 0.0 and alone.rgb[36, 36, 0] > 0.2
+    assert with_plate.rgb[36, 36, 1] > 0.2 and with_plate.rgb[36, 36, 0] < 1e-6
+
+
+def test_layers_that_interleave_are_sorted_by_depth() -> None:
+    """Two crossing cards listed in the wrong order for the left half: on both sides the nearer one is seen."""
+    alpha = np.ones(SIZE, np.float32) * 0.999999  # not opaque, so that only the depth can group them
+    rising = Layer(np.zeros((*SIZE, 3), np.float32) + alpha[..., None] * np.float32([1, 0, 0]), alpha, depth_m(np.linspace(8, -8, SIZE[1])).copy())
+    falling = Layer(np.zeros((*SIZE, 3), np.float32) + alpha[..., None] * np.float32([0, 0, 1]), alpha, depth_m(np.linspace(-8, 8, SIZE[1])).copy())
+    result = rendered([rising, falling])
+    assert result.rgb[36, 12, 2] > 0.95 and result.rgb[36, 12, 0] < 0.01
+    assert result.rgb[36, -12, 0] > 0.95 and result.rgb[36, -12, 2] < 0.01
+
+
+def test_the_antialiased_rim_of_a_blurred_lamp_leaves_no_dot() -> None:
+    """A lamp of radiance 100 whose light also fills 30 % of a pixel that is said to be in focus; the background is 0.1."""
+    rgb, coc_px = np.full((*SIZE, 3), 0.1), np.zeros(SIZE)
+    rgb[36, 48], coc_px[36, 48] = 100.0, -20.0
+    rgb[36, 49] = 0.3 * 100.0 + 0.7 * 0.1
+    result = rendered([picture(rgb, coc_px)]).rgb[..., 0]
+    disc = 130.0 / (100.0 * np.pi)  # the light of 1.3 pixels over the disc
+    np.testing.assert_allclose(result[32:41, 44:53], 0.1 + disc, rtol=0.03)
+    assert result[36, 49] < 2.0 * disc
+
+
+def test_parting_a_picture_loses_no_light() -> None:
+    rng = np.random.default_rng(2)
+    values = np.concatenate([rng.uniform(0.0, 1.0, (*SIZE, 3)), np.ones((*SIZE, 1))], axis=2).astype(np.float32)
+    coc_px = np.zeros(SIZE, np.float32)
+    coc_px[20:50, 30:60] = -15.0
+    (front, front_coc_px), (behind, _) = apart(values, coc_px)
+    shown = front + (1.0 - front[..., 3:]) * behind
+    assert shown[..., 3].min() == 1.0
+    np.testing.assert_allclose(shown, values, atol=1e-6)
+    np.testing.assert_array_equal(front_coc_px[front[..., 3] == 1.0], coc_px[front[..., 3] == 1.0])
+
+
+def test_background_is_filled_no_farther_than_the_lens_sees() -> None:
+    """Half of a difference of 16 px in the circles of confusion, and a rim of 3.5 px for the pixels that are mixed."""
+    values = np.ones((*SIZE, 4), np.float32)
+    coc_px = np.zeros(SIZE, np.float32)
+    coc_px[:, :48] = -16.0
+    _, (behind, behind_coc_px) = apart(values, coc_px)
+    filled = behind[36, :, 3] > 0
+    assert filled[40:48].all() and not filled[:36].any()
+    np.testing.assert_allclose(behind_coc_px[36, 40:48], 0.0)
+
+
+def test_lamps_are_no_source_of_background() -> None:
+    values = np.ones((*SIZE, 4), np.float32) * np.float32([0.1, 0.1, 0.1, 1.0])
+    coc_px = np.zeros(SIZE, np.float32)
+    coc_px[:, :48] = -16.0
+    values[36, 50, :3] = 1000.0
+    assert lights(values[..., :3]).sum() == 1
+    assert without_lights(values)[36, 50, 0] == np.float32(0.1)
+    _, (behind, _) = apart(values, coc_px)
+    assert behind[..., :3].max() < 0.11
+
+
+def test_field_cells_meet_their_limit() -> None:
+    """A cat-eye resolved in ever finer cells: halving them brings the result nearer to the finest, and no light is lost."""
+    aperture = replace(Aperture.disc(32), cat_eye=0.8)
+    rng = np.random.default_rng(3)
+    values = np.zeros((*SIZE, 4), np.float32)
+    values[20:52, 20:76] = rng.uniform(0.0, 1.0, (32, 56, 4))
+    coc_px = np.full(SIZE, 12.0, np.float32)
+    frame = Frame(SIZE[1], SIZE[0])
+    coarse, middle, finest = (spread_light(SPREAD, values, coc_px, aperture, frame, cells) for cells in ((4, 3), (8, 6), (48, 36)))
+    for each in (coarse, middle, finest):
+        np.testing.assert_allclose(each.sum((0, 1)), values.sum((0, 1)), rtol=1e-5)
+    assert np.abs(middle - finest).mean() < 0.6 * np.abs(coarse - finest).mean()
+
+
+def test_cells_of_a_part_are_those_of_the_whole_frame() -> None:
+    """Light in a window sees the aperture of its place in the frame, not of its place in the window."""
+    aperture = replace(Aperture.disc(32), cat_eye=0.8)
+    values = np.zeros((*SIZE, 4), np.float32)
+    values[60, 80] = 1.0
+    coc_px = np.full(SIZE, 14.0, np.float32)
+    whole = spread_light(SPREAD, values, coc_px, aperture, Frame(SIZE[1], SIZE[0]))
+    window = np.s_[44:72, 64:96]
+    part = spread_light(SPREAD, values[window].copy(), coc_px[window].copy(), aperture, Frame(SIZE[1], SIZE[0], 64, 44))
+    np.testing.assert_allclose(part, whole[window], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("layers", "said"),
+    [
+        ([], "at least one layer"),
+        ([picture(np.ones(3), 0.0), opaque(np.ones((8, 8, 3), np.float32), np.ones((8, 8), np.float32))], "one size"),
+        ([picture(np.ones(3), 0.0), replace(picture(np.ones(3), 3.0), extra={"id": np.ones((*SIZE, 1), np.float32)})], "extra channels"),
+        ([opaque(np.ones((*SIZE, 3), np.float32), np.zeros(SIZE, np.float32))], "finite circle of confusion"),
+    ],
+)
+def test_what_cannot_be_rendered_is_said(layers: list[Layer], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        rendered(layers)
