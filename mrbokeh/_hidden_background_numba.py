@@ -43,51 +43,51 @@ def pure_neighbours(coc_px: np.ndarray, pure: np.ndarray, step_px: float, radius
 
 
 @njit(cache=True, nogil=True)
-def _offer(seed_y: np.ndarray, seed_x: np.ndarray, coc_px: np.ndarray, y: int, x: int, sy: int, sx: int, step_px: float) -> None:
+def _takes(seed_y: np.ndarray, seed_x: np.ndarray, coc_px: np.ndarray, y: int, x: int, sy: int, sx: int, step_px: float) -> bool:
     """Let pixel (y, x) take (sy, sx) for its seed if that lies behind it, within sight, and nearer than the seed it has."""
-    if sy < 0 or coc_px[sy, sx] <= coc_px[y, x] + step_px:
-        return
+    behind_px = coc_px[sy, sx] - coc_px[y, x]
     distance = (sy - y) ** 2 + (sx - x) ** 2
-    sight_px = 0.5 * (coc_px[sy, sx] - coc_px[y, x]) + 3.5
-    if distance > sight_px * sight_px:
-        return
-    if seed_y[y, x] < 0 or distance < (seed_y[y, x] - y) ** 2 + (seed_x[y, x] - x) ** 2:
-        seed_y[y, x], seed_x[y, x] = sy, sx
+    if behind_px <= step_px or distance > (0.5 * behind_px + 3.5) ** 2:
+        return False
+    if seed_y[y, x] >= 0 and distance >= (seed_y[y, x] - y) ** 2 + (seed_x[y, x] - x) ** 2:
+        return False
+    seed_y[y, x], seed_x[y, x] = sy, sx
+    return True
 
 
 @njit(cache=True, nogil=True)
-def nearest_behind(coc_px: np.ndarray, pure_y: np.ndarray, pure_x: np.ndarray, step_px: float, sweeps: int) -> tuple[np.ndarray, np.ndarray]:
+def nearest_behind(coc_px: np.ndarray, pure_y: np.ndarray, pure_x: np.ndarray, step_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the nearest pure pixel that lies more than `step_px` behind; -1 where the lens sees none.
 
-    The lens sees past an edge by half the difference of the two circles of confusion (and a rim's width more is
-    searched). Vector distance propagation (Danielsson 1980) with a condition that differs from pixel to pixel: a seed
-    travels through pixels that it lies behind as well, so it can miss a nearer one by a pixel or two where several
-    depths meet.
+    The lens sees past an edge by half the difference of the two circles of confusion (and a rim's width more is searched).
+    A brush fire from the edges inwards; the condition differs from pixel to pixel, and a seed travels only through pixels
+    that it lies behind, so that a nearer one can be missed by a pixel or two where several depths meet.
     """
     height, width = coc_px.shape
     seed_y, seed_x = np.full((height, width), -1, np.int32), np.full((height, width), -1, np.int32)
-    for sweep in range(2 * sweeps):
-        down = sweep % 2 == 0
-        dy = -1 if down else 1
-        for row in range(height):
-            y = row if down else height - 1 - row
-            for i in range(width):
-                x = i if down else width - 1 - i
-                for dx in range(-1, 2):
-                    ny, nx = y + dy, x + dx
-                    if 0 <= ny < height and 0 <= nx < width:
-                        _offer(seed_y, seed_x, coc_px, y, x, pure_y[ny, nx], pure_x[ny, nx], step_px)
-                        _offer(seed_y, seed_x, coc_px, y, x, seed_y[ny, nx], seed_x[ny, nx], step_px)
-                nx = x - 1 if down else x + 1
-                if 0 <= nx < width:
-                    _offer(seed_y, seed_x, coc_px, y, x, pure_y[y, nx], pure_x[y, nx], step_px)
-                    _offer(seed_y, seed_x, coc_px, y, x, seed_y[y, nx], seed_x[y, nx], step_px)
-            for i in range(width):
-                x = width - 1 - i if down else i
-                nx = x + 1 if down else x - 1
-                if 0 <= nx < width:
-                    _offer(seed_y, seed_x, coc_px, y, x, pure_y[y, nx], pure_x[y, nx], step_px)
-                    _offer(seed_y, seed_x, coc_px, y, x, seed_y[y, nx], seed_x[y, nx], step_px)
+    queued = np.zeros(height * width, np.bool_)
+    queue = np.empty(height * width + 1, np.int64)
+    first, end = 0, 0
+    for y in range(height):
+        for x in range(width):
+            taken = False
+            for ny in range(max(0, y - 1), min(height, y + 2)):
+                for nx in range(max(0, x - 1), min(width, x + 2)):
+                    if pure_y[ny, nx] >= 0 and coc_px[ny, nx] > coc_px[y, x] + step_px:
+                        taken |= _takes(seed_y, seed_x, coc_px, y, x, pure_y[ny, nx], pure_x[ny, nx], step_px)
+            if taken:
+                queue[end], queued[y * width + x] = y * width + x, True
+                end += 1
+    while first != end:
+        y, x = queue[first] // width, queue[first] % width
+        first = (first + 1) % queue.size
+        queued[y * width + x] = False
+        for ny in range(max(0, y - 1), min(height, y + 2)):
+            for nx in range(max(0, x - 1), min(width, x + 2)):
+                taken = _takes(seed_y, seed_x, coc_px, ny, nx, seed_y[y, x], seed_x[y, x], step_px)
+                if taken and not queued[ny * width + nx]:
+                    queue[end], queued[ny * width + nx] = ny * width + nx, True
+                    end = (end + 1) % queue.size
     return seed_y, seed_x
 
 

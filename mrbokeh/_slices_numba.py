@@ -5,29 +5,50 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def slice_windows(index: np.ndarray, weight: np.ndarray, values: np.ndarray, lowest: int, highest: int) -> np.ndarray:
-    """(slices, 4) int64: first row, end row, first column, end column of the covered, weighty pixels of each; empty where end <= first."""
+def slice_windows(
+    windows: np.ndarray, largest_px: np.ndarray, index: np.ndarray, weight: np.ndarray, values: np.ndarray, coc_px: np.ndarray, lowest: int
+) -> None:
+    """Widen windows (slices, 4: first row, end row, first column, end column) and largest diameters (slices) by a sheet's weighty pixels."""
     height, width = index.shape
-    windows = np.empty((highest - lowest + 1, 4), np.int64)
-    windows[:, 0], windows[:, 1], windows[:, 2], windows[:, 3] = height, 0, width, 0
     for y in range(height):
         for x in range(width):
             if weight[y, x] > 0.0 and values[y, x, 3] > 0.0:
-                window = windows[index[y, x] - lowest]
+                place = index[y, x] - lowest
+                window = windows[place]
                 window[0], window[1] = min(window[0], y), max(window[1], y + 1)
                 window[2], window[3] = min(window[2], x), max(window[3], x + 1)
-    return windows
+                largest_px[place] = max(largest_px[place], abs(coc_px[y, x]))
 
 
 @njit(cache=True, nogil=True)
-def pick_slice(picked: np.ndarray, values: np.ndarray, weight: np.ndarray, index: np.ndarray, slice_index: int) -> None:
-    """Overwrite picked (h, w, C) with values times weight where the pixel belongs to the slice, with 0 elsewhere."""
+def place_slice(
+    light: np.ndarray,
+    light_coc_px: np.ndarray,
+    full: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    weight: np.ndarray,
+    index: np.ndarray,
+    slice_index: int,
+) -> bool:
+    """Put a sheet's pixels of a slice, times their weight, into light (h, w, C) where it is not full; what was put has no weight any more.
+
+    True if some pixels found their place full and still wait.
+    """
     height, width, channels = values.shape
+    waiting = False
     for y in range(height):
         for x in range(width):
-            share = weight[y, x] if index[y, x] == slice_index else np.float32(0.0)
+            share = weight[y, x]
+            if index[y, x] != slice_index or share <= 0.0 or values[y, x, 3] <= 0.0:
+                continue
+            if full[y, x]:
+                waiting = True
+                continue
+            full[y, x], weight[y, x], light_coc_px[y, x] = True, 0.0, coc_px[y, x]
             for c in range(channels):
-                picked[y, x, c] = values[y, x, c] * share if share > 0.0 else np.float32(0.0)
+                light[y, x, c] = values[y, x, c] * share
+    return waiting
 
 
 @njit(cache=True, nogil=True)

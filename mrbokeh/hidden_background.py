@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float32
 _STEP_PX = 1.0  # less than this difference of circles of confusion between neighbours is one surface
 _SURFACE_PX = 2.0  # the same, for pixels some way apart
 _RIM_PX = 3
-_SWEEPS = 2
 _LIGHT_OVER_SURROUNDINGS = 4.0
 
 Values = Float32[np.ndarray, "height width channels"]
@@ -34,7 +33,7 @@ def apart(values: Values, coc_px: Plane) -> tuple[tuple[Values, Plane], tuple[Va
     lit = lights(values[..., :3])
     pure = ~(rim | lit)
     pure_y, pure_x = pure_neighbours(coc_px, pure, _STEP_PX, _RIM_PX)
-    seed_y, seed_x = nearest_behind(coc_px, pure_y, pure_x, _STEP_PX, _SWEEPS)
+    seed_y, seed_x = nearest_behind(coc_px, pure_y, pure_x, _STEP_PX)
     seeded_rim = rim & (pure_y >= 0)
     seed_y[seeded_rim], seed_x[seeded_rim] = pure_y[seeded_rim], pure_x[seeded_rim]
     interpolate(behind, behind_coc_px, values, coc_px, pure, seed_y, seed_x, _SURFACE_PX)

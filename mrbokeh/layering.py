@@ -98,7 +98,8 @@ def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing, insi
 
 def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
     """Colour of a scene without holes: what nobody claimed belongs to those who did."""
-    return colour / np.maximum(taken[..., _kinds(colour, taken)], _NOTHING_TAKEN), np.ones_like(taken)
+    shares = np.maximum(taken, _NOTHING_TAKEN)
+    return colour / (shares if taken.shape[2] == 1 else shares[..., _kinds(colour, taken)]), np.ones_like(taken)
 
 
 def _over(front: Channels, front_taken: Channels, behind: Channels, behind_taken: Channels) -> tuple[Channels, Channels]:

@@ -14,6 +14,7 @@ from mrbokeh.lens import Lens
 from mrbokeh.spreading import Frame, Spread, reach_px, spread_light
 
 _LEAST_STEP_PX = 0.5
+_BORDER_PX = 5
 
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]
@@ -63,7 +64,9 @@ def continued(sheet: Sheet, margin_px: int) -> Sheet:
     around = ((margin_px, margin_px), (margin_px, margin_px))
     inside = (slice(margin_px, -margin_px), slice(margin_px, -margin_px))
     mode = "edge" if sheet.is_opaque else "constant"
-    source = without_lights(sheet.values) if sheet.is_opaque else sheet.values
+    source = sheet.values.copy()
+    for border in (np.s_[:_BORDER_PX], np.s_[-_BORDER_PX:], np.s_[:, :_BORDER_PX], np.s_[:, -_BORDER_PX:]):
+        source[border] = without_lights(source[border]) if sheet.is_opaque else source[border]
     values = np.pad(source, (*around, (0, 0)), mode=mode)
     values[inside] = sheet.values
     return Sheet(values, np.pad(sheet.coc_px, around, mode=mode), sheet.is_opaque)
@@ -83,18 +86,14 @@ def composited(sheets: Sequence[Sheet], slicing: Slicing) -> tuple[Channels, Cha
     for weights in _seen_and_hidden(sheets):
         for values, coc_px, window in _slices(sheets, weights, step_px, slicing.aperture):
             frame = slicing.frame.moved(window[1].start, window[0].start)
-            light = spread_light(slicing.spread, values, coc_px, slicing.aperture, frame, slicing.field_cells)
-            claim(colour[window], taken[window], light)
+            claim(colour[window], taken[window], spread_light(slicing.spread, values, coc_px, slicing.aperture, frame, slicing.field_cells))
     return colour, taken
 
 
 def _step_px(sheets: Sequence[Sheet], slices: int) -> float:
     """Width of a slice in pixels of circle of confusion."""
-    covered = [sheet.coc_px[sheet.values[..., 3] > 0] for sheet in sheets]
-    some = [each for each in covered if each.size]
-    if not some:
-        return _LEAST_STEP_PX
-    return max((max(float(each.max()) for each in some) - min(float(each.min()) for each in some)) / slices, _LEAST_STEP_PX)
+    farthest, nearest = max(float(sheet.coc_px.max()) for sheet in sheets), min(float(sheet.coc_px.min()) for sheet in sheets)
+    return max((farthest - nearest) / slices, _LEAST_STEP_PX)
 
 
 def _seen_and_hidden(sheets: Sequence[Sheet]) -> Iterator[list[Plane]]:
@@ -103,8 +102,9 @@ def _seen_and_hidden(sheets: Sequence[Sheet]) -> Iterator[list[Plane]]:
         yield [np.ones_like(sheets[0].coc_px)]
         return
     seen = [_shown(i, sheets) for i in range(len(sheets))]
+    hidden = [1.0 - each for each in seen]
     yield seen
-    yield [1.0 - each for each in seen]
+    yield hidden
 
 
 def _shown(i: int, sheets: Sequence[Sheet]) -> Plane:
@@ -120,32 +120,40 @@ def _shown(i: int, sheets: Sequence[Sheet]) -> Plane:
 def _slices(
     sheets: Sequence[Sheet], weights: Sequence[Plane], step_px: float, aperture: Aperture
 ) -> Iterator[tuple[Channels, Plane, tuple[slice, slice]]]:
-    """Light, circles of confusion and window of every slice that is not empty, front first; sheets of one slice in their order."""
-    from mrbokeh._slices_numba import pick_slice, slice_windows
+    """Light, circles of confusion and window of every slice that is not empty, front first. Uses the weights up.
+
+    Pixels of several sheets go together. Where two fall on one pixel within a slice the later sheet's goes in a second round.
+    """
+    from mrbokeh._slices_numba import place_slice
 
     indices = [np.floor(sheet.coc_px / step_px + 0.5).astype(np.int32) for sheet in sheets]
+    for slice_index, window in _windows(sheets, weights, indices, aperture):
+        waiting = True
+        while waiting:
+            waiting, size = False, indices[0][window].shape
+            light, coc_px = np.zeros((*size, sheets[0].values.shape[2]), np.float32), np.zeros(size, np.float32)
+            full = np.zeros(size, np.bool_)
+            for sheet, weight, index in zip(sheets, weights, indices, strict=True):
+                waiting |= place_slice(
+                    light, coc_px, full, sheet.values[window], sheet.coc_px[window], weight[window], index[window], slice_index
+                )
+            yield light, coc_px, window
+
+
+def _windows(
+    sheets: Sequence[Sheet], weights: Sequence[Plane], indices: Sequence[Int32[np.ndarray, "height width"]], aperture: Aperture
+) -> Iterator[tuple[int, tuple[slice, slice]]]:
+    """Every slice that is not empty, front first, and the rectangle that its light can reach."""
+    from mrbokeh._slices_numba import slice_windows
+
+    height, width = indices[0].shape
     lowest, highest = min(int(index.min()) for index in indices), max(int(index.max()) for index in indices)
-    boxes = [
-        slice_windows(index, weight, sheet.values, lowest, highest) for sheet, index, weight in zip(sheets, indices, weights, strict=True)
-    ]
-    for slice_index in range(lowest, highest + 1):
-        for sheet, weight, index, box in zip(sheets, weights, indices, boxes, strict=True):
-            window = _window(box[slice_index - lowest], sheet.coc_px, index, slice_index, aperture)
-            if window is None:
-                continue
-            picked = np.empty((*index[window].shape, sheet.values.shape[2]), np.float32)
-            pick_slice(picked, sheet.values[window], weight[window], index[window], slice_index)
-            yield picked, np.ascontiguousarray(sheet.coc_px[window]), window
-
-
-def _window(
-    box: np.ndarray, coc_px: Plane, index: Int32[np.ndarray, "height width"], slice_index: int, aperture: Aperture
-) -> tuple[slice, slice] | None:
-    """The rectangle that the light of a slice can reach, or None for an empty one."""
-    top, bottom, left, right = (int(edge) for edge in box)
-    if bottom <= top:
-        return None
-    own = index[top:bottom, left:right] == slice_index
-    reach = reach_px(aperture, float(np.abs(coc_px[top:bottom, left:right][own]).max(initial=0.0)))
-    height, width = coc_px.shape
-    return slice(max(0, top - reach), min(height, bottom + reach)), slice(max(0, left - reach), min(width, right + reach))
+    windows = np.tile(np.array([height, 0, width, 0]), (highest - lowest + 1, 1))
+    largest_px = np.zeros(len(windows), np.float32)
+    for sheet, weight, index in zip(sheets, weights, indices, strict=True):
+        slice_windows(windows, largest_px, index, weight, sheet.values, sheet.coc_px, lowest)
+    for place, (top, bottom, left, right) in enumerate(windows.tolist()):
+        if bottom > top:
+            reach = reach_px(aperture, float(largest_px[place]))
+            rows, columns = slice(max(0, top - reach), min(height, bottom + reach)), slice(max(0, left - reach), min(width, right + reach))
+            yield lowest + place, (rows, columns)
