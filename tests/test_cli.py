@@ -96,19 +96,19 @@ def test_lens_and_render_from_end_to_end(tmp_path: Path) -> None:
     assert mrbokeh("lens", "show", lens, "--out", tmp_path / "lens.png").returncode == 0
     coc = mrbokeh("lens", "coc", lens, 0.5, 1, "inf", "--width", 32).stdout
     assert "0.5 m: -" in coc and "1 m: +0.00 px" in coc and "inf m: +" in coc
-    done = mrbokeh("render", layer, "--lens", lens, "--out", out, "--focus", 0.4)
+    done = mrbokeh("render", "--layer", layer, "--lens", lens, "--out", out, "--focus-distance-m", 0.4, "--alpha-out")
     assert done.returncode == 0, done.stderr
     blurred, sharp = read_layer(out), read_layer(layer)
     assert blurred.alpha.sum() == pytest.approx(sharp.alpha.sum(), rel=2e-3)  # half float
     assert (blurred.alpha > 0).sum() > (sharp.alpha > 0).sum()
-    again = mrbokeh("render", layer, "--lens", lens, "--out", out)
+    again = mrbokeh("render", "--layer", layer, "--lens", lens, "--out", out)
     assert again.returncode == 2 and "--overwrite" in again.stderr
 
 
 def test_an_unknown_renderer_is_refused(tmp_path: Path) -> None:
     small_layer(tmp_path / "layer.exr")
     mrbokeh("lens", "new", tmp_path / "lens.json", "--focal-length", 50, "--f-number", 2, "--focus", 1)
-    done = mrbokeh("render", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json", "--out", tmp_path / "o.exr", "--renderer", "magic")
+    done = mrbokeh("render", "--layer", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json", "--out", tmp_path / "o.exr", "--method", "magic")
     assert done.returncode == 2 and "expected a renderer" in done.stderr
 
 

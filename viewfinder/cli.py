@@ -11,7 +11,7 @@ import typer
 
 from mrbokeh.image_io import read_layer
 from mrbokeh.lens_file import read_lens
-from mrbokeh.renderers.choose import make_renderer
+from mrbokeh.renderers.choose import DEFAULT, make_renderer
 from viewfinder.focused_layer import FocusedLayer
 from viewfinder.frame_source import open_source
 from viewfinder.pipeline import Pipeline
@@ -37,7 +37,7 @@ def serve(
     ],
     layer: Annotated[Path, typer.Option(metavar="RGBAZ.exr", help="All-in-focus virtual layer; the stream has its size.")],
     lens: Annotated[Path, typer.Option(metavar="LENS.json", help="The lens; its focus is where the slider begins.")],
-    renderer: Annotated[str, typer.Option(help="Name of a renderer, or a network (.onnx).")] = "reference",
+    renderer: Annotated[str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).")] = DEFAULT,
     port: Annotated[int, typer.Option(help="Port of the page; 0 takes a free one.")] = 8080,
     host: Annotated[str, typer.Option(help="Address to listen on; other machines reach only what is not loopback.")] = "127.0.0.1",
     fps: Annotated[float | None, typer.Option(help="At most so many frames per second.")] = None,

@@ -20,7 +20,8 @@ def composite(
         Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. A stack brings its own.")
     ] = None,
     renderer: Annotated[
-        str | None, typer.Option(help="reference, or a network (.onnx). Default: the network of --lens, else reference.")
+        str | None,
+        typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or NETWORK.onnx. Default: the network of --lens, else polygon."),
     ] = None,
     slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.")] = None,
     depth: Annotated[

@@ -8,6 +8,7 @@ import typer
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
+from mrbokeh.renderers.choose import DEFAULT, make_renderer
 
 app = typer.Typer(add_completion=False)
 
@@ -19,7 +20,9 @@ def render(
     rgb: Annotated[Path | None, typer.Option(help="All-in-focus picture, scene-linear: .exr, .hdr or float .tif.")] = None,
     depth: Annotated[Path | None, typer.Option(help="Its depth: EXR channel Z, depth.Z or Y in metres; inf or <= 0: background.")] = None,
     layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with R, G, B, A (premultiplied) and Z; repeat it, front first.")] = None,
-    method: Annotated[str, typer.Option(help="polygon, low-rank, scatter (exact, slow), or a trained network (.onnx).")] = "polygon",
+    method: Annotated[
+        str, typer.Option("--method", "--renderer", help="polygon, low-rank, scatter (exact, slow), or a trained network (.onnx).")
+    ] = DEFAULT,
     focus_distance_m: Annotated[float | None, typer.Option(help="Focus distance in place of the lens file's; inf is allowed.")] = None,
     focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None,
     srgb: Annotated[bool, typer.Option("--srgb", help="--rgb holds integers encoded as sRGB (highlights are lost).")] = False,
@@ -36,7 +39,6 @@ def render(
     from mrbokeh.image_io import write_image, write_layer
     from mrbokeh.layering import Layering
     from mrbokeh.lens_file import read_lens
-    from mrbokeh.renderers.choose import make_renderer
 
     refuse_existing(out, overwrite)
     if alpha_out and out.suffix.lower() != ".exr":
@@ -103,4 +105,4 @@ def _focused(lens: Lens, sharp: dict[str, Layer], focus_distance_m: float | None
         x_px, y_px, radius_px = (*map(int, focus_at.split(",")), 0)[:3]
     except ValueError:
         raise InputError(f"--focus-at: expected X,Y or X,Y,RADIUS in whole pixels, got {focus_at!r}") from None
-    return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, radius_px)
+    return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))

@@ -13,7 +13,7 @@ from mrbokeh.layer import Layer
 from mrbokeh.lens_file import read_lens
 from mrbokeh.overlay import Overlay
 from mrbokeh.progress import track
-from mrbokeh.renderers.choose import make_renderer
+from mrbokeh.renderers.choose import DEFAULT, make_renderer
 from mrbokeh.video_frames import encoding_for
 from mrbokeh.video_io import Frame, VideoInfo, VideoWriter, probe, read_frames
 
@@ -23,7 +23,7 @@ ClipArgument = Annotated[Path, typer.Argument(metavar="CLIP", help="Video from a
 LayerOption = Annotated[Path, typer.Option(metavar="RGBAZ.exr", help="All-in-focus virtual layer: linear, premultiplied, Z in metres.")]
 LensOption = Annotated[Path, typer.Option(metavar="LENS.json", help="The lens, focused as it was when the clip was shot.")]
 OutOption = Annotated[Path, typer.Option(metavar="VIDEO", help=".mov (ProRes 4444), .mp4 (H.264) or .mkv (FFV1, lossless).")]
-RendererOption = Annotated[str, typer.Option(help="Name of a renderer, or a network (.onnx).")]
+RendererOption = Annotated[str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).")]
 FramesOption = Annotated[str, typer.Option(metavar="START:STOP", help="Frames to take, counted from 0; STOP is left out.")]
 EncodingOption = Annotated[
     str | None, typer.Option(help="h264, h264-10bit, prores4444, prores422 or ffv1; by default the usual one of OUT.")
@@ -37,7 +37,7 @@ def video(
     layer: LayerOption,
     lens: LensOption,
     out: OutOption,
-    renderer: RendererOption = "reference",
+    renderer: RendererOption = DEFAULT,
     frames: FramesOption = ":",
     encoding: EncodingOption = None,
     overwrite: OverwriteOption = False,

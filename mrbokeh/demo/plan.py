@@ -96,7 +96,7 @@ def _composites(folder: Path, stack: Path, placements: tuple[Placement, ...]) ->
 
 def _composite(folder: Path, stack: Path, placement: Placement, renderer: str) -> Stage:
     picture = folder / f"{placement.name}_{renderer}.png"
-    blur = ("--lens", str(folder / "lens.onnx")) if renderer == "network" else ("--renderer", "reference")
+    blur = ("--lens", str(folder / "lens.onnx")) if renderer == "network" else ("--renderer", "scatter")
     arguments = (
         *("composite", str(stack), "--slice", str(placement.slice_index), "--object", str(DATA / "objects" / placement.glb)),
         *("--at-pixel", placement.at_pixel, "--height", f"{placement.height_m:g}", "--turn", f"{placement.turn_deg:g}"),

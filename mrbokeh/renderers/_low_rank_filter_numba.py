@@ -1,0 +1,163 @@
+"""Low-rank scatter of a picture whose blur changes from pixel to pixel: per tile of the result, level by level, term by term.
+
+A tile is TILE_FLOATS numbers wide, so that one row of it is a fixed count that the compiler turns into vector code.
+Its work (rows of one level's share of the picture, and one term's rows filtered across) stays in the processor's cache.
+"""
+
+import numpy as np
+from numba import njit
+
+TILE_FLOATS = 128
+_ROWS_AT_ONCE = 4
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _across(row: np.ndarray, line: np.ndarray, taps: np.ndarray, channels: int) -> None:
+    """row[x] = sum of taps[j] * line[x + j * channels]; four taps at once, or storing the row would cost more than adding."""
+    row[:] = np.float32(0)
+    count = taps.shape[0]
+    whole = count - count % 4
+    for j in range(0, whole, 4):
+        a, b, c, d = taps[j], taps[j + 1], taps[j + 2], taps[j + 3]
+        at = j * channels
+        line0, line1 = line[at : at + TILE_FLOATS], line[at + channels : at + channels + TILE_FLOATS]
+        at += 2 * channels
+        line2, line3 = line[at : at + TILE_FLOATS], line[at + channels : at + channels + TILE_FLOATS]
+        for x in range(TILE_FLOATS):
+            row[x] += a * line0[x] + b * line1[x] + c * line2[x] + d * line3[x]
+    for j in range(whole, count):
+        a = taps[j]
+        line0 = line[j * channels : j * channels + TILE_FLOATS]
+        for x in range(TILE_FLOATS):
+            row[x] += a * line0[x]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _four_by_four(out: np.ndarray, across: np.ndarray, taps: np.ndarray) -> None:
+    """Four rows of the result from four filtered rows; taps: the seven that lie between them, the middle one for row = row."""
+    out0, out1, out2, out3 = out[0], out[1], out[2], out[3]
+    in0, in1, in2, in3 = across[0], across[1], across[2], across[3]
+    t0, t1, t2, t3, t4, t5, t6 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5], taps[6]
+    for x in range(TILE_FLOATS):
+        a, b, c, d = in0[x], in1[x], in2[x], in3[x]
+        out0[x] += t3 * a + t4 * b + t5 * c + t6 * d
+        out1[x] += t2 * a + t3 * b + t4 * c + t5 * d
+        out2[x] += t1 * a + t2 * b + t3 * c + t4 * d
+        out3[x] += t0 * a + t1 * b + t2 * c + t3 * d
+
+
+@njit(cache=True, nogil=True)
+def _down(out: np.ndarray, across: np.ndarray, lit: np.ndarray, padded_taps: np.ndarray, count: int) -> None:
+    """out[y] += sum of tap[j] * across[y + j]; padded_taps has 3 zeros before and 6 behind, so that no four need a case."""
+    for y in range(0, out.shape[0], _ROWS_AT_ONCE):
+        for at in range(y, y + count + 3, _ROWS_AT_ONCE):
+            if lit[at] or lit[at + 1] or lit[at + 2] or lit[at + 3]:
+                _four_by_four(out[y : y + 4], across[at : at + 4], padded_taps[at - y : at - y + 7])
+
+
+@njit(cache=True, nogil=True)
+def _stage(
+    line: np.ndarray, values: np.ndarray, shares: np.ndarray, levels: np.ndarray, uppers: np.ndarray, left: int, pixels: int, level: int
+) -> bool:
+    """One level's share of a row of the picture from column `left` on, 0 beyond the frame; False where that is nothing."""
+    line[:] = np.float32(0)
+    channels = values.shape[1]
+    lit = False
+    for x in range(max(0, left), min(values.shape[0], left + pixels)):
+        if levels[x] == level:
+            weight = shares[x] * (np.float32(1) - uppers[x])
+        elif levels[x] == level - 1:
+            weight = shares[x] * uppers[x]
+        else:
+            continue
+        if weight > 0:
+            lit = True
+            at = (x - left) * channels
+            for c in range(channels):
+                line[at + c] = weight * values[x, c]
+    return lit
+
+
+@njit(cache=True, nogil=True)
+def _level_on_tile(
+    sums: np.ndarray, lines: np.ndarray, lit: np.ndarray, across: np.ndarray, columns: np.ndarray, rows: np.ndarray, channels: int
+) -> None:
+    """All terms of one level: every lit line across, then down into the sums; columns with their zeros around them."""
+    count = rows.shape[1]
+    for term in range(rows.shape[0]):
+        for y in range(lines.shape[0]):
+            if lit[y]:
+                _across(across[y], lines[y], rows[term], channels)
+            else:
+                across[y] = np.float32(0)
+        _down(sums, across, lit, columns[term], count)
+
+
+@njit(cache=True, nogil=True)
+def _any_in_reach(spans: np.ndarray, top: int, bottom: int, left: int, right: int, level: int) -> bool:
+    for y in range(max(0, top), min(spans.shape[0], bottom)):
+        for tile in range(max(0, left), min(spans.shape[1], right)):
+            if spans[y, tile, 0] <= level <= spans[y, tile, 1]:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def scatter_piece(
+    out: np.ndarray,
+    values: np.ndarray,
+    shares: np.ndarray,
+    levels: np.ndarray,
+    uppers: np.ndarray,
+    spans: np.ndarray,
+    columns: np.ndarray,
+    rows: np.ndarray,
+    ranks: np.ndarray,
+    radii_px: np.ndarray,
+    top: int,
+    bottom: int,
+    first_tile: int,
+    end_tile: int,
+) -> None:
+    """Add to rows top:bottom and tiles first_tile:end_tile of out (H, W, C) what all levels throw there.
+
+    shares (H, W): how much of a pixel goes this way. levels (H, W) int16, uppers (H, W): the share `upper` of a pixel goes to
+    the kernel of level + 1, the rest to that of its level. columns (levels, terms, 3 + K + 6), rows (levels, terms, K): taps
+    in the order in which a pixel of the result meets its sources; K differs, radii_px and ranks say how much of it is used.
+    """
+    height, width, channels = values.shape
+    tile_px = TILE_FLOATS // channels
+    size = bottom - top + (-(bottom - top)) % _ROWS_AT_ONCE
+    longest = 2 * radii_px.max() + 1
+    sums = np.empty((size, TILE_FLOATS), np.float32)
+    across = np.empty((size + longest + 6, TILE_FLOATS), np.float32)
+    lines = np.empty((across.shape[0], TILE_FLOATS + longest * channels), np.float32)
+    lit = np.empty(across.shape[0], np.bool_)
+    for tile in range(first_tile, end_tile):
+        left = tile * tile_px
+        sums[:] = np.float32(0)
+        for level in range(ranks.shape[0]):
+            radius_px = radii_px[level]
+            tiles_away = (radius_px + tile_px - 1) // tile_px
+            if ranks[level] == 0 or not _any_in_reach(
+                spans, top - radius_px, bottom + radius_px, tile - tiles_away, tile + tiles_away + 1, level
+            ):
+                continue
+            count = 2 * radius_px + 1
+            used = size + count + 6
+            any_lit = False
+            for i in range(used):
+                y = top - radius_px + i
+                lit[i] = (
+                    0 <= y < min(height, bottom + radius_px)
+                    and _any_in_reach(spans, y, y + 1, tile - tiles_away, tile + tiles_away + 1, level)
+                    and _stage(lines[i], values[y], shares[y], levels[y], uppers[y], left - radius_px, tile_px + count - 1, level)
+                )
+                any_lit = any_lit or lit[i]
+            if any_lit:
+                terms = ranks[level]
+                _level_on_tile(sums, lines[:used], lit[:used], across[:used], columns[level, :terms], rows[level, :terms, :count], channels)
+        for y in range(top, bottom):
+            for x in range(left, min(width, left + tile_px)):
+                for c in range(channels):
+                    out[y, x, c] += sums[y - top, (x - left) * channels + c]
