@@ -10,6 +10,31 @@ _LARGEST_SHARE = 0.6
 
 
 @njit(cache=True, nogil=True)
+def snapped(coc_px: np.ndarray, step_px: float) -> np.ndarray:
+    """Circles of confusion in which no pixel floats in the air between two surfaces, as antialiased or resized depth makes them.
+
+    A pixel between two even surfaces, each at most 2 pixels away on opposite sides, takes the nearer value of the two.
+    """
+    height, width = coc_px.shape
+    result = coc_px.copy()
+    for y in range(2, height - 2):
+        for x in range(2, width - 2):
+            here = coc_px[y, x]
+            for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+                for before in range(1, 3):
+                    for after in range(1, 3):
+                        if not (before + 1 <= min(y, x, width - 1 - x) and after + 1 <= min(height - 1 - y, x, width - 1 - x)):
+                            continue
+                        a, aa = coc_px[y - before * dy, x - before * dx], coc_px[y - (before + 1) * dy, x - (before + 1) * dx]
+                        b, bb = coc_px[y + after * dy, x + after * dx], coc_px[y + (after + 1) * dy, x + (after + 1) * dx]
+                        even = abs(a - aa) <= 0.5 * step_px and abs(b - bb) <= 0.5 * step_px
+                        between = (here - a) * (b - here) > 0.0 and min(abs(here - a), abs(b - here)) > 0.5 * step_px
+                        if even and between and abs(b - a) > 2.0 * step_px:
+                            result[y, x] = a if abs(here - a) < abs(b - here) else b
+    return result
+
+
+@njit(cache=True, nogil=True)
 def rims(coc_px: np.ndarray, step_px: float) -> np.ndarray:
     """(H, W) bool: pixels with something more than `step_px` nearer beside them; they may hold some of its colour."""
     height, width = coc_px.shape

@@ -23,8 +23,9 @@ def apart(values: Values, coc_px: Plane) -> tuple[tuple[Values, Plane], tuple[Va
 
     values: (H, W, 4 + E) premultiplied R, G, B, coverage 1, others; coc_px: (H, W) signed diameters.
     """
-    from mrbokeh._hidden_background_numba import interpolate, nearest_behind, pure_neighbours, rims, unmix_rims
+    from mrbokeh._hidden_background_numba import interpolate, nearest_behind, pure_neighbours, rims, snapped, unmix_rims
 
+    coc_px = snapped(coc_px, _STEP_PX)
     rim = rims(coc_px, _STEP_PX)
     front, front_coc_px = values, coc_px
     behind, behind_coc_px = np.zeros_like(values), np.zeros_like(coc_px)

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mrbokeh._hidden_background_numba import snapped
 from mrbokeh.aperture import Aperture
+
 from mrbokeh.errors import InputError
 from mrbokeh.hidden_background import apart, lights, without_lights
 from mrbokeh.layer import Layer, opaque
@@ -99,6 +101,22 @@ def test_the_antialiased_rim_of_a_blurred_lamp_leaves_no_dot() -> None:
     disc = 130.0 / (100.0 * np.pi)  # the light of 1.3 pixels over the disc
     np.testing.assert_allclose(result[32:41, 44:53], 0.1 + disc, rtol=0.03)
     assert result[36, 49] < 2.0 * disc
+
+
+def test_antialiased_depth_leaves_nothing_in_the_air() -> None:
+    """A disc at another depth, its depth map resized as pictures are, so that its rim lies at every depth between: the rim's
+    pixels take one side or the other, and a steep but even slope stays as it is."""
+    import cv2
+
+    rows, columns = np.mgrid[: 4 * SIZE[0], : 4 * SIZE[1]]
+    fine = np.where(np.hypot(rows - 144, columns - 192) < 80, -12.0, 9.0).astype(np.float32)
+    coc_px = cv2.resize(fine, SIZE[::-1], interpolation=cv2.INTER_AREA)
+    floating = (coc_px > -11.9) & (coc_px < 8.9)
+    (_, front_coc_px), _ = apart(np.ones((*SIZE, 4), np.float32), coc_px)
+    left = (front_coc_px > -11.9) & (front_coc_px < 8.9)
+    assert floating.sum() > 100 and left.sum() <= 0.05 * floating.sum()
+    slope = np.broadcast_to(np.linspace(-60.0, 60.0, SIZE[1], dtype=np.float32), SIZE).copy()
+    np.testing.assert_array_equal(snapped(slope, 1.0), slope)
 
 
 def test_parting_a_picture_loses_no_light() -> None:
