@@ -129,8 +129,9 @@ def interpolate(
 ) -> None:
     """Where there is a seed, overwrite filled (H, W, C) and its circle of confusion with what lies around on the seed's surface.
 
-    The first pure pixels in 16 directions, up to twice as far as the seed, weighted by one over the squared distance: behind
-    a thin wire this interpolates between both sides, behind a broad object it continues what is beside it.
+    The first pure pixels in 16 directions, up to twice as far as the seed, weighted by one over the squared distance; in each
+    direction the mean of a quarter as many pixels as they are far. So behind a thin wire this interpolates between both
+    sides, and behind a broad object it continues what is beside it, ever smoother, as a guess should be.
     """
     height, width, channels = values.shape
     for y in range(height):
@@ -146,16 +147,21 @@ def interpolate(
             for direction in range(_DIRECTIONS):
                 angle_rad = 2.0 * math.pi * direction / _DIRECTIONS
                 step_x, step_y = math.cos(angle_rad), math.sin(angle_rad)
-                for distance in range(1, int(2.0 * nearest_px) + 4):
+                first = 0
+                for distance in range(1, int(4.0 * nearest_px) + 6):
                     ny, nx = int(round(y + distance * step_y)), int(round(x + distance * step_x))
-                    if not (0 <= ny < height and 0 <= nx < width):
+                    if not (0 <= ny < height and 0 <= nx < width) or (first == 0 and distance > 2.0 * nearest_px + 3.0):
                         break
                     if pure[ny, nx] and abs(coc_px[ny, nx] - coc_px[sy, sx]) <= surface_px:
-                        weight = 1.0 / distance**2
+                        first = distance if first == 0 else first
+                        weight = 1.0 / (first**2 * max(1, first // 4))
                         total += weight
                         coc_sum += weight * coc_px[ny, nx]
                         for c in range(channels):
                             filled[y, x, c] += weight * values[ny, nx, c]
+                        if distance - first + 1 >= first // 4:
+                            break
+                    elif first > 0:
                         break
             filled_coc_px[y, x] = coc_sum / total
             for c in range(channels):
