@@ -8,7 +8,7 @@ from numba import njit
 def slice_windows(
     windows: np.ndarray, largest_px: np.ndarray, index: np.ndarray, weight: np.ndarray, values: np.ndarray, coc_px: np.ndarray, lowest: int
 ) -> None:
-    """Widen windows (slices, 4: first row, end row, first column, end column) and largest diameters (slices) by a sheet's weighty pixels."""
+    """Widen windows (slices, 4: first and end row, first and end column) and largest diameters (slices) by a sheet's weighty pixels."""
     height, width = index.shape
     for y in range(height):
         for x in range(width):

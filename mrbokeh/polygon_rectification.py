@@ -12,8 +12,8 @@ then covers one sector, from mirror axis to mirror axis or from a line to its tu
 polygon among those with the same symmetry, not a symmetrised one.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from math import gcd
 from typing import Literal
 
@@ -22,17 +22,10 @@ from jaxtyping import Float64
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
+from mrbokeh.outline_symmetry import EXACT, NO_SYMMETRY, Outline, Sector, sectors
 
 PAPER_DIRECTIONS = ((1, 0), (0, 1), (1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
 """The set D of Fig. 6: the slopes whose differenced edges have few non-zero elements."""
-
-ALIKE = 1e-3
-"""An outline counts as symmetric if its mirror image stays this close to it, in its half extents."""
-
-EXACT = 1e-9
-"""Half extents below which two points are one, and sines below which an edge has a direction."""
-
-Outline = Float64[np.ndarray, "_ 2"]
 
 
 def rectify(
@@ -161,134 +154,19 @@ def _already_rectified(outline: Outline, steps: Outline, max_edges: int) -> Outl
     return None
 
 
-@dataclass(frozen=True)
-class _Symmetry:
-    """Turns by 1 / `turns` of a full one and, unless `axis` is None, mirrors: one axis at `axis` times 45 degrees."""
-
-    turns: int
-    axis: int | None
-
-    @property
-    def mirrors(self) -> list[np.ndarray]:
-        """Mirror matrices, by angle of their axes."""
-        return [] if self.axis is None else [_mirror(self.axis + 4 * i // self.turns) for i in range(self.turns)]
-
-    @property
-    def elements(self) -> list[np.ndarray]:
-        return self.mirrors + [_rotation(4 * i // self.turns) for i in range(1, self.turns)]
-
-
-def _mirror(eighths: int) -> np.ndarray:
-    """Mirror at the axis through the origin at `eighths` times 45 degrees."""
-    return _rotation(eighths % 4) @ np.diag([1.0, -1.0])
-
-
-def _rotation(quarters: int) -> np.ndarray:
-    """Turn by `quarters` times 90 degrees, x towards y."""
-    return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
-
-
-NO_SYMMETRY = _Symmetry(1, None)
-SYMMETRIES = (
-    *(_Symmetry(4, 0), _Symmetry(2, 0), _Symmetry(2, 1), _Symmetry(4, None)),
-    *(_Symmetry(1, axis) for axis in range(4)),
-    _Symmetry(2, None),
-)
-"""All that a grid of pixels has, the largest first."""
-
-
-@dataclass(frozen=True)
-class _Sector:
-    """An exactly symmetric outline, whose vertices 0 to `size` lie in one sector, and what maps that onto the next one or two."""
-
-    outline: Outline
-    size: int
-    symmetry: _Symmetry
-    to_image: tuple[np.ndarray, ...]
-
-
 def _smallest(shape: Outline, steps: Outline, max_edges: int, symmetry_cost: float) -> Outline | None:
     """The smallest polygon of the largest symmetry that is not too dear; None where nothing closes."""
-    plain = _simple_walk(_Sector(shape, len(shape), NO_SYMMETRY, (np.eye(2),)), shape, steps, max_edges)
+    plain = _simple_walk(Sector(shape, len(shape), NO_SYMMETRY, (np.eye(2),)), shape, steps, max_edges)
     if plain is None or symmetry_cost < 0.0:
         return plain
-    for sector in _sectors(shape, steps):
+    for sector in sectors(shape, steps):
         polygon = _simple_walk(sector, shape, steps, max_edges)
         if polygon is not None and _area(polygon) <= _area(plain) + symmetry_cost * _area(shape) + EXACT:
             return polygon
     return plain
 
 
-def _sectors(shape: Outline, steps: Outline) -> Iterator[_Sector]:
-    """The outline unfolded from one sector of every symmetry that it shares with the directions, the largest first."""
-    from mrbokeh._polygon_rectification_numba import farthest_from_outline
-
-    def holds(element: np.ndarray) -> bool:
-        if not all(np.abs(steps - step).max(axis=1).min() < EXACT for step in steps @ element.T):
-            return False
-        return farthest_from_outline(shape @ element.T, shape, 0) <= ALIKE
-
-    held = {tuple(element.astype(int).flat) for element in SYMMETRIES[0].elements if holds(element)}
-    for symmetry in SYMMETRIES:
-        if not {tuple(element.astype(int).flat) for element in symmetry.elements} <= held:
-            continue
-        unfolded = _unfolded_by_turns(shape, symmetry) if symmetry.axis is None else _unfolded_by_mirrors(shape, symmetry)
-        if unfolded is None:
-            continue
-        outline, size, to_image = unfolded
-        if farthest_from_outline(shape, outline, 0) <= ALIKE and farthest_from_outline(outline, shape, 0) <= ALIKE:
-            yield _Sector(outline, size, symmetry, to_image)
-
-
-Unfolded = tuple[Outline, int, tuple[np.ndarray, ...]]
-
-
-def _unfolded_by_turns(shape: Outline, symmetry: _Symmetry) -> Unfolded | None:
-    """The outline from vertex 0 to its turned image, repeated."""
-    turn = _rotation(4 // symmetry.turns)
-    image = turn @ shape[0]
-    edges = np.roll(shape, -1, axis=0) - shape
-    share = np.clip(((image - shape) * edges).sum(axis=1) / (edges**2).sum(axis=1), 0.0, 1.0)
-    nearest = int(np.hypot(*(shape + share[:, None] * edges - image).T).argmin())
-    chain = shape[: nearest + 1]
-    if np.hypot(*(chain[-1] - image)) < EXACT:
-        chain = chain[:-1]
-    if len(chain) == 0:
-        return None
-    return _repeated(chain, turn, symmetry.turns), len(chain), (turn,)
-
-
-def _unfolded_by_mirrors(shape: Outline, symmetry: _Symmetry) -> Unfolded | None:
-    """The outline from one mirror axis to the next, mirrored and repeated; None if it does not cross every axis twice."""
-    crossings = [crossing for mirror in symmetry.mirrors for crossing in _crossings(shape, mirror)]
-    if len(crossings) != 2 * symmetry.turns:
-        return None
-    (start, at_start, first), (stop, at_stop, second) = sorted(crossings, key=lambda crossing: crossing[0])[:2]
-    inner = shape[int(np.floor(start)) + 1 : int(np.ceil(stop))]
-    apart = np.minimum(np.hypot(*(inner - at_start).T), np.hypot(*(inner - at_stop).T)) > EXACT
-    chain = np.concatenate([at_start[None], inner[apart], at_stop[None]])
-    period = np.concatenate([chain, (chain[1:-1] @ second.T)[::-1]])
-    return _repeated(period, second @ first, symmetry.turns), len(chain) - 1, (first, second)
-
-
-def _crossings(shape: Outline, mirror: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """(place along the outline, point on the axis, mirror) of every vertex on a mirror axis and every edge across it."""
-    onto_axis = 0.5 * (np.eye(2) + mirror)
-    normal = np.eye(2) - onto_axis
-    normal = normal[np.abs(normal).sum(axis=1).argmax()]
-    side = shape @ normal / np.hypot(*normal)
-    side[np.abs(side) < EXACT] = 0.0
-    following = np.roll(side, -1)
-    share = np.where(side == 0.0, 0.0, side / np.where(side == following, 1.0, side - following))
-    points = (shape + share[:, None] * (np.roll(shape, -1, axis=0) - shape)) @ onto_axis.T
-    return [(i + share[i], points[i], mirror) for i in np.flatnonzero((side == 0.0) | (side * following < 0.0))]
-
-
-def _repeated(points: np.ndarray, turn: np.ndarray, times: int) -> np.ndarray:
-    return np.concatenate([points @ np.linalg.matrix_power(turn, i).T for i in range(times)])
-
-
-def _simple_walk(sector: _Sector, shape: Outline, steps: Outline, max_edges: int) -> Outline | None:
+def _simple_walk(sector: Sector, shape: Outline, steps: Outline, max_edges: int) -> Outline | None:
     """The smallest polygon around `shape` of the sector's symmetry that does not cross itself.
 
     Where two corners on either side of a narrow gap overlap, the smallest walk crosses itself; then fewer edges are tried,
@@ -327,7 +205,7 @@ def _enclosing(lines: np.ndarray, shape: Outline) -> Outline:
     return polygon
 
 
-def _turned_walk(sector: _Sector, steps: Outline, most: int) -> np.ndarray:
+def _turned_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
     """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each of the turned parts."""
     from mrbokeh import _polygon_rectification_numba as compiled
 
@@ -353,7 +231,7 @@ def _fewest_origins(starts: np.ndarray, targets: np.ndarray) -> np.ndarray:
     return line[((line <= cut) & (cut < farthest)) | (cut + count < farthest)]
 
 
-def _mirrored_walk(sector: _Sector, steps: Outline, most: int) -> np.ndarray:
+def _mirrored_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
     """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each pair of mirrored sectors."""
     from mrbokeh import _polygon_rectification_numba as compiled
 

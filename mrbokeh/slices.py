@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -63,7 +64,7 @@ def continued(sheet: Sheet, margin_px: int) -> Sheet:
         return sheet
     around = ((margin_px, margin_px), (margin_px, margin_px))
     inside = (slice(margin_px, -margin_px), slice(margin_px, -margin_px))
-    mode = "edge" if sheet.is_opaque else "constant"
+    mode: Literal["edge", "constant"] = "edge" if sheet.is_opaque else "constant"
     source = sheet.values.copy()
     for border in (np.s_[:_BORDER_PX], np.s_[-_BORDER_PX:], np.s_[:, :_BORDER_PX], np.s_[:, -_BORDER_PX:]):
         source[border] = without_lights(source[border]) if sheet.is_opaque else source[border]

@@ -7,6 +7,7 @@ sorted by side and by field cell, and each group goes through the plain aperture
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -48,7 +49,8 @@ class Frame:
     def field_at(self, x_px: float, y_px: float) -> tuple[float, float]:
         """Field position of a place in the array: 0 in the middle of the picture, 1 half a diagonal away; x right, y down."""
         half_diagonal_px = 0.5 * float(np.hypot(self.width_px, self.height_px))
-        return (x_px + self.left_px - 0.5 * self.width_px) / half_diagonal_px, (y_px + self.top_px - 0.5 * self.height_px) / half_diagonal_px
+        right_px, down_px = x_px + self.left_px - 0.5 * self.width_px, y_px + self.top_px - 0.5 * self.height_px
+        return right_px / half_diagonal_px, down_px / half_diagonal_px
 
 
 def reach_px(aperture: Aperture, largest_coc_px: float) -> int:
@@ -114,9 +116,7 @@ def _spread_groups(
     return total
 
 
-def _cells(
-    shape: tuple[int, ...], frame: Frame, field_cells: tuple[int, int]
-) -> Iterator[tuple[tuple[slice, slice], tuple[float, float]]]:
+def _cells(shape: tuple[int, ...], frame: Frame, field_cells: tuple[int, int]) -> Iterator[tuple[tuple[slice, slice], tuple[float, float]]]:
     """Slices of the array and the field position of each cell's centre; pixels beyond the picture belong to its outermost cells."""
     columns = _cuts(shape[1], frame.left_px, frame.width_px, field_cells[0])
     rows = _cuts(shape[0], frame.top_px, frame.height_px, field_cells[1])
@@ -130,5 +130,5 @@ def _cuts(length: int, offset_px: int, size_px: int, cells: int) -> list[tuple[s
     borders = np.rint(np.linspace(0, size_px, cells + 1)).astype(int) - offset_px
     middles = 0.5 * (borders[:-1] + borders[1:])
     borders[0], borders[-1] = min(borders[0], 0), max(borders[-1], length)
-    parts = [slice(int(max(0, a)), int(min(length, b))) for a, b in zip(borders[:-1], borders[1:], strict=True)]
+    parts = [slice(int(max(0, a)), int(min(length, b))) for a, b in pairwise(borders)]
     return [(part, float(middle)) for part, middle in zip(parts, middles, strict=True) if part.stop > part.start]

@@ -108,7 +108,8 @@ def test_lens_and_render_from_end_to_end(tmp_path: Path) -> None:
 def test_an_unknown_renderer_is_refused(tmp_path: Path) -> None:
     small_layer(tmp_path / "layer.exr")
     mrbokeh("lens", "new", tmp_path / "lens.json", "--focal-length", 50, "--f-number", 2, "--focus", 1)
-    done = mrbokeh("render", "--layer", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json", "--out", tmp_path / "o.exr", "--method", "magic")
+    paths = ("--layer", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json", "--out", tmp_path / "o.exr")
+    done = mrbokeh("render", *paths, "--method", "magic")
     assert done.returncode == 2 and "expected a renderer" in done.stderr
 
 

@@ -159,7 +159,7 @@ def test_half_a_picture_and_alpha_in_a_png_are_refused(folder: Path) -> None:
         run(folder, "--rgb", "aif.exr", "--lens", "lens.json")
     with pytest.raises(InputError, match="nothing to blur"):
         run(folder, "--lens", "lens.json")
-    with pytest.raises(InputError, match="needs an .exr"):
+    with pytest.raises(InputError, match="needs an \\.exr"):
         run(folder, *PICTURE, "--alpha-out", out="out.png")
 
 

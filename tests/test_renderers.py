@@ -15,7 +15,6 @@ from mrbokeh.renderers.low_rank_filter import LowRankFilter
 from mrbokeh.renderers.scatter_reference import ScatterReference
 
 
-
 @dataclass(frozen=True)
 class Promise:
     """A renderer and how near to the exact kernels it promises to come.
@@ -276,7 +275,8 @@ def test_every_parameter_of_the_lens_changes_the_picture(renderer: Renderer, cha
 
 
 def test_neutral_parameters_change_nothing(renderer: Renderer) -> None:
-    neutral = replace(Aperture.disc(), cat_eye=0.0, spherical_aberration=0.0, axial_chromatic=(0.0, 0.0, 0.0), lateral_chromatic=(0.0, 0.0, 0.0))
+    no_colour = (0.0, 0.0, 0.0)
+    neutral = replace(Aperture.disc(), cat_eye=0.0, spherical_aberration=0.0, axial_chromatic=no_colour, lateral_chromatic=no_colour)
     lens = replace(LENS, aperture=neutral.rotated(0.0).squeezed(1.0).obstructed(0.0), tilt_rad=(0.0, 0.0), petzval_radius_mm=np.inf)
     layer = flat_layer(texture(11), np.ones((SIZE_PX, SIZE_PX)), 11.0)
     np.testing.assert_array_equal(renderer.render([layer], lens).rgb, renderer.render([layer], LENS).rgb)

@@ -21,7 +21,9 @@ def composite(
     ] = None,
     renderer: Annotated[
         str | None,
-        typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or NETWORK.onnx. Default: the network of --lens, else polygon."),
+        typer.Option(
+            "--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network, else polygon."
+        ),
     ] = None,
     slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.")] = None,
     depth: Annotated[

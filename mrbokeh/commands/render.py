@@ -19,7 +19,7 @@ def render(
     out: Annotated[Path, typer.Option(help="Where the result goes: .exr, or .png, .tif, .jpg (over black).")],
     rgb: Annotated[Path | None, typer.Option(help="All-in-focus picture, scene-linear: .exr, .hdr or float .tif.")] = None,
     depth: Annotated[Path | None, typer.Option(help="Its depth: EXR channel Z, depth.Z or Y in metres; inf or <= 0: background.")] = None,
-    layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with R, G, B, A (premultiplied) and Z; repeat it, front first.")] = None,
+    layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with premultiplied RGBA and Z; repeat it, front first.")] = None,
     method: Annotated[
         str, typer.Option("--method", "--renderer", help="polygon, low-rank, scatter (exact, slow), or a trained network (.onnx).")
     ] = DEFAULT,

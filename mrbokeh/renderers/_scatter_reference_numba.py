@@ -19,7 +19,7 @@ def scatter_rows(
     starts: np.ndarray,
     weights: np.ndarray,
 ) -> None:
-    """Add values (H, W, C), each spread by its pixel's PSF, to padded (H + 2 margin, W + 2 margin, C); margin: the largest kernel's radius."""
+    """Add values (H, W, C), each spread by its pixel's PSF, to padded, which has a margin of the largest kernel's radius."""
     height, width, channels = values.shape
     for y in range(height):
         for x in range(width):

@@ -5,7 +5,7 @@ Slow and obvious: no kernel is rounded, cached or shared; everything is summed i
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import cpu_count
 
 import numpy as np
@@ -28,7 +28,7 @@ class ScatterReference:
     threads: 0 takes all cores.
     """
 
-    layering: Layering = Layering()
+    layering: Layering = field(default_factory=Layering)
     threads: int = 0
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
