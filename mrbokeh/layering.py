@@ -88,12 +88,28 @@ def _interleave(front: Sheet, behind: Sheet) -> bool:
 
 
 def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing, inside: tuple[slice, slice]) -> tuple[Channels, Channels]:
-    if layering.fill and len(group) == 1 and group[0].is_opaque:
-        sheets = [Sheet(*each, False) for each in apart(group[0].values, group[0].coc_px)]
-    else:
-        sheets = list(group)
-    colour, taken = (each[inside] for each in composited(sheets, slicing))
-    return _shared_out(colour, taken) if any(sheet.is_opaque for sheet in group) else (colour, taken)
+    """Colour and how much of the pupil is taken of one group, within the frame."""
+    opaque = any(sheet.is_opaque for sheet in group)
+    sheets = _with_hidden(group) if layering.fill and group[0].is_opaque else list(group)
+    colour, taken = (each[inside] for each in composited(sheets, slicing, by_depth=not group[0].is_opaque))
+    return _shared_out(colour, taken) if opaque else (colour, taken)
+
+
+def _with_hidden(group: Sequence[Sheet]) -> list[Sheet]:
+    """An opaque sheet taken apart, what is known to lie behind it, and last what was filled in where nothing is known."""
+    picture, known = group[0], [_behind(sheet, group[0]) for sheet in group[1:]]
+    (front, front_coc_px), (behind, behind_coc_px) = apart(picture.values, picture.coc_px)
+    rim = front[..., 3:4] < 1.0
+    rest, filled = behind * rim, behind * ~rim
+    for sheet in known:
+        filled *= 1.0 - sheet.values[..., 3:4]
+    return [Sheet(front, front_coc_px, False), Sheet(rest, behind_coc_px, False), *known, Sheet(filled, behind_coc_px, False)]
+
+
+def _behind(sheet: Sheet, picture: Sheet) -> Sheet:
+    """What of a sheet lies behind the picture: where it shows the same surface it has nothing to add."""
+    behind = sheet.coc_px > picture.coc_px + _ONE_SURFACE_PX
+    return Sheet(sheet.values * behind[..., None], sheet.coc_px, False)
 
 
 def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:

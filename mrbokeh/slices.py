@@ -73,9 +73,10 @@ def continued(sheet: Sheet, margin_px: int) -> Sheet:
     return Sheet(values, np.pad(sheet.coc_px, around, mode=mode), sheet.is_opaque)
 
 
-def composited(sheets: Sequence[Sheet], slicing: Slicing) -> tuple[Channels, Channels]:
-    """Sheets at any depth, what the pinhole picture shows first: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
+def composited(sheets: Sequence[Sheet], slicing: Slicing, by_depth: bool) -> tuple[Channels, Channels]:
+    """What the pinhole picture shows of the sheets, then the rest: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
 
+    by_depth: which sheet the pinhole picture shows at a pixel is a matter of depth, else of their order (slices are always by depth).
     The pupil is counted per colour where the aperture is chromatic.
     """
     from mrbokeh._slices_numba import claim
@@ -84,7 +85,7 @@ def composited(sheets: Sequence[Sheet], slicing: Slicing) -> tuple[Channels, Cha
     colour = np.zeros((height, width, channels - 1), np.float32)
     taken = np.zeros((height, width, 3 if slicing.aperture.is_chromatic else 1), np.float32)
     step_px = _step_px(sheets, slicing.slices)
-    for weights in _seen_and_hidden(sheets):
+    for weights in _seen_and_hidden(sheets, by_depth):
         for values, coc_px, window in _slices(sheets, weights, step_px, slicing.aperture):
             frame = slicing.frame.moved(window[1].start, window[0].start)
             claim(colour[window], taken[window], spread_light(slicing.spread, values, coc_px, slicing.aperture, frame, slicing.field_cells))
@@ -97,22 +98,24 @@ def _step_px(sheets: Sequence[Sheet], slices: int) -> float:
     return max((farthest - nearest) / slices, _LEAST_STEP_PX)
 
 
-def _seen_and_hidden(sheets: Sequence[Sheet]) -> Iterator[list[Plane]]:
+def _seen_and_hidden(sheets: Sequence[Sheet], by_depth: bool) -> Iterator[list[Plane]]:
     """Per sheet the share of each pixel that the pinhole picture shows, then, if there is any, the share that hides behind others."""
     if len(sheets) == 1:
         yield [np.ones_like(sheets[0].coc_px)]
         return
-    seen = [_shown(i, sheets) for i in range(len(sheets))]
+    seen = [_shown(i, sheets, by_depth) for i in range(len(sheets))]
     hidden = [1.0 - each for each in seen]
     yield seen
     yield hidden
 
 
-def _shown(i: int, sheets: Sequence[Sheet]) -> Plane:
-    """How much of sheet i's pixels the others leave uncovered: nearer ones cover it, and at one depth those listed before."""
+def _shown(i: int, sheets: Sequence[Sheet], by_depth: bool) -> Plane:
+    """How much of sheet i's pixels the others leave uncovered: those listed before, or nearer ones (and those before at one depth)."""
     shown = np.ones_like(sheets[i].coc_px)
     for j, other in enumerate(sheets):
-        if j != i:
+        if not by_depth and j < i:
+            shown *= 1.0 - other.values[..., 3]
+        elif by_depth and j != i:
             nearer = other.coc_px <= sheets[i].coc_px if j < i else other.coc_px < sheets[i].coc_px
             shown *= np.where(nearer, 1.0 - other.values[..., 3], 1.0).astype(np.float32)
     return shown

@@ -27,6 +27,7 @@ ROWS = (
     ("image_io",),
     ("exr_io",),
     ("layering",),
+    ("other_view",),
     ("slices", "_slices_numba"),
     ("hidden_background", "_hidden_background_numba"),
     ("spreading",),

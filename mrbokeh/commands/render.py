@@ -20,6 +20,9 @@ def render(
     rgb: Annotated[Path | None, typer.Option(help="All-in-focus picture, scene-linear: .exr, .hdr or float .tif.")] = None,
     depth: Annotated[Path | None, typer.Option(help="Its depth: EXR channel Z, depth.Z or Y in metres; inf or <= 0: background.")] = None,
     layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with premultiplied RGBA and Z; repeat it, front first.")] = None,
+    behind: Annotated[
+        list[Path] | None, typer.Option(help="EXR layer behind --rgb: what is known of what it hides (clean plate, other view).")
+    ] = None,
     method: Annotated[
         str, typer.Option("--method", "--renderer", help="polygon, low-rank, scatter (exact, slow), or a trained network (.onnx).")
     ] = DEFAULT,
@@ -43,7 +46,7 @@ def render(
     refuse_existing(out, overwrite)
     if alpha_out and out.suffix.lower() != ".exr":
         raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
-    sharp = _read(rgb, depth, layer or [], srgb)
+    sharp = _read(rgb, depth, layer or [], behind or [], srgb)
     used = _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
     blurred = make_renderer(method, threads=threads, layering=Layering(slices=slices)).render(list(sharp.values()), used)
     if alpha_out:
@@ -53,7 +56,7 @@ def render(
     typer.echo(f"wrote {out}")
 
 
-def _read(rgb: Path | None, depth: Path | None, layers: list[Path], srgb: bool) -> dict[str, Layer]:
+def _read(rgb: Path | None, depth: Path | None, layers: list[Path], behind: list[Path], srgb: bool) -> dict[str, Layer]:
     """What to blur by where it came from, front first."""
     from mrbokeh.image_io import read_layer
 
@@ -62,6 +65,9 @@ def _read(rgb: Path | None, depth: Path | None, layers: list[Path], srgb: bool) 
         raise InputError("--rgb and --depth belong together: give both, or only --layer")
     if rgb is not None and depth is not None:
         sharp[str(rgb)] = _picture(rgb, depth, srgb)
+    if behind and rgb is None:
+        raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
+    sharp |= {str(path): read_layer(path, extra=True) for path in behind}
     if not sharp:
         raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
     if len({each.alpha.shape for each in sharp.values()}) > 1:
