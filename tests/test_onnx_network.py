@@ -160,7 +160,9 @@ def test_more_blur_than_trained_is_refused_with_what_to_do(network: OnnxNetwork)
 
 def test_other_widths_work_while_the_blur_fits(network: OnnxNetwork) -> None:
     """Twice the width doubles the circle of confusion: 3 px become 6, 5 become 10."""
-    large = [np.kron(each, np.ones((2, 2, 1) if each.ndim == 3 else (2, 2))).astype(np.float32) for each in vars(card(3.0)).values()]
+    small = card(3.0)
+    planes = (small.rgb, small.alpha, small.depth_m)
+    large = [np.kron(each, np.ones((2, 2, 1) if each.ndim == 3 else (2, 2))).astype(np.float32) for each in planes]
     assert network.render([Layer(*large)], LENS).alpha.sum() == pytest.approx(4 * 400.0, rel=0.01)
     wide = replace(Layer(*large), depth_m=np.where(large[1] > 0, depth_for(5.0), np.inf).astype(np.float32))
     with pytest.raises(InputError, match="at a width of 192 px"):
