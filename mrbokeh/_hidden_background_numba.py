@@ -10,26 +10,31 @@ _LARGEST_SHARE = 0.6
 
 
 @njit(cache=True, nogil=True)
-def snapped(coc_px: np.ndarray, step_px: float) -> np.ndarray:
+def snapped(coc_px: np.ndarray, lit: np.ndarray, step_px: float) -> np.ndarray:
     """Circles of confusion in which no pixel floats in the air between two surfaces, as antialiased or resized depth makes them.
 
-    A pixel between two even surfaces, each at most 2 pixels away on opposite sides, takes the nearer value of the two.
+    A pixel between two even surfaces, each at most 2 pixels away on opposite sides, takes the nearer value of the two; a lit one
+    does not, for lamps do hang in the air.
     """
     height, width = coc_px.shape
     result = coc_px.copy()
-    for y in range(2, height - 2):
-        for x in range(2, width - 2):
+    even_px = 0.5 * step_px
+    for y in range(3, height - 3):
+        for x in range(3, width - 3):
             here = coc_px[y, x]
+            if lit[y, x]:
+                continue
             for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+                if abs(here - coc_px[y + dy, x + dx]) <= even_px and abs(here - coc_px[y - dy, x - dx]) <= even_px:
+                    continue
                 for before in range(1, 3):
+                    a, aa = coc_px[y - before * dy, x - before * dx], coc_px[y - (before + 1) * dy, x - (before + 1) * dx]
+                    if abs(a - aa) > even_px or abs(here - a) <= even_px:
+                        continue
                     for after in range(1, 3):
-                        if not (before + 1 <= min(y, x, width - 1 - x) and after + 1 <= min(height - 1 - y, x, width - 1 - x)):
-                            continue
-                        a, aa = coc_px[y - before * dy, x - before * dx], coc_px[y - (before + 1) * dy, x - (before + 1) * dx]
                         b, bb = coc_px[y + after * dy, x + after * dx], coc_px[y + (after + 1) * dy, x + (after + 1) * dx]
-                        even = abs(a - aa) <= 0.5 * step_px and abs(b - bb) <= 0.5 * step_px
-                        between = (here - a) * (b - here) > 0.0 and min(abs(here - a), abs(b - here)) > 0.5 * step_px
-                        if even and between and abs(b - a) > 2.0 * step_px:
+                        between = (here - a) * (b - here) > 0.0 and abs(b - here) > even_px
+                        if between and abs(b - bb) <= even_px and abs(b - a) > 2.0 * step_px:
                             result[y, x] = a if abs(here - a) < abs(b - here) else b
     return result
 
@@ -41,10 +46,32 @@ def rims(coc_px: np.ndarray, step_px: float) -> np.ndarray:
     rim = np.zeros((height, width), np.bool_)
     for y in range(height):
         for x in range(width):
-            for ny in range(max(0, y - 1), min(height, y + 2)):
-                for nx in range(max(0, x - 1), min(width, x + 2)):
-                    rim[y, x] |= coc_px[ny, nx] < coc_px[y, x] - step_px
+            here = coc_px[y, x]
+            for ny in range(y, min(height, y + 2)):
+                for nx in range(x if ny == y else max(0, x - 1), min(width, x + 2)):
+                    difference = here - coc_px[ny, nx]
+                    if difference > step_px:
+                        rim[y, x] = True
+                    elif difference < -step_px:
+                        rim[ny, nx] = True
     return rim
+
+
+@njit(cache=True, nogil=True)
+def far_over_median(brightness: np.ndarray, candidates: np.ndarray, ratio: float) -> np.ndarray:
+    """Of the candidates, (H, W) bool, those more than `ratio` times as bright as most (13) of the 5x5 pixels around them."""
+    height, width = brightness.shape
+    found = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            if not candidates[y, x]:
+                continue
+            darker = 0
+            for ny in range(y - 2, y + 3):
+                for nx in range(x - 2, x + 3):
+                    darker += ratio * brightness[min(max(ny, 0), height - 1), min(max(nx, 0), width - 1)] < brightness[y, x]
+            found[y, x] = darker >= 13
+    return found
 
 
 @njit(cache=True, nogil=True)
@@ -126,15 +153,17 @@ def interpolate(
     seed_y: np.ndarray,
     seed_x: np.ndarray,
     surface_px: float,
+    top: int,
+    bottom: int,
 ) -> None:
-    """Where there is a seed, overwrite filled (H, W, C) and its circle of confusion with what lies around on the seed's surface.
+    """Where rows top to bottom have a seed, overwrite filled (H, W, C) and its circle of confusion by what is around on the seed's surface.
 
     The first pure pixels in 16 directions, up to twice as far as the seed, weighted by one over the squared distance; in each
     direction the mean of a quarter as many pixels as they are far. So behind a thin wire this interpolates between both
     sides, and behind a broad object it continues what is beside it, ever smoother, as a guess should be.
     """
     height, width, channels = values.shape
-    for y in range(height):
+    for y in range(top, bottom):
         for x in range(width):
             if seed_y[y, x] < 0:
                 continue
@@ -169,6 +198,19 @@ def interpolate(
 
 
 @njit(cache=True, nogil=True)
+def _lamp_in_front(values: np.ndarray, coc_px: np.ndarray, y: int, x: int, step_px: float) -> bool:
+    """Whether the brightest of the 5x5 pixels around, the lamp whose light a pixel holds, is nearer than the pixel."""
+    height, width, _ = values.shape
+    brightest, nearer = -1.0, False
+    for ny in range(max(0, y - 2), min(height, y + 3)):
+        for nx in range(max(0, x - 2), min(width, x + 3)):
+            brightness = values[ny, nx, 0] + values[ny, nx, 1] + values[ny, nx, 2]
+            if brightness > brightest:
+                brightest, nearer = brightness, coc_px[ny, nx] < coc_px[y, x] - step_px
+    return nearer
+
+
+@njit(cache=True, nogil=True)
 def unmix_rims(
     front: np.ndarray,
     front_coc_px: np.ndarray,
@@ -183,8 +225,8 @@ def unmix_rims(
 
     Of the nearer neighbours the one counts that differs most from what is filled in: it is the least mixed itself. Its share
     explains the pixel best as a mixture of the two, is smaller the worse the mixture explains it, and at most 0.6, as the pixel's
-    own depth is that behind. Front and rest together are the pixel: no light is lost. Where the nearer one is the sharper of the
-    two nothing is gained, except beside lamps: there the pixel stays whole.
+    own depth is that behind. One brighter than the neighbour is no mixture of it (a lamp behind a wire) and stays whole.
+    Front and rest together are the pixel: no light is lost.
     """
     height, width, channels = values.shape
     for y in range(height):
@@ -200,12 +242,16 @@ def unmix_rims(
                             difference += (values[ny, nx, c] - behind[y, x, c]) ** 2
                         if difference > most:
                             fy, fx, most = ny, nx, difference
-            if fy < 0 or not (lit[y, x] or abs(coc_px[fy, fx]) > abs(coc_px[y, x])):
+            if fy < 0:
+                continue
+            if lit[y, x] and not _lamp_in_front(values, coc_px, y, x, step_px):
                 continue
             along, off = 0.0, 0.0
             for c in range(3):
                 along += (values[y, x, c] - behind[y, x, c]) * (values[fy, fx, c] - behind[y, x, c])
                 off += (values[y, x, c] - behind[y, x, c]) ** 2
+            if along > most:
+                continue
             explained = along * along / (most * off) if off > 0.0 and along > 0.0 else 0.0
             share = min(_LARGEST_SHARE, explained * along / most)
             front_coc_px[y, x] = coc_px[fy, fx]

@@ -17,7 +17,7 @@ the curvature of the area, sum of curvature f (1 - f).
 The lattice holds the corners of pixels: lattice point (0, 0) is the top left corner of pixel (0, 0).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, gcd
 
@@ -29,6 +29,9 @@ from mrbokeh.errors import InputError
 
 Direction = tuple[int, int]
 Taps = dict[tuple[int, int], float]
+
+BLUNTED = 1.0
+"""Steps that an edge inserted to walk a sharp corner in several turns cuts off its tip."""
 
 _PARALLEL = 1e-6
 
@@ -64,7 +67,7 @@ def edge_profile(direction: Direction, binary: bool = False) -> Taps:
     return taps
 
 
-def _mean_ramp(y: float, high: float, low: float) -> float:
+def _mean_ramp(y: float | int, high: float, low: float) -> float:
     """Mean of max(0, y - t) for t spread evenly over [high, low]."""
     if y <= high:
         return 0.0
@@ -91,48 +94,101 @@ def differenced_kernel(corners: Sequence[tuple[int, int]], binary: bool = True) 
 
 @dataclass(frozen=True)
 class PolygonCorners:
-    """Weighted polygons as edges and corners, per unit of radius. Corner i lies between edges before[i] and after[i].
+    """Weighted polygons as edges and corners. Corner i lies between the edges before[i] and after[i].
 
-    direction: of each edge, downwards. slope: det(direction, point of the edge) at radius 1. curvature: half the second
-    derivative of the weighted area by the edge's offset. sign: of a corner's impulse, weight included; its direct effect is
-    -run(d) on the direction of the edge before and +run(d) on the one after, where run is the sign of the x of d.
-    area: of all polygons, weighted, at radius 1.
+    At a signed radius r, in pixels, an edge is the line det(direction, x) = slope r + sign(r) shift. direction: downwards.
+    curvature: half the second derivative of the weighted area by that offset. weight: of a corner's impulse, by the sense in
+    which the outline winds; its effect is -run on the direction of the edge before and +run on the one after, run being the
+    sign of the direction's x. area: coefficients of r^2 and of 1 in the weighted area of all polygons. shortest: in steps, the
+    shortest edge of the outlines at radius 1.
     """
 
     direction: tuple[Direction, ...]
     slope: Float64[np.ndarray, " edges"]
+    shift: Float64[np.ndarray, " edges"]
     curvature: Float64[np.ndarray, " edges"]
     before: tuple[int, ...]
     after: tuple[int, ...]
-    sign: Float64[np.ndarray, " corners"]
-    area: float
+    weight: Float64[np.ndarray, " corners"]
+    area: tuple[float, float]
+    shortest: float
 
     @property
     def origin(self) -> Float64[np.ndarray, " edges"]:
         """What det(direction, .) adds for the centre of a pixel over its top left corner."""
         return np.array([0.5 * (dx - dy) for dx, dy in self.direction])
 
+    @property
+    def growth(self) -> float:
+        """What to add to r^2 so that the area is right on average over the places of edges between lattice lines."""
+        return -(self.area[1] + self.curvature.sum() / 6.0) / self.area[0]
+
+
+@dataclass(frozen=True)
+class _Outline:
+    """One polygon: the step of every edge in walking order, the offset of its line at radius 1, and what it is made of."""
+
+    steps: tuple[Direction, ...]
+    slope: Float64[np.ndarray, " edges"]
+    inserted: tuple[bool, ...]
+
+    @property
+    def lengths(self) -> Float64[np.ndarray, "edges edges"]:
+        """Lengths of the edges, in steps, as a matrix times the offsets of all edges' lines."""
+        count = len(self.steps)
+        matrix = np.zeros((count, count))
+        for i, step in enumerate(self.steps):
+            before, here, after = (downwards(self.steps[j % count]) for j in (i - 1, i, i + 1))
+            sense = 1 if here == step else -1
+            into, out = _det(before, here), _det(here, after)
+            along = (after[0] / out + before[0] / into) * here[0] + (after[1] / out + before[1] / into) * here[1]
+            matrix[i, i] += sense * along / (here[0] ** 2 + here[1] ** 2)
+            matrix[i, i - 1] -= sense / into
+            matrix[i, (i + 1) % count] -= sense / out
+        return matrix
+
+    @property
+    def quadratic(self) -> Float64[np.ndarray, "edges edges"]:
+        """The area as a quadratic form of the offsets."""
+        senses = np.array([1.0 if downwards(step) == step else -1.0 for step in self.steps])
+        return -0.5 * senses[:, None] * self.lengths
+
+    @property
+    def shift(self) -> Float64[np.ndarray, " edges"]:
+        """How far to move inserted edges in so that each gets BLUNTED steps long."""
+        shift = np.zeros(len(self.steps))
+        inserted = np.array(self.inserted)
+        if inserted.any():
+            shift[inserted] = np.linalg.solve(self.lengths[np.ix_(inserted, inserted)], np.full(int(inserted.sum()), BLUNTED))
+        return shift
+
 
 def polygon_corners(aperture: Aperture, directions: Sequence[Direction]) -> PolygonCorners:
     """Edges and corners of an aperture whose edges all run along `directions` (see mrbokeh.polygon_rectification)."""
     known = sorted({downwards(direction) for direction in directions})
     edges: list[Direction] = []
-    slopes, curvatures, befores, afters, signs = [], [], [], [], []
-    area = 0.0
-    for outline, weight in zip(aperture.outlines, aperture.weights, strict=True):
-        first = len(edges)
-        signed_area = _area(outline)
-        walk = list(_with_turns(_walk(outline, known)))
+    slopes, shifts, curvatures, weights = [], [], [], []
+    befores: list[int] = []
+    afters: list[int] = []
+    area, shortest = np.zeros(2), np.inf
+    for points, weight in zip(aperture.outlines, aperture.weights, strict=True):
+        outline = _with_turns(_walk(points, known))
+        first, count = len(edges), len(outline.steps)
+        edges += [downwards(step) for step in outline.steps]
+        form, shift = outline.quadratic, outline.shift
+        shortest = min(shortest, float(np.abs(outline.lengths @ outline.slope)[~np.array(outline.inserted)].min()))
+        signed_area = float(outline.slope @ form @ outline.slope)
         oriented = weight * np.sign(signed_area)
-        for i, (step, point) in enumerate(walk):
-            edges.append(downwards(step))
-            slopes.append(_det(edges[-1], point))
-            befores.append(first + (i - 1) % len(walk))
-            afters.append(first + i)
-            signs.append(oriented)
-        curvatures += [oriented * each for each in _curvatures(edges[first:])]
-        area += weight * abs(signed_area)
-    return PolygonCorners(tuple(edges), np.array(slopes), np.array(curvatures), tuple(befores), tuple(afters), np.array(signs), area)
+        slopes.append(outline.slope)
+        shifts.append(shift)
+        curvatures.append(oriented * np.diag(form))
+        befores += [first + (i - 1) % count for i in range(count)]
+        afters += range(first, first + count)
+        weights += [oriented] * count
+        area += oriented * np.array([signed_area, shift @ form @ shift])
+    slope, shift, curvature = (np.concatenate(each) for each in (slopes, shifts, curvatures))
+    parts = (float(area[0]), float(area[1]))
+    return PolygonCorners(tuple(edges), slope, shift, curvature, tuple(befores), tuple(afters), np.array(weights), parts, shortest)
 
 
 def _walk(outline: Float64[np.ndarray, "_ 2"], known: Sequence[Direction]) -> list[tuple[Direction, tuple[float, float]]]:
@@ -157,13 +213,19 @@ def _step_along(edge: Float64[np.ndarray, "2"], known: Sequence[Direction]) -> D
     raise InputError(f"an edge of the outline runs along ({edge[0]:.4g}, {edge[1]:.4g}), which is none of {tuple(known)}: rectify it first")
 
 
-def _with_turns(walk: Sequence[tuple[Direction, tuple[float, float]]]) -> Iterator[tuple[Direction, tuple[float, float]]]:
-    """Edges of length zero where two neighbours do not span the lattice, so that afterwards all do."""
+def _with_turns(walk: Sequence[tuple[Direction, tuple[float, float]]]) -> _Outline:
+    """With edges of length zero where two neighbours do not span the lattice, so that afterwards all do."""
+    steps, slopes, inserted = [], [], []
     for (previous, _), (step, point) in zip((walk[-1], *walk[:-1]), walk, strict=True):
         while abs(_det(previous, step)) != 1:
             previous = _next_turn(previous, step)
-            yield previous, point
-        yield step, point
+            steps.append(previous)
+            slopes.append(_det(downwards(previous), point))
+            inserted.append(True)
+        steps.append(step)
+        slopes.append(_det(downwards(step), point))
+        inserted.append(False)
+    return _Outline(tuple(steps), np.array(slopes), tuple(inserted))
 
 
 def _next_turn(previous: Direction, step: Direction) -> Direction:
@@ -179,21 +241,5 @@ def _next_turn(previous: Direction, step: Direction) -> Direction:
     return min(between, key=lambda each: (abs(_det(each, step)), each[0] ** 2 + each[1] ** 2))
 
 
-def _curvatures(edges: Sequence[Direction]) -> list[float]:
-    """Half the second derivative of a polygon's area by the offset of each edge, neighbours held: it grows shorter or longer."""
-    curvatures = []
-    for i, (dx, dy) in enumerate(edges):
-        before, after = edges[i - 1], edges[(i + 1) % len(edges)]
-        into, out = _det(before, (dx, dy)), _det((dx, dy), after)
-        along = (after[0] / out + before[0] / into) * dx + (after[1] / out + before[1] / into) * dy
-        curvatures.append(-0.5 * along / (dx * dx + dy * dy))
-    return curvatures
-
-
-def _det(a: Sequence[float], b: Sequence[float]) -> float:
+def _det(a: Sequence[float | int], b: Sequence[float | int]) -> float | int:
     return a[0] * b[1] - a[1] * b[0]
-
-
-def _area(outline: Float64[np.ndarray, "_ 2"]) -> float:
-    x, y = outline.T
-    return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))

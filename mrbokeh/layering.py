@@ -99,6 +99,8 @@ def _with_hidden(group: Sequence[Sheet]) -> list[Sheet]:
     """An opaque sheet taken apart, what is known to lie behind it, and last what was filled in where nothing is known."""
     picture, known = group[0], [_behind(sheet, group[0]) for sheet in group[1:]]
     (front, front_coc_px), (behind, behind_coc_px) = apart(picture.values, picture.coc_px)
+    if not known:
+        return [Sheet(front, front_coc_px, False), Sheet(behind, behind_coc_px, False)]
     rim = front[..., 3:4] < 1.0
     rest, filled = behind * rim, behind * ~rim
     for sheet in known:

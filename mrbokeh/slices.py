@@ -1,8 +1,10 @@
 """Slices: sheets of light sorted by the circle of confusion, spread one by one and put together front to back."""
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -16,7 +18,9 @@ from mrbokeh.spreading import Frame, Spread, reach_px, spread_light
 
 _LEAST_STEP_PX = 0.5
 _BORDER_PX = 5
+_SLICES_AT_ONCE = 2
 
+_Result = TypeVar("_Result")
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]
 
@@ -42,6 +46,11 @@ class Slicing:
     slices: int
     field_cells: tuple[int, int]
     frame: Frame
+
+    def spread_slice(self, values: Channels, coc_px: Plane, window: tuple[slice, slice]) -> tuple[Channels, tuple[slice, slice]]:
+        """The light of a slice that lies in a window of the frame, spread, and that window."""
+        frame = self.frame.moved(window[1].start, window[0].start)
+        return spread_light(self.spread, values, coc_px, self.aperture, frame, self.field_cells), window
 
 
 def sheet_of(layer: Layer, lens: Lens) -> Sheet:
@@ -85,11 +94,22 @@ def composited(sheets: Sequence[Sheet], slicing: Slicing, by_depth: bool) -> tup
     colour = np.zeros((height, width, channels - 1), np.float32)
     taken = np.zeros((height, width, 3 if slicing.aperture.is_chromatic else 1), np.float32)
     step_px = _step_px(sheets, slicing.slices)
-    for weights in _seen_and_hidden(sheets, by_depth):
-        for values, coc_px, window in _slices(sheets, weights, step_px, slicing.aperture):
-            frame = slicing.frame.moved(window[1].start, window[0].start)
-            claim(colour[window], taken[window], spread_light(slicing.spread, values, coc_px, slicing.aperture, frame, slicing.field_cells))
+    with ThreadPoolExecutor(_SLICES_AT_ONCE) as pool:
+        for weights in _seen_and_hidden(sheets, by_depth):
+            for light, window in _ahead(pool, slicing.spread_slice, _slices(sheets, weights, step_px, slicing.aperture)):
+                claim(colour[window], taken[window], light)
     return colour, taken
+
+
+def _ahead(pool: Executor, work: Callable[..., _Result], tasks: Iterable[tuple[Any, ...]]) -> Iterator[_Result]:
+    """What work makes of the tasks, in their order, with one more of them under way than is waited for: bounded memory, busy cores."""
+    under_way: deque[Future[_Result]] = deque()
+    for task in tasks:
+        under_way.append(pool.submit(work, *task))
+        if len(under_way) > _SLICES_AT_ONCE:
+            yield under_way.popleft().result()
+    while under_way:
+        yield under_way.popleft().result()
 
 
 def _step_px(sheets: Sequence[Sheet], slices: int) -> float:

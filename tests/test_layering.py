@@ -116,7 +116,7 @@ def test_antialiased_depth_leaves_nothing_in_the_air() -> None:
     left = (front_coc_px > -11.9) & (front_coc_px < 8.9)
     assert floating.sum() > 100 and left.sum() <= 0.05 * floating.sum()
     slope = np.broadcast_to(np.linspace(-60.0, 60.0, SIZE[1], dtype=np.float32), SIZE).copy()
-    np.testing.assert_array_equal(snapped(slope, 1.0), slope)
+    np.testing.assert_array_equal(snapped(slope, np.zeros(SIZE, bool), 1.0), slope)
 
 
 def test_parting_a_picture_loses_no_light() -> None:

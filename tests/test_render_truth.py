@@ -5,7 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
+from datasets_scripts.render_truth import main, render_truth
 from datasets_scripts.traced_scene import Vector, plain_texture
 from datasets_scripts.truth_bodies import Body, quad
 from datasets_scripts.truth_mitsuba import LLVM, SCALAR, best_variant
@@ -16,7 +19,8 @@ from datasets_scripts.truth_scene import Lamp, TruthScene, pack
 from datasets_scripts.truth_scenes import SCENES, make_scene
 from datasets_scripts.truth_shapes import SHAPE_NAMES, lens_shape
 from datasets_scripts.truth_sharp import sharp_layer
-from datasets_scripts.truth_tracer import Opening, Part, TruthTracer, lamp_flux, make_tracer
+from datasets_scripts.truth_tracer import Opening, Part, TruthTracer, lamp_flux
+from datasets_scripts.truth_tracer_choice import make_tracer
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
@@ -25,6 +29,7 @@ from mrbokeh.image_io import read_image, read_layer
 from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import over
 from mrbokeh.lens import Lens
+from mrbokeh.renderers.scatter_reference import scatter
 
 SIZE_PX = 96
 FOCAL_PX = 900.0
@@ -110,7 +115,8 @@ def test_a_lamp_casts_the_psf_of_its_aperture(shape: str, z_m: float) -> None:
     difference = np.abs(picture / picture.sum() - placed(seen.rasterize(coc_px(z_m, 1.0)).kernel, at_px, size_px)).sum()
     mirrored = np.abs(picture / picture.sum() - placed(seen.rasterize(-coc_px(z_m, 1.0)).kernel, at_px, size_px)).sum()
     assert difference < 0.01
-    assert mirrored > 0.1 or shape in ("disc", "ring")
+    # Seven nearly round blades differ from their mirror image in 7 % of their light, a disc on the axis not at all.
+    assert mirrored > 5.0 * difference or shape in ("disc", "ring")
 
 
 def placed(kernel: np.ndarray, at_px: np.ndarray, size_px: int) -> np.ndarray:
@@ -150,21 +156,40 @@ def test_a_plane_in_focus_is_the_sharp_picture(shape: str) -> None:
     traced = tracer((wall(1.3, (0.0, 0.0, 0.0), texture=texture),))
     sharp, focused = traced.traced(None, 1024).rgb, traced.traced(opening(1.3, lens_shape(shape)), 1024).rgb
     assert psnr(focused, sharp) > 55.0
-    assert np.abs(focused - sharp).mean() < 1e-3
+    assert abs(float((focused - sharp).mean(dtype=np.float64))) < 1e-4
     assert sharp.std() > 0.05
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("z_m", [1.0, 3.0])
+@pytest.mark.parametrize("z_m", [1.0, 0.8, 3.0])
 def test_the_cat_eye_leaves_open_what_two_discs_share(z_m: float) -> None:
-    """On a wall at the focus distance a pixel sees one point; elsewhere the blur mixes points, whose places average to the pixel's."""
-    shape = lens_shape("cat_eye")
+    """In focus: the overlap of two unit discs, cat_eye times the field position apart.
+
+    Out of focus the ray through lens point u shows a point u * coc / 2 away from the pixel, whose own rim counts: with k = cat_eye *
+    coc / 2 / half diagonal, |u + cat_eye * field - k u| <= 1, a disc of radius 1 / (1 - k), as many times farther away.
+    """
+    shape, half_diagonal_px = lens_shape("cat_eye"), float(np.hypot(SIZE_PX / 2, SIZE_PX / 2))
     traced = tracer((wall(z_m, (0.7, 0.7, 0.7)),)).traced(opening(1.0, shape), 1024)
-    field = np.hypot(*np.moveaxis(camera().pixel_centres_px() - SIZE_PX / 2, -1, 0)) / np.hypot(SIZE_PX / 2, SIZE_PX / 2)
-    blur_bends = 0.0 if z_m == 1.0 else 0.03
-    assert np.abs(traced.open_share - two_disc_overlap(shape.cat_eye * field)).max() < 0.01 + blur_bends
+    field = np.hypot(*np.moveaxis(camera().pixel_centres_px() - SIZE_PX / 2, -1, 0)) / half_diagonal_px
+    stretch = 1.0 / (1.0 - shape.cat_eye * 0.5 * coc_px(z_m, 1.0) / half_diagonal_px)
+    expected = share_of_unit_disc(stretch, stretch * shape.cat_eye * field)
+    if z_m == 1.0:
+        assert expected == pytest.approx(two_disc_overlap(shape.cat_eye * field))
+    blocks = (traced.open_share - expected).reshape(SIZE_PX // 8, 8, SIZE_PX // 8, 8).mean(axis=(1, 3))
+    assert np.abs(blocks).max() < 0.001
+    # Single pixels: a share of 1024 rays.
+    assert (traced.open_share - expected).std() < 0.004
     # What is open is all that counts: nothing is vignetted.
     assert traced.rgb == pytest.approx(0.7, abs=1e-5)
+
+
+def share_of_unit_disc(radius: float, distance: np.ndarray) -> np.ndarray:
+    """Share of a unit disc that a disc of another radius covers, their centres `distance` (not 0) apart: two circular segments."""
+    with np.errstate(invalid="ignore"):
+        one = np.arccos((distance**2 + 1.0 - radius**2) / (2.0 * distance))
+        other = np.arccos((distance**2 + radius**2 - 1.0) / (2.0 * distance * radius))
+    overlap = (one - np.sin(2 * one) / 2 + radius**2 * (other - np.sin(2 * other) / 2)) / np.pi
+    return np.where(distance <= abs(radius - 1.0), min(1.0, radius**2), overlap)
 
 
 @pytest.mark.slow
@@ -305,25 +330,21 @@ def test_parts_make_the_whole(small_leaves: tuple[TruthPlan, TruthScene]) -> Non
 
 def test_the_script_makes_a_set_goes_on_and_refuses_another(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed (pip install 'mrbokeh[datasets]')")
-    from typer.testing import CliRunner
-
-    from datasets_scripts.render_truth import main, render_truth
-    from mrbokeh.progress import track  # noqa: F401
-
     plan = TruthPlan(32, 18, 2, 1, 1, ("fence",), ("disc",))
     assert render_truth(tmp_path, plan) == 6
     folder = tmp_path / "fence_1" / "view_00"
     assert (folder / "sheet.png").is_file() and read_layer(folder / "layers" / "00.exr").width_px == 32
-    before = (folder / "truth" / "disc_1.exr").read_bytes()
+    before = read_image(folder / "truth" / "disc_1.exr")
     (folder / "truth" / "disc_1.exr").unlink()
     assert render_truth(tmp_path, plan) == 1
-    assert (folder / "truth" / "disc_1.exr").read_bytes() == before
-    import typer
-
+    # Threads add a lamp's rays in any order, which may change the last bit.
+    assert read_image(folder / "truth" / "disc_1.exr") == pytest.approx(before, rel=2e-3)
     app = typer.Typer()
     app.command()(main)
     refused = CliRunner().invoke(app, [str(tmp_path), "--scenes", "fence", "--shapes", "disc", "--width", "48", "--height", "27"])
     assert refused.exit_code == 2 and "--overwrite" in refused.output
+    unknown = CliRunner().invoke(app, [str(tmp_path / "new"), "--scenes", "sea"])
+    assert unknown.exit_code == 2 and "fence" in unknown.output and not (tmp_path / "new").exists()
 
 
 # --- The committed set ---------------------------------------------------------------------------------------------------------------
@@ -369,10 +390,21 @@ def test_what_committed_views_say_of_their_blur_is_what_lens_says(view: Path) ->
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.parent.name)
-def test_committed_truth_keeps_the_light_of_the_sharp_picture(view: Path) -> None:
-    """Away from occlusion light only moves: the whole picture keeps it within what crosses the frame or is hidden."""
+def test_committed_truth_is_blurred_by_the_opening_and_focus_that_its_description_says(view: Path) -> None:
+    """Plain scattering comes close with them, and far less close with the mirrored opening or another focus."""
     meta = json.loads((view / "meta.json").read_text())
-    sharp = np.minimum(read_image(view / "all_in_focus.exr"), 1.0).mean()
-    for names in meta["truth"].values():
-        for name in names:
-            assert np.minimum(read_image(view / name), 1.0).mean() == pytest.approx(sharp, rel=0.15)
+    sharp, depth_m = read_image(view / "all_in_focus.exr"), read_exr(view / "depth.exr")[0].channels["Z"]
+    truth = read_image(view / meta["truth"]["heart"][0])
+    outline, mirrored = np.asarray(meta["apertures"]["heart"]["outlines"][0]), -np.asarray(meta["apertures"]["heart"]["outlines"][0])
+    near_m, middle_m, _ = meta["focus_distances_m"]
+
+    def scattered_psnr(focus_m: float, shape: np.ndarray) -> float:
+        lens = Lens(**meta["lens"], focus_distance_m=focus_m, aperture=Aperture((shape,), (1.0,)))
+        spread = scatter(
+            np.dstack([sharp, np.ones_like(depth_m)]).astype(np.float64), lens.coc_px(depth_m, depth_m.shape[1]), lens.aperture
+        )
+        return psnr((spread[..., :3] / np.maximum(spread[..., 3:], 1e-3)).astype(np.float32), truth)
+
+    right = scattered_psnr(near_m, outline)
+    assert right > 28.0
+    assert right > scattered_psnr(near_m, mirrored) + 2.0 and right > scattered_psnr(middle_m, outline) + 5.0

@@ -1,0 +1,55 @@
+"""An opening on Dr.Jit's LLVM back end: points of the pupil, and what the front rim lets through."""
+
+from typing import Any
+
+import drjit as dr
+
+from datasets_scripts.truth_pupil import pupil_table
+from datasets_scripts.truth_tracer import Opening, field_scale
+from mrbokeh.camera import Camera
+
+
+class LlvmPupil:
+    """radius_m, focus_m: of the Opening. Numbers that change from picture to picture are opaque, so that kernels are reused."""
+
+    def __init__(self, mi: Any, opening: Opening, camera: Camera) -> None:
+        self._mi, self._camera, self._cat_eye = mi, camera, opening.aperture.cat_eye
+        table = pupil_table(opening.aperture)
+        self._spans, self._columns, self._count = table.spans, table.bands.shape[1], len(table.bands)
+        self._bands = mi.Float(table.bands.ravel())
+        self.radius_m, self.focus_m = dr.opaque(mi.Float, 0.5 * opening.diameter_m), dr.opaque(mi.Float, opening.focus_distance_m)
+
+    def point(self, along: Any, across: Any) -> Any:
+        """See `PupilTable.points`."""
+        mi = self._mi
+        scaled = across * self._count
+        band = dr.minimum(mi.UInt32(scaled), self._count - 1)
+        row = [dr.gather(mi.Float, self._bands, band * self._columns + column) for column in range(self._columns)]
+        y = row[0] + (scaled - mi.Float(band)) * (row[1] - row[0])
+        widths = [row[2 * span + 3] - row[2 * span + 2] for span in range(self._spans)]
+        left = along * sum(widths)
+        x = row[2] + left
+        for span in range(1, self._spans):
+            left = left - widths[span - 1]
+            x = dr.select(left > 0, row[2 * span + 2] + left, x)
+        return mi.Point2f(x, y)
+
+    def weight(self, ray: Any, inverse_depth: Any, lens_uv: Any) -> Any:
+        """1 over the open share where the rim lets the ray pass, 0 where not; the rim is placed by where the point seen lies."""
+        mi = self._mi
+        if not self._cat_eye:
+            return mi.Float(1.0)
+        return self.open_weight(lens_uv, mi.Vector2f(ray.d.x, ray.d.y) / ray.d.z + mi.Vector2f(lens_uv) * self.radius_m * inverse_depth)
+
+    def open_weight(self, lens_uv: Any, slope: Any) -> Any:
+        """The same for a point in the direction `slope` (x / z, y / z) from the middle of the pupil."""
+        mi = self._mi
+        if not self._cat_eye:
+            return mi.Float(1.0)
+        (fx, fy), (cx, cy) = self._camera.focal_px, self._camera.principal_px
+        middle_x, middle_y, half_diagonal = field_scale(self._camera)
+        field = mi.Vector2f(slope.x * fx + cx - middle_x, slope.y * fy + cy - middle_y) / half_diagonal
+        passes = dr.squared_norm(mi.Vector2f(lens_uv) + self._cat_eye * field) <= 1.0
+        half = dr.minimum(0.5 * abs(self._cat_eye) * dr.norm(field), 0.999)
+        share = (dr.acos(half) - half * dr.sqrt(1.0 - half * half)) * (2.0 / dr.pi)
+        return dr.select(passes, 1.0 / share, 0.0)

@@ -1,0 +1,98 @@
+"""Thin-lens ray tracing of truth scenes: what there is to see through a lens of any opening, whichever way rays are computed.
+
+A camera ray goes from a point of the entrance pupil through the point of the focus plane that its film point is an image of.
+The film keeps its distance, so that the field of view does not change with the focus. A lens point u of the unit pupil
+(x right, y down) moves a point at depth z by u * coc / 2 with coc = focal_px * pupil diameter * (1 / focus - 1 / z).
+
+Cat-eyes: a front rim clips the pupil by a circle of radius 1 around -cat_eye * field_xy, where field_xy is the place of the
+point that is SEEN, in half diagonals from the middle of the frame. Each ray counts 1 over the share of the pupil that is open for
+its point, so that nothing is vignetted.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from datasets_scripts.truth_scene import PackedScene
+from mrbokeh.aperture import Aperture
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
+
+Part = Literal["all", "thin", "rest"]
+Picture = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+
+# A shadow ray starts this far above its surface, so as not to meet it.
+SHADOW_GAP_M = 2e-4
+# A ray from a lamp to the lens ends on its own lamp, which must not hide it.
+OWN_LAMP = 1.0 - 1e-4
+# Lamps draw their numbers from scrambles of their own, beside those of the camera rays.
+LAMP_STREAM = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """The lens of one picture: shape of the unit pupil, its diameter and the distance of the focus plane."""
+
+    aperture: Aperture
+    diameter_m: float
+    focus_distance_m: float
+
+    def __post_init__(self) -> None:
+        aperture = self.aperture
+        if aperture.spherical_aberration or aperture.is_chromatic:
+            raise InputError("the ray tracer knows openings and cat-eyes, but no spherical or chromatic aberration")
+        if aperture.cat_eye and (len(aperture.outlines) > 1 or not np.allclose(np.hypot(*aperture.outlines[0].T), 1.0, atol=5e-3)):
+            raise InputError("the ray tracer clips only round openings to cat-eyes: use Aperture.disc() with cat_eye")
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """rgb: mean radiance over the pixel and the open part of the pupil, lamps black. alpha: share of the rays that met a body
+    or the sky. open_share: share of the pupil that the rim leaves open."""
+
+    rgb: Picture
+    alpha: Plane
+    open_share: Plane
+
+
+@runtime_checkable
+class TruthTracer(Protocol):
+    """Looks at one part of a scene ("thin": the foreground alone, "rest": all but that); shadows are those of the whole scene."""
+
+    scene: PackedScene
+    camera: Camera
+    part: Part
+
+    def traced(self, opening: Opening | None, samples: int) -> Traced:
+        """The picture through an opening (None: a pinhole) with so many rays per pixel."""
+        ...
+
+    def lamp_light(self, opening: Opening | None, rays: int) -> Picture:
+        """What the lamps add to it, by so many rays per lamp from the lamps to the film."""
+        ...
+
+    def depth_m(self, offset_x: float = 0.5, offset_y: float = 0.5) -> Plane:
+        """Metres along the optical axis at one place of each pixel, inf where there is nothing."""
+        ...
+
+
+def field_scale(camera: Camera) -> tuple[float, float, float]:
+    """(middle x, middle y, half diagonal) of the frame in pixels: field_xy = (position - middle) / half diagonal."""
+    return 0.5 * camera.width_px, 0.5 * camera.height_px, 0.5 * float(np.hypot(camera.width_px, camera.height_px))
+
+
+def triangles_of(scene: PackedScene, part: Part) -> slice:
+    return {"all": slice(0, None), "thin": slice(0, scene.thin_triangles), "rest": slice(scene.thin_triangles, None)}[part]
+
+
+def lamps_of(scene: PackedScene, part: Part) -> list[int]:
+    return [number for number, lamp in enumerate(scene.lamps) if part == "all" or lamp.thin == (part == "thin")]
+
+
+def lamp_flux(scene: PackedScene, camera: Camera, number: int) -> Float64[np.ndarray, "3"]:
+    """What a lamp adds to the sum of all pixels where nothing hides it: radiance times the area of its sharp image, square pixels."""
+    lamp, depth_m = scene.lamps[number], float(scene.lamp_centres_m[number, 2])
+    return np.asarray(lamp.radiance_rgb) * np.pi * lamp.radius_m**2 * np.prod(camera.focal_px) / depth_m**2

@@ -1,0 +1,58 @@
+"""One part of a picture through polygon_differences: splatted row by row into a ring, summed back as soon as rows are complete."""
+
+import math
+
+import numpy as np
+
+from mrbokeh.renderers._polygon_ring_numba import BLOCK_ROWS, SPARE_PX, Corners, Exact, Picture, Ring, Scratch, Sums, Target, compiled
+from mrbokeh.renderers._polygon_splat_numba import splat_chunk
+from mrbokeh.renderers._polygon_sums_numba import add_row, cut_negative, finish_row
+from mrbokeh.renderers._polygon_vector_numba import CHUNK_PX
+
+
+@compiled
+def spread_part(
+    picture: Picture,
+    corners: Corners,
+    sums: Sums,
+    exact: Exact,
+    ring: Ring,
+    scratch: Scratch,
+    target: Target,
+    first: int,
+    end: int,
+    right: int,
+) -> None:
+    """Add the spread light of rows first..end, columns ring.left..right of a picture to the target, whose band holds the rows.
+
+    The ring is empty before and after.
+    """
+    reach = ring.margin
+    blurred, lit = (end + reach, first - reach - 1), (end + reach, first - reach - 1)
+    scratch.sums[:] = 0.0
+    scratch.total[:] = 0.0
+    for block in range(first, end, BLOCK_ROWS):
+        block_end = min(block + BLOCK_ROWS, end)
+        for left in range(ring.left, right, CHUNK_PX):
+            for y in range(block, block_end):
+                summed, whole = splat_chunk(picture, corners, exact, ring, scratch, y, left, min(left + CHUNK_PX, right))
+                if summed > 0.0:
+                    away = min(int(math.ceil(summed * corners.extent)) + SPARE_PX, reach)
+                    blurred = (min(blurred[0], y - away), max(blurred[1], y + away))
+                if whole > 0.0:
+                    away = min(int(math.ceil(0.5 * whole * exact.unit_radius)), reach)
+                    lit = (min(lit[0], y - away), max(lit[1], y + away))
+        for y in range(block - reach, block_end - reach):
+            finish_row(sums, ring, scratch, target, y, blurred, lit)
+    for y in range(end - reach, end + reach):
+        finish_row(sums, ring, scratch, target, y, blurred, lit)
+
+
+@compiled
+def settle(target: Target, strays: np.ndarray, starts: np.ndarray, nonnegative: np.ndarray) -> None:
+    """Complete the rows of a band. strays (pieces, rows, 4 W): what other bands threw up and down, from rows `starts` on."""
+    for y in range(target.top, target.bottom):
+        for piece in range(strays.shape[0]):
+            if 0 <= y - starts[piece] < strays.shape[1]:
+                add_row(target.out[y], strays[piece, y - starts[piece]])
+        cut_negative(target.out[y], nonnegative)

@@ -1,0 +1,114 @@
+"""Polygonal directional differences: a blur whose cost does not grow with its size (Moroto, Hachisuka, Umetani, 2021).
+
+The aperture is rectified to polygons along few directions. Every pixel throws the impulses of its kernel's corners into
+buffers, one per pair of directions that meet in a corner; sums along the directions and then downwards turn impulses into
+light (mrbokeh.directional_differences). Pixels come row by row and rows are summed as soon as they are complete, so that
+only as many rows as the largest kernel is high are held.
+
+Beyond the paper:
+- Weighted sums of polygons: every outline adds its corners, with its weight.
+- Any diameter, without steps: corners lie between lattice points and are split among the four around them. No table of
+  kernels by radius is needed. Light is exact, symmetric kernels stay in place, and the size of the blur is right on average.
+- High dynamic range: impulses in single precision are off by up to 1e-6 of the strongest light in the picture, anywhere in
+  it. They are used where that is below 1e-4 of the darkest tile, else double precision, which is off by about 1e-10.
+  Measured with lights of 1e5 over 0.1: 0.17 of the local signal in single, 2e-7 (the rounding of the result) in double.
+- Small kernels are splatted whole, by the true aperture: below `exact_below_px` they are cheaper and sharper so.
+- Highlights are splatted whole too: a pixel that gives more than 5 % of the light in the square of four radii around it shows
+  its kernel, corners and all, and there can be but few of those. The share spread so rises smoothly from 5 to 10 %.
+- Layers and occlusion: mrbokeh.layering.
+
+How near to the exact kernels of a texture of noise in [0, 1] with noisy diameters around 8 to 18 px: 54 dB for an octagon,
+59 for a disc of 16 edges, 61 and more for hearts, rings and 7 blades. What rectification itself leaves out is not in an
+isolated light (see above), and in a texture it is 1 to 4 % of the kernel at its rim.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from os import cpu_count
+from typing import TYPE_CHECKING, Literal
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.directional_differences import Direction
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+from mrbokeh.layering import Layering, render_layers
+from mrbokeh.lens import Lens
+from mrbokeh.polygon_rectification import PAPER_DIRECTIONS
+from mrbokeh.renderers._polygon_memory import ZeroedMemory
+
+if TYPE_CHECKING:
+    from mrbokeh.renderers._polygon_tables import ApertureTables
+
+_SINGLE_PRECISION = 50.0
+"""Where the strongest light is at most so many times that of the darkest tile, single precision is 1e-4 of the local signal in a
+picture of 2 megapixels; rounding adds up as the root of their number."""
+
+
+@dataclass(frozen=True)
+class PolygonDifferences:
+    """A Renderer that spreads light by polygonal differences; layers, slices and hidden background as in mrbokeh.layering.
+
+    directions, max_edges: of the rectified polygons; an aperture that fits them already is taken as it is.
+    exact_below_px: diameters up to this are splatted whole, those above 7/6 of it through the sums, those between by both.
+      None takes what suits the aperture, 8 to 16 px: the diameter at which its shortest edge is 3/4 of a lattice step.
+    exact_highlights: False also takes highlights through the sums, which is strictly linear (else light scaled as a whole gives
+      the scaled result, but two pictures spread apart add up to their sum only as near as rectified kernels come).
+    precision: of the impulses, "auto" for the choice above; "single" and "double" force it.
+    threads: 0 takes all cores. The result does not depend on it, bit for bit.
+    Memory for the rows is kept between calls.
+    """
+
+    directions: tuple[Direction, ...] = PAPER_DIRECTIONS
+    max_edges: int = 16
+    exact_below_px: float | None = None
+    exact_highlights: bool = True
+    precision: Literal["auto", "single", "double"] = "auto"
+    layering: Layering = Layering()  # noqa: RUF009
+    threads: int = 0
+    _memory: ZeroedMemory = field(default_factory=ZeroedMemory, repr=False, compare=False)
+    _tables: "WeakKeyDictionary[Aperture, ApertureTables]" = field(default_factory=WeakKeyDictionary, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.exact_below_px is not None and not self.exact_below_px >= 2.0:
+            raise InputError(f"exact_below_px must be at least 2 px, where polygons have no inside yet, got {self.exact_below_px}")
+        if self.precision not in ("auto", "single", "double"):
+            raise InputError(f"precision must be auto, single or double, got {self.precision!r}")
+
+    def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
+        return render_layers(layers, lens, self.spread, self.layering)
+
+    def spread(
+        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+    ) -> Float32[np.ndarray, "height width channels"]:
+        """See mrbokeh.spreading.Spread."""
+        from mrbokeh.renderers._polygon_bands import spread_four
+        from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
+
+        threads = self.threads or cpu_count() or 1
+        with ThreadPoolExecutor(threads) as pool:
+            light = SurveyedLight.of(values, coc_px, pool)
+            if light.largest_px <= 1.0:
+                return values.copy()
+            tables = self.tables_of(aperture)
+            share = light.highlights(tables.exact.from_px, pool) if self.exact_highlights else NO_HIGHLIGHTS
+            double = self.precision == "double" or (
+                self.precision == "auto" and light.contrast * light.pixels**0.5 > _SINGLE_PRECISION * 2e6**0.5
+            )
+            dtype = np.float64 if double else np.float32
+            groups = (light.group(first) for first in range(0, values.shape[2], 4))
+            spreads = [spread_four(group, share, tables, dtype, pool, threads, self._memory) for group in groups]
+        return spreads[0] if values.shape[2] == 4 else np.ascontiguousarray(np.concatenate(spreads, axis=2)[..., : values.shape[2]])
+
+    def tables_of(self, aperture: Aperture) -> "ApertureTables":
+        """What is computed once for each aperture and kept as long as it lives."""
+        from mrbokeh.renderers._polygon_tables import tables_of
+
+        tables = self._tables.get(aperture)
+        if tables is None:
+            tables = self._tables[aperture] = tables_of(aperture, self.directions, self.max_edges, self.exact_below_px)
+        return tables
