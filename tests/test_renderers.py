@@ -12,6 +12,7 @@ from mrbokeh.layer import Layer, clear, opaque
 from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.low_rank_filter import LowRankFilter
+from mrbokeh.renderers.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 
 
@@ -32,6 +33,7 @@ class Promise:
 
 PROMISES = {
     "scatter_reference": Promise(lambda threads: ScatterReference(threads=threads)),
+    "polygon_differences": Promise(lambda threads: PolygonDifferences(threads=threads), agreement_db=60.0, straight_edge=1.5e-3),
     "low_rank_filter": Promise(lambda threads: LowRankFilter(threads=threads), agreement_db=50.0, straight_edge=2e-3),
 }
 RENDERERS = {name: promise.make(0) for name, promise in PROMISES.items()}

@@ -17,9 +17,13 @@ Beyond the paper:
   its kernel, corners and all, and there can be but few of those. The share spread so rises smoothly from 5 to 10 %.
 - Layers and occlusion: mrbokeh.layering.
 
-How near to the exact kernels of a texture of noise in [0, 1] with noisy diameters around 8 to 18 px: 54 dB for an octagon,
-59 for a disc of 16 edges, 61 and more for hearts, rings and 7 blades. What rectification itself leaves out is not in an
-isolated light (see above), and in a texture it is 1 to 4 % of the kernel at its rim.
+How near to exact kernels of the true aperture: a texture of noise in [0, 1] under noisy diameters of 0 to 30 px comes within
+58 dB for an octagon, 61 for a disc, 59 for 7 blades, 57 for a ring, 52 for a heart; a kernel's rim is off by up to 0.16 of a
+pixel. In single precision pixels in focus that share a picture with blurred ones are off by up to 1e-7.
+
+What it costs (tests/bench_polygon_differences.py, 2 cores): 4 splats of four channels per corner and pixel, which with the sums
+is 0.75 of OpenCV's GaussianBlur with sigma 10 for an octagon up to 121 px, 1.1 in double precision. Kernels up to 400 px take 1.4
+to 1.5 times as long as up to 40: their rings outgrow the cache and the bands reach far into one another.
 """
 
 from collections.abc import Sequence
@@ -68,7 +72,7 @@ class PolygonDifferences:
     exact_below_px: float | None = None
     exact_highlights: bool = True
     precision: Literal["auto", "single", "double"] = "auto"
-    layering: Layering = Layering()  # noqa: RUF009
+    layering: Layering = field(default_factory=Layering)
     threads: int = 0
     _memory: ZeroedMemory = field(default_factory=ZeroedMemory, repr=False, compare=False)
     _tables: "WeakKeyDictionary[Aperture, ApertureTables]" = field(default_factory=WeakKeyDictionary, repr=False, compare=False)
