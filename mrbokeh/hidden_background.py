@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32
 _STEP_PX = 1.0  # less than this difference of circles of confusion between neighbours is one surface
 _SURFACE_PX = 2.0  # the same, for pixels some way apart
 _RIM_PX = 3
-_BAND_ROWS = 32
+_BAND_ROWS = 64
 _LIGHT_OVER_SURROUNDINGS = 4.0
 
 Values = Float32[np.ndarray, "height width channels"]

@@ -39,7 +39,7 @@ ROWS = (
     ("aperture_shapes",),
     ("psf", "_polygon_coverage_numba"),
     ("layer", "camera", "color", "image_metrics"),
-    ("atomic_files", "progress"),
+    ("atomic_files", "progress", "workers"),
     ("errors",),
 )
 ALLOWED_ACROSS = {

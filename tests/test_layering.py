@@ -67,7 +67,7 @@ def test_what_hides_behind_a_thin_wire_is_interpolated_from_both_sides() -> None
     rgb, coc_px = np.broadcast_to(ramp, (*SIZE, 3)).copy(), np.zeros(SIZE)
     rgb[:, 47:50], coc_px[:, 47:50] = 0.0, -20.0
     result = rendered([picture(rgb, coc_px)])
-    # 1.5 %: the formula's own, and what the weights of 16 directions make of a ramp.
+    # 1.5 %: the formula's own, and what the weights of 8 directions make of a ramp.
     np.testing.assert_allclose(result.rgb[30:40, 47:50, 0] / ramp[0, 47:50, 0], 1.0 - 60.0 / (100.0 * np.pi), atol=0.015)
 
 

@@ -1,7 +1,7 @@
 """The pieces of work of polygon_differences, and the threads that work through them."""
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import pairwise
 from threading import Lock
@@ -67,7 +67,7 @@ def spread_four(
     share: Float32[np.ndarray, "_ _"],
     tables: ApertureTables,
     dtype: type,
-    pool: ThreadPoolExecutor,
+    pool: Executor,
     workers: int,
     memory: ZeroedMemory,
 ) -> Float32[np.ndarray, "height width 4"]:

@@ -1,6 +1,6 @@
 """What polygon_differences learns from one look at all pixels, before it spreads them."""
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,7 @@ class SurveyedLight:
 
     @classmethod
     def of(
-        cls, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], pool: ThreadPoolExecutor
+        cls, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], pool: Executor
     ) -> "SurveyedLight":
         from mrbokeh.renderers._polygon_survey_numba import TILE_PX, survey
 
@@ -66,7 +66,7 @@ class SurveyedLight:
         darkest = np.where(self.sums > 0, self.sums, np.inf).min(axis=(0, 1)) / TILE_PX**2
         return float((self.peaks.max(axis=(0, 1)) / darkest).max(initial=0.0))
 
-    def highlights(self, from_px: float, pool: ThreadPoolExecutor) -> Float32[np.ndarray, "_ _"]:
+    def highlights(self, from_px: float, pool: Executor) -> Float32[np.ndarray, "_ _"]:
         """How much of each pixel is spread by its exact kernel; empty if there is no highlight."""
         from mrbokeh.renderers._polygon_survey_numba import HIGHLIGHT, find_highlights
 

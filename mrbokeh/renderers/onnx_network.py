@@ -96,7 +96,7 @@ class OnnxNetwork:
         return self.facts.lens
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        """See Renderer. The aperture of `lens` has no say: the network learned its own. Extra channels are left out: it knows colour only."""
+        """See Renderer. The aperture of `lens` has no say: the network learned its own. Extra channels are left out."""
         self._require_trained_lens(lens)
         return flatten([self._blurred_layer(layer, lens) for layer in layers])
 

@@ -27,7 +27,6 @@ to 1.5 times as long as up to 40: their rings outgrow the cache and the bands re
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from os import cpu_count
 from typing import TYPE_CHECKING, Literal
@@ -44,6 +43,7 @@ from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
 from mrbokeh.polygon_rectification import PAPER_DIRECTIONS
 from mrbokeh.renderers._polygon_memory import ZeroedMemory
+from mrbokeh.workers import workers
 
 if TYPE_CHECKING:
     from mrbokeh.renderers._polygon_tables import ApertureTables
@@ -94,7 +94,7 @@ class PolygonDifferences:
         from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
 
         threads = self.threads or cpu_count() or 1
-        with ThreadPoolExecutor(threads) as pool:
+        with workers(coc_px.size, threads) as pool:
             light = SurveyedLight.of(values, coc_px, pool)
             if light.largest_px <= 1.0:
                 return values.copy()
