@@ -161,7 +161,26 @@ def _slices(
                 waiting |= place_slice(
                     light, coc_px, full, sheet.values[window], sheet.coc_px[window], weight[window], index[window], slice_index
                 )
-            yield light, coc_px, window
+            yield _trimmed(light, coc_px, full, window, aperture)
+
+
+def _trimmed(
+    light: Channels, coc_px: Plane, full: np.ndarray, window: tuple[slice, slice], aperture: Aperture
+) -> tuple[Channels, Plane, tuple[slice, slice]]:
+    """The same, without borders that no light can reach: the few pixels of a second round need not fill the slice's window."""
+    rows, columns = np.flatnonzero(full.any(axis=1)), np.flatnonzero(full.any(axis=0))
+    if rows.size == 0:
+        return light[:0], coc_px[:0], (slice(window[0].start, window[0].start), window[1])
+    parts = []
+    for used, around, size in ((rows, window[0], full.shape[0]), (columns, window[1], full.shape[1])):
+        reach = reach_px(aperture, float(np.abs(coc_px[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]).max()))
+        parts.append((max(0, int(used[0]) - reach), min(size, int(used[-1]) + 1 + reach), around.start))
+    (top, bottom, y0), (left, right, x0) = parts
+    if (bottom - top) * (right - left) > full.size // 2:
+        return light, coc_px, window
+    inner = np.s_[top:bottom, left:right]
+    moved = slice(y0 + top, y0 + bottom), slice(x0 + left, x0 + right)
+    return np.ascontiguousarray(light[inner]), np.ascontiguousarray(coc_px[inner]), moved
 
 
 def _windows(
