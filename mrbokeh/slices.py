@@ -166,7 +166,7 @@ def _slices(
 
 def _trimmed(
     light: Channels, coc_px: Plane, full: np.ndarray, window: tuple[slice, slice], aperture: Aperture
-) -> tuple[Channels, Plane, tuple[slice, slice]]:
+) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]]:
     """The same, without borders that no light can reach: the few pixels of a second round need not fill the slice's window."""
     rows, columns = np.flatnonzero(full.any(axis=1)), np.flatnonzero(full.any(axis=0))
     if rows.size == 0:

@@ -45,7 +45,7 @@ def scatter_without_order(picture: Layer, lens: Lens) -> np.ndarray:
     around = ((margin, margin), (margin, margin))
     values = np.pad(np.dstack([picture.rgb, picture.alpha]).astype(np.float64), (*around, (0, 0)), mode="symmetric")
     spread = scatter(values, np.pad(coc_px, around, mode="symmetric"), aperture)[margin:-margin, margin:-margin]
-    return (spread[..., :3] / spread[..., 3:]).astype(np.float32)
+    return (spread[..., :3] / np.maximum(spread[..., 3:], 1e-6)).astype(np.float32)
 
 
 def has_gegl() -> bool:

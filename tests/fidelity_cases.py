@@ -73,7 +73,7 @@ def card_cases(seeds: Sequence[int], kept: Path | None) -> Iterator[Case]:
         scene = cards.card_scene(seed)
         picture, layers = opaque(cards.all_in_focus(scene), cards.depth_m(scene)), cards.layers(scene)
         for radius_px in CARD_RADII_PX:
-            lens = cards.lens_of_radius(radius_px, scene.width_px)
+            lens = cards.lens_of_radius(float(radius_px), scene.width_px)
             file = None if kept is None else kept / f"cards_{seed}_{radius_px}px.exr"
             if file is None or not file.is_file():
                 truth = cards.truth(scene, lens)
