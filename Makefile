@@ -14,6 +14,7 @@ test: $(READY)
 	$(RUN)/python -m pytest -n 2 -m "not slow"
 
 test-slow: $(READY)
+	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,datasets]"
 	$(RUN)/python -m pytest -m slow
 
 check: $(READY)
