@@ -1,7 +1,7 @@
 """Progress bars with the time left, the same everywhere; silent where nobody watches (no terminal)."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TypeVar
 
 from rich.console import Console
@@ -34,3 +34,8 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
         for item in items:
             yield item
             progress.advance(task)
+
+
+def working(description: str) -> AbstractContextManager[object]:
+    """A spinner on the terminal while something runs whose length nobody knows."""
+    return Console(stderr=True).status(description)

@@ -42,13 +42,15 @@ def render(
     from mrbokeh.image_io import write_image, write_layer
     from mrbokeh.layering import Layering
     from mrbokeh.lens_file import read_lens
+    from mrbokeh.progress import working
 
     refuse_existing(out, overwrite)
     if alpha_out and out.suffix.lower() != ".exr":
         raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
     sharp = _read(rgb, depth, layer or [], behind or [], srgb)
     used = _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
-    blurred = make_renderer(method, threads=threads, layering=Layering(slices=slices)).render(list(sharp.values()), used)
+    with working("rendering (the first time on a machine it takes a minute to compile)"):
+        blurred = make_renderer(method, threads=threads, layering=Layering(slices=slices)).render(list(sharp.values()), used)
     if alpha_out:
         write_layer(out, blurred)
     else:
