@@ -108,7 +108,9 @@ def _takes(seed_y: np.ndarray, seed_x: np.ndarray, coc_px: np.ndarray, y: int, x
 
 
 @njit(cache=True, nogil=True)
-def nearest_behind(coc_px: np.ndarray, pure_y: np.ndarray, pure_x: np.ndarray, step_px: float) -> tuple[np.ndarray, np.ndarray]:
+def nearest_behind(
+    coc_px: np.ndarray, rim: np.ndarray, pure_y: np.ndarray, pure_x: np.ndarray, step_px: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the nearest pure pixel that lies more than `step_px` behind; -1 where the lens sees none.
 
     The lens sees past an edge by half the difference of the two circles of confusion (and a rim's width more is searched).
@@ -122,14 +124,18 @@ def nearest_behind(coc_px: np.ndarray, pure_y: np.ndarray, pure_x: np.ndarray, s
     first, end = 0, 0
     for y in range(height):
         for x in range(width):
-            taken = False
+            if not rim[y, x] or pure_y[y, x] < 0:
+                continue
             for ny in range(max(0, y - 1), min(height, y + 2)):
                 for nx in range(max(0, x - 1), min(width, x + 2)):
-                    if pure_y[ny, nx] >= 0 and coc_px[ny, nx] > coc_px[y, x] + step_px:
-                        taken |= _takes(seed_y, seed_x, coc_px, y, x, pure_y[ny, nx], pure_x[ny, nx], step_px)
-            if taken:
-                queue[end], queued[y * width + x] = y * width + x, True
-                end += 1
+                    nearer = coc_px[ny, nx] < coc_px[y, x] - step_px
+                    if (
+                        nearer
+                        and _takes(seed_y, seed_x, coc_px, ny, nx, pure_y[y, x], pure_x[y, x], step_px)
+                        and not queued[ny * width + nx]
+                    ):
+                        queue[end], queued[ny * width + nx] = ny * width + nx, True
+                        end += 1
     while first != end:
         y, x = queue[first] // width, queue[first] % width
         first = (first + 1) % queue.size

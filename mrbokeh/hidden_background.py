@@ -38,7 +38,7 @@ def apart(values: Values, coc_px: Plane) -> tuple[tuple[Values, Plane], tuple[Va
         return (front, front_coc_px), (behind, behind_coc_px)
     pure = ~(rim | lit)
     pure_y, pure_x = pure_neighbours(coc_px, pure, _STEP_PX, _RIM_PX)
-    seed_y, seed_x = nearest_behind(coc_px, pure_y, pure_x, _STEP_PX)
+    seed_y, seed_x = nearest_behind(coc_px, rim, pure_y, pure_x, _STEP_PX)
     seeded_rim = rim & (pure_y >= 0)
     seed_y[seeded_rim], seed_x[seeded_rim] = pure_y[seeded_rim], pure_x[seeded_rim]
     bands = [(top, min(top + _BAND_ROWS, len(values))) for top in range(0, len(values), _BAND_ROWS)]

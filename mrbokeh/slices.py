@@ -21,6 +21,7 @@ _BORDER_PX = 5
 _SLICES_AT_ONCE = 2
 
 _Result = TypeVar("_Result")
+_Window = tuple[slice, slice]
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]
 
@@ -151,16 +152,18 @@ def _slices(
     from mrbokeh._slices_numba import place_slice
 
     indices = [np.floor(sheet.coc_px / step_px + 0.5).astype(np.int32) for sheet in sheets]
-    for slice_index, window in _windows(sheets, weights, indices, aperture):
+    for slice_index, window, boxes in _windows(sheets, weights, indices, aperture):
+        top, left = window[0].start, window[1].start
         waiting = True
         while waiting:
             waiting, size = False, indices[0][window].shape
             light, coc_px = np.zeros((*size, sheets[0].values.shape[2]), np.float32), np.zeros(size, np.float32)
             full = np.zeros(size, np.bool_)
-            for sheet, weight, index in zip(sheets, weights, indices, strict=True):
-                waiting |= place_slice(
-                    light, coc_px, full, sheet.values[window], sheet.coc_px[window], weight[window], index[window], slice_index
-                )
+            for sheet, weight, index, box in zip(sheets, weights, indices, boxes, strict=True):
+                if box is not None:
+                    here = slice(box[0].start - top, box[0].stop - top), slice(box[1].start - left, box[1].stop - left)
+                    own = sheet.values[box], sheet.coc_px[box], weight[box], index[box]
+                    waiting |= place_slice(light[here], coc_px[here], full[here], *own, slice_index)
             yield _trimmed(light, coc_px, full, window, aperture)
 
 
@@ -185,18 +188,27 @@ def _trimmed(
 
 def _windows(
     sheets: Sequence[Sheet], weights: Sequence[Plane], indices: Sequence[Int32[np.ndarray, "height width"]], aperture: Aperture
-) -> Iterator[tuple[int, tuple[slice, slice]]]:
-    """Every slice that is not empty, front first, and the rectangle that its light can reach."""
+) -> Iterator[tuple[int, _Window, list[_Window | None]]]:
+    """Every slice that is not empty, front first, the rectangle that its light can reach, and those of the pixels of each sheet."""
     from mrbokeh._slices_numba import slice_windows
 
     height, width = indices[0].shape
     lowest, highest = min(int(index.min()) for index in indices), max(int(index.max()) for index in indices)
-    windows = np.tile(np.array([height, 0, width, 0]), (highest - lowest + 1, 1))
-    largest_px = np.zeros(len(windows), np.float32)
-    for sheet, weight, index in zip(sheets, weights, indices, strict=True):
-        slice_windows(windows, largest_px, index, weight, sheet.values, sheet.coc_px, lowest)
-    for place, (top, bottom, left, right) in enumerate(windows.tolist()):
-        if bottom > top:
-            reach = reach_px(aperture, float(largest_px[place]))
-            rows, columns = slice(max(0, top - reach), min(height, bottom + reach)), slice(max(0, left - reach), min(width, right + reach))
-            yield lowest + place, (rows, columns)
+    count = highest - lowest + 1
+    edges = np.tile(np.array([height, 0, width, 0]), (len(sheets), count, 1))
+    largest_px = np.zeros(count, np.float32)
+    for own, sheet, weight, index in zip(edges, sheets, weights, indices, strict=True):
+        slice_windows(own, largest_px, index, weight, sheet.values, sheet.coc_px, lowest)
+    for place in range(count):
+        boxes = [_window(y0, y1, x0, x1, 0, height, width) for y0, y1, x0, x1 in edges[:, place].tolist()]
+        (top, left), (bottom, right) = edges[:, place, ::2].min(axis=0).tolist(), edges[:, place, 1::2].max(axis=0).tolist()
+        window = _window(top, bottom, left, right, reach_px(aperture, float(largest_px[place])), height, width)
+        if window is not None:
+            yield lowest + place, window, boxes
+
+
+def _window(top: int, bottom: int, left: int, right: int, reach: int, height: int, width: int) -> _Window | None:
+    """A rectangle widened by a reach, within the frame; None for an empty one."""
+    if bottom <= top:
+        return None
+    return slice(max(0, top - reach), min(height, bottom + reach)), slice(max(0, left - reach), min(width, right + reach))
