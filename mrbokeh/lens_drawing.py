@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
-from mrbokeh.low_rank import relative_errors
+from mrbokeh.low_rank import aperture_errors
 from mrbokeh.polygon_rectification import rectify
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def _closed(outline: Float64[np.ndarray, "vertices 2"]) -> Float64[np.ndarray, "
 
 def draw_low_rank_error(axes: "Axes", aperture: Aperture) -> None:
     """Relative error of the kernel's approximation by a few separable passes (McGraw, Eq. 4), behind the focus."""
-    errors = relative_errors(aperture.rasterize(KERNEL_COC_PX[-1]).kernel)[:LARGEST_RANK]
+    errors = aperture_errors(aperture, KERNEL_COC_PX[-1])[:LARGEST_RANK]
     axes.semilogy(np.arange(1, len(errors) + 1), np.maximum(errors, 1e-6), marker="o", ms=3)
     axes.set_xlabel("rank")
     axes.set_xticks(np.arange(1, len(errors) + 1))
