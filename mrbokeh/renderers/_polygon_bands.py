@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from mrbokeh.renderers._polygon_differences_numba import settle, spread_part
-from mrbokeh.renderers._polygon_light import SurveyedLight
+from mrbokeh.renderers._polygon_halves import halves_of
+from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
 from mrbokeh.renderers._polygon_memory import ZeroedMemory
 from mrbokeh.renderers._polygon_ring_numba import Picture, Target
 from mrbokeh.renderers._polygon_survey_numba import TILE_PX
@@ -62,46 +63,72 @@ def _parts(occupied: Bool[np.ndarray, "rows columns"], top: int, bottom: int, wi
             yield top + int(rows[0]) * TILE_PX, min(top + (int(rows[-1]) + 1) * TILE_PX, bottom), max(left, start), min(right, end)
 
 
-def spread_four(
-    light: SurveyedLight,
-    share: Float32[np.ndarray, "_ _"],
-    tables: ApertureTables,
-    dtype: type,
-    pool: Executor,
-    workers: int,
-    memory: ZeroedMemory,
-) -> Float32[np.ndarray, "height width 4"]:
-    """Bands one by one, by as many threads as there are; what light leaves its band is added in the order of the bands."""
-    out = np.zeros_like(light.values)
-    if not light.sums.any():
+@dataclass(frozen=True)
+class Workshop:
+    """What all pictures of a call have in common. halve_from_px: see mrbokeh.renderers._polygon_halves; inf for never."""
+
+    tables: ApertureTables
+    dtype: type
+    pool: Executor
+    threads: int
+    memory: ZeroedMemory
+    halve_from_px: float
+
+    def spread_four(self, light: SurveyedLight, highlights: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "height width 4"]:
+        """A picture of four channels, the blurriest parts at half the resolution, and of those the blurriest at half of that."""
+        halves = halves_of(light, highlights, self.halve_from_px, self.pool)
+        half = np.zeros((0, 0), np.float32)
+        if halves.half is not None:
+            half = self.spread_four(halves.half, NO_HIGHLIGHTS)
+            half = half.reshape(len(half), -1)
+        return self._spread(halves.kept, highlights, halves.share, half)
+
+    def _spread(
+        self,
+        light: SurveyedLight,
+        highlights: Float32[np.ndarray, "_ _"],
+        halved: Float32[np.ndarray, "_ _"],
+        half: Float32[np.ndarray, "_ _"],
+    ) -> Float32[np.ndarray, "height width 4"]:
+        """Bands one by one, by as many threads as there are; what light leaves its band is added in the order of the bands."""
+        out = np.zeros(light.values.shape, np.float32)
+        flat, nonnegative = out.reshape(len(out), -1), light.least >= 0.0
+        bands, margin = [], 0
+        if light.sums.any():
+            margin = self.tables.margin_px(light.largest_px)
+            bands = bands_of(light, margin, (len(self.tables.planes) + 1) * 4 * np.dtype(self.dtype).itemsize)
+        edges = [(band.top, band.bottom) for band in bands] if len(bands) > 1 else [(0, len(out))]
+        strays = np.zeros((len(edges), 2, margin if len(bands) > 1 else 0, flat.shape[1]), np.float32)
+        targets = [Target(flat, above, below, *rows) for (above, below), rows in zip(strays, edges, strict=True)]
+        picture = Picture(light.values, light.coc_px, highlights, halved, nonnegative, light.largest_of_tile_px)
+        self._spread_bands(picture, list(zip(bands, targets, strict=False)), margin)
+        starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
+        pieces, cuts = strays.reshape(2 * len(edges), *strays.shape[2:]), np.linspace(0, len(out), 2 * self.threads + 1).astype(int)
+
+        def finish(top: int, bottom: int) -> None:
+            target = Target(flat, strays[0, 0], strays[0, 1], top, bottom)
+            settle(target, pieces, starts, half, np.empty(half.shape[1], np.float32), nonnegative)
+
+        list(self.pool.map(finish, map(int, cuts[:-1]), map(int, cuts[1:])))
         return out
-    margin = tables.margin_px(light.largest_px)
-    bands = bands_of(light, margin, (len(tables.planes) + 1) * 4 * np.dtype(dtype).itemsize)
-    width = max(right - left for band in bands for _, _, left, right in band.parts)
-    picture = Picture(light.values, light.coc_px, share, light.least >= 0.0)
-    flat = out.reshape(len(out), -1)
-    edges = [(band.top, band.bottom) for band in bands] if len(bands) > 1 else [(0, len(out))]
-    strays = np.zeros((len(bands), 2, margin if len(bands) > 1 else 0, flat.shape[1]), np.float32)
-    targets = [Target(flat, above, below, *rows) for (above, below), rows in zip(strays, edges, strict=True)]
-    waiting, lock = iter(zip(bands, targets, strict=True)), Lock()
 
-    def work() -> None:
-        planes = memory.take(ring_elements(tables, margin, width), dtype)
-        ring = ring_of(tables, margin, width, planes)
-        corners, scratch = laid_out(tables, ring), scratch_of(tables, ring)
-        while True:
-            with lock:
-                piece = next(waiting, None)
-            if piece is None:
-                break
-            band, target = piece
-            for first, end, left, right in band.parts:
-                spread_part(picture, corners, tables.sums, tables.exact, ring._replace(left=left), scratch, target, first, end, right)
-        memory.give_back(planes)
+    def _spread_bands(self, picture: Picture, bands: list[tuple[Band, Target]], margin: int) -> None:
+        waiting, lock = iter(bands), Lock()
+        width = max((right - left for band, _ in bands for _, _, left, right in band.parts), default=0)
+        tables = self.tables
 
-    list(pool.map(lambda _: work(), range(min(workers, len(bands)))))
-    starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
-    pieces, cuts = strays.reshape(2 * len(bands), *strays.shape[2:]), np.linspace(0, len(out), 2 * len(bands) + 1).astype(int)
-    settled = [Target(flat, strays[0, 0], strays[0, 1], int(top), int(bottom)) for top, bottom in pairwise(cuts)]
-    list(pool.map(lambda target: settle(target, pieces, starts, picture.nonnegative), settled))
-    return out
+        def work() -> None:
+            planes = self.memory.take(ring_elements(tables, margin, width), self.dtype)
+            ring = ring_of(tables, margin, width, planes)
+            corners, scratch = laid_out(tables, ring), scratch_of(tables, ring)
+            while True:
+                with lock:
+                    piece = next(waiting, None)
+                if piece is None:
+                    break
+                band, target = piece
+                for first, end, left, right in band.parts:
+                    spread_part(picture, corners, tables.sums, tables.exact, ring._replace(left=left), scratch, target, first, end, right)
+            self.memory.give_back(planes)
+
+        list(self.pool.map(lambda _: work(), range(min(self.threads, len(bands)))))

@@ -4,10 +4,11 @@ import math
 
 import numpy as np
 
+from mrbokeh.renderers._polygon_aim_numba import CHUNK_PX
+from mrbokeh.renderers._polygon_chunk_numba import splat_chunk
+from mrbokeh.renderers._polygon_halves_numba import add_doubled_row
 from mrbokeh.renderers._polygon_ring_numba import BLOCK_ROWS, SPARE_PX, Corners, Exact, Picture, Ring, Scratch, Sums, Target, compiled
-from mrbokeh.renderers._polygon_splat_numba import splat_chunk
 from mrbokeh.renderers._polygon_sums_numba import add_row, cut_negative, finish_row
-from mrbokeh.renderers._polygon_vector_numba import CHUNK_PX
 
 
 @compiled
@@ -49,10 +50,13 @@ def spread_part(
 
 
 @compiled
-def settle(target: Target, strays: np.ndarray, starts: np.ndarray, nonnegative: np.ndarray) -> None:
-    """Complete the rows of a band. strays (pieces, rows, 4 W): what other bands threw up and down, from rows `starts` on."""
+def settle(target: Target, strays: np.ndarray, starts: np.ndarray, half: np.ndarray, line: np.ndarray, nonnegative: np.ndarray) -> None:
+    """Complete the rows of a band. strays (pieces, rows, 4 W): what other bands threw up and down, from rows `starts` on.
+    half (rows, 4 cells): what was spread at half the resolution, or empty; line (4 cells) is scratch space."""
     for y in range(target.top, target.bottom):
         for piece in range(strays.shape[0]):
             if 0 <= y - starts[piece] < strays.shape[1]:
                 add_row(target.out[y], strays[piece, y - starts[piece]])
+        if half.shape[0] > 0:
+            add_doubled_row(half, y, line, target.out[y])
         cut_negative(target.out[y], nonnegative)

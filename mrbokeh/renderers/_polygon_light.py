@@ -4,7 +4,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from mrbokeh.errors import InputError
 
@@ -14,7 +14,8 @@ _ROWS_AT_ONCE = 24
 
 @dataclass(frozen=True)
 class SurveyedLight:
-    """A picture and what a look at all its pixels told: per tile sums and peaks of its channels and the largest diameter."""
+    """A picture and what a look at all its pixels told: per tile sums and peaks of its channels, the largest diameter, and
+    whether all pixels have light."""
 
     values: Float32[np.ndarray, "height width channels"]
     coc_px: Float32[np.ndarray, "height width"]
@@ -22,6 +23,7 @@ class SurveyedLight:
     peaks: Float32[np.ndarray, "rows columns channels"]
     largest_of_tile_px: Float32[np.ndarray, "rows columns"]
     least: Float32[np.ndarray, " channels"]
+    is_full: Bool[np.ndarray, "rows columns"]
 
     @classmethod
     def of(
@@ -34,15 +36,16 @@ class SurveyedLight:
         rows, columns = -(-height // TILE_PX), -(-width // TILE_PX)
         sums, peaks = np.zeros((rows, columns, channels), np.float32), np.zeros((rows, columns, channels), np.float32)
         largest_px, least = np.zeros((rows, columns), np.float32), np.zeros((rows, channels), np.float32)
+        is_full = np.zeros((rows, columns), np.bool_)
         each = range(0, rows, _ROWS_AT_ONCE)
 
         def look(first: int) -> None:
-            work = np.empty((4, width * channels), np.float32)
+            work = np.empty((5, width * channels), np.float32)
             for row in range(first, min(first + _ROWS_AT_ONCE, rows)):
-                survey(values.reshape(height, -1), coc_px, row, sums[row], peaks[row], largest_px[row], least[row], work)
+                survey(values.reshape(height, -1), coc_px, row, sums[row], peaks[row], largest_px[row], least[row], is_full[row], work)
 
         list(pool.map(look, each))
-        return cls(values, coc_px, sums, peaks, largest_px, least.min(axis=0))
+        return cls(values, coc_px, sums, peaks, largest_px, least.min(axis=0), is_full)
 
     @property
     def largest_px(self) -> float:
@@ -90,4 +93,4 @@ class SurveyedLight:
         least = np.zeros(4, np.float32)
         count = self.values[..., channels].shape[2]
         values[..., :count], sums[..., :count], least[:count] = self.values[..., channels], self.sums[..., channels], self.least[channels]
-        return SurveyedLight(values, self.coc_px, sums, sums, self.largest_of_tile_px, least)
+        return SurveyedLight(values, self.coc_px, sums, sums, self.largest_of_tile_px, least, self.is_full)

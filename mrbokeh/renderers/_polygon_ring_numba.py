@@ -23,9 +23,13 @@ compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract
 
 
 class Corners(NamedTuple):
-    """mrbokeh.directional_differences.PolygonCorners laid out for one ring: steps and planes count array elements.
+    """mrbokeh.directional_differences.PolygonCorners laid out for one ring: steps and places count array elements.
 
-    extent: farthest reach of an outline at radius 1.
+    Crossings of a corner that are neighbours in a row are added to together, so corners come in three kinds: up to `level`
+    crossings 0 and 1 are neighbours and so are 2 and 3, up to `steep` 1 and 2 are, and of the rest none. place (corners, 4):
+    where they are from crossing 0 on, in pairs as mrbokeh.renderers._polygon_aim_numba stores their weights. step, turned
+    (corners, 2): of the edge before and the one after, what one line on moves the crossing, and 1 where their two lines count
+    backwards, 0 elsewhere. below: the row under the lowest crossing. extent: farthest reach of an outline at radius 1.
     """
 
     slope: np.ndarray
@@ -34,10 +38,14 @@ class Corners(NamedTuple):
     curvature: np.ndarray
     before: np.ndarray
     after: np.ndarray
-    step_before: np.ndarray
-    step_after: np.ndarray
+    step: np.ndarray
+    turned: np.ndarray
     plane: np.ndarray
+    place: np.ndarray
+    below: np.ndarray
     weight: np.ndarray
+    level: int
+    steep: int
     area: float
     area_offset: float
     growth: float
@@ -120,12 +128,16 @@ class Scratch(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """values (H, W, 4) and coc_px (H, W) float32; share (H, W) of highlights, or empty; nonnegative: channels without values below 0."""
+    """values (H, W, 4) and coc_px (H, W) float32; share (H, W) of highlights, halved (blocks of 2 x 2) that is spread at half the
+    resolution, each empty if there is none; nonnegative: channels without values below 0; largest_px: of pixels with light, of
+    each tile."""
 
     values: np.ndarray
     coc_px: np.ndarray
     share: np.ndarray
+    halved: np.ndarray
     nonnegative: np.ndarray
+    largest_px: np.ndarray
 
 
 class Target(NamedTuple):

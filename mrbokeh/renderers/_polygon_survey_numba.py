@@ -22,14 +22,16 @@ def survey(
     peaks: np.ndarray,
     largest: np.ndarray,
     least: np.ndarray,
+    is_full: np.ndarray,
     work: np.ndarray,
 ) -> None:
-    """One row of tiles: absolute sums and peaks (columns of tiles, C), largest visible diameter (columns of tiles), least values (C).
+    """One row of tiles: absolute sums and peaks (columns of tiles, C), largest visible diameter and
+    whether all pixels are visible (columns of tiles), least values (C).
 
-    values (H, W C); work (4, W C) is scratch space. A visible pixel without a finite diameter makes largest infinite.
+    values (H, W C); work (5, W C) is scratch space. A visible pixel without a finite diameter makes largest infinite.
     """
     channels = least.shape[0]
-    work[:] = 0.0
+    work[:4], work[4], is_full[:] = 0.0, np.inf, True
     top, bottom = row * TILE_PX, min((row + 1) * TILE_PX, values.shape[0])
     for y in range(top, bottom):
         _add_sizes(values[y], work[0])
@@ -41,25 +43,29 @@ def survey(
             for y in range(top, bottom):
                 _raise_peaks(values[y, block], work[1, block])
                 _lower_least(values[y, block], work[2, block])
-                _raise_diameters(values[y, block], coc_px[y, left:right], channels, work[3, left:right])
-            _gather(work[:, block], work[3, left:right], left, channels, sums, peaks, largest, least)
+                _raise_diameters(values[y, block], coc_px[y, left:right], channels, work[3, left:right], work[4, left:right])
+            _gather(work[:, block], work[3:, left:right], left, channels, sums, peaks, largest, least, is_full)
+        else:
+            is_full[left // TILE_PX : -(-right // TILE_PX)] = False
 
 
 @compiled
 def _gather(
     work: np.ndarray,
-    diameters_px: np.ndarray,
+    of_pixels: np.ndarray,
     left: int,
     channels: int,
     sums: np.ndarray,
     peaks: np.ndarray,
     largest: np.ndarray,
     least: np.ndarray,
+    is_full: np.ndarray,
 ) -> None:
-    """From columns of pixels to columns of tiles."""
-    for x in range(diameters_px.shape[0]):
+    """From columns of pixels to columns of tiles. of_pixels: largest diameters and least light."""
+    for x in range(of_pixels.shape[1]):
         column = (left + x) // TILE_PX
-        largest[column] = max(largest[column], diameters_px[x])
+        largest[column] = max(largest[column], of_pixels[0, x])
+        is_full[column] = is_full[column] and of_pixels[1, x] > 0
         for c in range(channels):
             i = x * channels + c
             sums[column, c] += work[0, i]
@@ -89,7 +95,7 @@ def _lower_least(line: np.ndarray, least: np.ndarray) -> None:
 
 
 @compiled
-def _raise_diameters(line: np.ndarray, coc_px: np.ndarray, channels: int, largest: np.ndarray) -> None:
+def _raise_diameters(line: np.ndarray, coc_px: np.ndarray, channels: int, largest: np.ndarray, dimmest: np.ndarray) -> None:
     infinite, zero = np.float32(np.inf), np.float32(0.0)
     for x in range(coc_px.shape[0]):
         diameter = abs(coc_px[x])
@@ -101,6 +107,7 @@ def _raise_diameters(line: np.ndarray, coc_px: np.ndarray, channels: int, larges
             for i in range(x * channels, (x + 1) * channels):
                 light += abs(line[i])
         diameter = diameter if light > zero else zero
+        dimmest[x] = light if light < dimmest[x] else dimmest[x]
         largest[x] = diameter if diameter > largest[x] else largest[x]
 
 

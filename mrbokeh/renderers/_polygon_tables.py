@@ -1,6 +1,7 @@
 """Tables of polygon_differences: what depends on the aperture alone, and what on the size of the ring of rows."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from mrbokeh.aperture import Aperture
 from mrbokeh.directional_differences import Direction, PolygonCorners, edge_profile, polygon_corners
 from mrbokeh.polygon_rectification import rectify_aperture
+from mrbokeh.renderers._polygon_aim_numba import CHUNK_PX
 from mrbokeh.renderers._polygon_ring_numba import (
     ALIASED_ROWS,
     BLOCK_ROWS,
@@ -20,7 +22,6 @@ from mrbokeh.renderers._polygon_ring_numba import (
     Scratch,
     Sums,
 )
-from mrbokeh.renderers._polygon_vector_numba import CHUNK_PX
 
 LEVELS_PER_PX = 8.0
 """Small kernels are tabulated this densely in diameter; between two they are blended, which is 1e-3 of their peak off."""
@@ -138,28 +139,78 @@ def ring_elements(tables: ApertureTables, margin: int, width: int) -> int:
     return (len(tables.planes) + 1) * (2 * margin + BLOCK_ROWS + 2 * ALIASED_ROWS) * (width + 2 * margin) * 4
 
 
-def laid_out(tables: ApertureTables, ring: Ring) -> Corners:
-    corners = tables.corners
-    steps_before, steps_after, planes, weights = [], [], [], []
+@dataclass(frozen=True)
+class _Corner:
+    """A corner whose four crossings lie at 0, step, step_after and their sum, lattice points in (x, y).
+
+    turned, turned_after: whether the two lines of that edge count backwards, from the one farther along its step.
+    """
+
+    before: int
+    after: int
+    step: Direction
+    step_after: Direction
+    plane: int
+    weight: float
+    turned: bool = False
+    turned_after: bool = False
+
+    @property
+    def kind(self) -> int:
+        """0: crossings 0 and 1 are neighbours in a row, as are 2 and 3; 1: crossings 1 and 2 are; 2: none are."""
+        if self.step == (1, 0):
+            return 0
+        return 1 if (self.step_after[0] - self.step[0], self.step_after[1] - self.step[1]) == (1, 0) else 2
+
+    @property
+    def variants(self) -> "Iterator[_Corner]":
+        """The same corner with its edges named the other way round, and with lines counted backwards."""
+        other = replace(self, before=self.after, after=self.before, step=self.step_after, step_after=self.step)
+        for corner in (self, other):
+            step, step_after = ((-x, -y) for x, y in (corner.step, corner.step_after))
+            yield corner
+            yield replace(corner, step=step, turned=True)
+            yield replace(corner, step_after=step_after, turned_after=True)
+            yield replace(corner, step=step, turned=True, step_after=step_after, turned_after=True)
+
+    def places(self, stride: int) -> list[int]:
+        step, step_after = (4 * (y * stride + x) for x, y in (self.step, self.step_after))
+        return [0, step, step_after, step + step_after] if self.kind == 0 else [step, step_after, 0, step + step_after]
+
+
+def _crossed(tables: ApertureTables) -> list[_Corner]:
+    """Corners with as many neighbouring crossings as they have, the best kinds first."""
+    corners, found = tables.corners, []
     for before, after, weight in zip(corners.before, corners.after, corners.weight, strict=True):
         first, second = corners.direction[before], corners.direction[after]
         det = first[0] * second[1] - first[1] * second[0]
-        steps_before.append(det * (second[1] * ring.stride + second[0]) * 4)
-        steps_after.append(-det * (first[1] * ring.stride + first[0]) * 4)
+        step, step_after = (det * second[0], det * second[1]), (-det * first[0], -det * first[1])
         pair = _pair(corners, before, after)
-        planes.append(tables.planes[pair] * ring.plane_elements)
-        weights.append(weight if pair == (first, second) else -weight)
+        corner = _Corner(before, after, step, step_after, tables.planes[pair], weight if pair == (first, second) else -weight)
+        found.append(min(corner.variants, key=lambda each: each.kind))
+    return sorted(found, key=lambda corner: corner.kind)
+
+
+def laid_out(tables: ApertureTables, ring: Ring) -> Corners:
+    """Lines count forwards here; crossing 0 of a corner that is turned lies one line on, one step back."""
+    corners, crossed = tables.corners, _crossed(tables)
+    steps = 4 * np.array([[y * ring.stride + x for x, y in (corner.step, corner.step_after)] for corner in crossed])
+    turned = np.array([(corner.turned, corner.turned_after) for corner in crossed])
     return Corners(
-        slope=corners.slope,
-        shift=corners.shift,
-        origin=corners.origin,
-        curvature=corners.curvature,
-        before=_whole(corners.before),
-        after=_whole(corners.after),
-        step_before=_whole(steps_before),
-        step_after=_whole(steps_after),
-        plane=_whole(planes),
-        weight=np.array(weights),
+        slope=corners.slope.astype(ring.planes.dtype),
+        shift=corners.shift.astype(ring.planes.dtype),
+        origin=corners.origin.astype(ring.planes.dtype),
+        curvature=corners.curvature.astype(ring.planes.dtype),
+        before=_whole([corner.before for corner in crossed]),
+        after=_whole([corner.after for corner in crossed]),
+        step=np.where(turned, -steps, steps),
+        turned=turned.astype(np.float64),
+        plane=_whole([corner.plane * ring.plane_elements for corner in crossed]) - (turned * steps).sum(axis=1),
+        place=_whole([corner.places(ring.stride) for corner in crossed]),
+        below=_whole([max(corner.places(ring.stride)) + 4 * ring.stride for corner in crossed]),
+        weight=np.array([corner.weight for corner in crossed]),
+        level=sum(corner.kind == 0 for corner in crossed),
+        steep=sum(corner.kind <= 1 for corner in crossed),
         area=corners.area[0],
         area_offset=corners.area[1],
         growth=corners.growth,
@@ -172,8 +223,8 @@ def scratch_of(tables: ApertureTables, ring: Ring) -> Scratch:
     dtype = ring.planes.dtype
     return Scratch(
         element=np.zeros(CHUNK_PX, np.int32),
-        radius=np.zeros(CHUNK_PX),
-        gain=np.zeros(2 * CHUNK_PX),
+        radius=np.zeros(CHUNK_PX, dtype),
+        gain=np.zeros(2 * CHUNK_PX, dtype),
         line=np.zeros(edges * CHUNK_PX, np.int32),
         share=np.zeros(edges * CHUNK_PX, dtype),
         target=np.zeros((corners + 1) * CHUNK_PX, np.int32),
@@ -181,7 +232,7 @@ def scratch_of(tables: ApertureTables, ring: Ring) -> Scratch:
         sums=np.zeros((int(tables.sums.row_start[-1]), 4 * ring.stride + 2 * GUARD)),
         total=np.zeros(4 * ring.stride),
         carry=np.zeros(4),
-        taps=np.zeros((2 * int(tables.exact.radius[-1]) + 1) ** 2, dtype),
+        taps=np.zeros(max((2 * int(tables.exact.radius[-1]) + 1) ** 2, 2 * ring.margin + 1), dtype),
         kernel=np.zeros((2, (2 * ring.margin + 1) ** 2)),
     )
 

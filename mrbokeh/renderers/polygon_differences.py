@@ -13,17 +13,19 @@ Beyond the paper:
   it. They are used where that is below 1e-4 of the darkest tile, else double precision, which is off by about 1e-10.
   Measured with lights of 1e5 over 0.1: 0.17 of the local signal in single, 2e-7 (the rounding of the result) in double.
 - Small kernels are splatted whole, by the true aperture: below `exact_below_px` they are cheaper and sharper so.
+- What is far out of focus is spread at half the resolution, the blurriest of it at half of that, and so on
+  (mrbokeh.renderers._polygon_halves): such light is smooth, so its kernel's rim may be a cell softer. Centres and light stay.
 - Highlights are splatted whole too: a pixel that gives more than 5 % of the light in the square of four radii around it shows
   its kernel, corners and all, and there can be but few of those. The share spread so rises smoothly from 5 to 10 %.
 - Layers and occlusion: mrbokeh.layering.
 
 How near to exact kernels of the true aperture: a texture of noise in [0, 1] under noisy diameters of 0 to 30 px comes within
 58 dB for an octagon, 61 for a disc, 59 for 7 blades, 57 for a ring, 52 for a heart; a kernel's rim is off by up to 0.16 of a
-pixel. In single precision pixels in focus that share a picture with blurred ones are off by up to 1e-7.
+pixel. In single precision pixels in focus that share a picture with blurred ones are off by up to 1e-7. Halving costs little
+beside that: under 0 to 400 px both ways agree to 68 dB.
 
-What it costs (tests/bench_polygon_differences.py, 2 cores): 4 splats of four channels per corner and pixel, which with the sums
-is 0.75 of OpenCV's GaussianBlur with sigma 10 for an octagon up to 121 px, 1.1 in double precision. Kernels up to 400 px take 1.4
-to 1.5 times as long as up to 40: their rings outgrow the cache and the bands reach far into one another.
+What it costs (tests/bench_polygon_differences.py): per corner and pixel four splats of four channels, neighbouring ones together,
+then the sums. Larger kernels cost no more: what they need at the halved resolutions, and what is kept of the rest, is less work.
 """
 
 from collections.abc import Sequence
@@ -62,6 +64,8 @@ class PolygonDifferences:
       None takes what suits the aperture, 8 to 16 px: the diameter at which its shortest edge is 3/4 of a lattice step.
     exact_highlights: False also takes highlights through the sums, which is strictly linear (else light scaled as a whole gives
       the scaled result, but two pictures spread apart add up to their sum only as near as rectified kernels come).
+    halve_from_px: diameters up to this are spread at full resolution, those above 9/8 of it at half of it or less, those between
+      by both; inf for never. Pixels beside others of quite another diameter are never halved.
     precision: of the impulses, "auto" for the choice above; "single" and "double" force it.
     threads: 0 takes all cores. The result does not depend on it, bit for bit.
     Memory for the rows is kept between calls.
@@ -71,6 +75,7 @@ class PolygonDifferences:
     max_edges: int = 16
     exact_below_px: float | None = None
     exact_highlights: bool = True
+    halve_from_px: float = 112.0
     precision: Literal["auto", "single", "double"] = "auto"
     layering: Layering = field(default_factory=Layering)
     threads: int = 0
@@ -80,6 +85,8 @@ class PolygonDifferences:
     def __post_init__(self) -> None:
         if self.exact_below_px is not None and not self.exact_below_px >= 2.0:
             raise InputError(f"exact_below_px must be at least 2 px, where polygons have no inside yet, got {self.exact_below_px}")
+        if not self.halve_from_px >= 32.0:
+            raise InputError(f"halve_from_px must be at least 32 px, so that kernels keep their shape, got {self.halve_from_px}")
         if self.precision not in ("auto", "single", "double"):
             raise InputError(f"precision must be auto, single or double, got {self.precision!r}")
 
@@ -90,7 +97,7 @@ class PolygonDifferences:
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
         """See mrbokeh.spreading.Spread."""
-        from mrbokeh.renderers._polygon_bands import spread_four
+        from mrbokeh.renderers._polygon_bands import Workshop
         from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
 
         threads = self.threads or cpu_count() or 1
@@ -104,8 +111,8 @@ class PolygonDifferences:
                 self.precision == "auto" and light.contrast * light.pixels**0.5 > _SINGLE_PRECISION * 2e6**0.5
             )
             dtype = np.float64 if double else np.float32
-            groups = (light.group(first) for first in range(0, values.shape[2], 4))
-            spreads = [spread_four(group, share, tables, dtype, pool, threads, self._memory) for group in groups]
+            workshop = Workshop(tables, dtype, pool, threads, self._memory, self.halve_from_px)
+            spreads = [workshop.spread_four(light.group(first), share) for first in range(0, values.shape[2], 4)]
         return spreads[0] if values.shape[2] == 4 else np.ascontiguousarray(np.concatenate(spreads, axis=2)[..., : values.shape[2]])
 
     def tables_of(self, aperture: Aperture) -> "ApertureTables":
