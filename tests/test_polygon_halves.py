@@ -58,8 +58,8 @@ def test_the_plain_twin_agrees(name: str, diameter_px: float) -> None:
 
 @pytest.mark.parametrize("aperture", [OCTAGON, HEART])
 def test_a_texture_looks_as_at_full_resolution(aperture: Aperture) -> None:
-    """Noise in [0, 1] under 20 to 220 px. From 64 px on kernels are 32 cells and wider; their rims, softened by about a cell, are all that differs: as
-    much as rectified kernels are off anyway."""
+    """Noise in [0, 1] under 20 to 220 px. From 64 px on kernels are 32 cells and wider; their rims, softened by about a cell, are all
+    that differs: as much as rectified kernels are off anyway."""
     values, coc_px = picture(360, 420), hills(360, 420, 20.0, 220.0)
     full, halved = FULL.spread(values, coc_px, aperture), HALVED.spread(values, coc_px, aperture)
     assert psnr(halved, full) > 59.0
