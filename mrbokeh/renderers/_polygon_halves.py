@@ -12,6 +12,8 @@ TOLERANCE = 0.125
 """By how much of the least diameter those around a pixel that is halved may differ."""
 FULLY = 1.125
 """At so many times the diameter from which on some of a pixel's light is halved, all of it is."""
+LEAST_SHARE = 0.25
+"""Of all tiles with light so many must be blurred so far, or halving costs more than it saves."""
 _ROWS_AT_ONCE = 32
 
 Blocks = Float32[np.ndarray, "rows columns"]
@@ -35,7 +37,8 @@ class Halves:
 def halves_of(light: SurveyedLight, highlights: Float32[np.ndarray, "_ _"], from_px: float, pool: Executor) -> Halves:
     """light: four channels. highlights: the share of each pixel that is spread exactly, or empty. from_px: see FULLY."""
     nothing = Halves(light, None, np.zeros((0, 0), np.float32))
-    if light.largest_px <= from_px:
+    far = light.largest_of_tile_px > FULLY * from_px
+    if not far.any() or far.sum() < LEAST_SHARE * light.sums.any(axis=2).sum():
         return nothing
     limits = (from_px, FULLY * from_px, TOLERANCE)
     lowest, highest = _diameters_of_blocks(light, limits, pool)

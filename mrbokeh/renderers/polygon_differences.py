@@ -65,7 +65,8 @@ class PolygonDifferences:
     exact_highlights: False also takes highlights through the sums, which is strictly linear (else light scaled as a whole gives
       the scaled result, but two pictures spread apart add up to their sum only as near as rectified kernels come).
     halve_from_px: diameters up to this are spread at full resolution, those above 9/8 of it at half of it or less, those between
-      by both; inf for never. Pixels beside others of quite another diameter are never halved.
+      by both; inf for never. Pixels beside others of quite another diameter are never halved, nor is a picture of which less than
+      a quarter is so blurred.
     precision: of the impulses, "auto" for the choice above; "single" and "double" force it.
     threads: 0 takes all cores. The result does not depend on it, bit for bit.
     Memory for the rows is kept between calls.
