@@ -301,3 +301,15 @@ def test_it_renders_layers() -> None:
     assert result.rgb.shape == rgb.shape and result.alpha.min() == 1.0
     np.testing.assert_allclose(result.rgb.mean((0, 1)), rgb.mean((0, 1)), rtol=0.02)
     assert result.rgb.std() < 0.5 * rgb.std()
+
+
+def test_sparse_light_is_spread_like_any() -> None:
+    """A curved band of light and a few islands, worked through in narrow parts, and the rest of the picture: together the whole."""
+    values, coc_px = picture(400, 500), waves(400, 500, 5.0, 24.0)
+    y, x = np.mgrid[:400, :500]
+    sparse = (np.abs(y - 200 - 120 * np.sin(x / 80.0)) < 12) | (np.hypot(y - 40, x - 400) < 9) | (np.hypot(y - 380, x - 20) < 5)
+    renderer = PolygonDifferences(exact_highlights=False, precision="double")
+    octagon = APERTURES["octagon"]
+    parts = [renderer.spread(np.where(mask[..., None], values, 0.0).astype(np.float32), coc_px, octagon) for mask in (sparse, ~sparse)]
+    np.testing.assert_allclose(parts[0] + parts[1], renderer.spread(values, coc_px, octagon), atol=3e-7)
+    assert 0.0 < sparse.mean() < 0.2

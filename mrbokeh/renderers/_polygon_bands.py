@@ -21,8 +21,10 @@ BAND_ROWS = 384
 """Least height of a band; two margins where these are larger. Bands do not depend on the number of threads."""
 RING_BYTES = 6 << 20
 """A band is worked through in parts so narrow that the ring fits the cache, but not narrower than four margins."""
-FEW_PIXELS = 1 << 15
+FEW_PIXELS = 1 << 18
 """Pictures below this size are one band."""
+SPARSE, SPARSE_PART_PX = 0.5, 96
+"""Where less than this share of the tiles holds light, parts are narrow, so that they leave out what is dark."""
 _LEAST_ROWS = 64
 
 
@@ -44,8 +46,11 @@ def bands_of(light: SurveyedLight, margin: int, bytes_per_cell: int) -> list[Ban
     count = max((end - first) // max(BAND_ROWS, 2 * margin), min(2, (end - first) // least), 1)
     cuts = first + np.rint(np.linspace(0, (end - first) / TILE_PX, count + 1)).astype(int) * TILE_PX
     cuts[-1] = end
-    step = _part_width(width, margin, bytes_per_cell)
-    return [Band(int(top), int(bottom), tuple(_parts(occupied, int(top), int(bottom), width, step))) for top, bottom in pairwise(cuts)]
+    sparse = occupied.mean() < SPARSE
+    step = max(SPARSE_PART_PX, 2 * margin) if sparse else _part_width(width, margin, bytes_per_cell)
+    return [
+        Band(int(top), int(bottom), tuple(_parts(occupied, int(top), int(bottom), width, step, margin))) for top, bottom in pairwise(cuts)
+    ]
 
 
 def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
@@ -53,14 +58,21 @@ def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
     return -(-width // max(1, round(width / max(fitting, 4 * margin, 256))))
 
 
-def _parts(occupied: Bool[np.ndarray, "rows columns"], top: int, bottom: int, width: int, step: int) -> Iterator[tuple[int, int, int, int]]:
+def _parts(
+    occupied: Bool[np.ndarray, "rows columns"], top: int, bottom: int, width: int, step: int, margin: int
+) -> Iterator[tuple[int, int, int, int]]:
+    """Column by column, and within one apart where light of one does not reach that of the other."""
+    first = top // TILE_PX
     for start in range(0, width, step):
         end = min(start + step, width)
-        tiles = occupied[top // TILE_PX : -(-bottom // TILE_PX), start // TILE_PX : -(-end // TILE_PX)]
-        rows, columns = np.flatnonzero(tiles.any(axis=1)), np.flatnonzero(tiles.any(axis=0))
-        if rows.size:
-            left, right = (start // TILE_PX + int(columns[0])) * TILE_PX, (start // TILE_PX + int(columns[-1]) + 1) * TILE_PX
-            yield top + int(rows[0]) * TILE_PX, min(top + (int(rows[-1]) + 1) * TILE_PX, bottom), max(left, start), min(right, end)
+        tiles = occupied[first : -(-bottom // TILE_PX), start // TILE_PX : -(-end // TILE_PX)]
+        rows = np.flatnonzero(tiles.any(axis=1))
+        for run in np.split(rows, np.flatnonzero(np.diff(rows) * TILE_PX > 2 * margin) + 1):
+            if run.size:
+                columns = np.flatnonzero(tiles[run[0] : run[-1] + 1].any(axis=0))
+                left, right = (start // TILE_PX + int(columns[0])) * TILE_PX, (start // TILE_PX + int(columns[-1]) + 1) * TILE_PX
+                above, below = (first + int(run[0])) * TILE_PX, (first + int(run[-1]) + 1) * TILE_PX
+                yield max(above, top), min(below, bottom), max(left, start), min(right, end)
 
 
 @dataclass(frozen=True)

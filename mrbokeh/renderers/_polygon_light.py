@@ -40,9 +40,8 @@ class SurveyedLight:
         each = range(0, rows, _ROWS_AT_ONCE)
 
         def look(first: int) -> None:
-            work = np.empty((5, width * channels), np.float32)
-            for row in range(first, min(first + _ROWS_AT_ONCE, rows)):
-                survey(values.reshape(height, -1), coc_px, row, sums[row], peaks[row], largest_px[row], least[row], is_full[row], work)
+            work, some = np.empty((5, width * channels), np.float32), (first, min(first + _ROWS_AT_ONCE, rows))
+            survey(values.reshape(height, -1), coc_px, some, sums, peaks, largest_px, least, is_full, work)
 
         list(pool.map(look, each))
         return cls(values, coc_px, sums, peaks, largest_px, least.min(axis=0), is_full)

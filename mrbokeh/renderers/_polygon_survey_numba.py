@@ -17,6 +17,27 @@ compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type
 def survey(
     values: np.ndarray,
     coc_px: np.ndarray,
+    rows: tuple[int, int],
+    sums: np.ndarray,
+    peaks: np.ndarray,
+    largest: np.ndarray,
+    least: np.ndarray,
+    is_full: np.ndarray,
+    work: np.ndarray,
+) -> None:
+    """Some rows of tiles: absolute sums and peaks (tiles, C), largest visible diameter and whether all pixels are visible (tiles),
+    least values (rows of tiles, C).
+
+    values (H, W C); work (5, W C) is scratch space. A visible pixel without a finite diameter makes largest infinite.
+    """
+    for row in range(rows[0], rows[1]):
+        _survey_row(values, coc_px, row, sums[row], peaks[row], largest[row], least[row], is_full[row], work)
+
+
+@compiled
+def _survey_row(
+    values: np.ndarray,
+    coc_px: np.ndarray,
     row: int,
     sums: np.ndarray,
     peaks: np.ndarray,
@@ -25,11 +46,6 @@ def survey(
     is_full: np.ndarray,
     work: np.ndarray,
 ) -> None:
-    """One row of tiles: absolute sums and peaks (columns of tiles, C), largest visible diameter and
-    whether all pixels are visible (columns of tiles), least values (C).
-
-    values (H, W C); work (5, W C) is scratch space. A visible pixel without a finite diameter makes largest infinite.
-    """
     channels = least.shape[0]
     work[:4], work[4], is_full[:] = 0.0, np.inf, True
     top, bottom = row * TILE_PX, min((row + 1) * TILE_PX, values.shape[0])

@@ -34,13 +34,54 @@ EXACT_BELOW_PX = (8.0, 16.0)
 
 
 @dataclass(frozen=True)
+class CrossedCorner:
+    """A corner whose four crossings lie at 0, step, step_after and their sum, lattice points in (x, y).
+
+    turned, turned_after: whether the two lines of that edge count backwards, from the one farther along its step.
+    """
+
+    before: int
+    after: int
+    step: Direction
+    step_after: Direction
+    plane: int
+    weight: float
+    turned: bool = False
+    turned_after: bool = False
+
+    @property
+    def kind(self) -> int:
+        """0: crossings 0 and 1 are neighbours in a row, as are 2 and 3; 1: crossings 1 and 2 are; 2: none are."""
+        if self.step == (1, 0):
+            return 0
+        return 1 if (self.step_after[0] - self.step[0], self.step_after[1] - self.step[1]) == (1, 0) else 2
+
+    @property
+    def variants(self) -> "Iterator[CrossedCorner]":
+        """The same corner with its edges named the other way round, and with lines counted backwards."""
+        other = replace(self, before=self.after, after=self.before, step=self.step_after, step_after=self.step)
+        for corner in (self, other):
+            step, step_after = ((-x, -y) for x, y in (corner.step, corner.step_after))
+            yield corner
+            yield replace(corner, step=step, turned=True)
+            yield replace(corner, step_after=step_after, turned_after=True)
+            yield replace(corner, step=step, turned=True, step_after=step_after, turned_after=True)
+
+    def places(self, stride: int) -> list[int]:
+        step, step_after = (4 * (y * stride + x) for x, y in (self.step, self.step_after))
+        return [0, step, step_after, step + step_after] if self.kind == 0 else [step, step_after, 0, step + step_after]
+
+
+@dataclass(frozen=True)
 class ApertureTables:
     """An aperture as corners of its rectified polygons, as sums along directions, and as whole small kernels.
 
-    planes: of each pair of directions that meets in a corner, by number. extent: farthest reach at radius 1.
+    crossed: the corners as they are splatted. planes: of each pair of directions that meets in a corner, by number. extent:
+    farthest reach at radius 1.
     """
 
     corners: PolygonCorners
+    crossed: list[CrossedCorner]
     planes: dict[tuple[Direction, Direction], int]
     sums: Sums
     exact: Exact
@@ -61,7 +102,22 @@ def tables_of(aperture: Aperture, directions: tuple[Direction, ...], max_edges: 
     if exact_below_px is None:
         exact_below_px = float(np.clip(2.0 * EDGE_STEPS / corners.shortest, *EXACT_BELOW_PX))
     exact = _exact(aperture, exact_below_px)
-    return ApertureTables(corners, planes, _sums(planes), exact, max(aperture.unit_radius, rectified.unit_radius))
+    return ApertureTables(
+        corners, _crossed(corners, planes), planes, _sums(planes), exact, max(aperture.unit_radius, rectified.unit_radius)
+    )
+
+
+def _crossed(corners: PolygonCorners, planes: dict[tuple[Direction, Direction], int]) -> list[CrossedCorner]:
+    """Corners with as many neighbouring crossings as they have, the best kinds first."""
+    found = []
+    for before, after, weight in zip(corners.before, corners.after, corners.weight, strict=True):
+        first, second = corners.direction[before], corners.direction[after]
+        det = int(first[0] * second[1] - first[1] * second[0])
+        step, step_after = (det * second[0], det * second[1]), (-det * first[0], -det * first[1])
+        pair = _pair(corners, before, after)
+        corner = CrossedCorner(before, after, step, step_after, planes[pair], weight if pair == (first, second) else -weight)
+        found.append(min(corner.variants, key=lambda each: each.kind))
+    return sorted(found, key=lambda corner: corner.kind)
 
 
 def _pair(corners: PolygonCorners, before: int, after: int) -> tuple[Direction, Direction]:
@@ -139,61 +195,9 @@ def ring_elements(tables: ApertureTables, margin: int, width: int) -> int:
     return (len(tables.planes) + 1) * (2 * margin + BLOCK_ROWS + 2 * ALIASED_ROWS) * (width + 2 * margin) * 4
 
 
-@dataclass(frozen=True)
-class _Corner:
-    """A corner whose four crossings lie at 0, step, step_after and their sum, lattice points in (x, y).
-
-    turned, turned_after: whether the two lines of that edge count backwards, from the one farther along its step.
-    """
-
-    before: int
-    after: int
-    step: Direction
-    step_after: Direction
-    plane: int
-    weight: float
-    turned: bool = False
-    turned_after: bool = False
-
-    @property
-    def kind(self) -> int:
-        """0: crossings 0 and 1 are neighbours in a row, as are 2 and 3; 1: crossings 1 and 2 are; 2: none are."""
-        if self.step == (1, 0):
-            return 0
-        return 1 if (self.step_after[0] - self.step[0], self.step_after[1] - self.step[1]) == (1, 0) else 2
-
-    @property
-    def variants(self) -> "Iterator[_Corner]":
-        """The same corner with its edges named the other way round, and with lines counted backwards."""
-        other = replace(self, before=self.after, after=self.before, step=self.step_after, step_after=self.step)
-        for corner in (self, other):
-            step, step_after = ((-x, -y) for x, y in (corner.step, corner.step_after))
-            yield corner
-            yield replace(corner, step=step, turned=True)
-            yield replace(corner, step_after=step_after, turned_after=True)
-            yield replace(corner, step=step, turned=True, step_after=step_after, turned_after=True)
-
-    def places(self, stride: int) -> list[int]:
-        step, step_after = (4 * (y * stride + x) for x, y in (self.step, self.step_after))
-        return [0, step, step_after, step + step_after] if self.kind == 0 else [step, step_after, 0, step + step_after]
-
-
-def _crossed(tables: ApertureTables) -> list[_Corner]:
-    """Corners with as many neighbouring crossings as they have, the best kinds first."""
-    corners, found = tables.corners, []
-    for before, after, weight in zip(corners.before, corners.after, corners.weight, strict=True):
-        first, second = corners.direction[before], corners.direction[after]
-        det = first[0] * second[1] - first[1] * second[0]
-        step, step_after = (det * second[0], det * second[1]), (-det * first[0], -det * first[1])
-        pair = _pair(corners, before, after)
-        corner = _Corner(before, after, step, step_after, tables.planes[pair], weight if pair == (first, second) else -weight)
-        found.append(min(corner.variants, key=lambda each: each.kind))
-    return sorted(found, key=lambda corner: corner.kind)
-
-
 def laid_out(tables: ApertureTables, ring: Ring) -> Corners:
     """Lines count forwards here; crossing 0 of a corner that is turned lies one line on, one step back."""
-    corners, crossed = tables.corners, _crossed(tables)
+    corners, crossed = tables.corners, tables.crossed
     steps = 4 * np.array([[y * ring.stride + x for x, y in (corner.step, corner.step_after)] for corner in crossed])
     turned = np.array([(corner.turned, corner.turned_after) for corner in crossed])
     return Corners(
