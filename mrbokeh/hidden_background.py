@@ -6,68 +6,105 @@ an edge by half the difference of the two circles of confusion; no farther is an
 for it, or a single lamp beside an edge would shine twice.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-from os import cpu_count
+from concurrent.futures import Executor
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32
+
+from mrbokeh.lit_pixels import find_lights
+from mrbokeh.sheets import Pixels, Sheet
+from mrbokeh.workers import in_bands
 
 _STEP_PX = 1.0  # less than this difference of circles of confusion between neighbours is one surface
 _SURFACE_PX = 2.0  # the same, for pixels some way apart
 _RIM_PX = 3
-_BAND_ROWS = 64
-_LIGHT_OVER_SURROUNDINGS = 4.0
+_DIRECTIONS = 8
+_BAND_ROWS = 32
+_BAND_PIXELS = 256
 
 Values = Float32[np.ndarray, "height width channels"]
-Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Places = Int32[np.ndarray, " _"]
 
 
-def apart(values: Values, coc_px: Plane) -> tuple[tuple[Values, Plane], tuple[Values, Plane]]:
-    """An opaque picture as what is in front, with soft rims, and what lies behind its edges; each with its circles of confusion.
+@dataclass(frozen=True)
+class _Edges:
+    """The circles of confusion with none floating in the air, the pixels beside something nearer, and lights."""
 
-    values: (H, W, 4 + E) premultiplied R, G, B, coverage 1, others; coc_px: (H, W) signed diameters.
-    """
-    from mrbokeh._hidden_background_numba import interpolate, nearest_behind, pure_neighbours, rims, snapped, unmix_rims
-
-    lit = lights(values[..., :3])
-    coc_px = snapped(coc_px, lit, _STEP_PX)
-    rim = rims(coc_px, _STEP_PX)
-    front, front_coc_px = values, coc_px
-    behind, behind_coc_px = np.zeros_like(values), np.zeros_like(coc_px)
-    if not rim.any():
-        return (front, front_coc_px), (behind, behind_coc_px)
-    pure = ~(rim | lit)
-    pure_y, pure_x = pure_neighbours(coc_px, pure, _STEP_PX, _RIM_PX)
-    seed_y, seed_x = nearest_behind(coc_px, rim, pure_y, pure_x, _STEP_PX)
-    seeded_rim = rim & (pure_y >= 0)
-    seed_y[seeded_rim], seed_x[seeded_rim] = pure_y[seeded_rim], pure_x[seeded_rim]
-    bands = [(top, min(top + _BAND_ROWS, len(values))) for top in range(0, len(values), _BAND_ROWS)]
-    with ThreadPoolExecutor(cpu_count() or 1) as pool:
-        list(pool.map(lambda band: interpolate(behind, behind_coc_px, values, coc_px, pure, seed_y, seed_x, _SURFACE_PX, *band), bands))
-    front, front_coc_px = values.copy(), coc_px.copy()
-    unmix_rims(front, front_coc_px, values, coc_px, behind, seeded_rim, lit, _STEP_PX)
-    return (front, front_coc_px), (behind, behind_coc_px)
+    coc_px: Float32[np.ndarray, "height width"]
+    rims: Places
+    pure: Mask
+    lit: Mask
 
 
-def without_lights(values: Values) -> Values:
-    """The picture with the median of the surroundings in place of lights."""
-    from cv2 import medianBlur
-
-    lit = lights(values[..., :3])
-    if not lit.any():
-        return values
-    dark = values.copy()
-    for channel in range(3):
-        dark[lit, channel] = medianBlur(np.ascontiguousarray(values[..., channel]), 5)[lit]
-    return dark
+def apart(sheet: Sheet, pool: Executor) -> tuple[Pixels, Pixels]:
+    """An opaque sheet as what is in front, with soft rims, and what lies behind its edges. The front takes over the sheet's memory."""
+    edges = _edges(sheet, pool)
+    rims, places, seeds = _sources(edges)
+    behind = _filled(sheet.values, edges, places, seeds, pool)
+    _unmix(sheet.values, edges, rims, behind)
+    return Pixels.of(Sheet(sheet.values, edges.coc_px, False)), behind
 
 
-def lights(rgb: Float32[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
-    """Pixels several times brighter than the median of the 5x5 pixels around them."""
-    from cv2 import BORDER_REPLICATE, erode
+def _edges(sheet: Sheet, pool: Executor) -> _Edges:
+    from mrbokeh._depth_edges_numba import find_rims, snap
 
-    from mrbokeh._hidden_background_numba import far_over_median
+    coc_px, lit, rim = np.empty_like(sheet.coc_px), np.empty(sheet.coc_px.shape, np.bool_), np.empty(sheet.coc_px.shape, np.bool_)
 
-    brightest = np.maximum(np.maximum(rgb[..., 0], rgb[..., 1]), rgb[..., 2])
-    darkest_around = erode(brightest, np.ones((5, 5), np.uint8), borderType=BORDER_REPLICATE)
-    return far_over_median(brightest, brightest > _LIGHT_OVER_SURROUNDINGS * darkest_around, _LIGHT_OVER_SURROUNDINGS)
+    def look(top: int, bottom: int) -> None:
+        find_lights(lit, sheet.values, top, bottom)
+        snap(coc_px, sheet.coc_px, lit, _STEP_PX, top, bottom)
+
+    in_bands(pool, len(rim), _BAND_ROWS, look)
+    in_bands(pool, len(rim), _BAND_ROWS, lambda top, bottom: find_rims(rim, coc_px, _STEP_PX, top, bottom))
+    return _Edges(coc_px, np.flatnonzero(rim).astype(np.int32), ~(rim | lit), lit)
+
+
+def _sources(edges: _Edges) -> tuple[Places, Places, Places]:
+    """Rim pixels beside pure ones; where the lens sees behind an edge, those included, and the nearest pure pixel of what it sees there."""
+    from mrbokeh._hidden_background_numba import nearest_behind, pure_neighbours
+
+    pure = pure_neighbours(edges.rims, edges.coc_px, edges.pure, _STEP_PX, _RIM_PX)
+    pixels = edges.coc_px.size
+    seeds, squares, queued = np.zeros(pixels, np.int32), np.zeros(pixels, np.int32), np.zeros(pixels, np.bool_)
+    nearest_behind(seeds, squares, np.empty(pixels + 1, np.int32), queued, edges.coc_px, edges.rims, pure, _STEP_PX)
+    rims = edges.rims[pure >= 0]
+    seeds[rims] = pure[pure >= 0] + 1
+    places = np.flatnonzero(seeds != 0).astype(np.int32)
+    return rims, places, seeds[places] - 1
+
+
+def _filled(values: Values, edges: _Edges, places: Places, seeds: Places, pool: Executor) -> Pixels:
+    """What lies behind at these places, interpolated from what is around on the surface of each one's seed."""
+    from mrbokeh._hidden_background_numba import interpolate
+
+    filled = Pixels(places, np.empty((len(places), values.shape[2]), np.float32), np.empty(len(places), np.float32))
+    pure_coc_px = np.where(edges.pure, edges.coc_px, np.float32(np.nan))
+    paths = _paths(places, seeds, values.shape[1])
+
+    def fill(first: int, end: int) -> None:
+        interpolate(filled.values, filled.coc_px, places, seeds, values, pure_coc_px, paths, _SURFACE_PX, first, end)
+
+    in_bands(pool, len(places), _BAND_PIXELS, fill)
+    return filled
+
+
+def _paths(places: Places, seeds: Places, width: int) -> Int32[np.ndarray, "8 _ 2"]:
+    """Rows down and columns to the right in 8 directions, at every distance that is looked at."""
+    farthest_px = np.hypot(seeds // width - places // width, seeds % width - places % width).max(initial=0.0)
+    angles_rad = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
+    distances_px = np.arange(int(3.0 * farthest_px) + 6)
+    steps = np.stack([np.sin(angles_rad), np.cos(angles_rad)], axis=1)
+    return np.rint(distances_px[:, None] * steps[:, None]).astype(np.int32)
+
+
+def _unmix(values: Values, edges: _Edges, rims: Places, behind: Pixels) -> None:
+    """Part the pixels of rims in place: the front's share stays, the rest goes behind."""
+    from mrbokeh._rims_numba import unmix_rims
+
+    flat_values, flat_coc_px = values.reshape(-1, values.shape[2]), edges.coc_px.reshape(-1)
+    front, front_coc_px = flat_values[rims], flat_coc_px[rims]
+    of_behind = np.searchsorted(behind.places, rims)
+    unmix_rims(front, front_coc_px, behind.values, rims, of_behind, values, edges.coc_px, edges.lit, _STEP_PX)
+    flat_values[rims], flat_coc_px[rims] = front, front_coc_px

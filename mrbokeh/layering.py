@@ -16,7 +16,8 @@ Shared by all renderers that spread light; they differ in the `Spread` alone.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,11 +25,14 @@ from mrbokeh.errors import InputError
 from mrbokeh.hidden_background import apart
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
-from mrbokeh.slices import Channels, Sheet, Slicing, composited, continued, sheet_of
+from mrbokeh.sheets import Pixels, Sheet, coc_px_of, sheet_of
+from mrbokeh.slices import Channels, Slicing, composited
 from mrbokeh.spreading import FIELD_CELLS, Frame, Spread, reach_px
+from mrbokeh.workers import cores
+from mrbokeh.zeroed_memory import ZeroedMemory
 
 _ONE_SURFACE_PX = 1.0
-_NOTHING_TAKEN = 1e-6
+_NOTHING_TAKEN = np.float32(1e-6)
 
 
 @dataclass(frozen=True)
@@ -46,15 +50,15 @@ class Layering:
 
 def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread, layering: Layering) -> Layer:
     """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first."""
-    sheets = [sheet_of(layer, lens) for layer in _checked(layers)]
-    margin = reach_px(lens.aperture, max(float(np.abs(sheet.coc_px).max()) for sheet in sheets))
+    coc_px = [coc_px_of(layer, lens) for layer in _checked(layers)]
+    margin = reach_px(lens.aperture, max(float(np.abs(each).max()) for each in coc_px))
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
-    slicing = Slicing(lens.aperture, spread, layering.slices, layering.field_cells, frame)
-    inside = np.s_[margin : margin + frame.height_px, margin : margin + frame.width_px]
-    groups = _groups([continued(sheet, margin) for sheet in sheets])
-    colour, taken = _rendered(groups[-1], layering, slicing, inside)
-    for group in reversed(groups[:-1]):
-        colour, taken = _over(*_rendered(group, layering, slicing, inside), colour, taken)
+    with ThreadPoolExecutor(cores()) as pool:
+        slicing = Slicing(lens.aperture, spread, layering.slices, layering.field_cells, frame, pool, ZeroedMemory())
+        groups = _groups([sheet_of(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
+        colour, taken = _rendered(groups[-1], layering, slicing)
+        for group in reversed(groups[:-1]):
+            colour, taken = _over(*_rendered(group, layering, slicing), colour, taken)
     return _as_layer(colour, taken, layers)
 
 
@@ -87,37 +91,34 @@ def _interleave(front: Sheet, behind: Sheet) -> bool:
     return bool((both & (front.coc_px > behind.coc_px + _ONE_SURFACE_PX)).any())
 
 
-def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing, inside: tuple[slice, slice]) -> tuple[Channels, Channels]:
+def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing) -> tuple[Channels, Channels]:
     """Colour and how much of the pupil is taken of one group, within the frame."""
-    opaque = any(sheet.is_opaque for sheet in group)
-    sheets = _with_hidden(group) if layering.fill and group[0].is_opaque else list(group)
-    colour, taken = (each[inside] for each in composited(sheets, slicing, by_depth=not group[0].is_opaque))
-    return _shared_out(colour, taken) if opaque else (colour, taken)
+    is_filled = layering.fill and group[0].is_opaque
+    sheets = _with_hidden(group, slicing.pool) if is_filled else [Pixels.covered(sheet) for sheet in group]
+    colour, taken = composited(sheets, slicing, by_depth=not group[0].is_opaque)
+    return _shared_out(colour, taken) if any(sheet.is_opaque for sheet in group) else (colour, taken)
 
 
-def _with_hidden(group: Sequence[Sheet]) -> list[Sheet]:
+def _with_hidden(group: Sequence[Sheet], pool: Executor) -> list[Pixels]:
     """An opaque sheet taken apart, what is known to lie behind it, and last what was filled in where nothing is known."""
-    picture, known = group[0], [_behind(sheet, group[0]) for sheet in group[1:]]
-    (front, front_coc_px), (behind, behind_coc_px) = apart(picture.values, picture.coc_px)
+    known = [Pixels.covered(sheet, sheet.coc_px > group[0].coc_px + _ONE_SURFACE_PX) for sheet in group[1:]]
+    front, behind = apart(group[0], pool)
     if not known:
-        return [Sheet(front, front_coc_px, False), Sheet(behind, behind_coc_px, False)]
-    rim = front[..., 3:4] < 1.0
-    rest, filled = behind * rim, behind * ~rim
+        return [front, behind]
+    of_rim = front.values[behind.places, 3] < 1.0
+    rest, filled = behind.only(of_rim), behind.only(~of_rim)
+    free = np.ones(front.coc_px.size, np.float32)
     for sheet in known:
-        filled *= 1.0 - sheet.values[..., 3:4]
-    return [Sheet(front, front_coc_px, False), Sheet(rest, behind_coc_px, False), *known, Sheet(filled, behind_coc_px, False)]
-
-
-def _behind(sheet: Sheet, picture: Sheet) -> Sheet:
-    """What of a sheet lies behind the picture: where it shows the same surface it has nothing to add."""
-    behind = sheet.coc_px > picture.coc_px + _ONE_SURFACE_PX
-    return Sheet(sheet.values * behind[..., None], sheet.coc_px, False)
+        free[sheet.places] *= 1.0 - sheet.values[:, 3]
+    return [front, rest, *known, replace(filled, values=filled.values * free[filled.places, None])]
 
 
 def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
     """Colour of a scene without holes: what nobody claimed belongs to those who did."""
-    shares = np.maximum(taken, _NOTHING_TAKEN)
-    return colour / (shares if taken.shape[2] == 1 else shares[..., _kinds(colour, taken)]), np.ones_like(taken)
+    from mrbokeh._slices_numba import share_out
+
+    share_out(colour, taken, _NOTHING_TAKEN)
+    return colour, taken
 
 
 def _over(front: Channels, front_taken: Channels, behind: Channels, behind_taken: Channels) -> tuple[Channels, Channels]:

@@ -1,14 +1,12 @@
-"""Slices, hidden background, field cells: what all spreading renderers share."""
+"""Layers, slices and field cells: what all spreading renderers share."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mrbokeh._hidden_background_numba import snapped
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
-from mrbokeh.hidden_background import apart, lights, without_lights
 from mrbokeh.layer import Layer, opaque
 from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
@@ -101,56 +99,6 @@ def test_the_antialiased_rim_of_a_blurred_lamp_leaves_no_dot() -> None:
     disc = 130.0 / (100.0 * np.pi)  # the light of 1.3 pixels over the disc
     np.testing.assert_allclose(result[32:41, 44:53], 0.1 + disc, rtol=0.03)
     assert result[36, 49] < 2.0 * disc
-
-
-def test_antialiased_depth_leaves_nothing_in_the_air() -> None:
-    """A disc at another depth, its depth map resized as pictures are, so that its rim lies at every depth between: the rim's
-    pixels take one side or the other, and a steep but even slope stays as it is."""
-    import cv2
-
-    rows, columns = np.mgrid[: 4 * SIZE[0], : 4 * SIZE[1]]
-    fine = np.where(np.hypot(rows - 144, columns - 192) < 80, -12.0, 9.0).astype(np.float32)
-    coc_px = cv2.resize(fine, SIZE[::-1], interpolation=cv2.INTER_AREA)
-    floating = (coc_px > -11.9) & (coc_px < 8.9)
-    (_, front_coc_px), _ = apart(np.ones((*SIZE, 4), np.float32), coc_px)
-    left = (front_coc_px > -11.9) & (front_coc_px < 8.9)
-    assert floating.sum() > 100 and left.sum() <= 0.05 * floating.sum()
-    slope = np.broadcast_to(np.linspace(-60.0, 60.0, SIZE[1], dtype=np.float32), SIZE).copy()
-    np.testing.assert_array_equal(snapped(slope, np.zeros(SIZE, bool), 1.0), slope)
-
-
-def test_parting_a_picture_loses_no_light() -> None:
-    rng = np.random.default_rng(2)
-    values = np.concatenate([rng.uniform(0.0, 1.0, (*SIZE, 3)), np.ones((*SIZE, 1))], axis=2).astype(np.float32)
-    coc_px = np.zeros(SIZE, np.float32)
-    coc_px[20:50, 30:60] = -15.0
-    (front, front_coc_px), (behind, _) = apart(values, coc_px)
-    shown = front + (1.0 - front[..., 3:]) * behind
-    assert shown[..., 3].min() == 1.0
-    np.testing.assert_allclose(shown, values, atol=1e-6)
-    np.testing.assert_array_equal(front_coc_px[front[..., 3] == 1.0], coc_px[front[..., 3] == 1.0])
-
-
-def test_background_is_filled_no_farther_than_the_lens_sees() -> None:
-    """Half of a difference of 16 px in the circles of confusion, and a rim of 3.5 px for the pixels that are mixed."""
-    values = np.ones((*SIZE, 4), np.float32)
-    coc_px = np.zeros(SIZE, np.float32)
-    coc_px[:, :48] = -16.0
-    _, (behind, behind_coc_px) = apart(values, coc_px)
-    filled = behind[36, :, 3] > 0
-    assert filled[40:48].all() and not filled[:36].any()
-    np.testing.assert_allclose(behind_coc_px[36, 40:48], 0.0)
-
-
-def test_lamps_are_no_source_of_background() -> None:
-    values = np.ones((*SIZE, 4), np.float32) * np.float32([0.1, 0.1, 0.1, 1.0])
-    coc_px = np.zeros(SIZE, np.float32)
-    coc_px[:, :48] = -16.0
-    values[36, 50, :3] = 1000.0
-    assert lights(values[..., :3]).sum() == 1
-    assert without_lights(values)[36, 50, 0] == np.float32(0.1)
-    _, (behind, _) = apart(values, coc_px)
-    assert behind[..., :3].max() < 0.11
 
 
 def test_field_cells_meet_their_limit() -> None:

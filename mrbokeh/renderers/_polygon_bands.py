@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float32
 from mrbokeh.renderers._polygon_differences_numba import settle, spread_part
 from mrbokeh.renderers._polygon_halves import halves_of
 from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
-from mrbokeh.renderers._polygon_memory import ZeroedMemory
 from mrbokeh.renderers._polygon_ring_numba import Picture, Target
 from mrbokeh.renderers._polygon_survey_numba import TILE_PX
 from mrbokeh.renderers._polygon_tables import ApertureTables, laid_out, ring_elements, ring_of, scratch_of
+from mrbokeh.zeroed_memory import ZeroedMemory
 
 BAND_ROWS = 384
 """Least height of a band; two margins where these are larger. Bands do not depend on the number of threads."""

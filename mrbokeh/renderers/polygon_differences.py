@@ -44,8 +44,8 @@ from mrbokeh.layer import Layer
 from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
 from mrbokeh.polygon_rectification import PAPER_DIRECTIONS
-from mrbokeh.renderers._polygon_memory import ZeroedMemory
 from mrbokeh.workers import workers
+from mrbokeh.zeroed_memory import ZeroedMemory
 
 if TYPE_CHECKING:
     from mrbokeh.renderers._polygon_tables import ApertureTables

@@ -1,4 +1,4 @@
-"""Memory that polygon_differences keeps between pictures."""
+"""Zeroed memory that goes from one use to the next: fresh zeros cost more than to make the few used ones zero again."""
 
 from threading import Lock
 
@@ -6,14 +6,14 @@ import numpy as np
 
 
 class ZeroedMemory:
-    """Zeroed arrays between calls: fresh ones cost as much to have zeroed by the system as a quarter of the splatting."""
+    """Zeroed arrays for several threads; whoever takes one gives it back as zeros."""
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._arrays: list[np.ndarray] = []
 
     def take(self, elements: int, dtype: type) -> np.ndarray:
-        """At least so many zeros."""
+        """At least so many zeros. Arrays too small for that are let go."""
         with self._lock:
             fitting = [i for i, array in enumerate(self._arrays) if array.dtype == dtype and array.size >= elements]
             if fitting:

@@ -1,0 +1,17 @@
+"""Memory that is given back as zeros is handed out again, one array to one taker."""
+
+import numpy as np
+
+from mrbokeh.zeroed_memory import ZeroedMemory
+
+
+def test_what_was_given_back_is_taken_again_if_it_is_large_enough() -> None:
+    memory = ZeroedMemory()
+    first = memory.take(100, np.float32)
+    assert first.size == 100 and first.dtype == np.float32 and not first.any()
+    memory.give_back(first)
+    assert memory.take(80, np.float32) is first
+    assert memory.take(80, np.float32) is not first
+    memory.give_back(first)
+    assert memory.take(101, np.float32).size == 101
+    assert memory.take(80, np.float64).dtype == np.float64
