@@ -9,10 +9,10 @@ Shared by all renderers that spread light; they differ in the `Spread` alone.
    would let light through an opaque surface. Within a slice each pixel keeps its own circle of confusion.
 4. Front to back, each slice takes what is still free of the pupil at every pixel, at most its own coverage. Slices of
    one surface share the pupil side by side, so coverage adds up and neither seams nor slanted surfaces turn
-   translucent, as they would under "over". What the pinhole picture shows goes first. What hides there, real layers
-   before filled-in background (mrbokeh.hidden_background), gets what is left: the part of the pupil that looks past
-   the edge of the occluder.
-5. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage.
+   translucent, as they would under "over". What the pinhole picture shows goes first. What hides there, real layers before filled-in
+   background (mrbokeh.hidden_background), gets what is left: the part of the pupil that looks past the edge of the occluder.
+5. What moves while the shutter is open is drawn out along its path, slice by slice, before it is spread (mrbokeh.motion).
+6. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage.
 """
 
 from collections.abc import Sequence
@@ -25,6 +25,7 @@ from mrbokeh.errors import InputError
 from mrbokeh.hidden_background import apart
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
+from mrbokeh.motion import farthest_px, motion_channels
 from mrbokeh.sheets import Pixels, Sheet, coc_px_of, sheet_of
 from mrbokeh.slices import Channels, Slicing, composited
 from mrbokeh.spreading import FIELD_CELLS, Frame, Spread, reach_px
@@ -51,10 +52,22 @@ class Layering:
 def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread, layering: Layering) -> Layer:
     """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first."""
     coc_px = [coc_px_of(layer, lens) for layer in _checked(layers)]
-    margin = reach_px(lens.aperture, max(float(np.abs(each).max()) for each in coc_px))
+    motion = motion_channels(layers[0].extra)
+    farthest = farthest_px(layers)
+    margin = reach_px(lens.aperture, max(float(np.abs(each).max()) for each in coc_px)) + farthest
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
-        slicing = Slicing(lens.aperture, spread, layering.slices, layering.field_cells, frame, pool, ZeroedMemory())
+        slicing = Slicing(
+            lens.aperture,
+            spread,
+            layering.slices,
+            layering.field_cells,
+            frame,
+            pool,
+            ZeroedMemory(),
+            motion if farthest else None,
+            farthest,
+        )
         groups = _groups([sheet_of(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
         colour, taken = _rendered(groups[-1], layering, slicing)
         for group in reversed(groups[:-1]):

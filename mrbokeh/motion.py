@@ -7,11 +7,57 @@ out here, and the slice, all of whose pixels have nearly one circle of confusion
 change of depth; the picture's own time is the middle of the shutter.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+
 MOTION = "motion_px"
 """Name of a layer's extra channels that hold motion: (H, W, 2), right and down, in pixels while the shutter is open, times alpha."""
+
+
+def with_motion(layer: Layer, motion_px: Float32[np.ndarray, "height width 2"], shutter: float = 1.0) -> Layer:
+    """The layer with motion, right and down, in pixels of what it shows; shutter: the part of that time for which it is open."""
+    if motion_px.shape != (*layer.alpha.shape, 2):
+        raise InputError(f"motion must have the shape {(*layer.alpha.shape, 2)} of its layer, but came with {motion_px.shape}: resize it")
+    if not shutter >= 0.0:
+        raise InputError(f"the shutter must be open for a part of the time of 0 or more, got {shutter}")
+    if not np.isfinite(motion_px[layer.alpha > 0]).all():
+        raise InputError("motion must be finite where the layer is visible: write 0 where nothing moves")
+    moving = np.where(layer.alpha[..., None] > 0, motion_px, 0.0) * np.float32(shutter) * layer.alpha[..., None]
+    return replace(layer, extra={**layer.extra, MOTION: moving.astype(np.float32)})
+
+
+def motion_channels(extra: Mapping[str, np.ndarray]) -> slice | None:
+    """Where motion is among R, G, B, coverage and extra channels; None if it is not."""
+    start = 4
+    for name, values in extra.items():
+        if name == MOTION:
+            return slice(start, start + values.shape[2])
+        start += values.shape[2]
+    return None
+
+
+def farthest_px(layers: Sequence[Layer]) -> int:
+    """How many whole pixels light of any of the layers may move away from its place at most; 0 if nothing moves."""
+    return max((motion_reach_px(_of_surface(layer.extra[MOTION], layer.alpha)) for layer in layers if MOTION in layer.extra), default=0)
+
+
+def moved(
+    values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], channels: slice
+) -> tuple[Float32[np.ndarray, "height width channels"], Float32[np.ndarray, "height width"]]:
+    """`drawn_out` along the motion that is among the channels, as much of it as there is coverage."""
+    return drawn_out(values, coc_px, _of_surface(values[..., channels], values[..., 3]))
+
+
+def _of_surface(
+    motion_px: Float32[np.ndarray, "height width 2"], coverage: Float32[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width 2"]:
+    return np.divide(motion_px, coverage[..., None], out=np.zeros_like(motion_px), where=coverage[..., None] > 0)
 
 
 def motion_reach_px(motion_px: Float32[np.ndarray, "height width 2"]) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.aperture import Aperture
+from mrbokeh.motion import moved
 from mrbokeh.sheets import Pixels
 from mrbokeh.slice_islands import islands
 from mrbokeh.slice_sorting import Part, Shares, Window, sorted_slices, window_of
@@ -29,7 +30,8 @@ Channels = Float32[np.ndarray, "height width _"]
 class Slicing:
     """What the light goes through: the aperture, a renderer's Spread, how many slices at most, field cells, place in the frame.
 
-    frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them.
+    frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them. motion: the channels
+    that hold it, if anything moves, and farthest_px: by how many whole pixels at most.
     """
 
     aperture: Aperture
@@ -39,6 +41,8 @@ class Slicing:
     frame: Frame
     pool: Executor
     memory: ZeroedMemory
+    motion: slice | None = None
+    farthest_px: int = 0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -75,7 +79,8 @@ class Slicing:
             for each in parts
         ]
         frame = self.frame.moved(window[1].start, window[0].start)
-        spread = spread_light(self.spread, light, coc_px, self.aperture, frame, self.field_cells)
+        drawn, drawn_coc_px = (light, coc_px) if self.motion is None else moved(light, coc_px, self.motion)
+        spread = spread_light(self.spread, drawn, drawn_coc_px, self.aperture, frame, self.field_cells)
         spread = spread.copy() if np.may_share_memory(spread, memory) else spread
         for part in parts:
             remove_light(light, coc_px, part.runs, part.pixels.places, *where)
@@ -115,7 +120,7 @@ def _pieces(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Itera
     slices = [sorted_slices(sheets, shares, step_px, slicing.size[1], slicing.pool) for shares in seen_and_hidden]
     for k, parts in chain.from_iterable(slices):
         largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
-        reach = reach_px(slicing.aperture, largest_px)
+        reach = reach_px(slicing.aperture, largest_px) + slicing.farthest_px
         for island in islands(parts, reach, slicing.size):
             yield island, reach
 

@@ -20,7 +20,7 @@ ROWS = (
     ("renderers.",),
     ("renderers.base",),
     ("psf_models.",),
-    ("focal_stack", "video_io", "scene.", "contact_sheet", "psf_bank_file", "light_field_samples_file"),
+    ("focal_stack", "video_io", "scene.", "contact_sheet", "psf_bank_file", "light_field_samples_file", "motion_file"),
     ("video_frames", "video_audio"),
     ("video_color", "_video_frames_numba"),
     ("lens_file", "camera_file"),

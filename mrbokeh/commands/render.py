@@ -23,6 +23,12 @@ def render(
     behind: Annotated[
         list[Path] | None, typer.Option(help="EXR layer behind --rgb: what is known of what it hides (clean plate, other view).")
     ] = None,
+    motion: Annotated[
+        Path | None, typer.Option(help="EXR with forward.u and forward.v: how far --rgb moves right and up, in pixels of one frame.")
+    ] = None,
+    shutter: Annotated[
+        float, typer.Option(help="Part of the frame's time for which the shutter is open: 0.5 is 180 degrees.", min=0.0)
+    ] = 0.5,
     method: Annotated[
         str, typer.Option("--method", "--renderer", help="polygon, low-rank, scatter (exact, slow), or a trained network (.onnx).")
     ] = DEFAULT,
@@ -48,6 +54,7 @@ def render(
     if alpha_out and out.suffix.lower() != ".exr":
         raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
     sharp = _read(rgb, depth, layer or [], behind or [], srgb)
+    sharp = _moving(sharp, rgb, motion, shutter)
     used = _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
     with working("rendering (the first time on a machine it takes a minute to compile)"):
         blurred = make_renderer(method, threads=threads, layering=Layering(slices=slices)).render(list(sharp.values()), used)
@@ -74,7 +81,7 @@ def _read(rgb: Path | None, depth: Path | None, layers: list[Path], behind: list
         raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
     if len({each.alpha.shape for each in sharp.values()}) > 1:
         raise InputError("what is to be blurred differs in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in sharp.items()))
-    return _with_all_extras(sharp)
+    return sharp
 
 
 def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
@@ -94,9 +101,24 @@ def _with_all_extras(sharp: dict[str, Layer]) -> dict[str, Layer]:
 
     import numpy as np
 
-    names = sorted({name for each in sharp.values() for name in each.extra})
-    zeros = {path: np.zeros((*each.alpha.shape, 1), np.float32) for path, each in sharp.items()}
-    return {path: replace(each, extra={name: each.extra.get(name, zeros[path]) for name in names}) for path, each in sharp.items()}
+    shapes = {name: values.shape for each in sharp.values() for name, values in each.extra.items()}
+    return {
+        path: replace(each, extra={name: each.extra.get(name, np.zeros(shapes[name], np.float32)) for name in sorted(shapes)})
+        for path, each in sharp.items()
+    }
+
+
+def _moving(sharp: dict[str, Layer], rgb: Path | None, motion: Path | None, shutter: float) -> dict[str, Layer]:
+    """With motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
+    from mrbokeh.motion import with_motion
+    from mrbokeh.motion_file import read_motion, taken_from_channels
+
+    if motion is not None and rgb is None:
+        raise InputError("--motion belongs to --rgb: layers have their motion in their own channels forward.u and forward.v")
+    moving = {path: taken_from_channels(each, shutter) for path, each in sharp.items()}
+    if motion is not None:
+        moving[str(rgb)] = with_motion(moving[str(rgb)], read_motion(motion), shutter)
+    return _with_all_extras(moving)
 
 
 def _focused(lens: Lens, sharp: dict[str, Layer], focus_distance_m: float | None, focus_at: str | None) -> Lens:
