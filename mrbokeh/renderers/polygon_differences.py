@@ -30,7 +30,6 @@ then the sums. Larger kernels cost no more: what they need at the halved resolut
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from os import cpu_count
 from typing import TYPE_CHECKING, Literal
 from weakref import WeakKeyDictionary
 
@@ -44,7 +43,7 @@ from mrbokeh.layer import Layer
 from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
 from mrbokeh.polygon_rectification import PAPER_DIRECTIONS
-from mrbokeh.workers import workers
+from mrbokeh.workers import cores, workers
 from mrbokeh.zeroed_memory import ZeroedMemory
 
 if TYPE_CHECKING:
@@ -101,7 +100,7 @@ class PolygonDifferences:
         from mrbokeh.renderers._polygon_bands import Workshop
         from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
 
-        threads = self.threads or cpu_count() or 1
+        threads = self.threads or cores()
         with workers(coc_px.size, threads) as pool:
             light = SurveyedLight.of(values, coc_px, pool)
             if light.largest_px <= 1.0:
