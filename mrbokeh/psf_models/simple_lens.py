@@ -1,0 +1,123 @@
+"""SIMPLELENS: a thin lens with any opening; the coordinate is the circle of confusion (Leimkuehler 2018, Section 5.1)."""
+
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.psf import kernel_radius_px
+from mrbokeh.psf_bank import Axis, Turns
+from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, nodes
+from mrbokeh.psf_models.quasi_random import sobol_blocks
+
+EXPONENT = 2.0
+SAMPLES = 100
+LARGEST_PX = 512.0
+_BANDS = 256
+_STEP_PX = 0.25
+"""Diameters of the closed form lie so near to one another when it is averaged: edges move by an eighth of a pixel."""
+
+
+class SimpleLens:
+    """The opening of a thin lens, as large as the circle of confusion: shift-invariant, one coordinate.
+
+    aperture: its spherical aberration and axial colour make the sides of the focus differ, then diameters are signed; what
+    varies over the field (cat's eyes, lateral colour) needs a model with an eccentricity.
+    diameter_px: the largest of the bank. counts: samples, 100 (twice as many where diameters are signed) in the paper's Table 1.
+    """
+
+    name = "simple"
+    turns: Turns = "none"
+    default_rays = 0
+
+    def __init__(self, aperture: Aperture | None = None, diameter_px: float = LARGEST_PX, counts: tuple[int, ...] | None = None) -> None:
+        self.aperture = Aperture.disc() if aperture is None else aperture
+        if self.aperture.varies_over_field:
+            raise InputError("a simple lens looks the same all over the frame: give a lens without cat_eye and lateral_chromatic")
+        self._signed = not self.aperture.is_plain
+        largest = check_positive("the largest diameter of a simple lens", diameter_px)
+        self.axes = (Axis("diameter_px", -largest if self._signed else 0.0, largest, EXPONENT),)
+        self.counts = counts or ((2 * SAMPLES,) if self._signed else (SAMPLES,))
+        self.channels = 3 if self.aperture.is_chromatic else 1
+
+    @cached_property
+    def near_side_turned(self) -> bool:
+        """Signed diameters hold the near side themselves; an opening that half a turn maps to itself looks the same on both."""
+        behind = self.aperture.rasterize(64.0).kernel
+        return not self._signed and not np.allclose(behind, behind[::-1, ::-1], atol=1e-9)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        opening = self.aperture
+        modifiers = np.array([opening.spherical_aberration, *opening.axial_chromatic])
+        return {"aperture": digest(*opening.outlines, np.array(opening.weights), modifiers)}
+
+    def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
+        """See `PsfModel.kernel`. Rays go through all of the pupil, evenly, and carry the weight that the opening has there."""
+        low, high = float(box[0, 0]), float(box[0, 1])
+        size = self._size(max(abs(low), abs(high)))
+        total = np.zeros((size, size, self.channels))
+        for part_low, part_high in _sides(low, high):
+            share = 1.0 if high == low else (part_high - part_low) / (high - low)
+            if rays:
+                total += share * self._traced(part_low, part_high, size, max(1, round(rays * share)), seed)
+            else:
+                places = nodes(self.axes[0], part_low, part_high, _STEP_PX)
+                total += share * sum(centred(self._closed_form(place), size) for place in places.tolist()) / len(places)
+        return np.maximum(total, 0.0).astype(np.float32)
+
+    def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel:
+        """The opening's polygons clipped against pixels (`Aperture.rasterize`)."""
+        return self.kernel(np.stack([coords, coords], axis=1), 0, 0)
+
+    def _size(self, largest_px: float) -> int:
+        return 2 * kernel_radius_px(largest_px * max(self._scales(1) + self._scales(-1)), self.aperture.unit_radius) + 1
+
+    def _scales(self, side: int) -> tuple[float, ...]:
+        return self.aperture.channel_scale(side) if self.channels == 3 else (1.0,)
+
+    def _closed_form(self, diameter_px: float) -> Float64[np.ndarray, "size size channels"]:
+        kernels = [self.aperture.rasterize(diameter_px * scale).kernel for scale in self._scales(1 if diameter_px >= 0.0 else -1)]
+        size = max(map(len, kernels))
+        return np.stack([centred(kernel, size) for kernel in kernels], axis=2)
+
+    def _traced(self, low: float, high: float, size: int, rays: int, seed: int) -> Float64[np.ndarray, "size size channels"]:
+        from mrbokeh.psf_models._simple_lens_numba import trace_lens
+
+        side = 1 if low + high >= 0.0 else -1
+        extent = self.aperture.unit_radius
+        opening = (extent, *banded_edges(self.aperture.seen(side), extent))
+        traced = np.zeros((self.channels, size, size))
+        for kernel, scale in zip(traced, self._scales(side), strict=True):
+            light = sum(trace_lens(kernel, low * scale, high * scale, block, *opening) for block in sobol_blocks(3, rays, seed))
+            if not light > 0.0:
+                raise InputError(f"none of {rays} rays found the opening: trace more of them")
+            kernel /= light
+        return traced.transpose(1, 2, 0)
+
+
+def banded_edges(plain: Aperture, extent: float) -> tuple[Float64[np.ndarray, "edges 5"], Int64[np.ndarray, " bands_and_end"]]:
+    """(edges, starts) as `_simple_lens_numba.opening_at` takes them: the edges of all outlines, sorted into bands of height.
+
+    An outline that goes round the one way or the other counts alike: its weight takes the sign of its area.
+    """
+    edges = []
+    for outline, weight in zip(plain.outlines, plain.weights, strict=True):
+        following = np.roll(outline, -1, axis=0)
+        area = float(np.sum(outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]))
+        up = np.sign(following[:, 1] - outline[:, 1]) * weight * np.sign(area)
+        edges.append(np.column_stack([outline, following, up]))
+    rows = np.concatenate(edges)
+    low, high = np.minimum(rows[:, 1], rows[:, 3]), np.maximum(rows[:, 1], rows[:, 3])
+    borders = np.linspace(-extent, extent, _BANDS + 1)
+    bands = [rows[(low <= top) & (high >= bottom)] for bottom, top in pairwise(borders)]
+    return np.concatenate(bands), np.cumsum([0, *map(len, bands)], dtype=np.int64)
+
+
+def _sides(low: float, high: float) -> list[tuple[float, float]]:
+    """An interval of diameters, cut at the focus."""
+    return [(low, 0.0), (0.0, high)] if low < 0.0 < high else [(low, high)]
