@@ -30,7 +30,7 @@ class SubCommand(NamedTuple):
 SUB_COMMANDS = {
     "capture": SubCommand("capture.cli", "Photographs at many focus distances become an all-in-focus image with depth."),
     "train": SubCommand("training.cli", "Focal stacks become a network that blurs like this very lens."),
-    "lens": SubCommand("mrbokeh.commands.lens", "Make, inspect and draw lens files."),
+    "lens": SubCommand("mrbokeh.commands.lens", "Make, inspect and draw lens files and banks of PSFs."),
     "render": SubCommand("mrbokeh.commands.render", "Blur layers as a lens does."),
     "composite": SubCommand("mrbokeh.commands.composite", "Put virtual objects into a photograph."),
     "video": SubCommand("mrbokeh.commands.video", "Put virtual objects into a video."),

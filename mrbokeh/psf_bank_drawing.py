@@ -103,7 +103,7 @@ def _draw_throughput(axes: "Axes", bank: PsfBank) -> None:
     for colour, light in zip(_COLOURS[bank.channels], bank.throughput.T, strict=True):
         axes.plot(_unit_centres(bank), light, ".", ms=3, color=colour)
     _label(axes, bank.axes[0], vertical=False)
-    axes.set_ylim(0.0, None)
+    axes.set_ylim(0.0, 1.05)
     axes.set_title("light that arrives", fontsize=9)
     axes.grid(alpha=0.3)
 

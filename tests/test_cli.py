@@ -14,7 +14,7 @@ from mrbokeh.layer import Layer
 
 COMMANDS = [
     ["capture"], ["capture", "ingest"], ["capture", "merge"], ["train"], ["train", "fit"], ["train", "evaluate"], ["train", "export"],
-    ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["render"], ["composite"], ["video"],
+    ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"], ["render"], ["composite"], ["video"],
     ["viewfinder"], ["viewfinder", "serve"], ["demo"], ["doctor"],
 ]  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from os import cpu_count
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +22,7 @@ from mrbokeh.psf_bank_file import (
     write_head,
 )
 from mrbokeh.psf_models.base import PsfModel
+from mrbokeh.workers import cores
 
 
 def bank_head(model: PsfModel, rays: int, seed: int) -> BankHead:
@@ -67,7 +67,7 @@ def build_bank(
         write_head(folder, head)
         write_cell(folder, 0, first)
 
-    with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         building = [pool.submit(_build_cell, model, folder, cell, boxes[cell], rays, seed) for cell in missing_cells(folder, head)]
         try:
             for future in track(building, f"kernels of {model.name}") if progress else building:

@@ -1,0 +1,181 @@
+"""`mrbokeh lens psf`, `export` and `show` as a user meets them: real files, builds that stopped half way, and mistakes."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.commands.lens import app
+from mrbokeh.errors import InputError
+from mrbokeh.image_io import read_image, write_image
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import write_lens
+from mrbokeh.psf_bank_file import cell_path, missing_cells, read_bank, read_head
+from mrbokeh.psf_models.build import build_bank
+from mrbokeh.psf_models.choose import MODEL_NAMES, ModelOptions, choose_model
+from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.simple_lens import SimpleLens
+
+SMALL = ["--diameter", "12", "--counts", "4"]
+
+
+def run(*arguments: object) -> str:
+    return CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False).stdout
+
+
+def process(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own, for its exit code and what it says."""
+    command = [sys.executable, "-m", "mrbokeh.cli", "lens", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200", "NO_COLOR": "1"})
+
+
+def picture_file(path: Path) -> Path:
+    write_image(path, np.random.default_rng(0).random((9, 12, 3)).astype(np.float32))
+    return path
+
+
+def test_a_bank_of_the_disc_holds_the_disc(tmp_path: Path) -> None:
+    """At the largest diameter of the last cell, 12 px, and below: every kernel lies between those of its cell's ends."""
+    assert "4 kernels" in run("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    bank = read_bank(tmp_path / "bank")
+    np.testing.assert_allclose(bank.boxes[:, 0], [[0, 0.75], [0.75, 3], [3, 6.75], [6.75, 12]])
+    np.testing.assert_array_equal(bank.kernels[0], np.ones((1, 1, 1)))
+    middle = len(bank.kernels[3]) // 2
+    ends = [Aperture.disc().rasterize(diameter_px).kernel.max() for diameter_px in (12.0, 6.75)]
+    assert ends[0] < bank.kernels[3][middle, middle, 0] < ends[1]
+
+
+def test_the_opening_of_a_lens_file(tmp_path: Path) -> None:
+    write_lens(tmp_path / "lens.json", Lens(50.0, 1.8, 2.0, 36.0, Aperture.heart()))
+    run("psf", "simple", "--lens", tmp_path / "lens.json", "--out", tmp_path / "bank", *SMALL)
+    bank = read_bank(tmp_path / "bank")
+    expected = SimpleLens(Aperture.heart()).kernel(bank.boxes[3], 0, 0)
+    np.testing.assert_allclose(bank.kernels[3], expected, atol=1e-7)
+    assert bank.near_side_turned
+
+
+def test_combined_traced_by_rays(tmp_path: Path) -> None:
+    run("psf", "combined", "--out", tmp_path / "bank", "--diameter", 8, "--motion", 6, "--counts", "3,3", "--rays", 1 << 18, "--seed", 4)
+    bank = read_bank(tmp_path / "bank")
+    assert (bank.turns, bank.settings["rays"], bank.settings["seed"]) == ("motion", 1 << 18, 4)
+    assert bank.axes[0].high == 8.0 and bank.axes[1].high == 6.0
+    for box, kernel in zip(bank.boxes, bank.kernels, strict=True):
+        assert np.abs(kernel - Combined().kernel(box, 0, 0)).sum() < 0.03
+
+
+def test_a_picture_becomes_a_bank(tmp_path: Path) -> None:
+    run("psf", "stylized", "--image", picture_file(tmp_path / "logo.png"), "--out", tmp_path / "bank", *SMALL)
+    bank = read_bank(tmp_path / "bank")
+    assert bank.channels == 3 and len(bank.kernels) == 4 and bank.near_side_turned
+
+
+def test_the_same_bank_whatever_the_threads(tmp_path: Path) -> None:
+    banks = [build_bank(Combined(9.0, 9.0, (5, 5)), tmp_path / str(threads), 4000, 1, threads=threads) for threads in (1, 3)]
+    for one, other in zip(banks[0].kernels, banks[1].kernels, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+class Interrupted(SimpleLens):
+    """A simple lens whose owner stops it after two kernels."""
+
+    asked = 0
+
+    def kernel(self, *arguments: Any) -> np.ndarray:
+        self.asked += 1
+        if self.asked > 2:
+            raise KeyboardInterrupt
+        return super().kernel(*arguments)
+
+
+def test_an_interrupted_build_goes_on(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        build_bank(Interrupted(diameter_px=12.0, counts=(6,)), tmp_path / "bank", threads=1)
+    head = read_head(tmp_path / "bank")
+    assert missing_cells(tmp_path / "bank", head) == [2, 3, 4, 5]
+    with pytest.raises(InputError, match="only 2 of its 6 kernels are built"):
+        read_bank(tmp_path / "bank")
+    kept = cell_path(tmp_path / "bank", 1).stat().st_mtime_ns
+    run("psf", "simple", "--out", tmp_path / "bank", "--diameter", 12, "--counts", 6)
+    assert cell_path(tmp_path / "bank", 1).stat().st_mtime_ns == kept
+    whole = build_bank(SimpleLens(diameter_px=12.0, counts=(6,)), tmp_path / "at once")
+    for one, other in zip(read_bank(tmp_path / "bank").kernels, whole.kernels, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not list((tmp_path / "bank").rglob("*.part*"))
+
+
+def test_a_part_of_another_bank_is_not_gone_on_with(tmp_path: Path) -> None:
+    run("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    cell_path(tmp_path / "bank", 2).unlink()
+    with pytest.raises(InputError, match="exists already"):
+        run("psf", "simple", "--out", tmp_path / "bank", "--diameter", 13, "--counts", 4)
+    with pytest.raises(InputError, match="exists already"):
+        run("psf", "simple", "--out", tmp_path / "bank", *SMALL, "--rays", 1000)
+    run("psf", "simple", "--out", tmp_path / "bank", "--diameter", 13, "--counts", 4, "--overwrite")
+    assert read_bank(tmp_path / "bank").axes[0].high == 13.0
+
+
+def test_a_finished_bank_is_kept(tmp_path: Path) -> None:
+    run("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    with pytest.raises(InputError, match="exists already"):
+        run("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+
+
+def test_export_and_sheet(tmp_path: Path) -> None:
+    run("psf", "combined", "--out", tmp_path / "bank", "--diameter", 8, "--motion", 6, "--counts", "3,3")
+    run("export", tmp_path / "bank", "--out", tmp_path / "kernels", "--format", "exr")
+    bank = read_bank(tmp_path / "bank")
+    assert sorted(path.suffix for path in (tmp_path / "kernels").iterdir()) == [".csv", *[".exr"] * len(bank.kernels)]
+    np.testing.assert_array_equal(read_image(tmp_path / "kernels" / "00004.exr")[..., :1], bank.kernels[4])
+    run("show", tmp_path / "bank", "--out", tmp_path / "sheet.png")
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (8 * 150, 13 * 150)
+
+
+@pytest.mark.parametrize("name", MODEL_NAMES)
+def test_every_model_can_be_made_by_name(name: str, tmp_path: Path) -> None:
+    options = ModelOptions(image=picture_file(tmp_path / "logo.png")) if name == "stylized" else ModelOptions()
+    model = choose_model(name, options)
+    assert model.name == name and len(model.axes) == len(model.counts) and model.channels in (1, 3)
+
+
+MISTAKES = {
+    "an unknown model": (["psf", "blob"], "expected a model out of simple, combined, physical, volume, stylized"),
+    "no picture": (["psf", "stylized"], "--image"),
+    "an option of another model": (["psf", "combined", "--image", "a.png"], "--image does nothing"),
+    "a motion for a model without": (["psf", "simple", "--motion", "3"], "--motion does nothing"),
+    "no such lens": (["psf", "simple", "--lens", "none.json"], "none.json"),
+    "no such picture": (["psf", "stylized", "--image", "none.png"], "none.png"),
+    "counts in words": (["psf", "simple", "--counts", "many"], "--counts as whole numbers"),
+    "too many counts": (["psf", "simple", "--counts", "3,3"], "a count for each"),
+    "a diameter below 0": (["psf", "simple", "--diameter", "-3"], "positive number"),
+    "less than no rays": (["psf", "simple", "--rays", "-1"], "number of rays"),
+    "no bank": (["export", "none"], "expected a bank of PSFs"),
+    "another format": (["export", "none", "--format", "jpg"], "exr or png"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_one_sentence_and_leave_nothing(mistake: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments, message = MISTAKES[mistake]
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=message):
+        run(*arguments, "--out", "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_exit_codes_of_real_processes(tmp_path: Path) -> None:
+    done = process("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    assert done.returncode == 0 and "wrote" in done.stdout, done.stderr
+    shutil.rmtree(tmp_path / "bank" / "cells")
+    for arguments in (["show", tmp_path / "bank"], ["export", tmp_path / "bank"]):
+        done = process(*arguments, "--out", tmp_path / "sheet.png")
+        assert done.returncode == 2 and "Traceback" not in done.stderr
+        assert done.stderr.startswith("error: ") and "only 0 of its 4 kernels are built" in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "sheet.png").exists()
