@@ -27,9 +27,10 @@ def read_motion(path: Path | str) -> Float32[np.ndarray, "height width 2"]:
 
 
 def taken_from_channels(layer: Layer, shutter: float) -> Layer:
-    """The layer with its extra channels forward.u and forward.v as its motion; unchanged if it has none."""
+    """The layer with its extra channels forward.u and forward.v, times alpha as all extra channels, as its motion; else unchanged."""
     if not {"forward.u", "forward.v"} <= layer.extra.keys():
         return layer
-    motion_px = np.concatenate([layer.extra["forward.u"], -layer.extra["forward.v"]], axis=2)
+    alpha = np.maximum(layer.alpha, np.float32(1e-6))[..., None]
+    motion_px = np.concatenate([layer.extra["forward.u"], -layer.extra["forward.v"]], axis=2) / alpha
     rest = {name: values for name, values in layer.extra.items() if name not in ("forward.u", "forward.v")}
-    return with_motion(replace(layer, extra=rest), motion_px, shutter)
+    return with_motion(replace(layer, extra=rest), motion_px.astype(np.float32), shutter)

@@ -1,0 +1,150 @@
+"""Compiled bodies that move in straight lines while the shutter is open: what a ray meets first, its light and its motion.
+
+Camera axes, metres; every ray has d_z = 1 and starts in the plane of the lens, so that its parameter t is depth. A body that
+has moved by d is met by a ray as the body at rest is met by the ray moved by -d. Arrays are passed one by one because
+reading them out of a tuple in an inner loop counts references each time.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+NOTHING = -1
+QUAD, ROUND, SPHERE, LAMP = 0, 1, 2, 3
+# Columns of the table of bodies: x, y, z from each of these on.
+CENTRE, VELOCITY, HALF_BOX, NORMAL, DUAL_U, DUAL_V, RADIANCE = 0, 3, 6, 9, 12, 15, 18
+RADIUS, GAIN, REPEAT_U, REPEAT_V, COLUMNS = 21, 22, 23, 24, 25
+# Columns of the light: the sun's direction, its strength, that of the sky, and the background.
+SUN_DIRECTION, SUN, SKY, BACKGROUND = 0, 3, 4, 5
+
+
+class PackedBodies(NamedTuple):
+    """A scene in motion.
+
+    table: (bodies, COLUMNS) places in the middle of the exposure, velocities per shutter, half sides of the box around it.
+    kind: (bodies,) QUAD to LAMP. bounds_px: (bodies, 4) x0, y0, x1, y1 of all that a body's blur can touch over the exposure.
+    texture: (bodies, 3) start, height and width within texels. light: (8,).
+    """
+
+    table: np.ndarray
+    kind: np.ndarray
+    bounds_px: np.ndarray
+    texture: np.ndarray
+    texels: np.ndarray
+    light: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def first_hit(
+    table: np.ndarray,
+    kind: np.ndarray,
+    members: np.ndarray,
+    count: int,
+    ox: float,
+    oy: float,
+    dx: float,
+    dy: float,
+    since: float,
+) -> tuple[int, float, float, float]:
+    """(body or NOTHING, depth or inf, place u, v on a quad) of the first of `members[:count]`; since: time - 0.5, in shutters."""
+    best, best_t, best_u, best_v = NOTHING, math.inf, 0.0, 0.0
+    steep_x, steep_y = abs(dx), abs(dy)
+    for m in range(count):
+        i = members[m]
+        cz = table[i, CENTRE + 2] + since * table[i, VELOCITY + 2]
+        # The ray relative to the body's middle, at the depth of the middle.
+        x = ox + dx * cz - table[i, CENTRE] - since * table[i, VELOCITY]
+        y = oy + dy * cz - table[i, CENTRE + 1] - since * table[i, VELOCITY + 1]
+        deep = table[i, HALF_BOX + 2]
+        beside = abs(x) > table[i, HALF_BOX] + steep_x * deep or abs(y) > table[i, HALF_BOX + 1] + steep_y * deep
+        if beside or cz - deep > best_t:
+            continue
+        s, u, v = math.inf, 0.5, 0.5
+        if kind[i] <= ROUND:
+            along = table[i, NORMAL] * dx + table[i, NORMAL + 1] * dy + table[i, NORMAL + 2]
+            if along != 0.0:
+                s = -(table[i, NORMAL] * x + table[i, NORMAL + 1] * y) / along
+                px, py = x + s * dx, y + s * dy
+                u = table[i, DUAL_U] * px + table[i, DUAL_U + 1] * py + table[i, DUAL_U + 2] * s + 0.5
+                v = table[i, DUAL_V] * px + table[i, DUAL_V + 1] * py + table[i, DUAL_V + 2] * s + 0.5
+                outside = u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0
+                if outside or (kind[i] == ROUND and (u - 0.5) ** 2 + (v - 0.5) ** 2 > 0.25):
+                    s = math.inf
+        elif kind[i] == SPHERE:
+            a, b = dx * dx + dy * dy + 1.0, x * dx + y * dy
+            discriminant = b * b - a * (x * x + y * y - table[i, RADIUS] ** 2)
+            if discriminant >= 0.0:
+                s = (-b - math.sqrt(discriminant)) / a
+        elif x * x + y * y <= table[i, RADIUS] ** 2:
+            s = 0.0
+        if 0.0 < cz + s < best_t:
+            best, best_t, best_u, best_v = i, cz + s, u, v
+    return best, best_t, best_u, best_v
+
+
+@njit(cache=True, nogil=True)
+def _bilinear(texels: np.ndarray, start: int, height: int, width: int, u: float, v: float) -> tuple[float, float, float]:
+    """A repeating texture; the centre of texel (0, 0) is half a texel from the corner."""
+    x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
+    x0, y0 = int(math.floor(x)), int(math.floor(y))
+    fx, fy = x - x0, y - y0
+    left, right = (x0 + width) % width, (x0 + 1) % width
+    top, bottom = start + (y0 + height) % height * width, start + (y0 + 1) % height * width
+    w00, w01, w10, w11 = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+    a, b, c, d = top + left, top + right, bottom + left, bottom + right
+    return (
+        w00 * texels[a, 0] + w01 * texels[b, 0] + w10 * texels[c, 0] + w11 * texels[d, 0],
+        w00 * texels[a, 1] + w01 * texels[b, 1] + w10 * texels[c, 1] + w11 * texels[d, 1],
+        w00 * texels[a, 2] + w01 * texels[b, 2] + w10 * texels[c, 2] + w11 * texels[d, 2],
+    )
+
+
+@njit(cache=True, nogil=True)
+def radiance_of(
+    table: np.ndarray,
+    kind: np.ndarray,
+    texture: np.ndarray,
+    texels: np.ndarray,
+    light: np.ndarray,
+    i: int,
+    t: float,
+    u: float,
+    v: float,
+    x: float,
+    y: float,
+    since: float,
+) -> tuple[float, float, float]:
+    """Linear RGB of a hit at (x, y, t): Lambert under the sun and a sky, which on spheres fades downwards."""
+    if i == NOTHING:
+        return light[BACKGROUND], light[BACKGROUND + 1], light[BACKGROUND + 2]
+    if kind[i] == LAMP:
+        return table[i, RADIANCE], table[i, RADIANCE + 1], table[i, RADIANCE + 2]
+    gain = table[i, GAIN]
+    if kind[i] == SPHERE:
+        nx = (x - table[i, CENTRE] - since * table[i, VELOCITY]) / table[i, RADIUS]
+        ny = (y - table[i, CENTRE + 1] - since * table[i, VELOCITY + 1]) / table[i, RADIUS]
+        nz = (t - table[i, CENTRE + 2] - since * table[i, VELOCITY + 2]) / table[i, RADIUS]
+        u = 0.5 + math.atan2(ny, -nz) / (2.0 * math.pi)
+        v = math.acos(min(max(nx, -1.0), 1.0)) / math.pi
+        facing = nx * light[SUN_DIRECTION] + ny * light[SUN_DIRECTION + 1] + nz * light[SUN_DIRECTION + 2]
+        gain = light[SKY] * (0.65 - 0.35 * ny) + light[SUN] * max(facing, 0.0)
+    red, green, blue = _bilinear(
+        texels, texture[i, 0], texture[i, 1], texture[i, 2], u * table[i, REPEAT_U], v * table[i, REPEAT_V]
+    )  # fmt: skip
+    return red * gain, green * gain, blue * gain
+
+
+@njit(cache=True, nogil=True)
+def motion_of(table: np.ndarray, i: int, t: float, x: float, y: float, since: float, focal_x: float, focal_y: float) -> tuple[float, float]:
+    """Pixels per shutter of the hit point (x, y, t) in the pinhole picture, averaged between its time and the middle of the exposure.
+
+    (p(t) - p(0.5)) / (t - 0.5) of p = f X / Z is f (V_x Z - V_z X) / (Z Z_middle): the derivative where t = 0.5, and the
+    point's place at t = 0.5 follows from it exactly at any time.
+    """
+    if i == NOTHING:
+        return 0.0, 0.0
+    vz = table[i, VELOCITY + 2]
+    scale = 1.0 / (t * (t - since * vz))
+    return focal_x * (table[i, VELOCITY] * t - vz * x) * scale, focal_y * (table[i, VELOCITY + 1] * t - vz * y) * scale
