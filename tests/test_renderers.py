@@ -11,6 +11,7 @@ from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import Layer, clear, opaque
 from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.low_rank_filter import LowRankFilter
 from mrbokeh.renderers.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
@@ -35,6 +36,7 @@ PROMISES = {
     "scatter_reference": Promise(lambda threads: ScatterReference(threads=threads)),
     "polygon_differences": Promise(lambda threads: PolygonDifferences(threads=threads), agreement_db=60.0, straight_edge=1.5e-3),
     "low_rank_filter": Promise(lambda threads: LowRankFilter(threads=threads), agreement_db=50.0, straight_edge=2e-3),
+    "laplacian_spreadlets": Promise(lambda threads: LaplacianSpreadlets(threads=threads), agreement_db=50.0, straight_edge=2e-3),
 }
 RENDERERS = {name: promise.make(0) for name, promise in PROMISES.items()}
 SIZE_PX = 65

@@ -30,7 +30,13 @@ def _low_rank(**settings: Any) -> Renderer:
     return LowRankFilter(**settings)
 
 
-BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "scatter": _scatter}
+def _laplacian(**settings: Any) -> Renderer:
+    from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+
+    return LaplacianSpreadlets(**settings)
+
+
+BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "scatter": _scatter}
 
 
 def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None) -> Renderer:

@@ -1,0 +1,117 @@
+"""Kernels of a bank for every pixel: the nearest sample, turned to where it is used (Leimkuehler et al. 2018, Section 6.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+from scipy.ndimage import affine_transform
+
+from mrbokeh.errors import InputError
+from mrbokeh.progress import track
+from mrbokeh.psf_bank import PsfBank
+from mrbokeh.renderers._laplacian_tables import Points, by_rows, joined_points, taps_of
+from mrbokeh.spreadlet_values import turned
+from mrbokeh.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify, whole_laplacian
+
+_LEAST_ANGLES, _MOST_ANGLES = 16, 256
+_DENSE_TAPS = 452  # those of a disc of 24 px: fewer are splatted as they are
+_SHOW_FROM = 8
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a pixel's PSF depends on besides its circle of confusion; what the bank does not ask for may be None.
+
+    motion_px (H, W, 2): right and down per shutter. field_xy (H, W, 2): position in half diagonals. depth_m (H, W).
+    """
+
+    motion_px: Float[np.ndarray, "height width 2"] | None = None
+    field_xy: Float[np.ndarray, "height width 2"] | None = None
+    depth_m: Float[np.ndarray, "height width"] | None = None
+
+
+@dataclass
+class BankTables:
+    """Spreadlets of a bank's kernels, made once, and their turned copies, kept. A code is cell * angles + angle, twice:
+    even for the sparse kernel, odd for the whole one."""
+
+    bank: PsfBank
+    sparsification: Sparsification | None
+    spreadlets: Spreadlets | None = None
+    _kept: dict[tuple[int, bool], Spreadlet] = field(default_factory=dict)
+
+    @property
+    def angles(self) -> int:
+        """How many directions are told apart: an even number, so that half a turn is one of them."""
+        if self.bank.turns == "none":
+            return 2
+        return int(np.clip(4 * self.bank.radius_px, _LEAST_ANGLES, _MOST_ANGLES)) // 2 * 2
+
+    def codes(self, coc_px: Float32[np.ndarray, "height width"], bright: np.ndarray, place: Place) -> Int64[np.ndarray, "height width"]:
+        """The kernel of every pixel."""
+        planes = [self._coordinate(axis.name, coc_px, place) for axis in self.bank.axes]
+        cells = self.bank.nearest(np.stack(planes, axis=-1).astype(np.float64))
+        turn = np.zeros(coc_px.shape, np.int64)
+        if self.bank.turns != "none":
+            way = self._needed(place.motion_px if self.bank.turns == "motion" else place.field_xy, self.bank.turns)
+            turn = np.rint(np.arctan2(way[..., 1], way[..., 0]) * self.angles / (2.0 * np.pi)).astype(np.int64)
+        if self.bank.near_side_turned:
+            turn = turn + np.where(coc_px < 0, self.angles // 2, 0)
+        return 2 * (cells * self.angles + turn % self.angles) + bright
+
+    def is_dense(self, code: int) -> bool:
+        """Whether a kernel has so few taps that they are splatted as they are (Section 6.4)."""
+        return bool(np.count_nonzero(self.bank.kernels[code // 2 // self.angles].any(axis=2)) <= _DENSE_TAPS)
+
+    def points(self, codes: Sequence[int], dense: bool, channel: int | None) -> Points:
+        """The points of these codes, in their order; what is new is computed and kept. dense: all taps."""
+        new = [code for code in codes if (code, dense) not in self._kept]
+        for code in track(new, "spreadlets of the bank") if len(new) >= _SHOW_FROM else new:
+            self._kept[code, dense] = by_rows(self._computed(code, dense))
+        return joined_points([self._kept[code, dense] for code in codes], channel)
+
+    def _computed(self, code: int, dense: bool) -> Spreadlet:
+        cell, turn = divmod(code // 2, self.angles)
+        angle_rad = 2.0 * np.pi * turn / self.angles
+        if dense or code % 2 or self.sparsification is None:
+            kernel = turned_kernel(self.bank.kernels[cell], angle_rad)
+            return taps_of(kernel) if dense else whole_laplacian(kernel)
+        if turn:
+            upright = self._kept.get((code - 2 * turn, False))
+            upright = upright or self._kept.setdefault((code - 2 * turn, False), self._computed(code - 2 * turn, False))
+            return Spreadlet(*turned(upright.points, upright.values, angle_rad))
+        return self.spreadlets[cell] if self.spreadlets is not None else sparsify(self.bank.kernels[cell], self.sparsification)
+
+    def _coordinate(self, name: str, coc_px: np.ndarray, place: Place) -> np.ndarray:
+        if name == "diameter_px":
+            return coc_px
+        if name == "depth_m":
+            return self._needed(place.depth_m, "depth")
+        if name == "motion_px":
+            return np.hypot(*np.moveaxis(self._needed(place.motion_px, "motion"), -1, 0))
+        return np.hypot(*np.moveaxis(self._needed(place.field_xy, "the place in the frame"), -1, 0))
+
+    def _needed(self, plane: np.ndarray | None, what: str) -> np.ndarray:
+        if plane is None:
+            raise InputError(f"the bank '{self.bank.model}' needs {what} for every pixel, but none came: give it or take another bank")
+        return plane
+
+
+def spreadlets_of(bank: PsfBank, sparsification: Sparsification) -> Spreadlets:
+    """The spreadlets of all cells of a bank, under a progress bar; kept in files by mrbokeh.spreadlets_file."""
+    return Spreadlets.joined([sparsify(kernel, sparsification) for kernel in track(bank.kernels, "spreadlets of the bank")])
+
+
+def turned_kernel(kernel: Float32[np.ndarray, "size size channels"], angle_rad: float) -> Float64[np.ndarray, "side side channels"]:
+    """A kernel turned about its middle pixel from x towards y, interpolated, with its light; half turns are exact."""
+    quarters = angle_rad / (0.5 * np.pi)
+    if abs(quarters - round(quarters)) < 1e-9:
+        return np.ascontiguousarray(np.rot90(kernel, -round(quarters))).astype(np.float64)
+    radius = kernel.shape[0] // 2
+    side = int(np.ceil(np.sqrt(2.0) * radius)) + 1 - radius
+    wide = np.pad(kernel.astype(np.float64), ((side, side), (side, side), (0, 0)))
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    back, middle = np.array([[cosine, -sine], [sine, cosine]]), np.full(2, wide.shape[0] // 2)
+    out = np.stack([affine_transform(wide[..., c], back, middle - back @ middle, order=1) for c in range(wide.shape[2])], axis=2)
+    return out * (kernel.sum(axis=(0, 1), dtype=np.float64) / out.sum(axis=(0, 1)))

@@ -1,0 +1,124 @@
+"""Which kernel a pixel takes, and the points of all kernels that a picture needs, kept from call to call."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from os import cpu_count
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.progress import track
+from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify, whole_laplacian
+
+DENSE, SPARSE, WHOLE = 0, 1, 2
+DENSE_PER_PX = 32.0
+LEVELS_PER_OCTAVE = 64.0
+_BLOCK = 4096  # codes per kind and side
+_MOST_KERNELS = 8192  # that are kept between calls
+_SHOW_FROM = 8
+_AROUND_PX, _OUTSHINES = 8, 8.0
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of the cells in use: xy (N, 2), weights (N,), cell i at starts[i]:starts[i + 1], sorted by y within a cell."""
+
+    xy: Int32[np.ndarray, "points 2"]
+    weights: Float64[np.ndarray, " points"]
+    starts: Int64[np.ndarray, " starts"]
+    reach_px: int
+
+
+@dataclass
+class KernelTables:
+    """Kernels of plain apertures by diameter: all taps up to dense_up_to_px, spreadlets beyond."""
+
+    dense_up_to_px: float
+    sparsification: Sparsification | None
+    kept: dict[tuple[bytes, int, bool], Spreadlet] = field(default_factory=dict)
+
+    def codes(
+        self,
+        out: Float32[np.ndarray, "height width channels"],
+        values: Float32[np.ndarray, "height width channels"],
+        coc_px: Float32[np.ndarray, "height width"],
+        aperture: Aperture,
+    ) -> Int32[np.ndarray, "height width"]:
+        """Codes of the kernels, -1 for what is sharp or dark; sharp pixels are copied to out."""
+        from mrbokeh.renderers._laplacian_splat_numba import choose_cells
+
+        codes = np.empty(coc_px.shape, np.int32)
+        large = np.abs(coc_px) > self.dense_up_to_px
+        bright = stands_out(values) if self.sparsification is not None and large.any() else np.zeros(coc_px.shape, np.bool_)
+        limits = 1.0 / aperture.unit_radius, self.dense_up_to_px, DENSE_PER_PX, LEVELS_PER_OCTAVE, _BLOCK
+        if not choose_cells(codes, out, values, coc_px, bright, *limits):
+            raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
+        return codes
+
+    def points(self, codes: Sequence[int], aperture: Aperture, threads: int, dense: bool = False) -> Points:
+        """The points of these codes, in their order; what is new is computed and kept. dense: all taps, whatever the code says."""
+        vertices, starts, weights = aperture.packed()
+        key = vertices.tobytes() + starts.tobytes() + weights.tobytes()
+        if len(self.kept) > _MOST_KERNELS:
+            self.kept.clear()
+        new = [code for code in codes if (key, code, dense) not in self.kept]
+        slow = not dense and sum(kind_of(code) == SPARSE for code in new) >= _SHOW_FROM
+        with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
+            made = pool.map(lambda code: self._computed(code, aperture, dense), new)
+            for code, spreadlet in zip(new, track(made, "spreadlets", len(new)) if slow else made, strict=True):
+                self.kept[key, code, dense] = by_rows(spreadlet)
+        return joined_points([self.kept[key, code, dense] for code in codes])
+
+    def diameter_px(self, code: int) -> float:
+        """The signed diameter that a code stands for."""
+        level, sign = code % _BLOCK, -1.0 if code >= 3 * _BLOCK else 1.0
+        size = level / DENSE_PER_PX if kind_of(code) == DENSE else self.dense_up_to_px * 2.0 ** (level / LEVELS_PER_OCTAVE)
+        return sign * size
+
+    def _computed(self, code: int, aperture: Aperture, dense: bool) -> Spreadlet:
+        kernel, kind = aperture.rasterize(self.diameter_px(code)).kernel, kind_of(code)
+        if dense or kind == DENSE:
+            return taps_of(kernel)
+        return whole_laplacian(kernel) if kind == WHOLE or self.sparsification is None else sparsify(kernel, self.sparsification)
+
+
+def taps_of(kernel: Float[np.ndarray, "size size *channels"]) -> Spreadlet:
+    """All pixels of a kernel that are not 0, as points."""
+    colours = kernel.reshape(*kernel.shape[:2], -1).astype(np.float64)
+    rows, columns = np.nonzero(np.any(colours != 0.0, axis=2))
+    xy = np.stack([columns, rows], axis=1) - kernel.shape[0] // 2
+    return Spreadlet(xy.astype(np.int16), colours[rows, columns])
+
+
+def kind_of(code: int) -> int:
+    """DENSE, SPARSE or WHOLE."""
+    return code // _BLOCK % 3
+
+
+def by_rows(cell: Spreadlet) -> Spreadlet:
+    """The same points sorted by row."""
+    order = np.lexsort((cell.points[:, 0], cell.points[:, 1]))
+    return Spreadlet(cell.points[order], cell.values[order])
+
+
+def joined_points(cells: Sequence[Spreadlet], channel: int | None = 0) -> Points:
+    """Cells that are sorted by row, one after the other; weights of one channel, or None: their mean."""
+    xy = np.concatenate([each.points for each in cells]).astype(np.int32)
+    weights = np.concatenate([each.values.mean(axis=1) if channel is None else each.values[:, channel] for each in cells])
+    starts = np.cumsum([0, *(len(each.points) for each in cells)]).astype(np.int64)
+    return Points(xy, weights, starts, int(np.abs(xy).max(initial=0)))
+
+
+def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.ndarray, "height width"]:
+    """Pixels that outshine the mean of their surroundings in any channel: lamps and lone pixels, whose PSF can be seen."""
+    import cv2
+
+    window = (2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1)
+    found = np.zeros(values.shape[:2], np.bool_)
+    for c in range(values.shape[2]):
+        light = np.abs(values[..., c])
+        found |= light > _OUTSHINES * cv2.boxFilter(light, cv2.CV_64F, window, borderType=cv2.BORDER_REFLECT_101)
+    return found

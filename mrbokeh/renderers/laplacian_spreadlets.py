@@ -1,0 +1,149 @@
+"""Laplacian spreadlets: few points of the Laplacian of every pixel's PSF, splatted, and one integration (Leimkuehler et al. 2018).
+
+What is exact: the Laplacian that makes the points and the integration that undoes them are inverse to rounding, so the points
+of whole Laplacians (`sparsification=None`) give what splatting all taps gives. Sparse points are off by about a tenth of a
+kernel's norm along its outline, which averages out over the pixels of a picture, but not for a lamp or a lone pixel: those
+get whole Laplacians. Light and centroid of every kernel are exact. Circles of confusion are rounded: to 1/32 px on the
+fast track, to 1.1 % (64 steps per octave) beyond it. Measured (tests/bench_laplacian_spreadlets.py) at a mean circle
+of 40 px: SSIM 0.998 and 55 dB to dense splatting of the same kernels, 56 dB to exact ones.
+
+Laplacians are summed in double precision: a rounding error of one pixel shows, integrated, all over the picture.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+from mrbokeh.layering import Layering, render_layers
+from mrbokeh.lens import Lens
+from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.psf_bank import PsfBank
+from mrbokeh.renderers._laplacian_bank import BankTables, Place
+from mrbokeh.renderers._laplacian_layers import bank_lens, with_places, without_places
+from mrbokeh.renderers._laplacian_samples import reconstructed
+from mrbokeh.renderers._laplacian_sums import add_light
+from mrbokeh.renderers._laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out
+from mrbokeh.spreadlets import Sparsification, Spreadlets
+
+PLAIN_APERTURE = Sparsification(lloyd_steps=0, annealing_steps=0)
+"""For apertures that are sparsified while somebody waits: once values are fitted, relaxation and annealing gain nothing."""
+
+
+@dataclass(frozen=True)
+class LaplacianSpreadlets:
+    """A Renderer that spreads light by spreadlets; layers, slices and hidden background as in mrbokeh.layering.
+
+    sparsification: how kernels become points; None takes the whole Laplacian (exact, about three times as slow at 40 px).
+    dense_up_to_px: the fast track: kernels of apertures up to this diameter are splatted as they are; those of a bank with
+    as few taps as a disc of 24 px. integration: "exact" or "pyramid", see mrbokeh.laplacian_integration. threads: 0 takes all.
+    bank: kernels to use instead of the lens's aperture; spreadlets: its own, if they have been computed before.
+    """
+
+    bank: PsfBank | None = None
+    layering: Layering = field(default_factory=Layering)
+    threads: int = 0
+    integration: str = "exact"
+    sparsification: Sparsification | None = PLAIN_APERTURE
+    dense_up_to_px: float = 24.0
+    spreadlets: Spreadlets | None = field(default=None, repr=False)
+    _tables: KernelTables = field(init=False, repr=False, compare=False)
+    _bank_tables: BankTables | None = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.integration not in ("exact", "pyramid"):
+            raise InputError(f"a Laplacian is integrated by 'exact' or 'pyramid', got {self.integration!r}")
+        if not self.dense_up_to_px >= 2.0:
+            raise InputError(f"kernels up to at least 2 px are splatted as they are, got dense_up_to_px {self.dense_up_to_px}")
+        bank_tables = None if self.bank is None else BankTables(self.bank, self.sparsification, self.spreadlets)
+        object.__setattr__(self, "_tables", KernelTables(self.dense_up_to_px, self.sparsification))
+        object.__setattr__(self, "_bank_tables", bank_tables)
+
+    def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
+        if self.bank is None:
+            return render_layers(layers, lens, self.spread, self.layering)
+        placed, place_of = with_places(layers, self.bank)
+
+        def spread(values: np.ndarray, coc_px: np.ndarray, aperture: Aperture) -> np.ndarray:  # noqa: ARG001
+            return self.spread_bank(values, coc_px, place_of(values, coc_px))
+
+        return without_places(render_layers(placed, bank_lens(lens, self.bank, layers[0].width_px), spread, self.layering), layers)
+
+    def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
+        """A picture from noisy samples: each gives its light to the whole PSF of the point that it saw (Section 6.2, Fig. 7)."""
+        return reconstructed(samples, lens, self)
+
+    def spread(
+        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+    ) -> Float32[np.ndarray, "height width channels"]:
+        """See mrbokeh.spreading.Spread."""
+        return self._spread(values, coc_px, aperture, densely=False)
+
+    def spread_densely(
+        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+    ) -> Float32[np.ndarray, "height width channels"]:
+        """The same with all taps of the same kernels and no Laplacian: what is fast in `spread` is measured against this."""
+        return self._spread(values, coc_px, aperture, densely=True)
+
+    def spread_bank(
+        self,
+        values: Float32[np.ndarray, "height width channels"],
+        coc_px: Float32[np.ndarray, "height width"],
+        place: Place,
+        densely: bool = False,
+    ) -> Float32[np.ndarray, "height width channels"]:
+        """The sum over all pixels of value times the bank's kernel, same size out; colours take their kernel, others the mean.
+
+        Values, circles and what gets lost as in mrbokeh.spreading.Spread. densely: all taps of the same kernels.
+        """
+        tables = self._bank_tables
+        if tables is None:
+            raise InputError("this renderer was made without a bank: give it one")
+        lit = np.any(values != 0, axis=-1)
+        if not np.isfinite(coc_px[lit]).all():
+            raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
+        codes = np.where(lit, tables.codes(np.where(lit, coc_px, np.float32(0)), stands_out(values), place), -1)
+        out = np.zeros_like(values)
+        colours = [(slice(None), 0)] if tables.bank.channels == 1 else [(np.s_[c : c + 1], c) for c in range(3)] + [(np.s_[3:], None)]
+        kinds = {int(code): densely or tables.is_dense(int(code)) for code in _used(codes)}
+        for part, channel in colours:
+            if values[..., part].shape[2]:
+                piece = np.ascontiguousarray(values[..., part])
+                out[..., part] = self._summed(piece, codes, kinds, partial(tables.points, channel=channel))
+        return out
+
+    def _spread(self, values: np.ndarray, coc_px: np.ndarray, aperture: Aperture, densely: bool) -> np.ndarray:
+        sharp = np.zeros_like(values)
+        codes = self._tables.codes(sharp, values, coc_px, aperture)
+        kinds = {int(code): densely or kind_of(int(code)) == DENSE for code in _used(codes)}
+        blurred = self._summed(values, codes, kinds, lambda some, dense: self._tables.points(some, aperture, self.threads, dense))
+        return sharp + blurred if kinds else sharp
+
+    def _summed(
+        self,
+        values: Float32[np.ndarray, "height width channels"],
+        codes: Int[np.ndarray, "height width"],
+        kinds: dict[int, bool],
+        points_of: Callable[[Sequence[int], bool], Points],
+    ) -> Float32[np.ndarray, "height width channels"]:
+        """The light of all pixels with a code, those whose kind is dense (True) by all taps, the others by Laplacians."""
+        out = np.zeros_like(values)
+        used = np.array(sorted(kinds), np.int64)
+        for dense in (True, False):
+            mine = used[[kinds[int(code)] is dense for code in used]]
+            if mine.size:
+                cell_of = np.full(int(used[-1]) + 2, -1, np.int32)  # its last entry is that of code -1
+                cell_of[mine] = np.arange(mine.size)
+                cells, points = cell_of[codes], points_of(mine.tolist(), dense)
+                add_light(out, values, cells, points, None if dense else self.integration, self.threads)
+        return out
+
+
+def _used(codes: Int[np.ndarray, "height width"]) -> Int[np.ndarray, " codes"]:
+    """The codes that occur, but -1, ascending; without sorting all pixels."""
+    return np.flatnonzero(np.bincount(codes.reshape(-1) + 1)[1:])

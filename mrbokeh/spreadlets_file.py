@@ -1,0 +1,49 @@
+"""Spreadlets in a file: what takes minutes to compute for a bank of kernels is kept beside it (`spreadlets.npz`)."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from mrbokeh.atomic_files import atomic_path
+from mrbokeh.errors import InputError
+from mrbokeh.spreadlets import Sparsification, Spreadlets
+
+_VERSION = 1
+
+
+def write_spreadlets(path: Path | str, spreadlets: Spreadlets, made_by: Sparsification, of: str) -> None:
+    """One .npz: points (N, 2) int16, values (N, C) float64, starts (cells + 1,), and what they were made of and how.
+
+    of: a fingerprint of the kernels (`fingerprint`).
+    """
+    facts = json.dumps({"version": _VERSION, "sparsification": asdict(made_by), "of": of})
+    with atomic_path(path) as temporary:
+        np.savez(temporary, points=spreadlets.points, values=spreadlets.values, starts=spreadlets.starts, facts=np.array(facts))
+
+
+def read_spreadlets(path: Path | str, made_by: Sparsification, of: str) -> Spreadlets | None:
+    """The spreadlets in a file; None if there is no such file or they are of other kernels or made in another way."""
+    if not Path(path).exists():
+        return None
+    try:
+        with np.load(path) as file:
+            facts = json.loads(str(file["facts"]))
+            if facts != {"version": _VERSION, "sparsification": asdict(made_by), "of": of}:
+                return None
+            return Spreadlets(file["points"], file["values"], file["starts"])
+    except (BadZipFile, KeyError, ValueError, OSError) as error:
+        raise InputError(f"{path} is not a file of spreadlets ({error}): remove it, it will be computed again") from None
+
+
+def fingerprint(kernels: tuple[np.ndarray, ...]) -> str:
+    """The same for the same kernels."""
+    from hashlib import sha256
+
+    digest = sha256()
+    for kernel in kernels:
+        digest.update(str(kernel.shape).encode())
+        digest.update(np.ascontiguousarray(kernel).tobytes())
+    return digest.hexdigest()[:32]

@@ -1,0 +1,252 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.image_metrics import psnr, ssim
+from mrbokeh.layer import opaque
+from mrbokeh.lens import Lens
+from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.psf_bank import Axis, PsfBank
+from mrbokeh.renderers._laplacian_bank import Place, turned_kernel
+from mrbokeh.renderers._laplacian_sums import splat, splat_plainly
+from mrbokeh.renderers._laplacian_tables import joined_points, stands_out, taps_of
+from mrbokeh.renderers.choose import make_renderer
+from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.spreadlets import whole_laplacian
+
+DISC, PENTAGON = Aperture.disc(), Aperture.blades(5)
+SIZE = (96, 120)
+
+
+def picture(seed: int = 0, size: tuple[int, int] = SIZE) -> np.ndarray:
+    """Patches of 6 px between 0.1 and 1 in three channels, coverage 1."""
+    patches = np.random.default_rng(seed).uniform(0.1, 1.0, (size[0] // 6, size[1] // 6, 4)).astype(np.float32)
+    values = np.kron(patches, np.ones((6, 6, 1), np.float32))
+    values[..., 3] = 1.0
+    return np.ascontiguousarray(values)
+
+
+def slope_px(low: float, high: float, size: tuple[int, int] = SIZE) -> np.ndarray:
+    return np.broadcast_to(np.linspace(low, high, size[1], dtype=np.float32), size).copy()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("aperture", [DISC, PENTAGON, Aperture.ring(0.5)], ids=["disc", "pentagon", "ring"])
+def test_whole_laplacians_are_dense_splatting_to_rounding(aperture: Aperture, sign: float) -> None:
+    """The 3x3 Laplacian and its integration are inverse; against taps summed in double precision only the result is rounded."""
+    renderer = LaplacianSpreadlets(sparsification=None, dense_up_to_px=4.0)
+    values, coc_px = picture(), sign * slope_px(6.0, 44.0)
+    codes = renderer._tables.codes(np.zeros_like(values), values, coc_px, aperture)
+    used, cells = np.unique(codes, return_inverse=True)
+    taps = renderer._tables.points(used.tolist(), aperture, 1, dense=True)
+    reach, dense = taps.reach_px, np.zeros((SIZE[0] + 2 * taps.reach_px, SIZE[1] + 2 * taps.reach_px, 4))
+    splat(dense, values, cells.reshape(SIZE).astype(np.int32), taps, (-reach, -reach))
+    np.testing.assert_allclose(renderer.spread(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=2e-7)
+    np.testing.assert_allclose(renderer.spread_densely(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=5e-5)
+
+
+def test_sparse_points_come_near_dense_splatting_of_the_same_kernels() -> None:
+    """Mean circle 40 px. What the bench measures on a larger picture, here in small: SSIM within 0.01, more than 45 dB."""
+    renderer = LaplacianSpreadlets()
+    values, coc_px = picture(1), slope_px(30.0, 50.0)
+    found, dense = renderer.spread(values, coc_px, DISC), renderer.spread_densely(values, coc_px, DISC)
+    assert ssim(found[..., :3], dense[..., :3]) > 0.99
+    assert psnr(found, dense) > 45.0
+
+
+def test_sparse_points_come_near_the_reference() -> None:
+    values, coc_px = picture(2), slope_px(-50.0, -30.0)
+    found, reference = LaplacianSpreadlets().spread(values, coc_px, PENTAGON), ScatterReference().spread(values, coc_px, PENTAGON)
+    assert psnr(found, reference) > 45.0
+    assert found.sum() == pytest.approx(reference.sum(), rel=2e-3)
+
+
+def test_the_fast_track_is_near_the_reference() -> None:
+    """Diameters rounded to 1/32 px."""
+    values, coc_px = picture(3), slope_px(0.0, 24.0)
+    found, reference = LaplacianSpreadlets().spread(values, coc_px, DISC), ScatterReference().spread(values, coc_px, DISC)
+    assert psnr(found, reference) > 60.0
+
+
+def test_light_of_a_sparse_area_is_kept_and_stays_in_place() -> None:
+    """A patch amid a dark frame, all of its light within: neither sum nor centroid nor the dark far away changes."""
+    values = np.zeros((200, 220, 1), np.float32)
+    values[90:110, 100:130] = picture(4)[:20, :30, :1]
+    coc_px = np.full((200, 220), 48.0, np.float32)
+    renderer = LaplacianSpreadlets()
+    assert not stands_out(values)[92:108, 102:128].all(), "else all would be whole Laplacians"
+    light = renderer.spread(values, coc_px, DISC).astype(np.float64)[..., 0]
+    rows, columns = np.indices(light.shape)
+    truth = values[..., 0].astype(np.float64)
+    assert light.sum() == pytest.approx(truth.sum(), rel=1e-3)
+    assert (light * rows).sum() / light.sum() == pytest.approx((truth * rows).sum() / truth.sum(), abs=0.05)
+    assert (light * columns).sum() / light.sum() == pytest.approx((truth * columns).sum() / truth.sum(), abs=0.05)
+    assert np.abs(light[:20]).max() < 1e-3 * light.max()
+
+
+def test_a_lamp_shows_its_exact_disc() -> None:
+    """A lamp of 1e5 amid a dim picture is no sum of few points, and its rounding does not show elsewhere."""
+    values, coc_px = picture(5, (192, 192)), np.full((192, 192), 42.0, np.float32)
+    lamp = values.copy()
+    lamp[96, 96, :3] = 1e5
+    renderer = LaplacianSpreadlets()
+    alone = renderer.spread(lamp, coc_px, DISC) - renderer.spread(values, coc_px, DISC)
+    dense = renderer.spread_densely(lamp, coc_px, DISC) - renderer.spread_densely(values, coc_px, DISC)
+    np.testing.assert_allclose(alone[..., :3], dense[..., :3], atol=2e-3 * dense.max())
+    assert np.abs(alone[:60]).max() < 1e-3, "1e-8 of the lamp"
+
+
+@pytest.mark.parametrize("dense_up_to_px", [24.0, 4.0])
+def test_linear_in_radiance(dense_up_to_px: float) -> None:
+    renderer = LaplacianSpreadlets(dense_up_to_px=dense_up_to_px)
+    values, coc_px = picture(6), slope_px(-6.0, 36.0)
+    one, scaled = (renderer.spread(factor * values, coc_px, DISC) for factor in (np.float32(1.0), np.float32(1000.0)))
+    np.testing.assert_allclose(scaled, 1000.0 * one, rtol=1e-5, atol=1e-3)
+
+
+def test_the_number_of_threads_changes_no_bit_of_sparse_sums() -> None:
+    values, coc_px = picture(7, (240, 120)), slope_px(-36.0, 40.0, (240, 120))
+    one, three = (LaplacianSpreadlets(threads=threads).spread(values, coc_px, PENTAGON) for threads in (1, 3))
+    np.testing.assert_array_equal(one, three)
+
+
+def test_the_pyramid_is_another_integration_and_a_worse_one() -> None:
+    values, coc_px = picture(8), slope_px(30.0, 50.0)
+    dense = LaplacianSpreadlets().spread_densely(values, coc_px, DISC)
+    exact, pyramid = (LaplacianSpreadlets(integration=name).spread(values, coc_px, DISC) for name in ("exact", "pyramid"))
+    assert psnr(exact, dense) > psnr(pyramid, dense) + 6.0 > 26.0
+
+
+def test_splatting_agrees_with_its_plain_twin() -> None:
+    """Several cells, dark pixels, tiles that are cut off."""
+    rng = np.random.default_rng(9)
+    points = joined_points([taps_of(DISC.rasterize(size).kernel) for size in (3.0, 7.5, 12.0)])
+    values, cells = rng.uniform(size=(40, 37, 3)).astype(np.float32), rng.integers(-1, 3, (40, 37)).astype(np.int32)
+    found, plain = np.zeros((56, 53, 3)), np.zeros((56, 53, 3))
+    splat(found, values, cells, points, (-8, -8))
+    splat_plainly(plain, values, cells, points, (-8, -8))
+    np.testing.assert_allclose(found, plain, atol=1e-12)
+
+
+def test_by_name_and_by_mistake() -> None:
+    assert isinstance(make_renderer("laplacian"), LaplacianSpreadlets)
+    with pytest.raises(InputError, match="'exact' or 'pyramid'"):
+        LaplacianSpreadlets(integration="sum")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="at least 2 px"):
+        LaplacianSpreadlets(dense_up_to_px=0.0)
+    with pytest.raises(InputError, match="finite circle of confusion"):
+        LaplacianSpreadlets().spread(picture(), np.full(SIZE, np.nan, np.float32), DISC)
+    with pytest.raises(InputError, match="without a bank"):
+        LaplacianSpreadlets().spread_bank(picture(), slope_px(1, 2), Place())
+
+
+def bank_of(aperture: Aperture, sizes_px: tuple[float, ...] = (6.0, 18.0, 30.0, 42.0), **facts: object) -> PsfBank:
+    """Kernels at the middles of equal cells from 0 to 48 px."""
+    kernels = tuple(aperture.rasterize(size).kernel[..., None].astype(np.float32) for size in sizes_px)
+    axis = Axis("diameter_px", 0.0, 12.0 * len(sizes_px), 1.0)
+    return PsfBank("made", (axis,), (len(sizes_px),), kernels, nested=False, **{"near_side_turned": True, **facts})
+
+
+@pytest.mark.parametrize("coc_px", [18.0, 42.0, -42.0])
+def test_a_bank_of_an_apertures_kernels_is_the_aperture(coc_px: float) -> None:
+    values, circles = picture(10), np.full(SIZE, coc_px, np.float32)
+    found = LaplacianSpreadlets(bank_of(PENTAGON)).spread_bank(values, circles, Place())
+    reference = ScatterReference().spread(values, circles, PENTAGON)
+    assert psnr(found, reference) > 45.0
+    densely = LaplacianSpreadlets(bank_of(PENTAGON)).spread_bank(values, circles, Place(), densely=True)
+    np.testing.assert_allclose(densely, reference, atol=4e-5)  # single precision: each of 1400 sums may round by 2**-25
+
+
+def test_kernels_are_turned_with_the_motion() -> None:
+    """A bar to the right, used for a point that moves down, is a bar downwards; its light is the same."""
+    bar = np.zeros((41, 41, 1), np.float32)
+    bar[18:23, :] = 1.0 / 205.0
+    bank = PsfBank("bar", (Axis("motion_px", 0.0, 40.0, 1.0),), (1,), (bar,), turns="motion")
+    values = np.zeros((81, 81, 1), np.float32)
+    values[40, 40] = 1.0
+    motion = np.broadcast_to(np.float32([0.0, 30.0]), (81, 81, 2))
+    found = LaplacianSpreadlets(bank).spread_bank(values, np.zeros((81, 81), np.float32), Place(motion_px=motion))[..., 0]
+    np.testing.assert_allclose(found[20:61, 20:61], bar[..., 0].T, atol=1e-7)
+    with pytest.raises(InputError, match="needs motion"):
+        LaplacianSpreadlets(bank).spread_bank(values, np.zeros((81, 81), np.float32), Place())
+
+
+def test_colours_of_a_bank_take_their_own_kernels_and_coverage_the_mean() -> None:
+    kernels = np.zeros((5, 5, 3), np.float32)
+    kernels[2, 0, 0] = kernels[2, 2, 1] = kernels[2, 4, 2] = 1.0
+    bank = PsfBank("prism", (Axis("eccentricity", 0.0, 1.0, 1.0),), (1,), (kernels,), turns="none")
+    values = np.zeros((9, 9, 4), np.float32)
+    values[4, 4] = 1.0
+    field_xy = np.zeros((9, 9, 2))
+    found = LaplacianSpreadlets(bank).spread_bank(values, np.zeros((9, 9), np.float32), Place(field_xy=field_xy))
+    np.testing.assert_allclose(found[4, 2:7, :3], kernels[2], atol=1e-7)
+    np.testing.assert_allclose(found[4, [2, 4, 6], 3], 1.0 / 3.0, atol=1e-7)
+
+
+def test_turning_a_kernel_is_turning_its_aperture() -> None:
+    kernel = Aperture.star().rasterize(60.0).kernel[..., None].astype(np.float32)
+    found = turned_kernel(kernel, 0.7)
+    truth = np.zeros_like(found[..., 0])
+    turned = Aperture.star().rotated(0.7).rasterize(60.0).kernel
+    side = (len(truth) - len(turned)) // 2
+    truth[side : side + len(turned), side : side + len(turned)] = turned
+    assert found.sum() == pytest.approx(1.0, abs=1e-6)
+    assert np.abs(found[..., 0] - truth).sum() < 0.05
+    np.testing.assert_array_equal(turned_kernel(kernel, np.pi), kernel[::-1, ::-1].astype(np.float64))
+
+
+LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=22.0, aperture=PENTAGON)
+
+
+def depth_for_coc_m(coc_px: np.ndarray, width_px: int) -> np.ndarray:
+    return (1.0 / (1.0 / LENS.focus_distance_m - coc_px / LENS.coc_px_per_dioptre(width_px))).astype(np.float32)
+
+
+def test_a_bank_renders_layers_as_its_aperture_does() -> None:
+    """At circles that the bank holds, near an edge of depth."""
+    coc_px = np.full(SIZE, 18.0)
+    coc_px[:, :50] = -6.0
+    layer = opaque(np.ascontiguousarray(picture(11)[..., :3]), depth_for_coc_m(coc_px, SIZE[1]))
+    with_bank = LaplacianSpreadlets(bank_of(PENTAGON)).render([layer], LENS)
+    without = LaplacianSpreadlets().render([layer], LENS)
+    assert psnr(with_bank.rgb, without.rgb) > 45.0
+    assert with_bank.extra == {}
+
+
+def samples_of_a_plane(coc_px: float, count: int, motion_px: tuple[float, float] = (0.0, 0.0)) -> tuple[LightFieldSamples, np.ndarray]:
+    """Samples of a bright square on black, one plane, and the sharp picture."""
+    rng, width, height = np.random.default_rng(12), 90, 80
+    xy = (np.indices((height, width))[::-1].reshape(2, -1).T[None] + rng.uniform(size=(count, height * width, 2))).reshape(-1, 2)
+    radius, angle = np.sqrt(rng.uniform(size=len(xy))), rng.uniform(0, 2 * np.pi, len(xy))
+    uv, time = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1), rng.uniform(size=len(xy))
+    motion = np.broadcast_to(motion_px, xy.shape)
+    at = xy - 0.5 * coc_px * uv - motion * (time - 0.5)[:, None]
+    sharp = np.zeros((height, width, 3), np.float32)
+    sharp[30:50, 35:55] = 1.0
+    lit = (at >= (35, 30)).all(axis=1) & (at < (55, 50)).all(axis=1)
+    depth_m = np.full(len(xy), depth_for_coc_m(np.float64(coc_px), width))
+    rgb = np.repeat(lit[:, None], 3, axis=1)
+    arrays = (xy, uv, time, rgb, depth_m, motion)
+    return LightFieldSamples(width, height, *(np.ascontiguousarray(each, np.float32) for each in arrays)), sharp
+
+
+@pytest.mark.parametrize(("coc_px", "motion_px"), [(20.0, (0.0, 0.0)), (-20.0, (0.0, 0.0)), (30.0, (0.0, 0.0)), (12.0, (15.0, 6.0))])
+def test_reconstruction_puts_each_kernel_once_and_where_it_belongs(coc_px: float, motion_px: tuple[float, float]) -> None:
+    """Of 4 noisy samples per pixel, the blur of the sharp square; splatted at the samples' own places it would be blurred twice."""
+    lens = replace(LENS, aperture=DISC)
+    samples, sharp = samples_of_a_plane(coc_px, 4, motion_px)
+    many, _ = samples_of_a_plane(coc_px, 256, motion_px)
+    found = LaplacianSpreadlets().reconstruct(samples, lens).rgb
+    truth = many.raw_picture()
+    assert psnr(found, truth) > psnr(samples.raw_picture(), truth) + 6.0
+    assert psnr(found, truth) > 34.0
+    assert sharp.sum() * 0.9 < found.sum() < sharp.sum() * 1.1
+
+
+def test_whole_laplacians_of_three_colours() -> None:
+    kernel = np.dstack([DISC.rasterize(9.0).kernel, DISC.rasterize(9.0).kernel[::-1], DISC.rasterize(9.0).kernel.T])
+    assert whole_laplacian(kernel).values.shape[1] == 3
