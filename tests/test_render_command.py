@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from mrbokeh.cli import app as everything
 from mrbokeh.commands.render import app
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.image_io import read_image, read_layer, write_layer
+from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import Layer, opaque
 from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
@@ -152,6 +154,20 @@ def test_a_mistake_gets_one_sentence_and_writes_nothing(folder: Path, mistake: s
         run(folder, *PICTURE, *options)
     assert "\n" not in str(caught.value)
     assert not (folder / "out.exr").exists()
+
+
+def test_a_bank_of_kernels_takes_the_place_of_the_opening(folder: Path) -> None:
+    """A bank of discs gives what the disc of a lens file gives, as near as its cells are fine."""
+    bank = folder / "bank"
+    made = CliRunner().invoke(everything, ["lens", "psf", "simple", "--diameter", "24", "--counts", "48", "--out", str(bank)])
+    assert made.exit_code == 0, made.output
+    spoil_lens(folder, aperture={"shape": "disc"})
+    by_bank, by_lens = (
+        read_image(run(folder, *PICTURE, "--method", "laplacian", *psf, out=f"{len(psf)}.exr")) for psf in (("--psf", str(bank)), ())
+    )
+    assert psnr(by_bank, by_lens) > 40.0
+    with pytest.raises(InputError, match="laplacian"):
+        run(folder, *PICTURE, "--psf", str(bank), out="other.exr")
 
 
 def test_half_a_picture_and_alpha_in_a_png_are_refused(folder: Path) -> None:

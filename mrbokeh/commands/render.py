@@ -1,13 +1,14 @@
 """`mrbokeh render`: blur a picture with depth, or layers, as a lens does."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
+from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import DEFAULT, make_renderer
 
 app = typer.Typer(add_completion=False)
@@ -30,8 +31,9 @@ def render(
         float, typer.Option(help="Part of the frame's time for which the shutter is open: 0.5 is 180 degrees.", min=0.0)
     ] = 0.5,
     method: Annotated[
-        str, typer.Option("--method", "--renderer", help="polygon, low-rank, scatter (exact, slow), or a trained network (.onnx).")
+        str, typer.Option("--method", "--renderer", help="polygon, low-rank, laplacian, scatter (exact, slow), or a network (.onnx).")
     ] = DEFAULT,
+    psf: Annotated[Path | None, typer.Option(help="Bank of PSFs in place of the lens's opening, for --method laplacian.")] = None,
     focus_distance_m: Annotated[float | None, typer.Option(help="Focus distance in place of the lens file's; inf is allowed.")] = None,
     focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None,
     srgb: Annotated[bool, typer.Option("--srgb", help="--rgb holds integers encoded as sRGB (highlights are lost).")] = False,
@@ -57,12 +59,24 @@ def render(
     sharp = _moving(sharp, rgb, motion, shutter)
     used = _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
     with working("rendering (the first time on a machine it takes a minute to compile)"):
-        blurred = make_renderer(method, threads=threads, layering=Layering(slices=slices)).render(list(sharp.values()), used)
+        renderer = _renderer(method, psf, threads=threads, layering=Layering(slices=slices))
+        blurred = renderer.render(list(sharp.values()), used)
     if alpha_out:
         write_layer(out, blurred)
     else:
         write_image(out, blurred.rgb)
     typer.echo(f"wrote {out}")
+
+
+def _renderer(method: str, psf: Path | None, **settings: Any) -> Renderer:
+    if psf is None:
+        return make_renderer(method, **settings)
+    if method != "laplacian":
+        raise InputError(f"--psf is for --method laplacian, got --method {method}: other methods take the opening of the lens file")
+    from mrbokeh.psf_bank_file import read_bank
+    from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+
+    return LaplacianSpreadlets(bank=read_bank(psf), **settings)
 
 
 def _read(rgb: Path | None, depth: Path | None, layers: list[Path], behind: list[Path], srgb: bool) -> dict[str, Layer]:
