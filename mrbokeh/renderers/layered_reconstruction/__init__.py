@@ -1,0 +1,159 @@
+"""Layered reconstruction of defocus and motion blur from few samples of the light field.
+
+Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/layered_reconstruction.md derives the filter.
+
+1. Samples are sorted into tiles and depth buckets; neighbouring buckets of a tile with like filters become one partition.
+2. Mean and variance of the blur and of the motion of a partition give its sheared filter.
+3. The samples around the tile are reprojected to the middle of pupil and shutter along the partition's slopes. Those of the
+   partition add colour and opacity, those behind it lower the opacity, for they were seen through it.
+4. A Gaussian over the screen spreads what the reprojection took together.
+5. Partitions are composited front to back.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from os import cpu_count
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer, flatten, opaque
+from mrbokeh.lens import Lens
+from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.renderers.layered_reconstruction._layer_samples import all_sharp, sample_layers
+from mrbokeh.renderers.layered_reconstruction._prepared import Prepared, prepared
+from mrbokeh.renderers.layered_reconstruction._pupil_spans import packed_pupil
+from mrbokeh.renderers.layered_reconstruction._settings import SCREEN_FILTERS, Settings, footprint_sigmas
+
+__all__ = ["SCREEN_FILTERS", "LayeredReconstruction", "PartitionCounts", "Settings", "footprint_sigmas"]
+
+_TILES_AT_ONCE = 8
+_KINDS = {"direct": 0, "sheared": 1, "texture": 2, "texture_one_tap": 3, "windows": 4}
+
+
+@dataclass(frozen=True)
+class PartitionCounts:
+    """Mean number of partitions per tile before layers are merged and after."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class LayeredReconstruction:
+    """Clean pictures from few samples, and a Renderer that takes samples of layers first.
+
+    per_pixel: how many samples of layers are taken a pixel. threads: 0 takes all cores. seed: of these samples and of the choice
+    that the sparse statistics look at.
+    """
+
+    settings: Settings = field(default_factory=Settings)
+    per_pixel: int = 64
+    threads: int = 0
+    seed: int = 0
+
+    def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
+        """See Renderer. Extra channels `motion_px` (mrbokeh.motion) blur as well.
+
+        Takes openings that are the same over the frame and for all colours; InputError for cat-eyes and chromatic errors.
+        """
+        flat, aperture = flatten(layers), lens.aperture
+        if aperture.varies_over_field or aperture.is_chromatic:
+            raise InputError(
+                "layered reconstruction takes openings that are the same over the frame and for all colours: set cat_eye, "
+                "axial_chromatic and lateral_chromatic to 0, or take another renderer"
+            )
+        if all_sharp(layers, lens):
+            return flat
+        samples, values, coc_px, margin = sample_layers(layers, lens, self.per_pixel, self.seed, self.threads)
+        spread, _ = self._reconstructed(samples, values, coc_px, lens.aperture)
+        inside = np.ascontiguousarray(spread[margin : margin + flat.height_px, margin : margin + flat.width_px])
+        extra, start = {}, 4
+        for name, plane in layers[0].extra.items():
+            extra[name] = inside[..., start : start + plane.shape[2]].copy()
+            start += plane.shape[2]
+        return Layer(inside[..., :3].copy(), np.clip(inside[..., 3], 0.0, 1.0), flat.depth_m, extra)
+
+    def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
+        """The picture that more samples would converge to: opaque, with the depth of the nearest sample of each pixel."""
+        rgb, _ = self.reconstruct_counted(samples, lens)
+        return opaque(rgb, _nearest_depth_m(samples))
+
+    def reconstruct_counted(self, samples: LightFieldSamples, lens: Lens) -> tuple[Float32[np.ndarray, "height width 3"], PartitionCounts]:
+        """The colour alone, and how many partitions it took."""
+        return self.reconstruct_values(samples, samples.rgb, lens)
+
+    def reconstruct_values(
+        self, samples: LightFieldSamples, values: Float32[np.ndarray, "samples channels"], lens: Lens
+    ) -> tuple[Float32[np.ndarray, "height width channels"], PartitionCounts]:
+        """Any values (N, C) in place of the samples' colour."""
+        return self._reconstructed(samples, values, samples.coc_px(lens), lens.aperture)
+
+    def _reconstructed(
+        self,
+        samples: LightFieldSamples,
+        values: Float32[np.ndarray, "samples channels"],
+        coc_px: Float32[np.ndarray, " samples"],
+        aperture: Aperture,
+    ) -> tuple[Float32[np.ndarray, "height width channels"], PartitionCounts]:
+        sorted_samples = prepared(samples, values, coc_px, self.settings)
+        partitions = self._survey(sorted_samples, samples.per_pixel)
+        out = np.zeros((samples.height_px, samples.width_px, values.shape[1]), np.float32)
+        self._reconstruct_tiles(out, sorted_samples, partitions, aperture)
+        before, after = partitions[2][partitions[2][:, 0] > 0].mean(axis=0)
+        return out, PartitionCounts(float(before), float(after))
+
+    def _survey(self, samples: Prepared, per_pixel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sums (T, B, 8), spans of buckets (T, B, 2) and counts before and after merging (T, 2) of all tiles."""
+        from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS
+        from mrbokeh.renderers.layered_reconstruction._statistics_numba import survey_tiles
+
+        chosen, tiles = self.settings, len(samples.starts) - 1
+        every = max(1, round(3 * per_pixel)) if chosen.sparse_statistics else 1
+        sums = np.empty((tiles, samples.buckets, SUMS))
+        spans, counts = np.zeros((tiles, samples.buckets, 2), np.int32), np.zeros((tiles, 2), np.int32)
+        choice = samples.window, chosen.sigma_x_px, chosen.bandwidth, (chosen.merge, chosen.merge_tolerance)
+
+        def run(part: np.ndarray) -> None:
+            survey_tiles(part, samples.starts, samples.bucket, samples.slopes, every, self.seed, *choice, sums, spans, counts)
+
+        self._each(run, tiles)
+        return sums, spans, counts
+
+    def _reconstruct_tiles(
+        self,
+        out: Float32[np.ndarray, "height width channels"],
+        samples: Prepared,
+        partitions: tuple[np.ndarray, np.ndarray, np.ndarray],
+        aperture: Aperture,
+    ) -> None:
+        from mrbokeh.renderers.layered_reconstruction._tiles_numba import reconstruct_tile
+
+        chosen, (sums, spans, counts) = self.settings, partitions
+        how = np.array([chosen.support, chosen.recursive_passes, footprint_sigmas(chosen.energy), chosen.tap_distance, chosen.enough])
+        light: tuple[Any, ...] = (samples.geometry, samples.values, samples.bucket, samples.starts, samples.window, samples.pupil_radius)
+        rest: tuple[Any, ...] = (chosen.sigma_x_px, chosen.bandwidth, how, _KINDS[chosen.screen_filter], *packed_pupil(aperture))
+
+        def run(part: np.ndarray) -> None:
+            for tile in part.tolist():
+                own = sums[tile], spans[tile], int(counts[tile, 1])
+                reconstruct_tile(out, tile, samples.columns, chosen.tile_px, *own, *light, *rest)
+
+        self._each(run, len(sums))
+
+    def _each(self, run: Callable[[np.ndarray], None], tiles: int) -> None:
+        """Tiles in groups; none touches another's pixels, so that their order and the number of threads change nothing."""
+        groups = [np.arange(first, min(first + _TILES_AT_ONCE, tiles)) for first in range(0, tiles, _TILES_AT_ONCE)]
+        with ThreadPoolExecutor(self.threads or cpu_count() or 1) as pool:
+            list(pool.map(run, groups))
+
+
+def _nearest_depth_m(samples: LightFieldSamples) -> Float32[np.ndarray, "height width"]:
+    depth_m = np.full((samples.height_px, samples.width_px), np.inf, np.float32)
+    x, y = samples.pixels()
+    np.minimum.at(depth_m, (y, x), samples.depth_m)
+    return depth_m

@@ -1,0 +1,144 @@
+"""Layers seen along rays: light field samples for a renderer that is given layers."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from os import cpu_count
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.motion import MOTION
+from mrbokeh.renderers.layered_reconstruction._pupil_spans import STRIPS, pupil_spans
+from mrbokeh.spreading import reach_px
+
+_BAND_ROWS = 16
+
+
+def motion_of(layer: Layer) -> Float32[np.ndarray, "height width 2"]:
+    """Motion in pixels, not premultiplied; 0 where the layer has none."""
+    if MOTION not in layer.extra:
+        return np.zeros((*layer.alpha.shape, 2), np.float32)
+    if layer.extra[MOTION].shape[2] != 2:
+        raise InputError(
+            f"the extra channel {MOTION!r} is motion in x and y and needs the shape (H, W, 2), got {layer.extra[MOTION].shape}"
+        )
+    return layer.extra[MOTION] / np.maximum(layer.alpha, 1e-6)[..., None]
+
+
+def coc_px_of(layer: Layer, lens: Lens) -> Float32[np.ndarray, "height width"]:
+    """Signed circle of confusion; 0 where nothing is covered and up to one pixel, where light stays as it is."""
+    covered = layer.alpha > 0
+    if not (layer.depth_m > 0)[covered].all():
+        raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
+    coc_px = lens.coc_px(np.where(covered, layer.depth_m, np.inf), layer.width_px)
+    return np.where(covered & (np.abs(coc_px) > 1.0), coc_px, 0.0).astype(np.float32)
+
+
+def all_sharp(layers: Sequence[Layer], lens: Lens) -> bool:
+    """Whether nothing moves and every circle of confusion is at most one pixel: then there is nothing to take samples of."""
+    return not any(coc_px_of(layer, lens).any() or motion_of(layer).any() for layer in layers)
+
+
+def sample_layers(
+    layers: Sequence[Layer], lens: Lens, per_pixel: int, seed: int, threads: int
+) -> tuple[LightFieldSamples, Float32[np.ndarray, "samples channels"], Float32[np.ndarray, " samples"], int]:
+    """Samples of the layers continued beyond the frame, their values (N, 4 + E: R, G, B, coverage, others), their circles of
+    confusion, and the margin in pixels.
+
+    Opaque layers go on beyond the frame as their border pixels do, others do not. A ray that meets nothing is a black sample
+    of coverage 0 at infinity.
+    """
+    coc_px, motions = [coc_px_of(layer, lens) for layer in layers], [motion_of(layer) for layer in layers]
+    blur_px = reach_px(lens.aperture, max(float(np.abs(each).max()) for each in coc_px))
+    margin = blur_px + int(np.ceil(0.5 * max(float(np.abs(motion).max()) for motion in motions)))
+    stacks = [
+        np.concatenate(
+            [layer.rgb, layer.alpha[..., None], *layer.extra.values(), each[..., None], layer.depth_m[..., None], motion], axis=2
+        )
+        for layer, each, motion in zip(layers, coc_px, motions, strict=True)
+    ]
+    continued = np.stack([_continued(stack, margin, bool((stack[..., 3] == 1.0).all())) for stack in stacks])
+    rays = _Rays(continued, lens, per_pixel, seed, threads)
+    hit = rays.met[:, 0] >= 0
+    met = np.zeros((len(hit), continued.shape[3]), np.float32)
+    met[:, -4], met[:, -3] = lens.coc_px(np.inf, layers[0].width_px), np.inf
+    met[hit] = continued[tuple(rays.met[hit].T)]
+    values = met[:, :-4] / np.where(hit, met[:, 3], 1.0)[:, None]
+    # A ray of an opaque scene that still met nothing left the continued picture; it says nothing.
+    keep = hit if rays.is_opaque else np.ones_like(hit)
+    size_px = continued.shape[2], continued.shape[1]
+    arrays = rays.xy_px, rays.lens_uv, rays.time, values[:, :3], met[:, -3], met[:, -2:]
+    samples = LightFieldSamples(*size_px, *(np.ascontiguousarray(each[keep]) for each in arrays))
+    return samples, values[keep], met[keep, -4], margin
+
+
+def _continued(planes: Float32[np.ndarray, "height width channels"], margin: int, is_opaque: bool) -> Float32[np.ndarray, "h w channels"]:
+    around = ((margin, margin), (margin, margin), (0, 0))
+    return np.pad(planes, around, mode="edge") if is_opaque else np.pad(planes, around)
+
+
+class _Rays:
+    """xy_px, lens_uv, time of all rays and what they met: (N, 3) layer, row and column, or -1."""
+
+    def __init__(
+        self, continued: Float32[np.ndarray, "layers height width _"], lens: Lens, per_pixel: int, seed: int, threads: int
+    ) -> None:
+        from mrbokeh.renderers.layered_reconstruction._layer_rays_numba import trace_rows
+
+        height, width = continued.shape[1:3]
+        count = height * width * per_pixel
+        self.xy_px, self.lens_uv = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32)
+        self.time, self.met = np.empty(count, np.float32), np.empty((count, 3), np.int32)
+        radius_px, alpha = np.ascontiguousarray(0.5 * continued[..., -4]), np.ascontiguousarray(continued[..., 3])
+        ranges = np.array([_range(r[a > 0]) for r, a in zip(radius_px, alpha, strict=True)])
+        self.is_opaque = bool((alpha == 1.0).all(axis=(1, 2)).any())
+        motion_px = np.ascontiguousarray(continued[..., -2:])
+        surfaces: tuple[Any, ...] = (
+            radius_px,
+            alpha,
+            motion_px,
+            np.stack([_fastest_around(each) for each in motion_px]),
+            ranges,
+            self.is_opaque,
+        )
+        pupil: tuple[Any, ...] = _pupil(lens)
+        results: tuple[Any, ...] = (self.xy_px, self.lens_uv, self.time, self.met)
+
+        def run(top: int) -> None:
+            trace_rows(top, min(top + _BAND_ROWS, height), width, per_pixel, seed, *pupil, *surfaces, *results)
+
+        with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
+            list(pool.map(run, range(0, height, _BAND_ROWS)))
+
+
+def _fastest_around(motion_px: Float32[np.ndarray, "height width 2"]) -> Float32[np.ndarray, "height width 2"]:
+    """Of all motions that begin within reach of a pixel, the fastest."""
+    from scipy.ndimage import maximum_filter
+
+    reach = int(np.ceil(0.5 * np.abs(motion_px).max()))
+    if reach == 0:
+        return motion_px
+    speeds = np.hypot(*motion_px.reshape(-1, 2).T)
+    order = np.argsort(speeds, kind="stable")
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order))
+    return motion_px.reshape(-1, 2)[order[maximum_filter(rank.reshape(motion_px.shape[:2]), 2 * reach + 1)]]
+
+
+def _range(radii_px: np.ndarray) -> tuple[float, float]:
+    return (float(radii_px.min()), float(radii_px.max())) if radii_px.size else (0.0, 0.0)
+
+
+def _pupil(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Strips in front of the focus and behind it, running sums of their weights, where each side begins, heights of the strips."""
+    sides = [lens.aperture.seen(side) for side in (-1, 1)]
+    tables = [pupil_spans(aperture, STRIPS[-1]) for aperture in sides]
+    corners = [np.concatenate(aperture.outlines)[:, 1] for aperture in sides]
+    heights = np.array([(v.max() - v.min()) / STRIPS[-1] for v in corners])
+    running = np.concatenate([np.cumsum(table[:, 3]) for table in tables])
+    return np.concatenate(tables), running, np.cumsum([0, *(len(table) for table in tables)]), heights

@@ -1,0 +1,53 @@
+"""The opening of a lens as strips along u: what the window filter sums over, and where rays are sent through."""
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from mrbokeh.aperture import Aperture
+
+STRIPS = (8, 16, 32, 64)
+"""How many strips a diameter has in the coarse to fine drawings of a pupil."""
+
+_LEAST_WIDTH = 1e-9
+
+
+def pupil_spans(aperture: Aperture, strips: int) -> Float64[np.ndarray, "spans 5"]:
+    """All stretches that let light pass on `strips` lines across a plain aperture: v, from u, to u, weight, height in v.
+
+    The weights sum to 1.
+    """
+    corners = np.concatenate(aperture.outlines)
+    low, high = float(corners[:, 1].min()), float(corners[:, 1].max())
+    lines = low + (np.arange(strips) + 0.5) * (high - low) / strips
+    table = np.array([(v, *stretch, (high - low) / strips) for v in lines.tolist() for stretch in _open_stretches(aperture, v)])
+    table[:, 3] /= table[:, 3].sum()
+    return table
+
+
+def packed_pupil(aperture: Aperture) -> tuple[Float64[np.ndarray, "spans 5"], Int64[np.ndarray, " starts"]]:
+    """All drawings of what is seen in front of the focus, then of what is seen behind it, and where each begins."""
+    tables = [pupil_spans(aperture.seen(side), strips) for side in (-1, 1) for strips in STRIPS]
+    return np.concatenate(tables), np.cumsum([0, *(len(table) for table in tables)])
+
+
+def _open_stretches(aperture: Aperture, v: float) -> list[tuple[float, float, float]]:
+    """From u, to u and length times weight along one line, where the weights of all outlines together are above 0."""
+    steps = []
+    for outline, weight in zip(aperture.outlines, aperture.weights, strict=True):
+        steps += [(u, weight if k % 2 == 0 else -weight) for k, u in enumerate(_crossings(outline, v))]
+    steps.sort()
+    stretches, open_share = [], 0.0
+    for (u, step), (following, _) in pairwise(steps):
+        open_share += step
+        if open_share > _LEAST_WIDTH and following - u > _LEAST_WIDTH:
+            stretches.append((u, following, open_share * (following - u)))
+    return stretches
+
+
+def _crossings(outline: Float64[np.ndarray, "points 2"], v: float) -> list[float]:
+    """Where a closed outline crosses the line of this v, from left to right."""
+    closed = np.concatenate([outline, outline[:1]])
+    pairs = ((a, b) for a, b in pairwise(closed) if (a[1] <= v) != (b[1] <= v))
+    return sorted(float(a[0] + (v - a[1]) / (b[1] - a[1]) * (b[0] - a[0])) for a, b in pairs)
