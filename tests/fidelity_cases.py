@@ -1,5 +1,6 @@
 """Pictures with a known defocused truth: the card scene, and folders written by datasets_scripts/render_truth.py."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +87,8 @@ def card_cases(seeds: Sequence[int], kept: Path | None) -> Iterator[Case]:
 
 
 def truth_cases(folder: Path) -> Iterator[Case]:
-    """All finished truths under a folder of scenes and views."""
+    """All finished truths under a folder of scenes and views; equal apertures are one object, whose tables renderers keep."""
+    known: dict[str, Aperture] = {}
     for meta_path in sorted(folder.glob("*/*/meta.json")):
         view, meta = meta_path.parent, read_json(meta_path, "the description of a view")
         if not (view / "depth.exr").is_file():
@@ -96,9 +98,11 @@ def truth_cases(folder: Path) -> Iterator[Case]:
         layer_paths = [view / each for each in meta["layers"]]
         layers = [read_layer(path) for path in layer_paths] if all(path.is_file() for path in layer_paths) else []
         for shape, files in meta["truth"].items():
+            document = meta["apertures"][shape]
+            aperture = known.setdefault(json.dumps(document), _aperture(document))
             for file, focus_m in zip(files, meta["focus_distances_m"], strict=True):
                 if (view / file).is_file():
-                    lens = Lens(**meta["lens"], focus_distance_m=focus_m, aperture=_aperture(meta["apertures"][shape]))
+                    lens = Lens(**meta["lens"], focus_distance_m=focus_m, aperture=aperture)
                     name = f"{view.parent.name}/{Path(file).stem}"
                     yield Case(name, meta["kind"], shape, picture, layers, lens, read_image(view / file), display=False)
 

@@ -31,7 +31,7 @@ def render(
         float, typer.Option(help="Part of the frame's time for which the shutter is open: 0.5 is 180 degrees.", min=0.0)
     ] = 0.5,
     method: Annotated[
-        str, typer.Option("--method", "--renderer", help="polygon, low-rank, laplacian, scatter (exact, slow), or a network (.onnx).")
+        str, typer.Option("--method", "--renderer", help="polygon, low-rank, laplacian, lrdm, scatter (exact, slow), or a network (.onnx).")
     ] = DEFAULT,
     psf: Annotated[Path | None, typer.Option(help="Bank of PSFs in place of the lens's opening, for --method laplacian.")] = None,
     focus_distance_m: Annotated[float | None, typer.Option(help="Focus distance in place of the lens file's; inf is allowed.")] = None,

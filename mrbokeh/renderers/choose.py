@@ -36,7 +36,13 @@ def _laplacian(**settings: Any) -> Renderer:
     return LaplacianSpreadlets(**settings)
 
 
-BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "scatter": _scatter}
+def _lrdm(threads: int, layering: Layering) -> Renderer:  # noqa: ARG001 (it makes layers of its own)
+    from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction
+
+    return LayeredReconstruction(threads=threads)
+
+
+BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "lrdm": _lrdm, "scatter": _scatter}
 
 
 def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None) -> Renderer:

@@ -6,7 +6,8 @@ from numba import njit
 from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS, extents, slope_distance
 
 SLOPES = 2.0
-"""Slopes may differ by twice the share by which filters may shrink: with that 4.2 partitions of a tile become 2.9 and nothing is lost."""
+"""Slopes may differ by so many times the share by which filters may shrink. With 2, 4.0 partitions of a tile become 2.7 in the fence scene
+of the benchmark and 7.4 become 3.4 on its slanted plane, for 0.1 and 0.8 to 1.0 dB; with 1 fewer merge, for nearly nothing."""
 
 
 @njit(cache=True, nogil=True)
