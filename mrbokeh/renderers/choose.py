@@ -36,10 +36,11 @@ def _laplacian(**settings: Any) -> Renderer:
     return LaplacianSpreadlets(**settings)
 
 
-def _lrdm(threads: int, layering: Layering) -> Renderer:  # noqa: ARG001 (it makes layers of its own)
+def _lrdm(**settings: Any) -> Renderer:
+    """It makes layers of its own."""
     from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction
 
-    return LayeredReconstruction(threads=threads)
+    return LayeredReconstruction(threads=settings["threads"])
 
 
 BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "lrdm": _lrdm, "scatter": _scatter}
