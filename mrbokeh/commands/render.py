@@ -30,6 +30,9 @@ def render(
     shutter: Annotated[
         float, typer.Option(help="Part of the frame's time for which the shutter is open: 0.5 is 180 degrees.", min=0.0)
     ] = 0.5,
+    samples: Annotated[
+        Path | None, typer.Option(help="Noisy light field samples (.npz, .exr) in place of pictures, for --method lrdm or laplacian.")
+    ] = None,
     method: Annotated[
         str, typer.Option("--method", "--renderer", help="polygon, low-rank, laplacian, lrdm, scatter (exact, slow), or a network (.onnx).")
     ] = DEFAULT,
@@ -55,12 +58,14 @@ def render(
     refuse_existing(out, overwrite)
     if alpha_out and out.suffix.lower() != ".exr":
         raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
-    sharp = _read(rgb, depth, layer or [], behind or [], srgb)
-    sharp = _moving(sharp, rgb, motion, shutter)
-    used = _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
+    given = [rgb, depth, *(layer or []), *(behind or []), motion, focus_distance_m, focus_at]
+    sharp = {} if samples is not None else _moving(_read(rgb, depth, layer or [], behind or [], srgb), rgb, motion, shutter)
+    used = read_lens(lens) if samples is not None else _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
+    if samples is not None and any(each is not None for each in given):
+        raise InputError("--samples holds all there is to see, with its focus and its motion: leave out pictures, layers, motion and focus")
     with working("rendering (the first time on a machine it takes a minute to compile)"):
         renderer = _renderer(method, psf, threads=threads, layering=Layering(slices=slices))
-        blurred = renderer.render(list(sharp.values()), used)
+        blurred = renderer.render(list(sharp.values()), used) if samples is None else _reconstructed(renderer, method, samples, used)
     if alpha_out:
         write_layer(out, blurred)
     else:
@@ -77,6 +82,14 @@ def _renderer(method: str, psf: Path | None, **settings: Any) -> Renderer:
     from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
 
     return LaplacianSpreadlets(bank=read_bank(psf), **settings)
+
+
+def _reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) -> Layer:
+    from mrbokeh.light_field_samples_file import read_samples
+
+    if not hasattr(renderer, "reconstruct"):
+        raise InputError(f"--samples are for --method lrdm or laplacian, got --method {method}")
+    return renderer.reconstruct(read_samples(samples), lens)
 
 
 def _read(rgb: Path | None, depth: Path | None, layers: list[Path], behind: list[Path], srgb: bool) -> dict[str, Layer]:
