@@ -8,7 +8,7 @@ holds one sample that fell on it, in 32 bit channels (16 bit are read as well):
     Z                        depth along the axis in metres; inf is background, 0 says that the pixel has no such sample
     lens.u, lens.v           place in the unit pupil, x right, y down
     time                     0 (shutter opens) to 1 (it closes)
-    forward.u, forward.v     motion in pixels during the shutter, x right, y down
+    forward.u, forward.v     motion in pixels during the shutter, right and up as renderers count it
     x, y                     where the ray met the sensor, in pixels from the top left corner (the pixel's centre is (i + 0.5, j + 0.5))
 """
 
@@ -31,6 +31,7 @@ CHANNELS = {
     "motion_px": ("forward.u", "forward.v"),
     "xy_px": ("x", "y"),
 }
+_UPWARDS = "forward.v"
 _SUFFIXES = (".npz", ".exr")
 
 
@@ -95,7 +96,7 @@ def _parts(samples: LightFieldSamples) -> list[ExrPart]:
             values = getattr(samples, name)[here].reshape(len(here), -1)
             for c, letter in enumerate(letters):
                 channels[letter] = np.zeros((samples.height_px, samples.width_px), np.float32)
-                channels[letter][where] = values[:, c]
+                channels[letter][where] = -values[:, c] if letter == _UPWARDS else values[:, c]
         parts.append(ExrPart(channels, f"sample{k:02d}"))
     return parts
 
@@ -110,5 +111,6 @@ def _from_parts(parts: list[ExrPart], path: Path | str) -> LightFieldSamples:
     arrays = {}
     for name, letters in CHANNELS.items():
         values = np.stack([part.stacked(letters) for part in parts], axis=2)[held]
+        values = values * np.float32([-1.0 if letter == _UPWARDS else 1.0 for letter in letters])
         arrays[name] = values if len(letters) > 1 else values[:, 0]
     return LightFieldSamples(width_px, height_px, **arrays)

@@ -143,3 +143,20 @@ def test_a_file_cut_short_and_one_of_the_future_are_refused(samples: LightFieldS
 
 
 _FIELDS = ("xy_px", "lens_uv", "time", "rgb", "depth_m", "motion_px")
+
+
+def test_motion_points_up_in_files(tmp_path: Path) -> None:
+    """forward.v counts upwards in EXR files, as in those of renderers; here y goes down."""
+    one = {
+        "xy_px": [[0.5, 0.5]],
+        "lens_uv": [[0.0, 0.0]],
+        "time": [0.5],
+        "rgb": [[1.0, 1.0, 1.0]],
+        "depth_m": [2.0],
+        "motion_px": [[3.0, 4.0]],
+    }
+    samples = LightFieldSamples(1, 1, **{name: np.array(values, np.float32) for name, values in one.items()})
+    write_samples(tmp_path / "one.exr", samples)
+    channels = read_exr(tmp_path / "one.exr")[0].channels
+    assert (channels["forward.u"][0, 0], channels["forward.v"][0, 0]) == (3.0, -4.0)
+    np.testing.assert_array_equal(read_samples(tmp_path / "one.exr").motion_px, samples.motion_px)
