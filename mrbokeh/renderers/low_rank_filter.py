@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from os import cpu_count
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -31,6 +30,7 @@ from mrbokeh.renderers._low_rank_exact import scatter_exactly
 from mrbokeh.renderers._low_rank_highlights import LEAST_RADIUS_PX, exact_share
 from mrbokeh.renderers._low_rank_levels import Levels, Taps, levels_of, taps_of
 from mrbokeh.renderers._low_rank_per_pixel import depth_edge_mask, scatter_per_pixel
+from mrbokeh.workers import cores
 
 _PIECE_ROWS, _PIECE_TILES = 192, 4  # fixed pieces of work: the result does not depend on the number of threads
 _MOST_CHANNELS = 16  # at once
@@ -78,7 +78,7 @@ class LowRankFilter:
             return np.concatenate([self.spread(np.ascontiguousarray(part), coc_px, aperture) for part in parts], axis=2)
         from mrbokeh.renderers._low_rank_pixels_numba import one_side
 
-        with ThreadPoolExecutor(self.threads or cpu_count() or 1) as pool:
+        with ThreadPoolExecutor(self.threads or cores()) as pool:
             out, diameters_px, sides, signed = _split(values, coc_px, 1.0 / aperture.unit_radius, pool.map)
             for sign in sides:
                 self._spread_side(out, values, one_side(diameters_px, sign), coc_px, aperture, sign, pool.map)

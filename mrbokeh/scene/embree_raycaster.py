@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from os import cpu_count
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
@@ -22,6 +21,7 @@ from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.pixel_edges import edge_pixels, sixteen_offsets_px
 from mrbokeh.scene.silhouettes import silhouette_pixels
 from mrbokeh.scene.virtual_scene import Scene
+from mrbokeh.workers import cores
 
 _RAYS_AT_ONCE = 1 << 16
 _Result = TypeVar("_Result")
@@ -41,7 +41,7 @@ class EmbreeRaycaster:
         """threads: None takes all cores. most_layers: how many see-through surfaces a ray follows behind each other."""
         if most_layers < 1 or (threads is not None and threads < 1):
             raise InputError(f"expected at least one thread and one layer, got {threads} and {most_layers}")
-        self._threads = threads or cpu_count() or 1
+        self._threads = threads or cores()
         self._most_layers = most_layers
         self._scenes: WeakKeyDictionary[Scene, PreparedScene] = WeakKeyDictionary()
         self._grounds: WeakKeyDictionary[Mesh, PreparedScene] = WeakKeyDictionary()

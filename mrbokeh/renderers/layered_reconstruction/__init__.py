@@ -13,7 +13,6 @@ Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/layer
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from os import cpu_count
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from mrbokeh.renderers.layered_reconstruction._layer_samples import all_sharp, s
 from mrbokeh.renderers.layered_reconstruction._prepared import Prepared, prepared
 from mrbokeh.renderers.layered_reconstruction._pupil_spans import packed_pupil
 from mrbokeh.renderers.layered_reconstruction._settings import SCREEN_FILTERS, Settings, footprint_sigmas
+from mrbokeh.workers import cores
 
 __all__ = ["SCREEN_FILTERS", "LayeredReconstruction", "PartitionCounts", "Settings", "footprint_sigmas"]
 
@@ -148,7 +148,7 @@ class LayeredReconstruction:
     def _each(self, run: Callable[[np.ndarray], None], tiles: int) -> None:
         """Tiles in groups; none touches another's pixels, so that their order and the number of threads change nothing."""
         groups = [np.arange(first, min(first + _TILES_AT_ONCE, tiles)) for first in range(0, tiles, _TILES_AT_ONCE)]
-        with ThreadPoolExecutor(self.threads or cpu_count() or 1) as pool:
+        with ThreadPoolExecutor(self.threads or cores()) as pool:
             list(pool.map(run, groups))
 
 
