@@ -111,6 +111,6 @@ def _from_parts(parts: list[ExrPart], path: Path | str) -> LightFieldSamples:
     arrays = {}
     for name, letters in CHANNELS.items():
         values = np.stack([part.stacked(letters) for part in parts], axis=2)[held]
-        values = values * np.float32([-1.0 if letter == _UPWARDS else 1.0 for letter in letters])
+        values = values * np.array([-1.0 if letter == _UPWARDS else 1.0 for letter in letters], np.float32)
         arrays[name] = values if len(letters) > 1 else values[:, 0]
     return LightFieldSamples(width_px, height_px, **arrays)
