@@ -12,15 +12,18 @@ from jaxtyping import Bool, Float32
 from mrbokeh.renderers._polygon_differences_numba import settle, spread_part
 from mrbokeh.renderers._polygon_halves import halves_of
 from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
+from mrbokeh.renderers._polygon_memory import laid_out, ring_elements, ring_of, scratch_of
 from mrbokeh.renderers._polygon_ring_numba import Picture, Target
 from mrbokeh.renderers._polygon_survey_numba import TILE_PX
-from mrbokeh.renderers._polygon_tables import ApertureTables, laid_out, ring_elements, ring_of, scratch_of
+from mrbokeh.renderers._polygon_tables import ApertureTables
 from mrbokeh.zeroed_memory import ZeroedMemory
 
 BAND_ROWS = 384
 """Least height of a band; two margins where these are larger. Bands do not depend on the number of threads."""
 RING_BYTES = 6 << 20
 """A band is worked through in parts so narrow that the ring fits the cache, but not narrower than four margins."""
+SETTLED_ROWS = 128
+"""Rows that are completed together when all bands are done."""
 FEW_PIXELS = 1 << 18
 """Pictures below this size are one band."""
 SPARSE, SPARSE_PART_PX = 0.5, 96
@@ -115,13 +118,13 @@ class Workshop:
         picture = Picture(light.values, light.coc_px, highlights, halved, nonnegative, light.largest_of_tile_px)
         self._spread_bands(picture, list(zip(bands, targets, strict=False)), margin)
         starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
-        pieces, cuts = strays.reshape(2 * len(edges), *strays.shape[2:]), np.linspace(0, len(out), 2 * self.threads + 1).astype(int)
+        pieces = strays.reshape(2 * len(edges), *strays.shape[2:])
 
-        def finish(top: int, bottom: int) -> None:
-            target = Target(flat, strays[0, 0], strays[0, 1], top, bottom)
+        def finish(top: int) -> None:
+            target = Target(flat, strays[0, 0], strays[0, 1], top, min(top + SETTLED_ROWS, len(out)))
             settle(target, pieces, starts, half, np.empty(half.shape[1], np.float32), nonnegative)
 
-        list(self.pool.map(finish, map(int, cuts[:-1]), map(int, cuts[1:])))
+        list(self.pool.map(finish, range(0, len(out), SETTLED_ROWS)))
         return out
 
     def _spread_bands(self, picture: Picture, bands: list[tuple[Band, Target]], margin: int) -> None:

@@ -117,7 +117,7 @@ def _sorted(
 ) -> tuple[int, float, float]:
     """Splat whole what need not go through the sums; how many pixels do, their largest radius, the largest diameter of the rest."""
     values, coc_px = picture.values, picture.coc_px
-    count, largest, whole = 0, 0.0, np.float32(0.0)
+    count, small, largest, whole = 0, 0, 0.0, np.float32(0.0)
     per_share = 1.0 / (exact.to_px - exact.from_px)
     for x in range(left, right):
         if values[y, x, 0] == 0 and values[y, x, 1] == 0 and values[y, x, 2] == 0 and values[y, x, 3] == 0:
@@ -130,7 +130,8 @@ def _sorted(
             if size <= np.float32(1.0):
                 keep(values, ring, row, y, x)
             else:
-                splat_small(values, coc_px[y, x], exact, ring, scratch, row, y, x, 1.0 - summed)
+                scratch.small[small], scratch.small_share[small] = np.int32(x), np.float32(1.0 - summed)
+                small += 1
         if summed > 0.0 and picture.share.shape[0] > 0 and picture.share[y, x] > 0:
             splat_exactly(values, coc_px[y, x], exact, ring, scratch, row, y, x, summed * picture.share[y, x])
             summed *= 1.0 - picture.share[y, x]
@@ -144,4 +145,5 @@ def _sorted(
             scratch.radius[count] = scratch.radius.dtype.type(math.copysign(radius, coc_px[y, x]))
             scratch.gain[count] = scratch.gain.dtype.type(summed)
             count += 1
+    splat_small(values, coc_px, exact, ring, scratch, row, y, small)
     return count, largest, float(whole)

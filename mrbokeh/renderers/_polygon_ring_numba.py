@@ -17,6 +17,9 @@ GUARD = 16
 """Elements (four cells) before the first of a row of sums, which a step to the side may reach."""
 ALIASED_ROWS = 4
 """Rows before and after the ring proper that stand for its last and first ones: a corner reaches a few rows beyond its own."""
+APART_PX = 8
+"""Pixels that follow one another when they are splatted are so far apart: neighbours add to overlapping pairs of cells, and
+the second would wait for the first."""
 
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False)  # type: ignore[call-overload]
 """Without counting references, which would be atomic and cost as much as the work: nothing here allocates."""
@@ -71,17 +74,18 @@ class Sums(NamedTuple):
 class Exact(NamedTuple):
     """Kernels that are splatted whole.
 
-    lower, rise: kernels of small diameters, flat, and what to add to them to reach those of the next level; `per_px` levels to
-    a pixel, from 1 px on, behind the focus and then in front. start: (side, level) where each begins, a square of `radius`
-    around the pixel. span: (side, level, row, 2) the columns of a row between which it is not 0.
+    lower, rise: taps of kernels of small diameters, in pairs of neighbours, and what to add to them to reach those of the next
+    level; `per_px` levels to a pixel, from 1 px on, `levels` behind the focus and then as many in front. place (pairs, 2): row,
+    counted from -radius on, and 4 times the column, counted from the pixel. start: with which pair each level begins, and the end.
     from_px, to_px: between these diameters the sums take over. vertices, starts, weights, unit_radius: the aperture itself.
     """
 
     lower: np.ndarray
     rise: np.ndarray
+    place: np.ndarray
     start: np.ndarray
-    span: np.ndarray
-    radius: np.ndarray
+    levels: int
+    radius: int
     per_px: float
     from_px: float
     to_px: float
@@ -109,8 +113,9 @@ class Ring(NamedTuple):
 class Scratch(NamedTuple):
     """Work space of one thread.
 
-    sums: (rows of all directions, 4 stride + 2 GUARD). total: (4 stride). taps: for the largest small kernel. kernel: 2 times
-    the largest kernel.
+    sums: (rows of all directions, 4 stride + 2 GUARD). total: (4 stride). small, small_share: the pixels of a chunk with small
+    kernels, and how much of their light these spread. rows: where column 0 of the picture is in the rows
+    that small kernels reach. taps: for a row of a kernel. kernel: 2 times the largest kernel.
     """
 
     element: np.ndarray
@@ -123,6 +128,9 @@ class Scratch(NamedTuple):
     sums: np.ndarray
     total: np.ndarray
     carry: np.ndarray
+    small: np.ndarray
+    small_share: np.ndarray
+    rows: np.ndarray
     taps: np.ndarray
     kernel: np.ndarray
 

@@ -3,12 +3,9 @@
 import numpy as np
 
 from mrbokeh.renderers._polygon_aim_numba import AIM_PX, CHUNK_PX, aim_level, aim_steep
-from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, Corners, Ring, Scratch, compiled
+from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, APART_PX, Corners, Ring, Scratch, compiled
 from mrbokeh.renderers._polygon_vector_numba import add_to_cell, add_to_two_cells, fetch, scaled
 
-APART_PX = 8
-"""Pixels that follow one another when corners are splatted are so far apart: neighbours add to overlapping pairs of cells, and
-the second would wait for the first."""
 CELLS_OF_LINE = 4
 """Cells of four numbers in single precision that share a line of the cache."""
 

@@ -39,6 +39,18 @@ def filled(builder: ir.IRBuilder, value: Any, lanes: int) -> Any:
     return shuffled(builder, one, [0] * lanes)
 
 
+def _add_weighted(builder: ir.IRBuilder, data: Any, at: Any, weights: Any, value: Any, size: int) -> None:
+    """data[at + 4 k : at + 4 k + 4] += weights[k] * value, a tuple of four."""
+    real, cells = weights.type.element, weights.type.count
+    four = ir.Constant(ir.VectorType(real, 4), ir.Undefined)
+    for lane in range(4):
+        four = builder.insert_element(four, builder.extract_value(value, lane), ir.Constant(ir.IntType(32), lane))
+    each = shuffled(builder, weights, [lane // 4 for lane in range(4 * cells)])
+    product = builder.fmul(shuffled(builder, four, [lane % 4 for lane in range(4 * cells)]), each, flags=("contract",))
+    there = load_vector(builder, data, at, real, 4 * cells, size)
+    store_vector(builder, builder.fadd(there, product, flags=("contract",)), data, at, size)
+
+
 def _adding_to(cells: int) -> Any:
     """Neighbouring cells: array[at + 4 k : at + 4 k + 4] += weights[first + k] * value for k = 0 .. cells - 1.
 
@@ -53,14 +65,8 @@ def _adding_to(cells: int) -> Any:
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
             real = context.get_value_type(array.dtype)
             data, weights = (data_of(context, builder, signature.args[k], arguments[k]) for k in (0, 2))
-            four = ir.Constant(ir.VectorType(real, 4), ir.Undefined)
-            for lane in range(4):
-                four = builder.insert_element(four, builder.extract_value(arguments[4], lane), ir.Constant(ir.IntType(32), lane))
             weight = load_vector(builder, weights, arguments[3], real, cells, size)
-            each = shuffled(builder, weight, [lane // 4 for lane in range(4 * cells)])
-            product = builder.fmul(shuffled(builder, four, [lane % 4 for lane in range(4 * cells)]), each, flags=("contract",))
-            there = load_vector(builder, data, arguments[1], real, 4 * cells, size)
-            store_vector(builder, builder.fadd(there, product, flags=("contract",)), data, arguments[1], size)
+            _add_weighted(builder, data, arguments[1], weight, arguments[4], size)
             return context.get_dummy_value()
 
         return signature, generate
@@ -89,6 +95,27 @@ def _scaled(typing_context: Any, values: Any, at: Any, gain: Any) -> Lowering:
 
 
 @intrinsic
+def _blend_onto_two_cells(typing_context: Any, array: Any, at: Any, lower: Any, rise: Any, first: Any, upper: Any, value: Any) -> Lowering:
+    """Neighbouring cells: array[at + 4 k : at + 4 k + 4] += (lower[first + k] + upper * rise[first + k]) * value for k = 0, 1.
+
+    lower, rise: flat, single precision, as `upper` is; for the rest see `_adding_to`.
+    """
+    signature = types.void(array, types.intp, lower, rise, types.intp, types.float32, types.UniTuple(array.dtype, 4))
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+        data, lower, rise = (data_of(context, builder, signature.args[k], arguments[k]) for k in (0, 2, 3))
+        low, more = (load_vector(builder, each, arguments[4], ir.FloatType(), 2, 4) for each in (lower, rise))
+        weights = builder.fadd(low, builder.fmul(filled(builder, arguments[5], 2), more, flags=("contract",)), flags=("contract",))
+        real = context.get_value_type(array.dtype)
+        if real != ir.FloatType():
+            weights = builder.fpext(weights, ir.VectorType(real, 2))
+        _add_weighted(builder, data, arguments[1], weights, arguments[6], array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
 def _fetch(typing_context: Any, array: Any, at: Any) -> Lowering:
     """Have the cache line of array[at] ready for writing soon."""
     signature = types.void(array, types.intp)
@@ -106,5 +133,6 @@ def _fetch(typing_context: Any, array: Any, at: Any) -> Lowering:
 # Compiled code calls them without the typing context, which type checkers cannot know.
 add_to_cell: Any = _adding_to(1)
 add_to_two_cells: Any = _adding_to(2)
+blend_onto_two_cells: Any = _blend_onto_two_cells
 scaled: Any = _scaled
 fetch: Any = _fetch

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from mrbokeh._polygon_coverage_numba import fill_psf
-from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, Exact, Ring, Scratch, compiled
-from mrbokeh.renderers._polygon_vector_numba import add_to_cell, add_to_two_cells
+from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, APART_PX, Exact, Ring, Scratch, compiled
+from mrbokeh.renderers._polygon_vector_numba import add_to_cell, add_to_two_cells, blend_onto_two_cells, scaled
 
 
 @compiled
@@ -25,31 +25,30 @@ def keep(values: np.ndarray, ring: Ring, row: int, y: int, x: int) -> None:
 
 
 @compiled
-def splat_small(
-    values: np.ndarray, diameter_px: float, exact: Exact, ring: Ring, scratch: Scratch, row: int, y: int, x: int, share: float
-) -> None:
-    """A whole kernel, between the two of the table nearest in diameter."""
-    at = (abs(diameter_px) - 1.0) * exact.per_px
-    side = 0 if diameter_px > 0 else 1
-    level = min(int(at), exact.radius.shape[0] - 1)
-    radius = exact.radius[level]
-    size = 2 * radius + 1
-    start = exact.start[side, level]
-    taps = scratch.taps[: size * size]
-    _blend(taps, exact.lower[start:], exact.rise[start:], np.float32(at - level), np.float32(share))
-    element = ring.planes.dtype.type
-    value = (element(values[y, x, 0]), element(values[y, x, 1]), element(values[y, x, 2]), element(values[y, x, 3]))
+def splat_small(values: np.ndarray, coc_px: np.ndarray, exact: Exact, ring: Ring, scratch: Scratch, row: int, y: int, count: int) -> None:
+    """The pixels of row y that scratch.small names, each the share of its light in scratch.small_share, by whole kernels."""
     plane = ring.light_plane * ring.plane_elements
-    for j in range(size):
-        cell = plane + _cell(ring, row + j - radius, x - radius)
-        _add_line(ring.planes, cell, taps, j * size, exact.span[side, level, j, 0], exact.span[side, level, j, 1], value)
+    for j in range(scratch.rows.shape[0]):
+        scratch.rows[j] = plane + _cell(ring, row + j - exact.radius, 0)
+    for start in range(min(APART_PX, count)):
+        for i in range(start, count, APART_PX):
+            x = np.int64(scratch.small[i])
+            value = scaled(values.reshape(-1), 4 * (y * values.shape[1] + x), ring.planes.dtype.type(scratch.small_share[i]))
+            _splat_small(coc_px[y, x], exact, ring, scratch.rows, 4 * x, value)
 
 
 @compiled
-def _blend(taps: np.ndarray, lower: np.ndarray, rise: np.ndarray, upper: float, share: float) -> None:
-    element = taps.dtype.type
-    for i in range(taps.shape[0]):
-        taps[i] = element(share * (lower[i] + upper * rise[i]))
+def _splat_small(
+    diameter_px: float, exact: Exact, ring: Ring, rows: np.ndarray, element: int, value: tuple[float, float, float, float]
+) -> None:
+    """A whole kernel, between the two of the table nearest in diameter."""
+    at = (abs(diameter_px) - np.float32(1.0)) * np.float32(exact.per_px)
+    level = min(int(at), exact.levels - 1)
+    upper = at - np.float32(level)
+    table = level if diameter_px > 0 else level + exact.levels
+    for pair in range(exact.start[table], exact.start[table + 1]):
+        cell = rows[exact.place[pair, 0]] + exact.place[pair, 1] + element
+        blend_onto_two_cells(ring.planes, cell, exact.lower, exact.rise, 2 * pair, upper, value)
 
 
 @compiled
