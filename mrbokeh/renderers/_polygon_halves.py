@@ -62,7 +62,7 @@ def _tiles_with(highlights: Float32[np.ndarray, "height width"], tiles: tuple[in
 
 
 def _diameters_of_blocks(light: SurveyedLight, limits: Limits, pool: Executor) -> tuple[Blocks, Blocks]:
-    from mrbokeh.renderers._polygon_halves_numba import measure_blocks
+    from mrbokeh.renderers._polygon_blocks_numba import measure_blocks
 
     height, width = light.coc_px.shape
     lowest, highest = (np.empty((-(-height // 2), -(-width // 2)), np.float32) for _ in range(2))
@@ -78,7 +78,7 @@ def _diameters_of_blocks(light: SurveyedLight, limits: Limits, pool: Executor) -
 def _chosen(
     lowest: Blocks, highest: Blocks, of_tiles: Float32[np.ndarray, "_ _"], limits: Limits, pool: Executor
 ) -> tuple[Blocks, Blocks, Float32[np.ndarray, "_ _"], Bool[np.ndarray, "_ _"]]:
-    from mrbokeh.renderers._polygon_halves_numba import choose_blocks
+    from mrbokeh.renderers._polygon_blocks_numba import choose_blocks
 
     share, weighted_px = np.empty_like(lowest), np.empty_like(lowest)
     largest_px, kept = of_tiles.copy(), np.empty(of_tiles.shape, np.bool_)
