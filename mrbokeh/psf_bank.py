@@ -10,81 +10,15 @@ from jaxtyping import Float, Float32, Float64, Int64
 
 from mrbokeh.errors import InputError
 from mrbokeh.nested_grid import NestedGrid
+from mrbokeh.proportional_grid import ProportionalGrid
+from mrbokeh.psf_axis import Axis
 
-AxisName = Literal["diameter_px", "motion_px", "depth_m", "eccentricity"]
 Turns = Literal["none", "motion", "field"]
 Kernel = Float32[np.ndarray, "size size channels"]
+Grid = NestedGrid | ProportionalGrid
 
 _MOST_LIGHT = 1.001
 """What a kernel may sum to: 1, but for the rounding of float32."""
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One coordinate of a space of PSFs and how its range is mapped to 0..1 (power remapping, Leimkuehler 2018, Section 5.2).
-
-    With the share x of the range at which a coordinate lies, its unit coordinate is x ** (1 / exponent): equal steps of the
-    unit coordinate are steps of x that grow for exponent > 1, so small coordinates are sampled more finely (the beta of the
-    paper's Table 1).
-
-    name: diameter_px, the circle of confusion (diameter); motion_px, path per shutter; depth_m, along the optical axis;
-    eccentricity, distance from the middle of the frame in half diagonals.
-    A diameter axis that begins at 0 or above serves both sides of the focus: its coordinates are taken without their sign.
-    One from -high to high keeps the sides apart; its unit coordinate is 1/2 in focus and fine on both sides of it.
-    in_dioptres: the share is one of 1 / depth, in which the circle of confusion is linear; `high` may then be inf.
-    """
-
-    name: str
-    low: float
-    high: float
-    exponent: float = 1.0
-    in_dioptres: bool = False
-
-    def __post_init__(self) -> None:
-        if self.name not in get_args(AxisName):
-            raise InputError(f"expected an axis out of {', '.join(get_args(AxisName))}, got {self.name!r}")
-        if not (self.low < self.high and (np.isfinite(self.high) or self.in_dioptres) and np.isfinite(self.low)):
-            raise InputError(f"the axis {self.name} needs a range of finite numbers, low before high, got {self.low} to {self.high}")
-        if not (np.isfinite(self.exponent) and self.exponent > 0.0):
-            raise InputError(f"the axis {self.name} needs a positive exponent, got {self.exponent}")
-        if self.in_dioptres and not self.low > 0.0:
-            raise InputError(f"a depth in dioptres needs a range that begins above 0 m, got {self.low}")
-        if self.low < 0.0 and (self.name != "diameter_px" or self.low != -self.high):
-            raise InputError(f"only diameter_px may be negative, and then from -high to high, got {self.name} {self.low} to {self.high}")
-
-    @property
-    def is_signed(self) -> bool:
-        """Whether the two sides of the focus lie apart."""
-        return self.low < 0.0
-
-    def to_unit(self, coordinate: Float[np.ndarray, "*batch"] | float) -> Float64[np.ndarray, "*batch"]:
-        """Physical to unit coordinate; what lies beyond the range goes to its nearer end."""
-        value = np.asarray(coordinate, np.float64)
-        if self.is_signed:
-            share = np.clip(value / self.high, -1.0, 1.0)
-            return np.asarray(0.5 + 0.5 * np.copysign(np.abs(share) ** (1.0 / self.exponent), share))
-        value = np.clip(np.abs(value) if self.name == "diameter_px" else value, self.low, self.high)
-        if self.in_dioptres:
-            share = (1.0 / self.low - 1.0 / value) / (1.0 / self.low - 1.0 / self.high)
-        else:
-            share = (value - self.low) / (self.high - self.low)
-        return np.asarray(np.clip(share, 0.0, 1.0) ** (1.0 / self.exponent))
-
-    def from_unit(self, unit: Float[np.ndarray, "*batch"] | float) -> Float64[np.ndarray, "*batch"]:
-        """Unit (0..1) to physical coordinate, the inverse of `to_unit`."""
-        value = np.asarray(unit, np.float64)
-        if self.is_signed:
-            share = 2.0 * value - 1.0
-            return np.asarray(self.high * np.copysign(np.abs(share) ** self.exponent, share))
-        return self.between(self.low, self.high, value**self.exponent)
-
-    def between(self, low: float, high: float, share: Float[np.ndarray, "*batch"] | float) -> Float64[np.ndarray, "*batch"]:
-        """The coordinate at a share (0..1) of the way from low to high, in metres, pixels or, where the axis says so, dioptres."""
-        part = np.asarray(share, np.float64)
-        if self.in_dioptres:
-            dioptres = 1.0 / low + part * (1.0 / high - 1.0 / low)
-            return np.divide(1.0, dioptres, out=np.full(part.shape, np.inf), where=dioptres > 0.0)
-        return np.asarray(low + part * (high - low))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +33,7 @@ class PsfBank:
     right; "field", of a source to the right of the middle of the frame; "none".
     near_side_turned: kernels are those behind the focus; in front (negative diameter) they are turned by half a turn.
     nested: False is a regular grid, as for a single axis, signed diameters or samples that were measured on one.
+    knee_px: not None makes it neither, but a `ProportionalGrid` with this knee, over two linear axes in pixels.
     settings: how it was made, as JSON values.
     """
 
@@ -110,6 +45,7 @@ class PsfBank:
     near_side_turned: bool = False
     nested: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
+    knee_px: float | None = None
 
     def __post_init__(self) -> None:
         check_space(self.axes, self.counts, self.nested, self.turns)
@@ -122,8 +58,8 @@ class PsfBank:
             check_kernel(kernel, f"kernel {index}")
 
     @cached_property
-    def grid(self) -> NestedGrid:
-        return NestedGrid(self.counts, self.nested)
+    def grid(self) -> Grid:
+        return grid_over(self.axes, self.counts, self.nested, self.knee_px)
 
     @property
     def channels(self) -> int:
@@ -162,6 +98,15 @@ class PsfBank:
         return kernel[::-1, ::-1] if in_front and self.near_side_turned else kernel
 
 
+def grid_over(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, knee_px: float | None) -> Grid:
+    """The grid of a bank, in unit coordinates of its axes."""
+    if knee_px is None:
+        return NestedGrid(counts, nested)
+    if any(axis.low != 0.0 or axis.exponent != 1.0 or not axis.name.endswith("_px") for axis in axes):
+        raise InputError("a proportional grid needs linear axes in pixels that begin at 0 (exponent 1): it bends them itself")
+    return ProportionalGrid(counts, tuple(axis.high for axis in axes), knee_px)
+
+
 def check_space(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, turns: str) -> None:
     """Whether axes, counts and the rest make a space of PSFs."""
     names = [axis.name for axis in axes]
@@ -182,6 +127,6 @@ def check_kernel(kernel: np.ndarray, where: str) -> None:
         raise InputError(f"{where}: each channel of a kernel must sum to 1, or to less where light is absorbed, got {light.tolist()}")
 
 
-def physical_boxes(axes: tuple[Axis, ...], grid: NestedGrid) -> Float64[np.ndarray, "cells axes 2"]:
+def physical_boxes(axes: tuple[Axis, ...], grid: Grid) -> Float64[np.ndarray, "cells axes 2"]:
     """The cells of a grid in physical coordinates."""
     return np.stack([axis.from_unit(grid.boxes[:, index]) for index, axis in enumerate(axes)], axis=1)

@@ -38,8 +38,13 @@ def draw_bank(bank: PsfBank) -> "Figure":
 
 
 def sampled_cells(bank: PsfBank) -> list[int]:
-    """The cells whose kernels are drawn: at even steps of the unit coordinates, the second axis downwards; others in their middle."""
+    """The cells whose kernels are drawn: at even steps of the unit coordinates (of their logarithms beyond the knee of a bank that
+    has one), the second axis downwards; others in their middle."""
     steps = (np.arange(KERNELS_IN_ROW) + 0.5) / KERNELS_IN_ROW
+    if bank.knee_px is not None:
+        ends = [axis.high / bank.knee_px for axis in bank.axes]
+        columns, rows = (np.expm1(steps * np.log1p(end)) / end for end in ends)
+        return [int(cell) for cell in bank.grid.index_of(np.stack(np.meshgrid(columns, rows), axis=-1)).ravel()]
     if len(bank.axes) == 1:
         fine = (np.arange(KERNELS_IN_ROW**2) + 0.5) / KERNELS_IN_ROW**2
         return [int(cell) for cell in bank.grid.index_of(fine[:, None])]

@@ -1,28 +1,26 @@
-"""A bank of PSFs as a folder: bank.json and one array per cell, so that it can be built piece by piece; and as pictures.
+"""A bank of PSFs as a folder: bank.json and one array per cell, so that it can be built piece by piece.
 
-    BANK/bank.json          format, version, model, channels, axes, counts, nested, turns, near_side_turned, settings
+    BANK/bank.json          format, version, model, channels, axes, counts, nested, knee_px, turns, near_side_turned, settings
     BANK/cells/00000.npy    (K, K, C) float32, one file per cell in the order of the grid
 
-Distances that are infinite are null. Caches that others keep beside it (spreadlets.npz) are removed when the bank changes.
+Distances that are infinite are null. What is computed from the kernels and kept beside them (BANK/spreadlets.npz and, half
+built, BANK/spreadlets.part) is removed when the bank is written anew; a kernel that changes otherwise is noticed by its hash.
 """
 
-import csv
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from mrbokeh.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.errors import InputError
-from mrbokeh.nested_grid import NestedGrid
-from mrbokeh.progress import track
-from mrbokeh.psf_bank import Axis, PsfBank, check_kernel, check_space
+from mrbokeh.psf_bank import Axis, Grid, PsfBank, check_kernel, check_space, grid_over
 
 FORMAT = "mrbokeh-psf-bank"
 VERSION = 1
 HEAD = "bank.json"
-CACHES = ("spreadlets.npz",)
+SPREADLETS, SPREADLETS_PART = "spreadlets.npz", "spreadlets.part"
 
 
 @dataclass(frozen=True)
@@ -37,17 +35,23 @@ class BankHead:
     turns: str
     near_side_turned: bool
     settings: dict[str, Any]
+    knee_px: float | None = None
 
     def __post_init__(self) -> None:
         check_space(self.axes, self.counts, self.nested, self.turns)
 
     @property
-    def grid(self) -> NestedGrid:
-        return NestedGrid(self.counts, self.nested)
+    def grid(self) -> Grid:
+        return grid_over(self.axes, self.counts, self.nested, self.knee_px)
 
     def to_json(self) -> dict[str, Any]:
         axes = [asdict(axis) | {"high": axis.high if np.isfinite(axis.high) else None} for axis in self.axes]
         return {"format": FORMAT, "version": VERSION} | asdict(self) | {"axes": axes, "counts": list(self.counts)}
+
+
+def head_of(bank: PsfBank) -> BankHead:
+    facts = (bank.axes, bank.counts, bank.nested, bank.turns, bank.near_side_turned, dict(bank.settings), bank.knee_px)
+    return BankHead(bank.model, bank.channels, *facts)
 
 
 def cell_path(folder: Path | str, cell: int) -> Path:
@@ -86,7 +90,8 @@ def missing_cells(folder: Path | str, head: BankHead) -> list[int]:
 def clear_bank(folder: Path | str) -> None:
     """Remove the files of a bank and their caches, and nothing else; the description goes last."""
     folder = Path(folder)
-    for path in [*sorted((folder / "cells").glob("[0-9]*.npy")), *(folder / name for name in CACHES), folder / HEAD]:
+    cells, parts = (folder / "cells").glob("[0-9]*.npy"), (folder / SPREADLETS_PART).glob("[0-9]*.npz")
+    for path in [*sorted(cells), *sorted(parts), folder / SPREADLETS, folder / HEAD]:
         path.unlink(missing_ok=True)
 
 
@@ -103,10 +108,7 @@ def write_bank(folder: Path | str, bank: PsfBank, overwrite: bool = False) -> No
     """A whole bank at once."""
     refuse_existing_bank(folder, overwrite)
     clear_bank(folder)
-    head = BankHead(
-        bank.model, bank.channels, bank.axes, bank.counts, bank.nested, bank.turns, bank.near_side_turned, dict(bank.settings)
-    )  # fmt: skip
-    write_head(folder, head)
+    write_head(folder, head_of(bank))
     for cell, kernel in enumerate(bank.kernels):
         write_cell(folder, cell, kernel)
 
@@ -121,7 +123,8 @@ def read_bank(folder: Path | str) -> PsfBank:
             f"--out {folder}` again, it goes on where it stopped"
         )
     kernels = tuple(_read_cell(cell_path(folder, cell), head.channels) for cell in range(cells))
-    return PsfBank(head.model, head.axes, head.counts, kernels, head.turns, head.near_side_turned, head.nested, head.settings)
+    facts = (head.turns, head.near_side_turned, head.nested, head.settings, head.knee_px)
+    return PsfBank(head.model, head.axes, head.counts, kernels, *facts)
 
 
 def _read_cell(path: Path, channels: int) -> np.ndarray:
@@ -133,30 +136,3 @@ def _read_cell(path: Path, channels: int) -> np.ndarray:
     if kernel.shape[2] != channels:
         raise InputError(f"{path}: expected {channels} channels, got {kernel.shape[2]}; remove the file and run `mrbokeh lens psf` again")
     return kernel
-
-
-def export_bank(bank: PsfBank, folder: Path | str, suffix: Literal["exr", "png"], overwrite: bool = False) -> int:
-    """One picture per cell, 00000.exr and so on, and index.csv with their coordinates; how many pictures.
-
-    EXR holds the values as they are (float). PNG has 16 bits, linear, its largest value white; `peak` in the index is what
-    white stands for. The index names for each axis the middle of the cell and its two ends; it is written last.
-    """
-    from mrbokeh.image_io import write_image
-
-    folder = Path(folder)
-    if suffix not in ("exr", "png"):
-        raise InputError(f"kernels are exported as exr or png, got {suffix!r}")
-    if folder.exists() and not (folder.is_dir() and (overwrite or not any(folder.iterdir()))):
-        raise InputError(f"{folder} exists already: give another name, or --overwrite to write into it")
-    rows = []
-    for cell, kernel in track(list(enumerate(bank.kernels)), "kernels"):
-        peak = float(kernel.max())
-        rgb = np.broadcast_to(kernel if suffix == "exr" else kernel / peak, (*kernel.shape[:2], 3))
-        name = f"{cell:05d}.{suffix}"
-        write_image(folder / name, np.ascontiguousarray(rgb), "linear", half=False)
-        places = [value for centre, ends in zip(bank.centres[cell], bank.boxes[cell], strict=True) for value in (centre, *ends)]
-        rows.append([name, kernel.shape[0], f"{peak:.9g}", *(f"{value:.9g}" for value in places)])
-    titles = [title for axis in bank.axes for title in (axis.name, f"{axis.name}_low", f"{axis.name}_high")]
-    with atomic_path(folder / "index.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([["file", "size_px", "peak", *titles], *rows])
-    return len(rows)

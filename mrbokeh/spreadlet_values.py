@@ -24,6 +24,7 @@ from mrbokeh.laplacian_integration import fast_width, integrate
 
 _DOMAIN = 4  # the table's domain over its reach: what the border adds to K is smooth, and polynomials up to degree 7 cancel
 _POINTS_PER_MOMENT = 3
+_LEAST_MOMENT = 1e-9
 
 
 @lru_cache(maxsize=8)
@@ -50,9 +51,9 @@ def table_for(size: int) -> Float64[np.ndarray, "side side"]:
     return biharmonic_table(1 << int(np.ceil(np.log2(max(size, 16)))))
 
 
-def moments(xy: np.ndarray, scale_px: float, degree: int) -> Float64[np.ndarray, "points moments"]:
-    """Monomials up to a degree at every point, in units of scale_px."""
-    x, y = xy[:, 0] / scale_px, xy[:, 1] / scale_px
+def moments(xy: np.ndarray, scale_px: float | np.ndarray, degree: int) -> Float64[np.ndarray, "points moments"]:
+    """Monomials up to a degree at every point, in units of scale_px, one for both axes or one for each."""
+    x, y = (xy / scale_px).T
     return np.stack([x ** (total - j) * y**j for total in range(degree + 1) for j in range(total + 1)], axis=1)
 
 
@@ -102,14 +103,32 @@ def _solved(
 ) -> Float64[np.ndarray, "points channels"]:
     """Values at points (N, 2) for charges at xy (M, 2), whose potential at the points is known.
 
-    Moments up to degree 3 are kept with at least 30 points; fewer points keep fewer moments, at least the charge.
+    Moments up to degree 3 are kept with at least 30 points; fewer points keep fewer moments, at least the charge. Points in few
+    rows, as those of a line, cannot have all of them on their own (y^3 = y in rows -1, 0 and 1): `_independent`.
     """
     scale_px = float(max(np.abs(xy).max(), 1.0))
     degree = max(d for d in range(4) if d == 0 or (d + 1) * (d + 2) // 2 * _POINTS_PER_MOMENT <= len(points))
-    held, wanted = moments(points, scale_px, degree), moments(xy, scale_px, degree).T @ charges
+    held, wanted = _independent(points, xy, charges, degree)
     apart = np.abs(points[:, None] - points)
     count, extra = len(points), held.shape[1]
     matrix = np.zeros((count + extra, count + extra))
     matrix[:count, :count] = table[apart[..., 1], apart[..., 0]] / scale_px**2
     matrix[:count, count:], matrix[count:, :count] = held, held.T
     return np.linalg.solve(matrix, np.concatenate([potential / scale_px**2, wanted]))[:count]
+
+
+def _independent(
+    points: Int64[np.ndarray, "points 2"], xy: np.ndarray, charges: Float64[np.ndarray, "pixels channels"], degree: int
+) -> tuple[Float64[np.ndarray, "points kept"], Float64[np.ndarray, "kept channels"]]:
+    """Combinations of moments that the points can have independently, and what the charges have of them.
+
+    A lower degree where the charges have a moment that the points cannot have.
+    """
+    scale_px = np.maximum(np.abs(xy).max(axis=0), 1.0)
+    held, wanted = moments(points, scale_px, degree), moments(xy, scale_px, degree).T @ charges
+    basis, sizes, mix = np.linalg.svd(held, full_matrices=False)
+    kept = sizes > _LEAST_MOMENT * sizes[0]
+    wanted = mix @ wanted
+    if degree and np.abs(wanted[~kept]).max(initial=0.0) > _LEAST_MOMENT * np.abs(charges).sum():
+        return _independent(points, xy, charges, degree - 1)
+    return basis[:, kept], wanted[kept] / sizes[kept, None]

@@ -26,15 +26,33 @@ def write_spreadlets(path: Path | str, spreadlets: Spreadlets, made_by: Sparsifi
 
 def read_spreadlets(path: Path | str, made_by: Sparsification, of: str) -> Spreadlets | None:
     """The spreadlets in a file; None if there is no such file or they are of other kernels or made in another way."""
+    found = _read(path)
+    return found[0] if found is not None and found[1:] == (asdict(made_by), of) else None
+
+
+def spreadlets_beside(folder: Path | str, kernels: tuple[np.ndarray, ...]) -> Spreadlets | None:
+    """The spreadlets that `mrbokeh lens spreadlets` has put beside a bank, however they were made; None if there are none.
+
+    InputError if they are not of these kernels: the bank was changed after.
+    """
+    path = Path(folder) / "spreadlets.npz"
+    found = _read(path)
+    if found is not None and found[2] != fingerprint(kernels):
+        raise InputError(f"{path} is of other kernels than the bank has now: run `mrbokeh lens spreadlets {folder}` again, or remove it")
+    return None if found is None else found[0]
+
+
+def _read(path: Path | str) -> tuple[Spreadlets, dict, str] | None:
+    """What is in a file, how it was made and of what; None if there is no such file or it is of another version."""
     if not Path(path).exists():
         return None
     try:
         with np.load(path) as file:
             facts = json.loads(str(file["facts"]))
-            if facts != {"version": _VERSION, "sparsification": asdict(made_by), "of": of}:
+            if facts["version"] != _VERSION:
                 return None
-            return Spreadlets(file["points"], file["values"], file["starts"])
-    except (BadZipFile, KeyError, ValueError, OSError) as error:
+            return Spreadlets(file["points"], file["values"], file["starts"]), facts["sparsification"], facts["of"]
+    except (BadZipFile, EOFError, KeyError, TypeError, ValueError, OSError) as error:
         raise InputError(f"{path} is not a file of spreadlets ({error}): remove it, it will be computed again") from None
 
 

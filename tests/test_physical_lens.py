@@ -12,9 +12,12 @@ from mrbokeh.lens import Lens
 from mrbokeh.nested_grid import NestedGrid
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import BANDS_UM, GREEN_UM
+from mrbokeh.psf_models._ray_tracing_numba import trace_ray
+from mrbokeh.psf_models.biconvex_lens import biconvex_lens
 from mrbokeh.psf_models.glass import cauchy_coefficients, index_at
-from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, biconvex_lens
+from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
+from mrbokeh.psf_models.quasi_random import sobol_blocks
 
 RAYS = 1 << 15
 
@@ -89,7 +92,7 @@ def test_compiled_tracing_is_the_plain_one(with_rims: bool) -> None:
     for ray in random_rays(300, 1):
         expected = snell_in_the_open(pair(16.0), ray[:3], ray[3:], 0.5, with_rims)
         got = ray.copy()
-        assert compiled.trace_ray(table, 0, 1.0, got, 0.5, with_rims) == (expected is not None)
+        assert trace_ray(table, 0, 1.0, got, 0.5, with_rims) == (expected is not None)
         if expected is not None:
             passed += 1
             assert_allclose(got, np.concatenate(expected), atol=1e-9)
@@ -103,7 +106,7 @@ def test_refraction_obeys_snell_at_one_surface(curvature: float) -> None:
     table = np.array([[0.0, curvature, 400.0, constant, slope]])
     for ray in random_rays(50, 2):
         after = ray.copy()
-        assert compiled.trace_ray(table, 0, 1.0, after, 0.45, True)
+        assert trace_ray(table, 0, 1.0, after, 0.45, True)
         place, old, new = after[:3], ray[3:], after[3:]
         normal = np.array([-curvature * place[0], -curvature * place[1], 1.0 - curvature * place[2]])
         assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-12)  # the place lies on the sphere
@@ -116,10 +119,10 @@ def test_a_ray_sent_back_goes_back_its_way() -> None:
     length_mm, passed = forward[-1, 0], 0
     for ray in random_rays(200, 3):
         out = ray.copy()
-        if compiled.trace_ray(forward, 0, 1.0, out, 0.5, True):
+        if trace_ray(forward, 0, 1.0, out, 0.5, True):
             passed += 1
             home = out * [1, 1, -1, -1, -1, 1] + [0, 0, length_mm, 0, 0, 0]
-            assert compiled.trace_ray(back, 0, 1.0, home, 0.5, True)
+            assert trace_ray(back, 0, 1.0, home, 0.5, True)
             home = home * [1, 1, -1, -1, -1, 1] + [0, 0, length_mm, 0, 0, 0]
             assert_allclose(home[3:], ray[3:], atol=1e-10)
             assert_allclose(np.cross(home[:3] - ray[:3], ray[3:]), 0.0, atol=1e-8)  # on the same line
@@ -132,7 +135,7 @@ def test_total_reflection_blocks() -> None:
     for degrees, passes in ((35.9, True), (36.1, False)):
         angle = np.deg2rad(degrees)
         ray = np.array([0.0, 0.0, -1.0, np.sin(angle), 0.0, np.cos(angle)])
-        assert compiled.trace_ray(table, 0, 1.7, ray, 0.55, True) == passes
+        assert trace_ray(table, 0, 1.7, ray, 0.55, True) == passes
 
 
 def light_on_axis(model: PhysicalLens, depth_m: float) -> np.ndarray:
@@ -309,7 +312,7 @@ def test_behind_the_focus_the_pupil_is_upright_in_front_it_is_turned(depth_m: fl
 def focus_of(model: LensPrescription, wavelength_um: float) -> float:
     """Where a ray parallel to the axis at 1 mm meets it, from the first vertex."""
     ray = np.array([1.0, 0.0, -10.0, 0.0, 0.0, 1.0])
-    assert compiled.trace_ray(model.optics_table(), 0, 1.0, ray, wavelength_um, True)
+    assert trace_ray(model.optics_table(), 0, 1.0, ray, wavelength_um, True)
     return float(ray[2] - ray[0] * ray[5] / ray[3])
 
 
@@ -366,6 +369,20 @@ def test_prefiltering_is_the_mean_over_the_box() -> None:
             total[margin : len(whole) - margin, margin : len(whole) - margin] += part / 32.0
     assert np.abs(whole - total).sum() / 3.0 < 0.06 * whole.sum() / 3.0
     assert whole.sum() == pytest.approx(total.sum(), rel=0.01)
+
+
+def test_rays_are_spread_more_evenly_than_chance_would() -> None:
+    """Against four times as many rays of another seed, half a million rays miss a third of what as many pseudo-random ones do.
+
+    Measured: 0.0025 of the light against 0.018. An additive recurrence over the five dimensions (square roots of primes), which
+    stood here before, left streaks and 0.0082, and hardly less with more rays.
+    """
+    model, rays, box = PhysicalLens(pair(), image_width_px=1000), 1 << 19, np.array([[0.65, 0.66], [0.0, 0.01]])
+    truth = model.landed(box, 4 * rays, sobol_blocks(5, 4 * rays, 1))
+    random = model.landed(box, rays, np.random.default_rng(0).random((8, rays // 8, 5)))
+    even = model.landed(box, rays, sobol_blocks(5, rays, 0))
+    missed, by_chance = (np.abs(each - truth).sum() / truth.sum() for each in (even, random))
+    assert missed < by_chance / 3.0
 
 
 def test_same_seed_same_kernel_other_seed_another() -> None:

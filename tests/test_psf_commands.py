@@ -22,7 +22,11 @@ from mrbokeh.psf_bank_file import cell_path, missing_cells, read_bank, read_head
 from mrbokeh.psf_models.build import build_bank
 from mrbokeh.psf_models.choose import MODEL_NAMES, ModelOptions, choose_model
 from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.simple_lens import SimpleLens
+from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify
+from mrbokeh.spreadlets_build import build_spreadlets
+from mrbokeh.spreadlets_file import spreadlets_beside
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 
@@ -145,6 +149,97 @@ def test_every_model_can_be_made_by_name(name: str, tmp_path: Path) -> None:
     assert model.name == name and len(model.axes) == len(model.counts) and model.channels in (1, 3)
 
 
+PAIR = "60 2 1.5 20\n-60 5 1 20\n0 5 0 12\n60 2 1.5 20\n-60 0 1 20\n"
+
+
+def test_a_physical_lens_is_what_its_options_say(tmp_path: Path) -> None:
+    """Each option of the command line arrives as its namesake of the constructor: same settings, same kernels."""
+    (tmp_path / "pair.dat").write_text(PAIR)
+    options = ("--prescription", tmp_path / "pair.dat", "--focus-distance-m", 3, "--f-number", 8, "--sensor-width-mm", 24)
+    depths = ("--nearest-m", 1, "--farthest-m", 20, "--image-width-px", 300, "--no-vignetting")
+    run("psf", "physical", *options, *depths, "--counts", "3,3", "--rays", 1 << 12, "--out", tmp_path / "bank")
+    bank = read_bank(tmp_path / "bank")
+    model = PhysicalLens(
+        tmp_path / "pair.dat", focus_distance_m=3.0, f_number=8.0, sensor_mm=(24.0, 16.0), image_width_px=300, nearest_m=1.0,
+        farthest_m=20.0, vignetting=False, counts=(3, 3),
+    )  # fmt: skip
+    assert bank.axes == model.axes and bank.settings == model.settings | {"rays": 1 << 12, "seed": 0}
+    assert bank.settings["f_number"] == 8.0 and bank.settings["mm_per_px"] == 0.08 and bank.axes[0].high == 20.0
+    np.testing.assert_array_equal(bank.kernels[4], model.kernel(bank.boxes[4], 1 << 12, 4))
+    made = choose_model("physical", ModelOptions(sensor_width_mm=24.0, sensor_height_mm=24.0, focus_distance_m=np.inf))
+    assert made.settings["half_diagonal_mm"] == pytest.approx(12.0 * np.sqrt(2.0)) and made.settings["focus_distance_m"] == "inf"
+
+
+def test_a_medium_is_what_its_options_say(tmp_path: Path) -> None:
+    options = ("--density-per-m", 0.4, "--anisotropy", 0.5, "--focal-px", 60, "--farthest-m", 2, "--counts", 3)
+    run("psf", "volume", *options, "--rays", 1000, "--out", tmp_path / "bank")
+    bank = read_bank(tmp_path / "bank")
+    assert [bank.settings[key] for key in ("density_per_m", "anisotropy", "focal_px")] == [0.4, 0.5, 60.0] and bank.axes[0].high == 2.0
+
+
+def test_cells_in_proportion_or_the_papers_grid(tmp_path: Path) -> None:
+    for name, option in (("ours", ("--cells", 30)), ("paper", ("--counts", "9,9"))):
+        run("psf", "combined", "--diameter", 16, "--motion", 16, *option, "--out", tmp_path / name)
+    ours, paper = read_bank(tmp_path / "ours"), read_bank(tmp_path / "paper")
+    assert 25 <= len(ours.kernels) <= 30 and ours.knee_px and len(paper.kernels) == 28 and paper.nested and paper.knee_px is None
+
+
+def test_spreadlets_beside_a_bank(tmp_path: Path) -> None:
+    """They are those of its kernels, one after the other, and what they are made with is what the command says."""
+    run("psf", "simple", "--out", tmp_path / "bank", "--diameter", 60, "--counts", 3)
+    said = run("spreadlets", tmp_path / "bank", "--points-per-px", 0.8, "--seed", 3)
+    bank = read_bank(tmp_path / "bank")
+    found = spreadlets_beside(tmp_path / "bank", bank.kernels)
+    assert found is not None and f"{len(found.points)} points of 3 kernels" in said and not (tmp_path / "bank" / "spreadlets.part").exists()
+    for cell, kernel in enumerate(bank.kernels):
+        expected = sparsify(kernel, Sparsification(points_per_px=0.8, lloyd_steps=0, annealing_steps=0, seed=3))
+        np.testing.assert_array_equal(found[cell].points, expected.points)
+        np.testing.assert_array_equal(found[cell].values, expected.values)
+    with pytest.raises(InputError, match="there already"):
+        run("spreadlets", tmp_path / "bank", "--points-per-px", 0.8, "--seed", 3)
+    run("spreadlets", tmp_path / "bank")
+    other = spreadlets_beside(tmp_path / "bank", bank.kernels)
+    assert other is not None and len(other.points) > len(found.points)
+
+
+def test_spreadlets_of_a_bank_that_has_changed_are_noticed(tmp_path: Path) -> None:
+    run("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    assert spreadlets_beside(tmp_path / "bank", read_bank(tmp_path / "bank").kernels) is None
+    run("spreadlets", tmp_path / "bank")
+    kernel = read_bank(tmp_path / "bank").kernels[3]
+    np.save(cell_path(tmp_path / "bank", 3), np.ascontiguousarray(kernel[:, ::-1] * np.float32(0.99)))
+    with pytest.raises(InputError, match="of other kernels than the bank has now: run `mrbokeh lens spreadlets"):
+        spreadlets_beside(tmp_path / "bank", read_bank(tmp_path / "bank").kernels)
+    run("spreadlets", tmp_path / "bank")
+    assert spreadlets_beside(tmp_path / "bank", read_bank(tmp_path / "bank").kernels) is not None
+    run("psf", "simple", "--out", tmp_path / "bank", *SMALL, "--overwrite")
+    assert not (tmp_path / "bank" / "spreadlets.npz").exists()
+
+
+def test_interrupted_spreadlets_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped at the third of four kernels, then a kernel changes: of the two that are there only the other one is kept."""
+    run("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    made: list[np.ndarray] = []
+
+    def counted(kernel: np.ndarray, settings: Sparsification) -> Spreadlet:
+        if len(made) == most:
+            raise KeyboardInterrupt
+        made.append(kernel)
+        return sparsify(kernel, settings)
+
+    monkeypatch.setattr("mrbokeh.spreadlets_build.sparsify", counted)
+    most = 2
+    with pytest.raises(KeyboardInterrupt):
+        build_spreadlets(tmp_path / "bank", Sparsification(), threads=1)
+    parts = tmp_path / "bank" / "spreadlets.part"
+    assert len(list(parts.iterdir())) == 2 and not (tmp_path / "bank" / "spreadlets.npz").exists()
+    kernels = read_bank(tmp_path / "bank").kernels
+    np.save(cell_path(tmp_path / "bank", 1), kernels[1] * np.float32(0.9))
+    most = 9
+    assert len(build_spreadlets(tmp_path / "bank", Sparsification(), threads=1)) == 4
+    assert [len(kernel) for kernel in made[2:]] == [len(kernel) for kernel in kernels[1:]]
+
+
 MISTAKES = {
     "an unknown model": (["psf", "blob"], "expected a model out of simple, combined, physical, volume, stylized"),
     "no picture": (["psf", "stylized"], "--image"),
@@ -155,6 +250,17 @@ MISTAKES = {
     "counts in words": (["psf", "simple", "--counts", "many"], "--counts as whole numbers"),
     "too many counts": (["psf", "simple", "--counts", "3,3"], "a count for each"),
     "a diameter below 0": (["psf", "simple", "--diameter", "-3"], "positive number"),
+    "a focus for a model without": (["psf", "simple", "--focus-distance-m", "3"], "--focus-distance-m does nothing"),
+    "vignetting of a thin lens": (["psf", "combined", "--no-vignetting"], "--vignetting does nothing"),
+    "two grids": (["psf", "combined", "--cells", "9", "--counts", "3,3"], "either --counts"),
+    "no cells": (["psf", "combined", "--cells", "0"], "at least one cell"),
+    "too open": (["psf", "physical", "--f-number", "2"], "opens to f/4 only"),
+    "too near a focus": (["psf", "physical", "--focus-distance-m", "0.01"], "cannot focus at 0.01 m"),
+    "no sensor": (["psf", "physical", "--sensor-width-mm", "0"], "width and height in mm must be a positive"),
+    "no width": (["psf", "physical", "--image-width-px", "-5"], "width in pixels must be a positive"),
+    "depths in the wrong order": (["psf", "physical", "--nearest-m", "9", "--farthest-m", "3"], "low before high"),
+    "a depth in the lens": (["psf", "physical", "--nearest-m", "0.001"], "depths in front of the lens"),
+    "no such prescription": (["psf", "physical", "--prescription", "none.dat"], "none.dat"),
     "less than no rays": (["psf", "simple", "--rays", "-1"], "number of rays"),
     "no bank": (["export", "none"], "expected a bank of PSFs"),
     "another format": (["export", "none", "--format", "jpg"], "exr or png"),

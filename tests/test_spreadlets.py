@@ -74,6 +74,26 @@ def test_few_points_are_nearly_the_kernel() -> None:
     assert relative_error(found) < 0.115
 
 
+@pytest.mark.parametrize("turn", [0, 1])
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_line_becomes_few_points_too(rows: int, turn: int) -> None:
+    """Its points lie in so few rows that y^3 is y or little else: moments that depend on others are kept with them.
+
+    Few points are no good for a line (error: half its norm; renderers take its taps), but they are not wrong either.
+    """
+    kernel = np.zeros((241, 241), np.float32)
+    middle = 120
+    kernel[middle - (rows - 1) // 2 : middle + rows // 2 + 1, middle - 100 : middle + 101] = 1.0 / (201 * rows)
+    kernel = np.rot90(kernel, turn).copy()
+    found = sparsify(kernel, Sparsification(lloyd_steps=0, annealing_steps=0))
+    x, y = found.points.T.astype(np.float64)
+    scale = np.abs(found.values).sum()
+    assert len(found.points) < 0.7 * len(whole_laplacian(kernel).points)
+    for polynomial, light in ((x * 0 + 1, 0.0), (x, 0.0), (y, 0.0), ((x * x + y * y) / 4, 1.0)):
+        assert polynomial @ found.values[:, 0] == pytest.approx(light, abs=1e-9 * scale * np.abs(polynomial).max())
+    assert relative_error(found, kernel) < 0.6
+
+
 def test_the_fit_beats_the_sums_of_the_paper() -> None:
     fitted = sparsify(KERNEL, QUICK)
     sums = sparsify(KERNEL, replace(QUICK, fit=False))

@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from mrbokeh.commands.lens_pictures import export, show
+from mrbokeh.commands.lens_psf import psf, spreadlets
 from mrbokeh.errors import InputError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="Make, inspect and draw lens files and banks of PSFs.")
@@ -110,100 +112,5 @@ def coc(
         typer.echo(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px")
 
 
-@app.command()
-def show(
-    lens: Annotated[Path, typer.Argument(help="Lens file, or the folder of a bank of PSFs.")],
-    out: Annotated[Path, typer.Option(help="The picture to write (.png, .pdf or .svg).")],
-    width: Annotated[int, typer.Option(help="Image width in pixels (of a lens file).")] = 1920,
-    overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
-) -> None:
-    """Draw the blur of a lens: its kernels over diameter and field, its outlines and low-rank error, and blur over depth.
-
-    Of a bank of PSFs: kernels over its coordinates, its cells, and their size or the light that they pass.
-
-    Example: mrbokeh lens show lens.json --out lens.png
-    """
-    from mrbokeh.atomic_files import atomic_path, refuse_existing
-
-    if out.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise InputError(f"cannot draw {out}: expected .png, .pdf or .svg")
-    refuse_existing(out, overwrite)
-    figure = _drawn_bank(lens) if lens.is_dir() else _drawn_lens(lens, width)
-    with atomic_path(out) as temporary:
-        figure.savefig(temporary, dpi=150)
-    typer.echo(f"wrote {out}")
-
-
-def _drawn_lens(path: Path, width_px: int) -> Any:
-    from mrbokeh.lens_drawing import draw_lens
-    from mrbokeh.lens_file import read_lens
-
-    return draw_lens(read_lens(path), width_px)
-
-
-def _drawn_bank(folder: Path) -> Any:
-    from mrbokeh.psf_bank_drawing import draw_bank
-    from mrbokeh.psf_bank_file import read_bank
-
-    return draw_bank(read_bank(folder))
-
-
-@app.command()
-def psf(
-    model: Annotated[str, typer.Argument(help="simple, combined (defocus and motion), physical, volume or stylized.")],
-    out: Annotated[Path, typer.Option(help="The folder of the bank; a half-built one is completed.")],
-    lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None,
-    image: Annotated[Path | None, typer.Option(help="The picture of a PSF (model stylized).")] = None,
-    prescription: Annotated[
-        Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")
-    ] = None,
-    diameter: Annotated[float | None, typer.Option(help="Largest circle of confusion in px (simple, combined, stylized).")] = None,
-    motion: Annotated[float | None, typer.Option(help="Longest motion in px per shutter (combined).")] = None,
-    counts: Annotated[str | None, typer.Option(help="Steps of the grid along each coordinate, e.g. 100 or 75,75.")] = None,
-    rays: Annotated[
-        int | None, typer.Option(help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the rays.")] = 0,
-    overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False,
-) -> None:
-    """Build a bank of point spread functions. An interrupted build goes on when the same command is given again.
-
-    Example: mrbokeh lens psf combined --out combined_bank --diameter 128 --motion 128
-    """
-    from mrbokeh.psf_models.build import build_bank
-    from mrbokeh.psf_models.choose import ModelOptions, choose_model
-
-    steps = None if counts is None else _steps(counts)
-    bank = build_bank(
-        choose_model(model, ModelOptions(lens, image, prescription, diameter, motion, steps)), out, rays, seed, overwrite=overwrite
-    )
-    typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px")
-
-
-def _steps(text: str) -> tuple[int, ...]:
-    try:
-        steps = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        steps = (0,)
-    if min(steps) < 1:
-        raise InputError(f"expected --counts as whole numbers from 1 up with commas between them, such as 75,75, got {text!r}")
-    return steps
-
-
-@app.command()
-def export(
-    bank: Annotated[Path, typer.Argument(help="The folder of a bank of PSFs.")],
-    out: Annotated[Path, typer.Option(help="The folder to write: one picture per kernel, and index.csv with their coordinates.")],
-    format_: Annotated[str, typer.Option("--format", help="exr (float, as they are) or png (16 bit, linear, the peak white).")] = "exr",
-    overwrite: Annotated[bool, typer.Option(help="Write into OUT where it exists.")] = False,
-) -> None:
-    """Write the kernels of a bank as pictures, for a convolution in Nuke, OpenDefocus or Blender.
-
-    Example: mrbokeh lens export combined_bank --out kernels --format exr
-    """
-    from mrbokeh.psf_bank_file import export_bank, read_bank
-
-    if format_ not in ("exr", "png"):
-        raise InputError(f"kernels are exported as exr or png, got --format {format_}")
-    written = export_bank(read_bank(bank), out, "png" if format_ == "png" else "exr", overwrite)
-    typer.echo(f"wrote {written} kernels and {out / 'index.csv'}")
+for command in (psf, spreadlets, show, export):
+    app.command()(command)

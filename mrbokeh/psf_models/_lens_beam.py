@@ -7,8 +7,9 @@ from jaxtyping import Float64
 
 from mrbokeh.errors import InputError
 from mrbokeh.psf_models import _physical_lens_numba as compiled
+from mrbokeh.psf_models._ray_tracing_numba import find_chief
 from mrbokeh.psf_models.lens_prescription import LensPrescription
-from mrbokeh.psf_models.quasi_random import quasi_random
+from mrbokeh.psf_models.quasi_random import sobol_blocks
 
 BANDS_UM = np.array([[0.6114, 0.04], [0.5491, 0.04], [0.4642, 0.04]])
 """Middle and half width of a triangular band for red, green and blue. The middles are the dominant wavelengths of the Rec.709
@@ -19,6 +20,7 @@ GREEN_UM = float(BANDS_UM[1, 0])
 
 _COARSE, _FINE, _LOOKS, _NODES = 48, 256, 3, 65
 _AREA_RAYS = 1 << 16
+_DARK = 0.01  # share of the light on the axis below which a field counts as black
 
 Window = Float64[np.ndarray, "3"]
 """A rectangle (a from, a to, |b| to) in mm on the plane that the chief ray meets at a right angle before the lens."""
@@ -43,7 +45,7 @@ class LensBeam:
         The source lies to the right (+x) in the scene, so its upside-down image lies at -x.
         """
         found, target_mm = np.empty(4), -eccentricity * self.half_diagonal_mm
-        if not compiled.find_chief(self.table, self._reversed, self.lens.stop, GREEN_UM, self.sensor_at_mm, target_mm, found):
+        if not find_chief(self.table, self._reversed, self.lens.stop, GREEN_UM, self.sensor_at_mm, target_mm, found):
             raise InputError(f"no ray through the middle of the stop of {self.lens.name} reaches the eccentricity {eccentricity:g}")
         return np.array([target_mm, *found])
 
@@ -100,11 +102,31 @@ class LensBeam:
         compiled.trace_rays(*optics, window, np.ascontiguousarray(shares), per_mm, field, bands_um, landings, weights)
         return landings, weights
 
+    def open_share(self, per_mm: float, eccentricity: float) -> float:
+        """Cross-section of the beam across the axis relative to that on the axis."""
+        return self.area_mm2(per_mm, eccentricity) / self.area_mm2(per_mm, 0.0)
+
+    def lit_up_to(self, per_mm: Float64[np.ndarray, " depths"]) -> float:
+        """1, or the eccentricity beyond which less than 1 % of the light on the axis comes through from one of these depths."""
+
+        def is_lit(eccentricity: float) -> bool:
+            try:
+                return all(self.open_share(each, eccentricity) > _DARK for each in per_mm.tolist())
+            except InputError:
+                return False
+
+        low, high = 0.0, 1.0
+        if is_lit(high):
+            return high
+        for _ in range(10):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if is_lit(middle) else (low, middle)
+        return low
+
     def _area_mm2(self, per_mm: float, eccentricity: float) -> float:
         """Cross-section across the axis of the beam that gets through from one point, mean of the colours."""
         window = self.window(np.array([per_mm]), np.array([eccentricity]))
-        offset, step = quasi_random(3, 0)
-        shares = (offset + np.arange(_AREA_RAYS)[:, None] * step) % 1.0
+        (shares,) = sobol_blocks(3, _AREA_RAYS, 0)
         _, weights = self.trace(
             self.chief_rays(eccentricity, eccentricity), window, shares, np.full(_AREA_RAYS, per_mm), np.zeros(_AREA_RAYS)
         )

@@ -21,8 +21,8 @@ class PsfModel(Protocol):
     a source to the right of the middle of the frame; whoever uses them turns them (from x towards y).
 
     name: as on the command line. axes: the coordinates, in the order in which they are passed. counts: steps of the
-    (nested) grid along each axis. channels: 1, or 3 for red, green, blue. near_side_turned: in front of the focus
-    (negative diameter) the kernel is the one behind it, turned by half a turn.
+    (nested) grid along each axis. knee_px: not None makes the grid a proportional one (`PsfBank`). channels: 1, or 3 for red,
+    green, blue. near_side_turned: in front of the focus (negative diameter) the kernel is the one behind it, turned by half a turn.
     default_rays: rays per kernel of a bank unless the user says otherwise; 0 where the closed form is better.
     settings: what else the kernels depend on, as JSON values; a half-built bank is only gone on with where they agree.
     """
@@ -33,6 +33,8 @@ class PsfModel(Protocol):
     def axes(self) -> tuple[Axis, ...]: ...
     @property
     def counts(self) -> tuple[int, ...]: ...
+    @property
+    def knee_px(self) -> float | None: ...
     @property
     def channels(self) -> int: ...
     @property

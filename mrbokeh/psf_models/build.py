@@ -26,16 +26,15 @@ from mrbokeh.workers import cores
 
 
 def bank_head(model: PsfModel, rays: int, seed: int) -> BankHead:
-    """The description of a model's bank. Several coordinates make a nested grid.
+    """The description of a model's bank. Several coordinates make a nested grid, unless the model has a knee for a proportional one.
 
     One coordinate keeps the regular grid after its power remapping: nesting saves cells only where coordinates multiply, and
     100 cells up to 512 px (exponent 2) are then 10 px wide at the far end instead of 20. Signed diameters must not be nested.
     """
-    nested = len(model.axes) > 1 and not any(axis.is_signed for axis in model.axes)
+    nested = model.knee_px is None and len(model.axes) > 1 and not any(axis.is_signed for axis in model.axes)
     settings = json.loads(json.dumps({**model.settings, "rays": rays, "seed": seed}))
-    return BankHead(
-        model.name, model.channels, model.axes, model.counts, nested, model.turns, model.near_side_turned, settings
-    )  # fmt: skip
+    facts = (model.axes, model.counts, nested, model.turns, model.near_side_turned, settings, model.knee_px)
+    return BankHead(model.name, model.channels, *facts)
 
 
 def build_bank(

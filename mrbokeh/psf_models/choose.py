@@ -10,18 +10,31 @@ from mrbokeh.psf_models.base import PsfModel
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """What a user may say about a model; None is the model's own default.
+    """What a user may say about a model; None is the model's own default. Names and units are those of the models' constructors.
 
-    lens: file of the lens whose aperture is swept over diameters. image: the picture of a stylised PSF. prescription: a .dat
-    file of lens surfaces. diameter_px, motion_px: the largest of the bank. counts: steps of the grid along each axis.
+    lens: file of the lens whose aperture is swept over diameters. image: the picture of a stylised PSF. diameter_px, motion_px:
+    the largest of the bank. prescription: a .dat file of lens surfaces. counts: steps of the grid along each axis. cells: of the
+    proportional grid.
     """
 
     lens: Path | None = None
     image: Path | None = None
-    prescription: Path | None = None
     diameter_px: float | None = None
     motion_px: float | None = None
+    prescription: Path | None = None
+    focus_distance_m: float | None = None
+    f_number: float | None = None
+    sensor_width_mm: float | None = None
+    sensor_height_mm: float | None = None
+    image_width_px: int | None = None
+    nearest_m: float | None = None
+    farthest_m: float | None = None
+    vignetting: bool | None = None
+    density_per_m: float | None = None
+    anisotropy: float | None = None
+    focal_px: float | None = None
     counts: tuple[int, ...] | None = None
+    cells: int | None = None
 
 
 def _simple(options: ModelOptions) -> PsfModel:
@@ -36,19 +49,23 @@ def _simple(options: ModelOptions) -> PsfModel:
 def _combined(options: ModelOptions) -> PsfModel:
     from mrbokeh.psf_models.combined import Combined
 
-    return Combined(**_given(options, "diameter_px", "motion_px", "counts"))
+    if options.counts is not None and options.cells is not None:
+        raise InputError("give either --counts (the paper's nested grid) or --cells (a proportional one), not both")
+    return Combined(**_given(options, "diameter_px", "motion_px", "counts", "cells"))
 
 
 def _physical(options: ModelOptions) -> PsfModel:
     from mrbokeh.psf_models.physical_lens import PhysicalLens
 
-    return PhysicalLens(**_given(options, "prescription", "counts"))
+    width_mm = _SENSOR_WIDTH_MM if options.sensor_width_mm is None else options.sensor_width_mm
+    height_mm = width_mm * 2.0 / 3.0 if options.sensor_height_mm is None else options.sensor_height_mm
+    return PhysicalLens(sensor_mm=(width_mm, height_mm), **_given(options, *_PHYSICAL))
 
 
 def _volume(options: ModelOptions) -> PsfModel:
     from mrbokeh.psf_models.volume import Volume
 
-    return Volume(**_given(options, "counts"))
+    return Volume(**_given(options, *_VOLUME))
 
 
 def _stylized(options: ModelOptions) -> PsfModel:
@@ -60,13 +77,17 @@ def _stylized(options: ModelOptions) -> PsfModel:
     return Stylized(read_image(options.image), **_given(options, "diameter_px", "counts"))
 
 
+_SENSOR_WIDTH_MM = 36.0
+_PHYSICAL = ("prescription", "focus_distance_m", "f_number", "image_width_px", "nearest_m", "farthest_m", "vignetting", "counts")
+_VOLUME = ("density_per_m", "anisotropy", "focal_px", "farthest_m", "counts")
 _MODELS: dict[str, tuple[Callable[[ModelOptions], PsfModel], frozenset[str]]] = {
     "simple": (_simple, frozenset({"lens", "diameter_px", "counts"})),
-    "combined": (_combined, frozenset({"diameter_px", "motion_px", "counts"})),
-    "physical": (_physical, frozenset({"prescription", "counts"})),
-    "volume": (_volume, frozenset({"counts"})),
+    "combined": (_combined, frozenset({"diameter_px", "motion_px", "counts", "cells"})),
+    "physical": (_physical, frozenset({*_PHYSICAL, "sensor_width_mm", "sensor_height_mm"})),
+    "volume": (_volume, frozenset(_VOLUME)),
     "stylized": (_stylized, frozenset({"image", "diameter_px", "counts"})),
 }
+_FLAGS = {"diameter_px": "--diameter", "motion_px": "--motion"}
 MODEL_NAMES = tuple(_MODELS)
 
 
@@ -81,6 +102,6 @@ def choose_model(name: str, options: ModelOptions | None = None) -> PsfModel:
         raise InputError(f"expected a model out of {', '.join(MODEL_NAMES)}, got {name!r}")
     make, known = _MODELS[name]
     named = _given(options, *(each.name for each in fields(options)))
-    if stray := [f"--{key.removesuffix('_px')}" for key in named if key not in known]:
+    if stray := [_FLAGS.get(key, f"--{key.replace('_', '-')}") for key in named if key not in known]:
         raise InputError(f"{', '.join(stray)} does nothing for the model {name}: leave it out, or choose another model")
     return make(options)

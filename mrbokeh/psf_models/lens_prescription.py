@@ -1,18 +1,15 @@
-"""LensPrescription: the spherical surfaces of a real lens, read from the tables in which lens designs are published."""
+"""LensPrescription: the spherical surfaces of a real lens."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import inf, isfinite, sqrt
-from pathlib import Path
+from math import inf, isfinite
 
 import numpy as np
 from jaxtyping import Float64
 
 from mrbokeh.errors import InputError
-from mrbokeh.psf_models.glass import LINE_D_UM, cauchy_coefficients, estimated_abbe_number, index_at
+from mrbokeh.psf_models.glass import LINE_C_UM, LINE_D_UM, LINE_F_UM, cauchy_coefficients, index_at
 from mrbokeh.psf_models.paraxial import Paraxial
-
-_COLUMNS = "radius, distance to the next surface, index behind it, [Abbe number,] aperture diameter, in mm"
 
 
 @dataclass(frozen=True)
@@ -95,6 +92,12 @@ class LensPrescription:
         return self.paraxial.focal_length_mm
 
     @property
+    def axial_colour_mm(self) -> float:
+        """How far behind the focus of blue (F line) that of red (C line) lies, for light from infinity; below 0 in front of it."""
+        red, blue = (self.paraxial_at(line_um).sensor_mm(inf) for line_um in (LINE_C_UM, LINE_F_UM))
+        return red - blue
+
+    @property
     def entrance_pupil_mm(self) -> tuple[float, float]:
         """(z, diameter) of the stop's image as seen from the scene."""
         return self.paraxial.entrance_pupil_mm(self.stop, self.surfaces[self.stop].diameter_mm)
@@ -129,75 +132,3 @@ class LensPrescription:
         table, last = self.optics_table(), self.vertices_mm[-1]
         media = np.concatenate([[[1.0, 0.0]], table[:-1, 3:]])
         return np.column_stack([last - table[:, 0], -table[:, 1], table[:, 2], media])[::-1].copy()
-
-
-def read_prescription(path: Path | str) -> LensPrescription:
-    """A table of surfaces from the scene to the sensor, one per line, `#` begins a comment.
-
-    Columns, in mm: radius (0: the stop; inf: flat), distance to the next surface, index n_d behind it (0: as before),
-    aperture diameter; with five columns the Abbe number stands before the aperture (the order of Kolb et al. 1995).
-    Where it is missing it is estimated (mrbokeh.psf_models.glass). InputError names the line that is not understood.
-    """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"expected a table of lens surfaces ({_COLUMNS}) at {path}, but it cannot be read: {error}") from None
-    rows = [(number, line.split("#")[0].split()) for number, line in enumerate(lines, 1)]
-    rows = [(number, words) for number, words in rows if words]
-    surfaces: list[Surface] = []
-    for number, words in rows:
-        try:
-            surfaces.append(_surface(words, surfaces[-1].index if surfaces else 1.0, surfaces[-1].abbe_number if surfaces else inf))
-        except InputError as error:
-            raise InputError(f"{path}, line {number}: {error}") from None
-    return LensPrescription(path.stem, with_estimated_abbe_numbers(surfaces))
-
-
-def _surface(words: list[str], index_before: float, abbe_before: float) -> Surface:
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        raise InputError(f"expected numbers ({_COLUMNS}), got {' '.join(words)!r}") from None
-    if len(numbers) not in (4, 5) or any(np.isnan(numbers)):
-        raise InputError(f"expected 4 or 5 numbers ({_COLUMNS}), got {' '.join(words)!r}")
-    radius_mm, distance_mm, index, diameter_mm = (*numbers[:3], numbers[-1])
-    is_stop = radius_mm == 0.0 and index in (0.0, index_before)
-    if radius_mm == 0.0 and not is_stop:
-        raise InputError(f"a radius of 0 is the stop and cannot change the index to {index:g}: write a flat surface as inf")
-    abbe = numbers[3] if len(numbers) == 5 and index not in (0.0, 1.0) else inf
-    if index == 0.0:
-        index, abbe = index_before, abbe_before
-    return Surface(inf if is_stop else radius_mm, distance_mm, index, diameter_mm, abbe, is_stop)
-
-
-def with_estimated_abbe_numbers(surfaces: list[Surface]) -> tuple[Surface, ...]:
-    """Give glass (index above 1.01) without an Abbe number one by its index and the power (n - 1)(1/R1 - 1/R2) of its element."""
-    done = list(surfaces)
-    for i, each in enumerate(surfaces):
-        if each.index > 1.01 and not isfinite(each.abbe_number):
-            front = next((before for before in surfaces[i::-1] if not before.is_stop), each)
-            back = next((behind for behind in surfaces[i + 1 :] if not behind.is_stop), each)
-            is_positive = front.curvature_per_mm >= back.curvature_per_mm
-            done[i] = replace(each, abbe_number=estimated_abbe_number(each.index, is_positive))
-    return tuple(done)
-
-
-def biconvex_lens(
-    focal_length_mm: float = 50.0, f_number: float = 4.0, edge_mm: float = 1.0, index: float = 1.5168, abbe_number: float = 64.17
-) -> LensPrescription:
-    """The simple bi-convex spherical lens of Leimkuehler et al. 2018: two equal radii, by default of BK7, no iris but its rims.
-
-    The paper states no numbers. Radius R and thickness t follow from the thick lensmaker's formula
-    1/f = (n - 1)(2/R - (n - 1) t / (n R^2)) with t just leaving `edge_mm` at the rim.
-    """
-    semi_mm, thickness_mm, radius_mm = 0.5 * focal_length_mm / f_number, 0.0, 0.0
-    for _ in range(50):
-        if thickness_mm >= index * focal_length_mm or radius_mm < 0.0:
-            break
-        radius_mm = focal_length_mm * (index - 1.0) * (1.0 + sqrt(1.0 - thickness_mm / (index * focal_length_mm)))
-        if radius_mm <= semi_mm:
-            raise InputError(f"one bi-convex lens of index {index:g} cannot have f/{f_number:g}: choose a larger f-number")
-        thickness_mm = edge_mm + 2.0 * (radius_mm - sqrt(radius_mm**2 - semi_mm**2))
-    front = Surface(radius_mm, thickness_mm, index, 2.0 * semi_mm, abbe_number)
-    return LensPrescription("biconvex", (front, Surface(-radius_mm, 0.0, 1.0, 2.0 * semi_mm)))

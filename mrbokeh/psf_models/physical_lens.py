@@ -6,6 +6,7 @@ refracted by Snell's law at every surface, with the index at its wavelength.
 Left out: reflections between surfaces, diffraction and the light that coatings lose.
 """
 
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,15 +19,16 @@ from mrbokeh.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import GREEN_UM, LensBeam, area_of
 from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest
-from mrbokeh.psf_models.lens_prescription import LensPrescription, biconvex_lens, read_prescription
-from mrbokeh.psf_models.quasi_random import quasi_random
+from mrbokeh.psf_models.biconvex_lens import biconvex_lens
+from mrbokeh.psf_models.lens_prescription import LensPrescription
+from mrbokeh.psf_models.lens_prescription_file import read_prescription
+from mrbokeh.psf_models.quasi_random import sobol_blocks
 
 EXPONENTS = (2.5, 1.2)
 COUNTS = (554, 554)
 """Steps along depth and eccentricity that give the 4,000 cells of the paper's Table 1."""
 
-_CHUNK, _LARGEST_RADIUS_PX = 1 << 16, 1024
-_DARK = 0.01  # share of the light on the axis below which a field counts as black
+_LARGEST_RADIUS_PX = 1024
 
 
 class PhysicalLens:
@@ -44,6 +46,7 @@ class PhysicalLens:
     """
 
     name = "physical"
+    knee_px: float | None = None
     turns: Turns = "field"
     channels = 3
     near_side_turned = False
@@ -72,10 +75,11 @@ class PhysicalLens:
         if not sensor_at_mm > self.lens.vertices_mm[-1]:
             raise InputError(f"{self.lens.name} forms its image inside its own glass: no sensor fits there")
         self.beam = LensBeam(self.lens, sensor_at_mm, 0.5 * float(np.hypot(width_mm, height_mm)))
+        self._ends_per_mm = self._per_mm(np.array([nearest_m, farthest_m]))
 
     @cached_property
     def axes(self) -> tuple[Axis, ...]:
-        return self._depth, Axis("eccentricity", 0.0, self._largest_eccentricity(), EXPONENTS[1])
+        return self._depth, Axis("eccentricity", 0.0, self.beam.lit_up_to(self._ends_per_mm), EXPONENTS[1])
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -98,19 +102,25 @@ class PhysicalLens:
         """See `PsfModel.kernel`. Each of the rays is traced in three colours, its wavelengths spread over their bands."""
         if rays <= 0:
             raise InputError("a physical lens has no closed form: expected at least one ray")
+        return self._of_known_light(self.landed(box, rays, sobol_blocks(5, rays, seed)), rays)
+
+    def landed(
+        self, box: Float64[np.ndarray, "axes 2"], rays: int, blocks: Iterable[Float64[np.ndarray, "rays 5"]]
+    ) -> Float64[np.ndarray, "size size 3"]:
+        """What so many rays bring to the sensor, relative to the light on the axis. Their shares in [0, 1) come in blocks: of the
+        window (meridional and across), of the band of wavelengths, of the range of depth and of that of eccentricity."""
         chiefs = self.beam.chief_rays(*box[1].tolist())
         ends = self._per_mm(np.unique(box[0]))[::-1]
         window = self.beam.window(ends, np.unique(np.append(box[1], box[1].mean())))
         areas_mm2 = np.array([self.beam.area_mm2(end, 0.0) for end in ends.tolist()])
-        kernel, (offset, step) = np.zeros((1, 1, 3)), quasi_random(5, seed)
-        for first in range(0, rays, _CHUNK):
-            shares = (offset + np.arange(first, min(first + _CHUNK, rays))[:, None] * step) % 1.0
+        kernel = np.zeros((1, 1, 3))
+        for shares in blocks:
             per_mm = self._per_mm(self._depth.between(box[0, 0], box[0, 1], shares[:, 3]))
             landings, weights = self.beam.trace(chiefs, window, shares[:, :3], per_mm, shares[:, 4] * (len(chiefs) - 1))
             weights *= (area_of(window) / rays / np.interp(per_mm, ends, areas_mm2))[:, None]
             kernel = self._wide_enough(kernel, landings, weights)
             compiled.add_landings(kernel, landings, weights, self.mm_per_px)
-        return self._of_known_light(kernel, rays)
+        return kernel
 
     def throughput(self, depth_m: float, eccentricity: float) -> float:
         """The open share: cross-section of the beam across the axis that reaches the sensor, relative to the beam on the axis.
@@ -118,8 +128,7 @@ class PhysicalLens:
         It is what rims take away (mechanical vignetting), without the natural fall of light by cos^4. Above 1 where the
         pupil of a wide-angle lens turns towards the field and grows; kernels sum to at most 1.
         """
-        per_mm = float(self._per_mm(np.array(depth_m)))
-        return self.beam.area_mm2(per_mm, float(eccentricity)) / self.beam.area_mm2(per_mm, 0.0)
+        return self.beam.open_share(float(self._per_mm(np.array(depth_m))), float(eccentricity))
 
     def _of_known_light(self, kernel: Float64[np.ndarray, "size size 3"], rays: int) -> Kernel:
         """All colours with the same sum: red, green and blue are the brightness of the light that arrives, not of the glass."""
@@ -141,19 +150,3 @@ class PhysicalLens:
         if radius > _LARGEST_RADIUS_PX:
             raise InputError(f"light lands {radius} px from its source: choose a nearest depth farther off or fewer pixels")
         return kernel if 2 * radius + 1 <= len(kernel) else centred(kernel, 2 * radius + 1)
-
-    def _largest_eccentricity(self) -> float:
-        """1, or where less than 1 % of the light on the axis comes through at an end of the range of depth."""
-        low, high = 0.0, 1.0
-        if self._is_bright(high):
-            return high
-        for _ in range(10):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self._is_bright(middle) else (low, middle)
-        return low
-
-    def _is_bright(self, eccentricity: float) -> bool:
-        try:
-            return all(self.throughput(depth_m, eccentricity) > _DARK for depth_m in (self._depth.low, self._depth.high))
-        except InputError:
-            return False

@@ -31,6 +31,7 @@ class SimpleLens:
     """
 
     name = "simple"
+    knee_px: float | None = None
     turns: Turns = "none"
     default_rays = 0
 

@@ -35,6 +35,7 @@ class Stylized:
     """
 
     name = "stylized"
+    knee_px: float | None = None
     turns: Turns = "none"
     near_side_turned = True
     channels = 3

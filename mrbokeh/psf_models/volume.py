@@ -17,12 +17,12 @@ from mrbokeh.errors import InputError
 from mrbokeh.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _volume_numba as compiled
 from mrbokeh.psf_models.base import Kernel, check_positive
-from mrbokeh.psf_models.quasi_random import quasi_random
+from mrbokeh.psf_models.quasi_random import sobol_blocks
 
 SAMPLES = 200
 EXPONENT = 1.0
 DENSITY_PER_M, ANISOTROPY, ALBEDO = 0.9, 0.8, (1.0, 1.0, 0.9)
-_RING_PX, _CHUNK = 0.125, 1 << 16
+_RING_PX = 0.125
 
 
 class Volume:
@@ -36,6 +36,7 @@ class Volume:
     """
 
     name = "volume"
+    knee_px: float | None = None
     turns: Turns = "none"
     channels = 3
     near_side_turned = False
@@ -94,10 +95,11 @@ class Volume:
         if rays <= 0:
             raise InputError("scattering has no closed form: expected at least one ray")
         rings, albedo = self._rings(), np.array([*self.albedo, 1.0])
-        for first in range(0, rays, _CHUNK):
-            distances_m = self._distances_m(box[0], first, min(first + _CHUNK, rays), seed)
-            cosines, collisions = self.trace(distances_m, seed, first)
+        first = 0
+        for shares in sobol_blocks(1, rays, seed):
+            cosines, collisions = self.trace(self.axes[0].between(box[0, 0], box[0, 1], shares[:, 0]), seed, first)
             compiled.add_to_rings(rings, cosines, collisions, albedo, self.focal_px, _RING_PX)
+            first += len(shares)
         kernel = np.zeros((self.size_px, self.size_px, 4))
         compiled.spread_rings(rings, _RING_PX, kernel)
         return self._of_known_light(_cut(kernel), rays)
@@ -114,10 +116,6 @@ class Volume:
     def _rings(self) -> Float64[np.ndarray, "rings 4"]:
         """As many as reach the corners of the window; the last channel loses nothing."""
         return np.zeros((int(np.ceil(self.size_px * np.sqrt(0.5) / _RING_PX)), 4))
-
-    def _distances_m(self, ends_m: Float64[np.ndarray, "2"], first: int, end: int, seed: int) -> Float64[np.ndarray, " rays"]:
-        offset, step = quasi_random(1, seed)
-        return self.axes[0].between(float(ends_m[0]), float(ends_m[1]), (offset[0] + np.arange(first, end) * step[0]) % 1.0)
 
     def _of_known_light(self, kernel: Float64[np.ndarray, "size size 4"], rays: int) -> Kernel:
         """Divided by what would be in the window without absorption."""

@@ -1,0 +1,112 @@
+"""`mrbokeh lens psf` and `mrbokeh lens spreadlets`: banks of point spread functions, and what a renderer splats of them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mrbokeh.errors import InputError
+
+
+def psf(
+    model: Annotated[str, typer.Argument(help="simple, combined (defocus and motion), physical, volume or stylized.")],
+    out: Annotated[Path, typer.Option(help="The folder of the bank; a half-built one is completed.")],
+    lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None,
+    image: Annotated[Path | None, typer.Option(help="The picture of a PSF (model stylized).")] = None,
+    diameter: Annotated[float | None, typer.Option(help="Largest circle of confusion in px (simple, combined, stylized).")] = None,
+    motion: Annotated[float | None, typer.Option(help="Longest motion in px per shutter (combined).")] = None,
+    prescription: Annotated[
+        Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")
+    ] = None,
+    focus_distance_m: Annotated[float | None, typer.Option(help="Where the lens is focused, inf is allowed (physical; else 2 m).")] = None,
+    f_number: Annotated[float | None, typer.Option(help="Closes the iris to this f-number (physical; open without).")] = None,
+    sensor_width_mm: Annotated[float | None, typer.Option(help="Sensor width (physical; else 36).")] = None,
+    sensor_height_mm: Annotated[float | None, typer.Option(help="Sensor height (physical; else two thirds of the width).")] = None,
+    image_width_px: Annotated[int | None, typer.Option(help="Width of the pictures to blur (physical; else 1024).")] = None,
+    nearest_m: Annotated[float | None, typer.Option(help="Nearest depth of the bank (physical; else 0.5).")] = None,
+    farthest_m: Annotated[float | None, typer.Option(help="Farthest depth of the bank (physical: else 100; volume: else 5).")] = None,
+    vignetting: Annotated[
+        bool | None,
+        typer.Option("--vignetting/--no-vignetting", help="Whether kernels darken off the axis (physical; else they do)."),
+    ] = None,
+    density_per_m: Annotated[float | None, typer.Option(help="Collisions per metre (volume; else 0.9).")] = None,
+    anisotropy: Annotated[float | None, typer.Option(help="Henyey-Greenstein's g, -1 to 1 (volume; else 0.8).")] = None,
+    focal_px: Annotated[float | None, typer.Option(help="Focal length of the picture in px (volume; else 1024).")] = None,
+    counts: Annotated[
+        str | None, typer.Option(help="Steps of the grid along each coordinate, e.g. 100 or 75,75 (combined: of the paper's grid).")
+    ] = None,
+    cells: Annotated[int | None, typer.Option(help="At most so many kernels, in proportion to their size (combined; else 400).")] = None,
+    rays: Annotated[
+        int | None, typer.Option(help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the rays.")] = 0,
+    overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False,
+) -> None:
+    """Build a bank of point spread functions. An interrupted build goes on when the same command is given again.
+
+    Example: mrbokeh lens psf combined --out combined_bank --diameter 128 --motion 128
+
+    Example: mrbokeh lens psf physical --prescription dgauss.50mm.dat --focus-distance-m 1.5 --f-number 2.8 --sensor-width-mm 23.5
+    --image-width-px 1920 --counts 40,40 --out double_gauss
+    """
+    from mrbokeh.psf_models.build import build_bank
+    from mrbokeh.psf_models.choose import ModelOptions, choose_model
+
+    options = ModelOptions(
+        lens=lens,
+        image=image,
+        diameter_px=diameter,
+        motion_px=motion,
+        prescription=prescription,
+        focus_distance_m=focus_distance_m,
+        f_number=f_number,
+        sensor_width_mm=sensor_width_mm,
+        sensor_height_mm=sensor_height_mm,
+        image_width_px=image_width_px,
+        nearest_m=nearest_m,
+        farthest_m=farthest_m,
+        vignetting=vignetting,
+        density_per_m=density_per_m,
+        anisotropy=anisotropy,
+        focal_px=focal_px,
+        counts=None if counts is None else _steps(counts),
+        cells=cells,
+    )
+    bank = build_bank(choose_model(model, options), out, rays, seed, overwrite=overwrite)
+    typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px")
+
+
+def _steps(text: str) -> tuple[int, ...]:
+    try:
+        steps = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        steps = (0,)
+    if min(steps) < 1:
+        raise InputError(f"expected --counts as whole numbers from 1 up with commas between them, such as 75,75, got {text!r}")
+    return steps
+
+
+def spreadlets(
+    bank: Annotated[Path, typer.Argument(help="The folder of a bank of PSFs.")],
+    points_per_px: Annotated[float, typer.Option(help="Points per pixel of a kernel's outline: more are nearer and slower.")] = 1.0,
+    lloyd_steps: Annotated[int, typer.Option(help="Steps of Lloyd's relaxation (the paper: 50; fitted values gain nothing by it).")] = 0,
+    annealing_steps: Annotated[int, typer.Option(help="Steps of annealing (the paper: 400; nor by this).")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of darts and annealing.")] = 0,
+    overwrite: Annotated[bool, typer.Option(help="Compute them again where they are.")] = False,
+) -> None:
+    """Compute what `render --psf BANK` splats (sparse points of the kernels' Laplacians) and keep it in BANK/spreadlets.npz.
+
+    An interrupted run goes on when the same command is given again. When the bank changes, give it once more.
+
+    Example: mrbokeh lens spreadlets combined_bank
+    """
+    import numpy as np
+
+    from mrbokeh.psf_bank_file import SPREADLETS
+    from mrbokeh.spreadlets import Sparsification
+    from mrbokeh.spreadlets_build import build_spreadlets
+
+    settings = Sparsification(points_per_px=points_per_px, lloyd_steps=lloyd_steps, annealing_steps=annealing_steps, seed=seed)
+    made = build_spreadlets(bank, settings, overwrite)
+    most = int(np.diff(made.starts).max())
+    typer.echo(f"wrote {bank / SPREADLETS}: {len(made.points)} points of {len(made)} kernels, up to {most} each")
