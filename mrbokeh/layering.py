@@ -11,8 +11,11 @@ Shared by all renderers that spread light; they differ in the `Spread` alone.
    one surface share the pupil side by side, so coverage adds up and neither seams nor slanted surfaces turn
    translucent, as they would under "over". What the pinhole picture shows goes first. What hides there, real layers before filled-in
    background (mrbokeh.hidden_background), gets what is left: the part of the pupil that looks past the edge of the occluder.
-5. What moves while the shutter is open is drawn out along its path, slice by slice, before it is spread (mrbokeh.motion).
-6. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage.
+5. What moves while the shutter is open is drawn out along its path, slice by slice, before it is spread (mrbokeh.motion),
+   unless the kernels hold motion themselves.
+6. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage. Coverage counts shares of
+   the pupil as the place sees it: light that a lens or a medium loses darkens the colour once and leaves coverage alone
+   (mrbokeh.optics), so it is not made up for here, and what is behind does not shine through.
 """
 
 from collections.abc import Sequence
@@ -25,10 +28,10 @@ from mrbokeh.errors import InputError
 from mrbokeh.hidden_background import apart
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
-from mrbokeh.motion import farthest_px, motion_channels
+from mrbokeh.optics import Optics, ThroughAperture
 from mrbokeh.sheets import Pixels, Sheet, coc_px_of, sheet_of
 from mrbokeh.slices import Channels, Slicing, composited
-from mrbokeh.spreading import FIELD_CELLS, Frame, Spread, reach_px
+from mrbokeh.spreading import FIELD_CELLS, Frame, Spread
 from mrbokeh.workers import cores
 from mrbokeh.zeroed_memory import ZeroedMemory
 
@@ -49,25 +52,18 @@ class Layering:
     field_cells: tuple[int, int] = FIELD_CELLS
 
 
-def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread, layering: Layering) -> Layer:
-    """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first."""
+def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread | Optics, layering: Layering) -> Layer:
+    """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first.
+
+    spread: how kernels of the lens's aperture are summed, or an Optics that takes the aperture's place.
+    """
     coc_px = [coc_px_of(layer, lens) for layer in _checked(layers)]
-    motion = motion_channels(layers[0].extra)
-    farthest = farthest_px(layers)
-    margin = reach_px(lens.aperture, max(float(np.abs(each).max()) for each in coc_px)) + farthest
+    cells = layering.field_cells
+    optics = spread if isinstance(spread, Optics) else ThroughAperture.of(layers, lens.aperture, spread, cells)
+    margin = optics.margin_px(layers, coc_px)
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
-        slicing = Slicing(
-            lens.aperture,
-            spread,
-            layering.slices,
-            layering.field_cells,
-            frame,
-            pool,
-            ZeroedMemory(),
-            motion if farthest else None,
-            farthest,
-        )
+        slicing = Slicing(lens.aperture, optics, layering.slices, cells, frame, pool, ZeroedMemory())
         groups = _groups([sheet_of(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
         colour, taken = _rendered(groups[-1], layering, slicing)
         for group in reversed(groups[:-1]):

@@ -4,7 +4,8 @@ A point that moves evenly at one depth while the shutter is open draws its circl
 aperture's kernel convolved with a segment of a line (the COMBINED model of Leimkuehler et al. 2018, Table 1). Convolving with
 the segment first and with the kernel then is the same, for every renderer that spreads light: so the light of a slice is drawn
 out here, and the slice, all of whose pixels have nearly one circle of confusion, is spread as ever. Motion is linear, without
-change of depth; the picture's own time is the middle of the shutter.
+change of depth; the picture's own time is the middle of the shutter. Kernels of a bank that hold motion themselves (mrbokeh.optics)
+take it from the same channels instead.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,19 +45,18 @@ def motion_channels(extra: Mapping[str, np.ndarray]) -> slice | None:
 
 def farthest_px(layers: Sequence[Layer]) -> int:
     """How many whole pixels light of any of the layers may move away from its place at most; 0 if nothing moves."""
-    return max((motion_reach_px(_of_surface(layer.extra[MOTION], layer.alpha)) for layer in layers if MOTION in layer.extra), default=0)
+    return max((motion_reach_px(motion_of(layer.extra[MOTION], layer.alpha)) for layer in layers if MOTION in layer.extra), default=0)
 
 
 def moved(
     values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], channels: slice
 ) -> tuple[Float32[np.ndarray, "height width channels"], Float32[np.ndarray, "height width"]]:
     """`drawn_out` along the motion that is among the channels, as much of it as there is coverage."""
-    return drawn_out(values, coc_px, _of_surface(values[..., channels], values[..., 3]))
+    return drawn_out(values, coc_px, motion_of(values[..., channels], values[..., 3]))
 
 
-def _of_surface(
-    motion_px: Float32[np.ndarray, "height width 2"], coverage: Float32[np.ndarray, "height width"]
-) -> Float32[np.ndarray, "height width 2"]:
+def motion_of(motion_px: Float32[np.ndarray, "*batch 2"], coverage: Float32[np.ndarray, "*batch"]) -> Float32[np.ndarray, "*batch 2"]:
+    """The motion of what is seen, from motion times coverage; 0 where nothing is."""
     return np.divide(motion_px, coverage[..., None], out=np.zeros_like(motion_px), where=coverage[..., None] > 0)
 
 

@@ -3,17 +3,18 @@
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 
 import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.aperture import Aperture
-from mrbokeh.motion import moved
+from mrbokeh.optics import Optics, ThroughAperture
 from mrbokeh.sheets import Pixels
 from mrbokeh.slice_islands import islands
 from mrbokeh.slice_sorting import Part, Shares, Window, sorted_slices, window_of
-from mrbokeh.spreading import Frame, Spread, reach_px, spread_light
+from mrbokeh.spreading import Frame, Spread
 from mrbokeh.workers import ahead, cores
 from mrbokeh.zeroed_memory import ZeroedMemory
 
@@ -28,21 +29,23 @@ Channels = Float32[np.ndarray, "height width _"]
 
 @dataclass(frozen=True)
 class Slicing:
-    """What the light goes through: the aperture, a renderer's Spread, how many slices at most, field cells, place in the frame.
+    """What the light goes through, how many slices at most, and the place in the frame.
 
-    frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them. motion: the channels
-    that hold it, if anything moves, and farthest_px: by how many whole pixels at most.
+    spread: an Optics, or a renderer's Spread through the aperture with its field cells (which say nothing to an Optics).
+    frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them.
     """
 
     aperture: Aperture
-    spread: Spread
+    spread: Spread | Optics
     slices: int
     field_cells: tuple[int, int]
     frame: Frame
     pool: Executor
     memory: ZeroedMemory
-    motion: slice | None = None
-    farthest_px: int = 0
+
+    @cached_property
+    def optics(self) -> Optics:
+        return self.spread if isinstance(self.spread, Optics) else ThroughAperture(self.aperture, self.spread, self.field_cells)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -78,9 +81,7 @@ class Slicing:
             place_light(light, coc_px, each.runs, each.pixels.places, each.pixels.values, each.pixels.coc_px, each.shares, *where)
             for each in parts
         ]
-        frame = self.frame.moved(window[1].start, window[0].start)
-        drawn, drawn_coc_px = (light, coc_px) if self.motion is None else moved(light, coc_px, self.motion)
-        spread = spread_light(self.spread, drawn, drawn_coc_px, self.aperture, frame, self.field_cells)
+        spread = self.optics.spread(light, coc_px, self.frame.moved(window[1].start, window[0].start))
         spread = spread.copy() if np.may_share_memory(spread, memory) else spread
         for part in parts:
             remove_light(light, coc_px, part.runs, part.pixels.places, *where)
@@ -99,13 +100,13 @@ def composited(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tu
     """What the pinhole picture shows of the sheets, then the rest: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
 
     by_depth: which sheet the pinhole picture shows at a pixel is a matter of depth, else of their order (slices are always by depth).
-    The pupil is counted per colour where the aperture is chromatic.
+    The pupil is counted per colour where the optics are chromatic.
     """
     from mrbokeh._slices_numba import claim
 
     frame, channels = slicing.frame, sheets[0].values.shape[1]
     colour = np.zeros((frame.height_px, frame.width_px, channels - 1), np.float32)
-    taken = np.zeros((frame.height_px, frame.width_px, 3 if slicing.aperture.is_chromatic else 1), np.float32)
+    taken = np.zeros((frame.height_px, frame.width_px, slicing.optics.coverages), np.float32)
     for rounds in ahead(slicing.pool, slicing.spread_piece, _pieces(sheets, slicing, by_depth), slicing.at_once):
         for light, (rows, columns) in rounds:
             claim(colour, taken, light, rows.start + frame.top_px, columns.start + frame.left_px)
@@ -120,7 +121,7 @@ def _pieces(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Itera
     slices = [sorted_slices(sheets, shares, step_px, slicing.size[1], slicing.pool) for shares in seen_and_hidden]
     for k, parts in chain.from_iterable(slices):
         largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
-        reach = reach_px(slicing.aperture, largest_px) + slicing.farthest_px
+        reach = slicing.optics.reach_px(parts, largest_px, slicing.frame)
         for island in islands(parts, reach, slicing.size):
             yield island, reach
 

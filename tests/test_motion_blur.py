@@ -10,15 +10,17 @@ from typer.testing import CliRunner
 from mrbokeh.cli import app
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.image_io import read_image, read_layer
+from mrbokeh.image_io import read_image, read_layer, write_layer
 from mrbokeh.image_metrics import psnr, ssim
 from mrbokeh.layer import Layer, opaque
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import read_lens, write_lens
 from mrbokeh.motion import with_motion
 from mrbokeh.motion_file import taken_from_channels
+from mrbokeh.psf_bank_file import read_bank
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
+from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
 
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)
 SIZE = (70, 110)
@@ -119,6 +121,32 @@ def test_ray_traced_scenes_with_motion_and_defocus(scene: str, method: str) -> N
         assert ssim(np.clip(blurred, 0.0, 1.0), truth) > least
 
 
+@pytest.fixture(scope="module", name="combined")
+def fixture_combined(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bank of kernels of defocus and motion together, built as users do it: 234 cells."""
+    bank = tmp_path_factory.mktemp("banks") / "combined"
+    words = ["lens", "psf", "combined", "--diameter", "12", "--motion", "16", "--counts", "48,48", "--out", str(bank)]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    return bank
+
+
+@pytest.mark.parametrize("scene", ["fence_1", "whirl_1"])
+def test_ray_traced_scenes_by_kernels_that_hold_motion(scene: str, combined: Path) -> None:
+    """The bounds of the test above, from picture, depth and motion and from layers, and within 0.005 of motion drawn out."""
+    folder = Path(__file__).parent / "data" / "samples" / scene
+    truth, lens = np.clip(read_image(folder / "reference.exr"), 0.0, 1.0), read_lens(folder / "lens.json")
+    picture = read_layer(folder / "all_in_focus.exr", extra=True)
+    layers = [read_layer(path, extra=True) for path in sorted((folder / "layers").glob("*.exr"))]
+    spreadlets = LaplacianSpreadlets(read_bank(combined))
+    for given, least in (([picture], 0.94), (layers, 0.97)):
+        moving_layers = [taken_from_channels(layer, 1.0) for layer in given]
+        found, drawn = (
+            ssim(np.clip(renderer.render(moving_layers, lens).rgb, 0.0, 1.0), truth) for renderer in (spreadlets, make_renderer("scatter"))
+        )
+        assert found > least
+        assert found > drawn - 0.005
+
+
 def files(folder: Path) -> list[str]:
     picture = background(4.0)
     write_exr(folder / "rgb.exr", ExrPart({name: picture.rgb[..., i] for i, name in enumerate("RGB")}))
@@ -136,6 +164,19 @@ def test_the_command_blurs_by_motion(tmp_path: Path) -> None:
     expected = make_renderer("polygon").render([moving(background(4.0), (4.0, -2.0))], LENS).rgb
     written = read_exr(tmp_path / "out.exr")[0].stacked("RGB")
     np.testing.assert_allclose(written, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("shutter", ["0.5", "1.5"])
+def test_the_command_blurs_by_a_bank_that_holds_motion(tmp_path: Path, combined: Path, shutter: str) -> None:
+    """Picture, depth and motion in files, a layer with its own motion in front; as the exact renderer draws it out."""
+    card = object_layer(40, -6.0)
+    up = np.repeat(card.alpha[..., None], 2, axis=2)
+    write_layer(tmp_path / "card.exr", replace(card, extra={"forward.u": 0.0 * up[..., :1], "forward.v": 9.0 * up[..., 1:]}), half=False)
+    words = [*files(tmp_path), "--layer", str(tmp_path / "card.exr"), "--motion", str(tmp_path / "motion.exr"), "--shutter", shutter]
+    for name, method in (("bank", ["laplacian", "--psf", str(combined)]), ("exact", ["scatter"])):
+        result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / f"{name}.exr"), "--method", *method])
+        assert result.exit_code == 0, result.output
+    assert psnr(read_image(tmp_path / "bank.exr"), read_image(tmp_path / "exact.exr")) > 40.0
 
 
 @pytest.mark.parametrize(

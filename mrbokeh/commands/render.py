@@ -1,15 +1,13 @@
 """`mrbokeh render`: blur a picture with depth, or layers, as a lens does."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import DEFAULT, make_renderer
+from mrbokeh.renderers.choose import DEFAULT
 
 app = typer.Typer(add_completion=False)
 
@@ -50,7 +48,8 @@ def render(
     Example: mrbokeh render --rgb aif.exr --depth z.exr --lens lens.json --focus-at 640,360 --out blurred.exr
     """
     from mrbokeh.atomic_files import refuse_existing
-    from mrbokeh.image_io import write_image, write_layer
+    from mrbokeh.commands._render_method import chosen_renderer, focused, reconstructed
+    from mrbokeh.commands._render_sharp import Sources, read_sharp
     from mrbokeh.layering import Layering
     from mrbokeh.lens_file import read_lens
     from mrbokeh.progress import working
@@ -58,108 +57,22 @@ def render(
     refuse_existing(out, overwrite)
     if alpha_out and out.suffix.lower() != ".exr":
         raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
-    given = [rgb, depth, *(layer or []), *(behind or []), motion, focus_distance_m, focus_at]
-    sharp = {} if samples is not None else _moving(_read(rgb, depth, layer or [], behind or [], srgb), rgb, motion, shutter)
-    used = read_lens(lens) if samples is not None else _focused(read_lens(lens), sharp, focus_distance_m, focus_at)
-    if samples is not None and any(each is not None for each in given):
+    sources = Sources(rgb, depth, tuple(layer or ()), tuple(behind or ()), motion, shutter, srgb)
+    sharp = {} if samples is not None else read_sharp(sources)
+    used = read_lens(lens) if samples is not None else focused(read_lens(lens), sharp, focus_distance_m, focus_at)
+    if samples is not None and (sources.are_given or focus_distance_m is not None or focus_at is not None):
         raise InputError("--samples holds all there is to see, with its focus and its motion: leave out pictures, layers, motion and focus")
     with working("rendering (the first time on a machine it takes a minute to compile)"):
-        renderer = _renderer(method, psf, threads=threads, layering=Layering(slices=slices))
-        blurred = renderer.render(list(sharp.values()), used) if samples is None else _reconstructed(renderer, method, samples, used)
+        renderer = chosen_renderer(method, psf, threads=threads, layering=Layering(slices=slices))
+        blurred = renderer.render(list(sharp.values()), used) if samples is None else reconstructed(renderer, method, samples, used)
+    _write(out, blurred, alpha_out)
+    typer.echo(f"wrote {out}")
+
+
+def _write(out: Path, blurred: Layer, alpha_out: bool) -> None:
+    from mrbokeh.image_io import write_image, write_layer
+
     if alpha_out:
         write_layer(out, blurred)
     else:
         write_image(out, blurred.rgb)
-    typer.echo(f"wrote {out}")
-
-
-def _renderer(method: str, psf: Path | None, **settings: Any) -> Renderer:
-    if psf is None:
-        return make_renderer(method, **settings)
-    if method != "laplacian":
-        raise InputError(f"--psf is for --method laplacian, got --method {method}: other methods take the opening of the lens file")
-    from mrbokeh.psf_bank_file import read_bank
-    from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
-
-    return LaplacianSpreadlets(bank=read_bank(psf), **settings)
-
-
-def _reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) -> Layer:
-    from mrbokeh.light_field_samples_file import read_samples
-
-    if not hasattr(renderer, "reconstruct"):
-        raise InputError(f"--samples are for --method lrdm or laplacian, got --method {method}")
-    return renderer.reconstruct(read_samples(samples), lens)
-
-
-def _read(rgb: Path | None, depth: Path | None, layers: list[Path], behind: list[Path], srgb: bool) -> dict[str, Layer]:
-    """What to blur by where it came from, front first."""
-    from mrbokeh.image_io import read_layer
-
-    sharp = {str(path): read_layer(path, extra=True) for path in layers}
-    if (rgb is None) != (depth is None):
-        raise InputError("--rgb and --depth belong together: give both, or only --layer")
-    if rgb is not None and depth is not None:
-        sharp[str(rgb)] = _picture(rgb, depth, srgb)
-    if behind and rgb is None:
-        raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
-    sharp |= {str(path): read_layer(path, extra=True) for path in behind}
-    if not sharp:
-        raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
-    if len({each.alpha.shape for each in sharp.values()}) > 1:
-        raise InputError("what is to be blurred differs in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in sharp.items()))
-    return sharp
-
-
-def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
-    from mrbokeh.image_io import read_depth, read_image, read_linear
-    from mrbokeh.layer import opaque
-
-    colour, depth_m = read_image(rgb) if srgb else read_linear(rgb), read_depth(depth)
-    if colour.shape[:2] != depth_m.shape:
-        sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
-        raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
-    return opaque(colour, depth_m)
-
-
-def _with_all_extras(sharp: dict[str, Layer]) -> dict[str, Layer]:
-    """Every layer with the extra channels of all, 0 where a layer has none of that name."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    shapes = {name: values.shape for each in sharp.values() for name, values in each.extra.items()}
-    return {
-        path: replace(each, extra={name: each.extra.get(name, np.zeros(shapes[name], np.float32)) for name in sorted(shapes)})
-        for path, each in sharp.items()
-    }
-
-
-def _moving(sharp: dict[str, Layer], rgb: Path | None, motion: Path | None, shutter: float) -> dict[str, Layer]:
-    """With motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
-    from mrbokeh.motion import with_motion
-    from mrbokeh.motion_file import read_motion, taken_from_channels
-
-    if motion is not None and rgb is None:
-        raise InputError("--motion belongs to --rgb: layers have their motion in their own channels forward.u and forward.v")
-    moving = {path: taken_from_channels(each, shutter) for path, each in sharp.items()}
-    if motion is not None:
-        moving[str(rgb)] = with_motion(moving[str(rgb)], read_motion(motion), shutter)
-    return _with_all_extras(moving)
-
-
-def _focused(lens: Lens, sharp: dict[str, Layer], focus_distance_m: float | None, focus_at: str | None) -> Lens:
-    """The lens at the distance that was asked for, or focused on what is frontmost at a pixel."""
-    if focus_distance_m is not None and focus_at is not None:
-        raise InputError("give either --focus-distance-m or --focus-at, not both")
-    if focus_distance_m is not None:
-        return lens.focused_at(focus_distance_m)
-    if focus_at is None:
-        return lens
-    from mrbokeh.layer import flatten
-
-    try:
-        x_px, y_px, radius_px = (*map(int, focus_at.split(",")), 0)[:3]
-    except ValueError:
-        raise InputError(f"--focus-at: expected X,Y or X,Y,RADIUS in whole pixels, got {focus_at!r}") from None
-    return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
-from scipy.ndimage import affine_transform
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from scipy.ndimage import affine_transform, binary_erosion
 
 from mrbokeh.errors import InputError
 from mrbokeh.progress import track
@@ -13,22 +14,27 @@ from mrbokeh.psf_bank import PsfBank
 from mrbokeh.renderers._laplacian_tables import Points, by_rows, joined_points, taps_of
 from mrbokeh.spreadlet_values import turned
 from mrbokeh.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify, whole_laplacian
+from mrbokeh.workers import one_blas_thread
 
 _LEAST_ANGLES, _MOST_ANGLES = 16, 256
 _DENSE_TAPS = 452  # those of a disc of 24 px: fewer are splatted as they are
+_DENSE_RIM = 2  # taps for each on the rim: a line that is up to about 4 px wide
+_MOST_TURNED = 1024
+"""Turning a spreadlet takes the cube of its points, seconds beyond this; a kernel so busy is turned before its Laplacian is taken."""
 _SHOW_FROM = 8
+_MOST_KERNELS = 1 << 15  # that are kept between calls
 
 
 @dataclass(frozen=True)
 class Place:
     """What a pixel's PSF depends on besides its circle of confusion; what the bank does not ask for may be None.
 
-    motion_px (H, W, 2): right and down per shutter. field_xy (H, W, 2): position in half diagonals. depth_m (H, W).
+    motion_px (..., 2): right and down per shutter. field_xy (..., 2): position in half diagonals. depth_m (...).
     """
 
-    motion_px: Float[np.ndarray, "height width 2"] | None = None
-    field_xy: Float[np.ndarray, "height width 2"] | None = None
-    depth_m: Float[np.ndarray, "height width"] | None = None
+    motion_px: Float[np.ndarray, "*batch 2"] | None = None
+    field_xy: Float[np.ndarray, "*batch 2"] | None = None
+    depth_m: Float[np.ndarray, "*batch"] | None = None
 
 
 @dataclass
@@ -48,28 +54,62 @@ class BankTables:
             return 2
         return int(np.clip(4 * self.bank.radius_px, _LEAST_ANGLES, _MOST_ANGLES)) // 2 * 2
 
-    def codes(self, coc_px: Float32[np.ndarray, "height width"], bright: np.ndarray, place: Place) -> Int64[np.ndarray, "height width"]:
-        """The kernel of every pixel."""
+    @property
+    def needed(self) -> frozenset[str]:
+        """What a `Place` must hold: "motion", "field", "depth"."""
+        of_axes = {"motion_px": "motion", "eccentricity": "field", "depth_m": "depth"}
+        names = {self.bank.turns, *(of_axes.get(axis.name, "none") for axis in self.bank.axes)}
+        return frozenset(names - {"none"})
+
+    @property
+    def holds_motion(self) -> bool:
+        return "motion" in self.needed
+
+    @cached_property
+    def reaches_px(self) -> Int64[np.ndarray, " cells"]:
+        """How many whole pixels the light of each cell's kernel travels at most along rows or columns, however it is turned."""
+        return np.array([_reach_px(kernel, self.bank.turns != "none") for kernel in self.bank.kernels], np.int64)
+
+    def cells(self, coc_px: Float32[np.ndarray, "*batch"], place: Place) -> Int64[np.ndarray, "*batch"]:
+        """The cell of the bank that holds each pixel."""
         planes = [self._coordinate(axis.name, coc_px, place) for axis in self.bank.axes]
-        cells = self.bank.nearest(np.stack(planes, axis=-1).astype(np.float64))
+        return self.bank.nearest(np.stack(planes, axis=-1).astype(np.float64))
+
+    def codes(
+        self, coc_px: Float32[np.ndarray, "height width"], bright: Bool[np.ndarray, "height width"], place: Place
+    ) -> Int64[np.ndarray, "height width"]:
+        """The kernel of every pixel."""
         turn = np.zeros(coc_px.shape, np.int64)
         if self.bank.turns != "none":
             way = self._needed(place.motion_px if self.bank.turns == "motion" else place.field_xy, self.bank.turns)
             turn = np.rint(np.arctan2(way[..., 1], way[..., 0]) * self.angles / (2.0 * np.pi)).astype(np.int64)
         if self.bank.near_side_turned:
             turn = turn + np.where(coc_px < 0, self.angles // 2, 0)
-        return 2 * (cells * self.angles + turn % self.angles) + bright
+        return 2 * (self.cells(coc_px, place) * self.angles + turn % self.angles) + bright
+
+    def light(self, codes: Int64[np.ndarray, "*batch"]) -> Float32[np.ndarray, "*batch channels"]:
+        """What the kernel of each code sums to."""
+        return self.bank.throughput.astype(np.float32)[codes // 2 // self.angles]
 
     def is_dense(self, code: int) -> bool:
-        """Whether a kernel has so few taps that they are splatted as they are (Section 6.4)."""
-        return bool(np.count_nonzero(self.bank.kernels[code // 2 // self.angles].any(axis=2)) <= _DENSE_TAPS)
+        """Whether a kernel is splatted tap by tap (Section 6.4): it has few of them, or most are rim, so that points were no fewer."""
+        return bool(self._dense[code // 2 // self.angles])
 
-    def points(self, codes: Sequence[int], dense: bool, channel: int | None) -> Points:
+    @cached_property
+    def _dense(self) -> Bool[np.ndarray, " cells"]:
+        supports = [kernel.any(axis=2) for kernel in self.bank.kernels]
+        return np.array([seen.sum() <= max(_DENSE_TAPS, _DENSE_RIM * (seen & ~binary_erosion(seen)).sum()) for seen in supports])
+
+    def points(self, codes: Sequence[int], dense: bool, channel: int) -> Points:
         """The points of these codes, in their order; what is new is computed and kept. dense: all taps."""
-        new = [code for code in codes if (code, dense) not in self._kept]
-        for code in track(new, "spreadlets of the bank") if len(new) >= _SHOW_FROM else new:
-            self._kept[code, dense] = by_rows(self._computed(code, dense))
-        return joined_points([self._kept[code, dense] for code in codes], channel)
+        if len(self._kept) > _MOST_KERNELS:
+            self._kept.clear()
+        found = {code: self._kept.get((code, dense)) for code in codes}
+        new = [code for code, spreadlet in found.items() if spreadlet is None]
+        with one_blas_thread():
+            for code in track(new, "spreadlets of the bank") if len(new) >= _SHOW_FROM else new:
+                found[code] = self._kept[code, dense] = by_rows(self._computed(code, dense))
+        return joined_points([found[code] for code in codes], channel)
 
     def _computed(self, code: int, dense: bool) -> Spreadlet:
         cell, turn = divmod(code // 2, self.angles)
@@ -80,6 +120,8 @@ class BankTables:
         if turn:
             upright = self._kept.get((code - 2 * turn, False))
             upright = upright or self._kept.setdefault((code - 2 * turn, False), self._computed(code - 2 * turn, False))
+            if len(upright.points) > _MOST_TURNED:
+                return whole_laplacian(turned_kernel(self.bank.kernels[cell], angle_rad))
             return Spreadlet(*turned(upright.points, upright.values, angle_rad))
         return self.spreadlets[cell] if self.spreadlets is not None else sparsify(self.bank.kernels[cell], self.sparsification)
 
@@ -101,6 +143,12 @@ class BankTables:
 def spreadlets_of(bank: PsfBank, sparsification: Sparsification) -> Spreadlets:
     """The spreadlets of all cells of a bank, under a progress bar; kept in files by mrbokeh.spreadlets_file."""
     return Spreadlets.joined([sparsify(kernel, sparsification) for kernel in track(bank.kernels, "spreadlets of the bank")])
+
+
+def _reach_px(kernel: Float32[np.ndarray, "size size channels"], turns: bool) -> int:
+    """To the farthest tap along rows or columns; of one that is turned as the crow flies, and what interpolation adds."""
+    down, right = np.abs(np.argwhere(kernel.any(axis=2)) - kernel.shape[0] // 2).T
+    return int(np.ceil(np.hypot(down, right).max() + np.sqrt(2.0))) if turns else int(max(down.max(), right.max()))
 
 
 def turned_kernel(kernel: Float32[np.ndarray, "size size channels"], angle_rad: float) -> Float64[np.ndarray, "side side channels"]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from os import cpu_count
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
@@ -11,7 +12,25 @@ from mrbokeh.laplacian_integration import fast_width, integrate, integrate_by_py
 from mrbokeh.renderers._laplacian_tables import Points
 
 _STRIP_ROWS = 64
-_FAR_FIELD_PX = 8  # beyond the reach of the points, before the border on which light is 0
+FAR_FIELD_PX = 8  # beyond the reach of the points, before the border on which light is 0
+
+
+class Window(NamedTuple):
+    """The part of the plane that light can reach: row and column of its first pixel, and its size."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+def window_of(cells: Int32[np.ndarray, "height width"], reach_px: int, is_integrated: bool) -> Window:
+    """What points of the pixels that have a cell (>= 0) reach, and for Laplacians the border on which light is 0."""
+    rows, columns = (np.flatnonzero((cells >= 0).any(axis=axis)) for axis in (1, 0))
+    margin = reach_px + (1 + FAR_FIELD_PX if is_integrated else 0)
+    top, left = int(rows[0]) - margin, int(columns[0]) - margin
+    height, width = int(rows[-1]) + margin + 1 - top, int(columns[-1]) + margin + 1 - left
+    return Window(top, left, height, fast_width(width) if is_integrated else width)
 
 
 def add_light(
@@ -26,12 +45,8 @@ def add_light(
 
     What points reach beyond the picture is summed, too: a Laplacian that is cut off is that of another picture.
     """
-    rows, columns = (np.flatnonzero((cells >= 0).any(axis=axis)) for axis in (1, 0))
-    margin = points.reach_px + (0 if integration is None else 1 + _FAR_FIELD_PX)
-    top, left = int(rows[0]) - margin, int(columns[0]) - margin
-    height, width = int(rows[-1]) + margin + 1 - top, int(columns[-1]) + margin + 1 - left
-    width, precision = (width, np.float32) if integration is None else (fast_width(width), np.float64)
-    sums = np.zeros((height, width, values.shape[2]), precision)
+    top, left, height, width = window_of(cells, points.reach_px, integration is not None)
+    sums = np.zeros((height, width, values.shape[2]), np.float32 if integration is None else np.float64)
     with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
         splat(sums, values, cells, points, (top, left), pool.map)
     if integration is not None:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from os import cpu_count
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
@@ -12,6 +11,7 @@ from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 from mrbokeh.progress import track
 from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify, whole_laplacian
+from mrbokeh.workers import cores, one_blas_thread
 
 DENSE, SPARSE, WHOLE = 0, 1, 2
 DENSE_PER_PX = 32.0
@@ -19,7 +19,7 @@ LEVELS_PER_OCTAVE = 64.0
 _BLOCK = 4096  # codes per kind and side
 _MOST_KERNELS = 8192  # that are kept between calls
 _SHOW_FROM = 8
-_AROUND_PX, _OUTSHINES = 8, 8.0
+AROUND_PX, OUTSHINES = 8, 8.0
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,14 @@ class KernelTables:
         key = vertices.tobytes() + starts.tobytes() + weights.tobytes()
         if len(self.kept) > _MOST_KERNELS:
             self.kept.clear()
-        new = [code for code in codes if (key, code, dense) not in self.kept]
+        found = {code: self.kept.get((key, code, dense)) for code in codes}
+        new = [code for code, spreadlet in found.items() if spreadlet is None]
         slow = not dense and sum(kind_of(code) == SPARSE for code in new) >= _SHOW_FROM
-        with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
+        with one_blas_thread(), ThreadPoolExecutor(threads or cores()) as pool:
             made = pool.map(lambda code: self._computed(code, aperture, dense), new)
             for code, spreadlet in zip(new, track(made, "spreadlets", len(new)) if slow else made, strict=True):
-                self.kept[key, code, dense] = by_rows(spreadlet)
-        return joined_points([self.kept[key, code, dense] for code in codes])
+                found[code] = self.kept[key, code, dense] = by_rows(spreadlet)
+        return joined_points([found[code] for code in codes])
 
     def diameter_px(self, code: int) -> float:
         """The signed diameter that a code stands for."""
@@ -104,11 +105,12 @@ def by_rows(cell: Spreadlet) -> Spreadlet:
     return Spreadlet(cell.points[order], cell.values[order])
 
 
-def joined_points(cells: Sequence[Spreadlet], channel: int | None = 0) -> Points:
-    """Cells that are sorted by row, one after the other; weights of one channel, or None: their mean."""
-    xy = np.concatenate([each.points for each in cells]).astype(np.int32)
-    weights = np.concatenate([each.values.mean(axis=1) if channel is None else each.values[:, channel] for each in cells])
-    starts = np.cumsum([0, *(len(each.points) for each in cells)]).astype(np.int64)
+def joined_points(cells: Sequence[Spreadlet | None], channel: int = 0) -> Points:
+    """Cells that are sorted by row, one after the other, but None; weights of one channel."""
+    some = [cell for cell in cells if cell is not None]
+    xy = np.concatenate([each.points for each in some]).astype(np.int32)
+    weights = np.concatenate([each.values[:, channel] for each in some])
+    starts = np.cumsum([0, *(len(each.points) for each in some)]).astype(np.int64)
     return Points(xy, weights, starts, int(np.abs(xy).max(initial=0)))
 
 
@@ -116,9 +118,9 @@ def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.
     """Pixels that outshine the mean of their surroundings in any channel: lamps and lone pixels, whose PSF can be seen."""
     import cv2
 
-    window = (2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1)
+    window = (2 * AROUND_PX + 1, 2 * AROUND_PX + 1)
     found = np.zeros(values.shape[:2], np.bool_)
     for c in range(values.shape[2]):
         light = np.abs(values[..., c])
-        found |= light > _OUTSHINES * cv2.boxFilter(light, cv2.CV_64F, window, borderType=cv2.BORDER_REFLECT_101)
+        found |= light > OUTSHINES * cv2.boxFilter(light, cv2.CV_64F, window, borderType=cv2.BORDER_REFLECT_101)
     return found

@@ -25,7 +25,7 @@ from mrbokeh.lens import Lens
 from mrbokeh.light_field_samples import LightFieldSamples
 from mrbokeh.psf_bank import PsfBank
 from mrbokeh.renderers._laplacian_bank import BankTables, Place
-from mrbokeh.renderers._laplacian_layers import bank_lens, with_places, without_places
+from mrbokeh.renderers._laplacian_layers import BankOptics
 from mrbokeh.renderers._laplacian_samples import reconstructed
 from mrbokeh.renderers._laplacian_sums import add_light
 from mrbokeh.renderers._laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out
@@ -65,14 +65,9 @@ class LaplacianSpreadlets:
         object.__setattr__(self, "_bank_tables", bank_tables)
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        if self.bank is None:
+        if self._bank_tables is None or not layers:
             return render_layers(layers, lens, self.spread, self.layering)
-        placed, place_of = with_places(layers, self.bank)
-
-        def spread(values: np.ndarray, coc_px: np.ndarray, aperture: Aperture) -> np.ndarray:  # noqa: ARG001
-            return self.spread_bank(values, coc_px, place_of(values, coc_px))
-
-        return without_places(render_layers(placed, bank_lens(lens, self.bank, layers[0].width_px), spread, self.layering), layers)
+        return render_layers(layers, lens, BankOptics.of(layers, lens, self._bank_tables, self.spread_bank), self.layering)
 
     def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
         """A picture from noisy samples: each gives its light to the whole PSF of the point that it saw (Section 6.2, Fig. 7)."""
@@ -96,10 +91,13 @@ class LaplacianSpreadlets:
         coc_px: Float32[np.ndarray, "height width"],
         place: Place,
         densely: bool = False,
-    ) -> Float32[np.ndarray, "height width channels"]:
-        """The sum over all pixels of value times the bank's kernel, same size out; colours take their kernel, others the mean.
+    ) -> Float32[np.ndarray, "height width channels_out"]:
+        """The sum over all pixels of value times the bank's kernel: R, G, B, coverage, then others, as in mrbokeh.optics.Optics.
 
-        Values, circles and what gets lost as in mrbokeh.spreading.Spread. densely: all taps of the same kernels.
+        Coverage, three times for a bank of three colours, and others take kernels scaled to sum to 1: light that is absorbed
+        darkens what is seen, but is no hole in it. Others go with green. What a bank of one colour is given may also be colour
+        alone, of up to three channels. Circles and what gets lost as in mrbokeh.spreading.Spread. densely: all taps of the
+        same kernels.
         """
         tables = self._bank_tables
         if tables is None:
@@ -108,14 +106,18 @@ class LaplacianSpreadlets:
         if not np.isfinite(coc_px[lit]).all():
             raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
         codes = np.where(lit, tables.codes(np.where(lit, coc_px, np.float32(0)), stands_out(values), place), -1)
-        out = np.zeros_like(values)
-        colours = [(slice(None), 0)] if tables.bank.channels == 1 else [(np.s_[c : c + 1], c) for c in range(3)] + [(np.s_[3:], None)]
         kinds = {int(code): densely or tables.is_dense(int(code)) for code in _used(codes)}
-        for part, channel in colours:
-            if values[..., part].shape[2]:
-                piece = np.ascontiguousarray(values[..., part])
-                out[..., part] = self._summed(piece, codes, kinds, partial(tables.points, channel=channel))
-        return out
+
+        def summed(colours: list[int], others: list[int], channel: int) -> np.ndarray:
+            picked = np.ascontiguousarray(values[..., [*colours, *others]])
+            picked[..., len(colours) :] /= tables.light(codes)[..., channel : channel + 1]
+            return self._summed(picked, codes, kinds, partial(tables.points, channel=channel))
+
+        others = list(range(3, values.shape[2]))
+        if tables.bank.channels == 1:
+            return summed([0, 1, 2][: values.shape[2]], others, 0)
+        each = [summed([c], others if c == 1 else [3], c) for c in range(3)]
+        return np.concatenate([*(light[..., :1] for light in each), *(light[..., 1:2] for light in each), each[1][..., 2:]], axis=2)
 
     def _spread(self, values: np.ndarray, coc_px: np.ndarray, aperture: Aperture, densely: bool) -> np.ndarray:
         sharp = np.zeros_like(values)

@@ -1,0 +1,86 @@
+"""What `mrbokeh render` blurs: a picture with depth and motion, layers in front of it and behind it, from their files."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files. depth and motion are those of rgb; srgb: its numbers are encoded. layers and behind come front first.
+
+    shutter: part of a frame's time for which it is open.
+    """
+
+    rgb: Path | None
+    depth: Path | None
+    layers: tuple[Path, ...] = ()
+    behind: tuple[Path, ...] = ()
+    motion: Path | None = None
+    shutter: float = 0.5
+    srgb: bool = False
+
+    @property
+    def are_given(self) -> bool:
+        return any((self.rgb, self.depth, self.layers, self.behind, self.motion))
+
+
+def read_sharp(sources: Sources) -> dict[str, Layer]:
+    """Layers by the file that they came from, front first, all with the same extra channels, motion among them."""
+    return _with_all_extras(_moving(_read(sources), sources))
+
+
+def _read(sources: Sources) -> dict[str, Layer]:
+    from mrbokeh.image_io import read_layer
+
+    rgb, depth = sources.rgb, sources.depth
+    sharp = {str(path): read_layer(path, extra=True) for path in sources.layers}
+    if (rgb is None) != (depth is None):
+        raise InputError("--rgb and --depth belong together: give both, or only --layer")
+    if rgb is not None and depth is not None:
+        sharp[str(rgb)] = _picture(rgb, depth, sources.srgb)
+    if sources.behind and rgb is None:
+        raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
+    sharp |= {str(path): read_layer(path, extra=True) for path in sources.behind}
+    if not sharp:
+        raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
+    if len({each.alpha.shape for each in sharp.values()}) > 1:
+        raise InputError("what is to be blurred differs in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in sharp.items()))
+    return sharp
+
+
+def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
+    from mrbokeh.image_io import read_depth, read_image, read_linear
+    from mrbokeh.layer import opaque
+
+    colour, depth_m = read_image(rgb) if srgb else read_linear(rgb), read_depth(depth)
+    if colour.shape[:2] != depth_m.shape:
+        sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
+        raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
+    return opaque(colour, depth_m)
+
+
+def _moving(sharp: dict[str, Layer], sources: Sources) -> dict[str, Layer]:
+    """With motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
+    from mrbokeh.motion import with_motion
+    from mrbokeh.motion_file import read_motion, taken_from_channels
+
+    if sources.motion is not None and sources.rgb is None:
+        raise InputError("--motion belongs to --rgb: layers have their motion in their own channels forward.u and forward.v")
+    moving = {path: taken_from_channels(each, sources.shutter) for path, each in sharp.items()}
+    if sources.motion is not None:
+        moving[str(sources.rgb)] = with_motion(moving[str(sources.rgb)], read_motion(sources.motion), sources.shutter)
+    return moving
+
+
+def _with_all_extras(sharp: dict[str, Layer]) -> dict[str, Layer]:
+    """Every layer with the extra channels of all, 0 where a layer has none of that name."""
+    import numpy as np
+
+    shapes = {name: values.shape for each in sharp.values() for name, values in each.extra.items()}
+    return {
+        path: replace(each, extra={name: each.extra.get(name, np.zeros(shapes[name], np.float32)) for name in sorted(shapes)})
+        for path, each in sharp.items()
+    }
