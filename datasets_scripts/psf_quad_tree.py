@@ -1,0 +1,129 @@
+"""PSFs as quad trees, the sparse code that Leimkuehler et al. 2018 compare spreadlets with (Section 7.3, "Laplacian Domain").
+
+`quad_tree` is theirs: squares of even light, split where they fit worst; each square that is not dark is one splat, into the level
+of a pyramid that has its size. `quad_tree_points` keeps to the Laplacian and takes the squares of a tree, split where most charge
+is, in place of the Voronoi cells of darts.
+"""
+
+import heapq
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+
+from mrbokeh.laplacian_integration import laplacian
+from mrbokeh.spreadlet_values import fitted_values, potential_of, table_for
+from mrbokeh.spreadlets import Spreadlet, whole_laplacian
+
+_LEAST_LINES = 3
+
+Square = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class QuadTree:
+    """Leaves of a tree over a square picture of side_px: (N, 3) top, left, size in pixels and their values, N; dark ones are left out."""
+
+    leaves: Int64[np.ndarray, "leaves 3"]
+    values: Float64[np.ndarray, " leaves"]
+    side_px: int
+
+    def picture(self) -> Float64[np.ndarray, "side side"]:
+        """The squares filled; the middle of the kernel is pixel (side / 2, side / 2)."""
+        out = np.zeros((self.side_px, self.side_px))
+        for (top, left, size), value in zip(self.leaves.tolist(), self.values, strict=True):
+            out[top : top + size, left : left + size] = value
+        return out
+
+
+def quad_tree(kernel: Float[np.ndarray, "size size"], leaves: int) -> QuadTree:
+    """A kernel (odd size) as so many squares that are not dark, or a few more; each holds the mean, so the light is kept.
+
+    The leaf with the largest squared error is split first.
+    """
+    picture = _in_a_power_of_two(kernel.astype(np.float64))
+    sums, squares = _Sums(picture), _Sums(picture**2)
+
+    def error(square: Square) -> float:
+        return squares.over(square) - sums.over(square) ** 2 / square[2] ** 2
+
+    found = _split(len(picture), leaves, error, lambda square: sums.over(square) > 0.0)
+    values = [sums.over(square) / square[2] ** 2 for square in found]
+    return QuadTree(np.array(found, np.int64).reshape(-1, 3), np.array(values), len(picture))
+
+
+def quad_tree_points(kernel: Float[np.ndarray, "size size"], points: int, fit: bool) -> Spreadlet:
+    """The Laplacian gathered in squares: one point in each that is not empty, at the centroid of its charges.
+
+    fit: values by least squares, as mrbokeh.spreadlets has them, else the sums; points in three rows or columns or fewer cannot
+    hold the moments that a fit keeps, and take the sums, too.
+    """
+    dense = laplacian(kernel[..., None])
+    whole = whole_laplacian(kernel)
+    xy, charges = whole.points.astype(np.int64), whole.values
+    magnitude = _Sums(_in_a_power_of_two(np.abs(dense[..., 0])))
+    squares = _split(magnitude.side, points, lambda square: magnitude.over(square) if square[2] > 1 else 0.0, magnitude.is_lit)
+    owner = np.full((magnitude.side, magnitude.side), -1)
+    for index, (top, left, size) in enumerate(squares):
+        owner[top : top + size, left : left + size] = index
+    mine = owner[xy[:, 1] + magnitude.side // 2, xy[:, 0] + magnitude.side // 2]
+    places = _centroids(xy, np.abs(charges[:, 0]), mine, len(squares))
+    sums = np.bincount(mine, charges[:, 0], len(squares))
+    unique, where = np.unique(places, axis=0, return_inverse=True)
+    values = np.bincount(where.reshape(-1), sums)[:, None]
+    if fit and all(len(np.unique(axis)) > _LEAST_LINES for axis in unique.T):
+        table = table_for(len(dense))
+        values = fitted_values(unique, xy, charges, potential_of(dense, table), table)
+    return Spreadlet(unique.astype(np.int16), values)
+
+
+def _centroids(xy: np.ndarray, weights: np.ndarray, owner: np.ndarray, count: int) -> Int64[np.ndarray, "count 2"]:
+    total = np.maximum(np.bincount(owner, weights, count), np.finfo(float).tiny)
+    return np.stack([np.rint(np.bincount(owner, weights * xy[:, axis], count) / total).astype(np.int64) for axis in range(2)], axis=1)
+
+
+def _split(side: int, wanted: int, error: Callable[[Square], float], is_lit: Callable[[Square], bool]) -> list[Square]:
+    """Lit leaves of a tree that is split at the largest error until there are so many of them, or no error is left."""
+    root = (0, 0, side)
+    waiting, lit = [(-error(root), root)], int(is_lit(root))
+    while lit < wanted and waiting[0][0] < 0.0 and waiting[0][1][2] > 1:
+        _, square = heapq.heappop(waiting)
+        children = list(_quarters(square))
+        lit += sum(map(is_lit, children)) - int(is_lit(square))
+        for child in children:
+            heapq.heappush(waiting, (-error(child) if child[2] > 1 else 0.0, child))
+    return sorted(square for _, square in waiting if is_lit(square))
+
+
+def _quarters(square: Square) -> Iterator[Square]:
+    top, left, half = square[0], square[1], square[2] // 2
+    for down in (0, half):
+        for right in (0, half):
+            yield top + down, left + right, half
+
+
+class _Sums:
+    """Sums over squares of a picture, from its summed-area table (Crow 1984)."""
+
+    def __init__(self, picture: Float64[np.ndarray, "side side"]) -> None:
+        self.side = len(picture)
+        self._table = np.pad(picture.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+
+    def over(self, square: Square) -> float:
+        top, left, size = square
+        table, bottom, right = self._table, top + size, left + size
+        return float(table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left])
+
+    def is_lit(self, square: Square) -> bool:
+        return self.over(square) > 1e-12 * float(self._table[-1, -1])
+
+
+def _in_a_power_of_two(picture: Float64[np.ndarray, "size size"]) -> Float64[np.ndarray, "side side"]:
+    """With zeros around it, the middle pixel at (side / 2, side / 2)."""
+    radius = len(picture) // 2
+    side = 1 << int(np.ceil(np.log2(2 * radius + 2)))
+    out = np.zeros((side, side))
+    part = slice(side // 2 - radius, side // 2 + radius + 1)
+    out[part, part] = picture
+    return out
