@@ -22,7 +22,7 @@ SAMPLE_STEPS = (12, 25, 50, 75, 110, 150)
 SPARSITIES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.04)
 GAUSSIANS_PX, RADII_PX, CAPSULES_PX = (25.0, 40.0, 55.0), (25.0, 50.0, 100.0), ((50.0, 50.0), (50.0, 128.0), (100.0, 128.0))
 _DEGREE = 3
-PLAIN = Sparsification(lloyd_steps=0, annealing_steps=0)
+PLAIN = Sparsification(least_points=1, lloyd_steps=0, annealing_steps=0)
 SUMS = replace(PLAIN, fit=False)
 
 Part = dict[str, Any]

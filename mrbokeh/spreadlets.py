@@ -24,18 +24,19 @@ from mrbokeh.spreadlet_values import fitted_values, potential_of, table_for
 _LEAST_CHARGE = 1e-9
 _DART_RADIUS = 1.75  # of the radius of a disc with the charge of one point: darts that keep that far apart come out about as many as wanted
 _MOVED_SHARE, _HEAT = 0.01, 0.01
-_LEAST_POINTS = 12
 
 
 @dataclass(frozen=True)
 class Sparsification:
     """How a kernel becomes few points.
 
-    points_per_px: points per pixel of outline. failures, lloyd_steps, annealing_steps: as in the paper. fit: least squares at
+    points_per_px: points per pixel of outline, and at least `least_points`: a bright core in a wide veil has a short outline,
+    and fewer than 30 points cannot hold all moments. failures, lloyd_steps, annealing_steps: as in the paper. fit: least squares at
     the end instead of sums over cells. seed: of darts and annealing; the same seed gives the same points.
     """
 
     points_per_px: float = 1.0
+    least_points: int = 48
     failures: int = 10_000
     lloyd_steps: int = 50
     annealing_steps: int = 400
@@ -43,8 +44,8 @@ class Sparsification:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.points_per_px > 0.0 or min(self.failures, self.lloyd_steps, self.annealing_steps) < 0:
-            raise InputError(f"a sparsification needs a positive number of points per pixel and no negative steps, got {self}")
+        if not self.points_per_px > 0.0 or self.least_points < 1 or min(self.failures, self.lloyd_steps, self.annealing_steps) < 0:
+            raise InputError(f"a sparsification needs a positive number of points and no negative steps, got {self}")
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ def sparsify(kernel: Float[np.ndarray, "height width *channels"], settings: Spar
     settings = settings or Sparsification()
     xy, charges, dense = _charges(kernel)
     importance = np.abs(charges).sum(axis=1)
-    wanted = settings.points_per_px * outline_px(kernel)
-    if len(xy) <= max(wanted, _LEAST_POINTS):
+    wanted = max(settings.points_per_px * outline_px(kernel), settings.least_points)
+    if len(xy) <= wanted:
         return Spreadlet(xy.astype(np.int16), charges)
     radius_px = np.sqrt(importance.sum() / wanted / (np.pi * importance)) * _DART_RADIUS
     points = xy[throw_darts(xy, importance, radius_px, settings.failures, settings.seed)].astype(np.float64)

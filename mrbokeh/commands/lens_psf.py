@@ -89,8 +89,8 @@ def _steps(text: str) -> tuple[int, ...]:
 def spreadlets(
     bank: Annotated[Path, typer.Argument(help="The folder of a bank of PSFs.")],
     points_per_px: Annotated[float, typer.Option(help="Points per pixel of a kernel's outline: more are nearer and slower.")] = 1.0,
-    lloyd_steps: Annotated[int, typer.Option(help="Steps of Lloyd's relaxation (the paper: 50; fitted values gain nothing by it).")] = 0,
-    annealing_steps: Annotated[int, typer.Option(help="Steps of annealing (the paper: 400; nor by this).")] = 0,
+    lloyd_steps: Annotated[int, typer.Option(help="Steps of Lloyd's relaxation, as in the paper; 10 % nearer than none.")] = 50,
+    annealing_steps: Annotated[int, typer.Option(help="Steps of annealing (the paper: 400; fitted values gain nothing by it).")] = 0,
     seed: Annotated[int, typer.Option(help="Seed of darts and annealing.")] = 0,
     overwrite: Annotated[bool, typer.Option(help="Compute them again where they are.")] = False,
 ) -> None:

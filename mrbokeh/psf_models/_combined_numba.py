@@ -63,6 +63,8 @@ def fill_capsule(kernel: np.ndarray, diameter_px: float, motion_px: float, weigh
                 ramps[row, column] += (1.0 - 2.0 * end) * _ramp(a, y, _half_disc(y, radius), bound, half_bound, radius)
     for row in range(rows - 1):
         for column in range(columns - 1):
+            if max(edges[column] - 0.5 * length, 0.0) ** 2 + edges[row] ** 2 >= radius * radius:
+                break  # wholly outside; what the differences would leave there is rounding
             light = ramps[row + 1, column + 1] - ramps[row, column + 1] - ramps[row + 1, column] + ramps[row, column]
             # The middle row and column are cut in two by the axes, and their halves are equal.
             light *= scale * (2.0 if row == 0 else 1.0) * (2.0 if column == 0 else 1.0)
