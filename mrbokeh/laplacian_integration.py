@@ -15,6 +15,7 @@ Measured (tests/bench_laplacian_spreadlets.py, 1024 x 1024, 4 channels): the exa
 """
 
 from concurrent.futures import Executor
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -54,19 +55,27 @@ def integrate(source: Channels, threads: int = 0) -> Channels:
     To the left and right the picture is continued antisymmetrically about the border, above and below by zeros. Widths
     as from `fast_width` are quickest. threads: 0 takes all cores; the result does not depend on it.
     """
-    from mrbokeh._laplacian_integration_numba import pivots, solve_columns
+    from mrbokeh._laplacian_integration_numba import solve_columns
 
     _check(source)
     height, width, _ = source.shape
-    cosine = np.cos(np.pi * np.arange(1, width + 1) / width)
-    beside = (4.0 + 2.0 * cosine) / 6.0
-    pivot = pivots((20.0 - 8.0 * cosine) / 6.0 / beside, height)
+    beside, pivot = _system(height, width)
     chunks = [*range(0, width, _CHUNK_MODES), width]
     with workers(height * width, threads) as pool:
         count = _threads_of(pool)
         modes = fft.dst(source, type=2, axis=1, workers=count)
         list(pool.map(lambda chunk: solve_columns(modes, pivot, -1.0 / beside, *chunk), pairwise(chunks)))
         return fft.idst(modes, type=2, axis=1, workers=count, overwrite_x=True)
+
+
+@lru_cache(maxsize=4)
+def _system(height: int, width: int) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, "height modes"]]:
+    """Of every sine mode what the neighbours in a column weigh, and the reciprocal pivots of its elimination."""
+    from mrbokeh._laplacian_integration_numba import pivots
+
+    cosine = np.cos(np.pi * np.arange(1, width + 1) / width)
+    beside = (4.0 + 2.0 * cosine) / 6.0
+    return beside, pivots((20.0 - 8.0 * cosine) / 6.0 / beside, height)
 
 
 def integrate_plainly(source: Channels) -> Float64[np.ndarray, "height width channels"]:

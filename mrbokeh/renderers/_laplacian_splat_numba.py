@@ -3,14 +3,11 @@
 import numpy as np
 from numba import njit
 
-TILE_PX = 16
+from mrbokeh.renderers._vectors_numba import add_to_cell
+
 NONE = -1
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _add(out: np.ndarray, weight: float, light: np.ndarray) -> None:
-    for i in range(out.shape[0]):
-        out[i] += weight * light[i]
+LANES = 4
+"""Channels that are added at once."""
 
 
 @njit(cache=True, nogil=True)
@@ -25,7 +22,7 @@ def _first_at_or_after(points: np.ndarray, low: int, high: int, row: int) -> int
     return low
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def splat_strip(
     out: np.ndarray,
     values: np.ndarray,
@@ -40,40 +37,29 @@ def splat_strip(
 ) -> None:
     """Add the light that falls into rows first:end of out (h, w * C), whose first pixel is row and column `origin` of the picture.
 
-    values (H, W, C), cells (H, W) or NONE. points (N, 2) x, y of cell i at starts[i]:starts[i + 1], sorted by y; weights (N,);
-    none reaches farther than reach_px, and all must fall into out. Neighbours of one cell within a tile go together: a point
-    is one run of multiplications, in which pixels of other cells take part with 0. Every sum is taken in the order of rows,
-    tiles and points, whatever the strip.
+    values (H, W, C), C a multiple of LANES, cells (H, W) or NONE. points (N, 2) x, y of cell i at starts[i]:starts[i + 1], sorted by
+    y; weights (N,); none reaches farther than reach_px, and all must fall into out. Every sum is taken in the order of rows,
+    columns and points, whatever the strip.
     """
     height, width, channels = values.shape
-    light = np.zeros(TILE_PX * channels, out.dtype)
-    done = np.zeros(TILE_PX, np.bool_)
     top, left = origin
+    flat, stride, element = out.reshape(-1), out.shape[1], out.dtype.type
+    offsets = points[:, 1].astype(np.int64) * stride + channels * points[:, 0]
     for y in range(max(0, first + top - reach_px), min(height, end + top + reach_px)):
         low_row, high_row = first + top - y, end + top - y
-        for begin in range(0, width, TILE_PX):
-            size = min(TILE_PX, width - begin)
-            done[:] = False
-            for i in range(size):
-                cell = cells[y, begin + i]
-                if cell == NONE or done[i]:
-                    continue
-                low = _first_at_or_after(points, starts[cell], starts[cell + 1], low_row)
-                high = _first_at_or_after(points, low, starts[cell + 1], high_row)
-                last = i
-                for j in range(i, size):
-                    if cells[y, begin + j] == cell and not done[j]:
-                        done[j], last = True, j
-                        for c in range(channels):
-                            light[(j - i) * channels + c] = values[y, begin + j, c]
-                    else:
-                        for c in range(channels):
-                            light[(j - i) * channels + c] = 0.0
-                length = (last - i + 1) * channels
-                run = light[:length]
+        for x in range(width):
+            cell = cells[y, x]
+            if cell == NONE:
+                continue
+            low, high = starts[cell], starts[cell + 1]
+            if low_row > -reach_px or high_row <= reach_px:
+                low = _first_at_or_after(points, low, high, low_row)
+                high = _first_at_or_after(points, low, high, high_row)
+            for c in range(0, channels, LANES):
+                value = (element(values[y, x, c]), element(values[y, x, c + 1]), element(values[y, x, c + 2]), element(values[y, x, c + 3]))
+                here = (y - top) * stride + channels * (x - left) + c
                 for n in range(low, high):
-                    at = (begin + i + points[n, 0] - left) * channels
-                    _add(out[y + points[n, 1] - top, at : at + length], weights[n], run)
+                    add_to_cell(flat, here + offsets[n], weights, n, value)
 
 
 @njit(cache=True, nogil=True)
@@ -115,3 +101,13 @@ def choose_cells(
                     code += 2 * blocks if bright[y, x] else blocks
                 codes[y, x] = code + 3 * blocks if coc_px[y, x] < 0 else code
     return finite
+
+
+@njit(cache=True, nogil=True)
+def find_outshining(found: np.ndarray, values: np.ndarray, around: np.ndarray, times: float) -> None:
+    """Mark the pixels (H, W) of which a channel of values (H, W, C) is more than so many times that of around."""
+    height, width, channels = values.shape
+    for y in range(height):
+        for x in range(width):
+            for c in range(channels):
+                found[y, x] |= abs(values[y, x, c]) > times * around[y, x, c]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from os import cpu_count
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +9,9 @@ from jaxtyping import Float, Float32, Int32
 
 from mrbokeh.laplacian_integration import fast_width, integrate, integrate_by_pyramid
 from mrbokeh.renderers._laplacian_tables import Points
+from mrbokeh.workers import cores
 
-_STRIP_ROWS = 64
+_LEAST_ROWS, _STRIPS_PER_CORE = 64, 2  # pixels beside two strips are looked at by both
 FAR_FIELD_PX = 8  # beyond the reach of the points, before the border on which light is 0
 
 
@@ -47,7 +47,7 @@ def add_light(
     """
     top, left, height, width = window_of(cells, points.reach_px, integration is not None)
     sums = np.zeros((height, width, values.shape[2]), np.float32 if integration is None else np.float64)
-    with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         splat(sums, values, cells, points, (top, left), pool.map)
     if integration is not None:
         sums = integrate(sums, threads) if integration == "exact" else integrate_by_pyramid(sums)
@@ -64,16 +64,22 @@ def splat(
     each: Callable[[Callable, Iterable], Iterable] = map,
 ) -> None:
     """Add every pixel's points to sums, whose first pixel lies at row and column `origin`. Same bits however `each` divides the work."""
-    from mrbokeh.renderers._laplacian_splat_numba import splat_strip
+    from mrbokeh.renderers._laplacian_splat_numba import LANES, splat_strip
 
-    flat = sums.reshape(sums.shape[0], -1)
-    weights, rows = points.weights.astype(sums.dtype), max(_STRIP_ROWS, points.reach_px)
+    channels = values.shape[2]
+    missing = -channels % LANES
+    padded = np.pad(values, ((0, 0), (0, 0), (0, missing))) if missing else values
+    into = np.zeros((*sums.shape[:2], channels + missing), sums.dtype) if missing else sums
+    flat, weights = into.reshape(len(into), -1), points.weights.astype(sums.dtype)
+    rows = max(_LEAST_ROWS, points.reach_px, -(-len(flat) // (_STRIPS_PER_CORE * cores())))
 
     def run(first: int) -> None:
         end = min(first + rows, len(flat))
-        splat_strip(flat, values, cells, points.xy, weights, points.starts, points.reach_px, origin, first, end)
+        splat_strip(flat, padded, cells, points.xy, weights, points.starts, points.reach_px, origin, first, end)
 
     list(each(run, range(0, len(flat), rows)))
+    if missing:
+        sums += into[..., :channels]
 
 
 def splat_plainly(

@@ -11,7 +11,7 @@ from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 from mrbokeh.progress import track
 from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify, whole_laplacian
-from mrbokeh.workers import cores, one_blas_thread
+from mrbokeh.workers import cores, one_blas_thread, workers
 
 DENSE, SPARSE, WHOLE = 0, 1, 2
 DENSE_PER_PX = 32.0
@@ -19,6 +19,7 @@ LEVELS_PER_OCTAVE = 64.0
 _BLOCK = 4096  # codes per kind and side
 _MOST_KERNELS = 8192  # that are kept between calls
 _SHOW_FROM = 8
+_ROWS_AT_ONCE = 64
 AROUND_PX, OUTSHINES = 8, 8.0
 
 
@@ -54,7 +55,14 @@ class KernelTables:
         large = np.abs(coc_px) > self.dense_up_to_px
         bright = stands_out(values) if self.sparsification is not None and large.any() else np.zeros(coc_px.shape, np.bool_)
         limits = 1.0 / aperture.unit_radius, self.dense_up_to_px, DENSE_PER_PX, LEVELS_PER_OCTAVE, _BLOCK
-        if not choose_cells(codes, out, values, coc_px, bright, *limits):
+
+        def choose(first: int) -> bool:
+            rows = slice(first, first + _ROWS_AT_ONCE)
+            return choose_cells(codes[rows], out[rows], values[rows], coc_px[rows], bright[rows], *limits)
+
+        with workers(codes.size) as pool:
+            all_finite = all(list(pool.map(choose, range(0, len(codes), _ROWS_AT_ONCE))))
+        if not all_finite:
             raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
         return codes
 
@@ -118,9 +126,11 @@ def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.
     """Pixels that outshine the mean of their surroundings in any channel: lamps and lone pixels, whose PSF can be seen."""
     import cv2
 
+    from mrbokeh.renderers._laplacian_splat_numba import find_outshining
+
     window = (2 * AROUND_PX + 1, 2 * AROUND_PX + 1)
+    light = np.ascontiguousarray(values, np.float32)
+    around = cv2.boxFilter(np.abs(light), cv2.CV_32F, window, borderType=cv2.BORDER_REFLECT_101)
     found = np.zeros(values.shape[:2], np.bool_)
-    for c in range(values.shape[2]):
-        light = np.abs(values[..., c])
-        found |= light > OUTSHINES * cv2.boxFilter(light, cv2.CV_64F, window, borderType=cv2.BORDER_REFLECT_101)
+    find_outshining(found, light, around.reshape(light.shape), OUTSHINES)
     return found

@@ -7,8 +7,8 @@ import numpy as np
 from mrbokeh.renderers._polygon_ring_numba import Corners, Exact, Picture, Ring, Scratch, compiled
 from mrbokeh.renderers._polygon_splat_numba import splat_corners
 from mrbokeh.renderers._polygon_survey_numba import TILE_PX
-from mrbokeh.renderers._polygon_vector_numba import fetch
 from mrbokeh.renderers._polygon_whole_numba import keep, splat_exactly, splat_small
+from mrbokeh.renderers._vectors_numba import fetch
 
 LINE_PX = 16
 """Numbers of single precision in a line of the cache."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from mrbokeh.renderers._polygon_aim_numba import AIM_PX, CHUNK_PX, aim_level, aim_steep
 from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, APART_PX, Corners, Ring, Scratch, compiled
-from mrbokeh.renderers._polygon_vector_numba import add_to_cell, add_to_two_cells, fetch, scaled
+from mrbokeh.renderers._vectors_numba import add_to_cell, add_to_two_cells, fetch, scaled
 
 CELLS_OF_LINE = 4
 """Cells of four numbers in single precision that share a line of the cache."""

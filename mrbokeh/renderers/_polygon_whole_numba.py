@@ -6,7 +6,7 @@ import numpy as np
 
 from mrbokeh._polygon_coverage_numba import fill_psf
 from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, APART_PX, Exact, Ring, Scratch, compiled
-from mrbokeh.renderers._polygon_vector_numba import add_to_cell, add_to_two_cells, blend_onto_two_cells, scaled
+from mrbokeh.renderers._vectors_numba import add_to_cell, add_to_two_cells, blend_onto_two_cells, scaled
 
 
 @compiled
