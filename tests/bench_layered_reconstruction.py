@@ -1,22 +1,30 @@
-"""How long layered reconstruction takes and how near it comes: `python -m tests.bench_layered_reconstruction [SIZE_PX]`.
+"""How long layered reconstruction takes and how near it comes: `python -m tests.bench_layered_reconstruction [SIZE_PX | FOLDER]`.
 
 The scene after Hasselgren 2015, Fig. 8 (an out-of-focus fence before a moving checkerboard and a slanted one) and a strongly slanted
 plane, both met by rays in closed form; truth is 1024 samples a pixel. Yardsticks: the raw samples, and OpenCV's and
 scikit-image's non-local means of them, each with the strength that suits the truth best (which nobody knows in earnest).
+FOLDER: sets of `datasets_scripts/render_samples.py`, met against their references instead, in linear light and as displayed
+(sRGB), both clipped to [0, 1], in which papers count.
 """
 
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from statistics import median
 
 import cv2
 import numpy as np
 from skimage.restoration import denoise_nl_means
 
-from mrbokeh.image_metrics import psnr
+from mrbokeh.color import linear_to_srgb, srgb_to_linear
+from mrbokeh.image_io import read_image
+from mrbokeh.image_metrics import psnr, ssim
+from mrbokeh.lens_file import read_lens
 from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.light_field_samples_file import read_samples
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from tests.machine import machine_line, memory_line
 from tests.sampled_planes import LENS, Plane, checker, fence_scene, sample_planes, truth, waves
@@ -26,6 +34,7 @@ REPEATS = 5
 ALL = Settings()
 VARIANTS = {
     "all improvements": ALL,
+    "one cell of motion": replace(ALL, motion_step_px=np.inf),
     "neither merging nor sparse statistics": replace(ALL, merge=False, sparse_statistics=False),
     "merging alone": replace(ALL, sparse_statistics=False),
     "sparse statistics alone": replace(ALL, merge=False),
@@ -78,22 +87,58 @@ def _one(name: str, samples: LightFieldSamples, exact: np.ndarray) -> None:
     for variant, settings in VARIANTS.items():
         method = LayeredReconstruction(settings)
         rgb, counts = method.reconstruct_counted(samples, LENS)
-        passed_ms, spent_ms = _milliseconds(lambda chosen=method: chosen.reconstruct_counted(samples, LENS))
+        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_counted, samples, LENS))
         print(
             f"  {variant}: {psnr(rgb, exact):.1f} dB, {passed_ms:.0f} ms ({spent_ms:.0f} ms of all cores), "
             f"partitions per tile {counts.before:.1f} -> {counts.after:.1f}"
         )
 
 
+def _means_of_displayed(raw: np.ndarray) -> list[np.ndarray]:
+    """Non-local means of a displayed picture at several strengths, OpenCV's and then scikit-image's."""
+    coded = (raw * 255 + 0.5).astype(np.uint8)
+    opencv = [cv2.fastNlMeansDenoisingColored(coded, None, h, h, 7, 21).astype(np.float32) / 255 for h in (10, 20, 30, 45)]
+    return opencv + [denoise_nl_means(raw, 5, 6, h=h, channel_axis=-1).astype(np.float32) for h in (0.06, 0.12, 0.18, 0.27)]
+
+
+def _set(folder: Path) -> None:
+    samples, lens = read_samples(folder / "samples.npz"), read_lens(folder / "lens.json")
+    exact = read_image(folder / "reference.exr")[..., :3]
+    shown, raw = linear_to_srgb(np.clip(exact, 0, 1)), linear_to_srgb(np.clip(samples.raw_picture(), 0, 1))
+    means = _means_of_displayed(raw)
+    linear_db = psnr(srgb_to_linear(raw), exact), max(psnr(srgb_to_linear(each), exact) for each in means)
+    shown_db = psnr(raw, shown), max(psnr(each, shown) for each in means)
+    print(
+        f"{folder.name}, {samples.per_pixel:.0f} spp (dB linear / displayed): raw {linear_db[0]:.1f} / {shown_db[0]:.1f}, "
+        f"best non-local means {linear_db[1]:.1f} / {shown_db[1]:.1f}"
+    )
+    for variant in ("all improvements", "neither merging nor sparse statistics", "one cell of motion"):
+        method = LayeredReconstruction(VARIANTS[variant])
+        rgb, counts = method.reconstruct_counted(samples, lens)
+        displayed = linear_to_srgb(np.clip(rgb, 0, 1))
+        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_counted, samples, lens))
+        print(
+            f"  {variant}: {psnr(rgb, exact):.1f} / {psnr(displayed, shown):.1f} dB, SSIM {ssim(displayed, shown):.3f}, {passed_ms:.0f} ms "
+            f"({spent_ms:.0f} ms of all cores), partitions per tile {counts.before:.1f} -> {counts.after:.1f}"
+        )
+
+
 def main() -> None:
-    size_px = int(sys.argv[1]) if len(sys.argv) > 1 else SIZE_PX
+    if len(sys.argv) > 1 and not sys.argv[1].isdigit():
+        for folder in sorted(path.parent for path in Path(sys.argv[1]).glob("*/samples.npz")):
+            _set(folder)
+    else:
+        _planes(int(sys.argv[1]) if len(sys.argv) > 1 else SIZE_PX)
+    print(memory_line())
+    print(machine_line())
+
+
+def _planes(size_px: int) -> None:
     print(f"{size_px} x {size_px} px, medians of {REPEATS}")
     for name, planes in scenes(size_px).items():
         exact = truth(planes, size_px)
         for per_pixel in (4, 8):
             _one(name, sample_planes(planes, size_px, per_pixel), exact)
-    print(memory_line())
-    print(machine_line())
 
 
 if __name__ == "__main__":

@@ -14,14 +14,16 @@ from mrbokeh.layer import Layer, opaque
 from mrbokeh.light_field_samples import LightFieldSamples
 from mrbokeh.motion import MOTION
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings, footprint_sigmas
-from mrbokeh.renderers.layered_reconstruction._buckets import bucket_of
+from mrbokeh.renderers.layered_reconstruction._buckets import bucket_of, motion_cells
 from mrbokeh.renderers.layered_reconstruction._direct_gaussian_numba import direct_gaussian
-from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS, axes, sheared_axes, sheared_filter
+from mrbokeh.renderers.layered_reconstruction._filter_numba import axes, sheared_axes, sheared_filter
+from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile
 from mrbokeh.renderers.layered_reconstruction._pupil_spans import pupil_spans
 from mrbokeh.renderers.layered_reconstruction._samples_numba import morton, tile_order
 from mrbokeh.renderers.layered_reconstruction._sheared_gaussian_numba import recursive_rows, sheared_gaussian
-from mrbokeh.renderers.layered_reconstruction._statistics_numba import bucket_sums, seeded, xorshift
+from mrbokeh.renderers.layered_reconstruction._statistics_numba import rows_of_tile, seeded, xorshift
 from mrbokeh.renderers.layered_reconstruction._texture_gaussian_numba import texture_gaussian
+from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light
 from mrbokeh.renderers.layered_reconstruction._window_numba import line_taps, window_filter, window_guards
 from tests.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth, waves
 
@@ -36,10 +38,27 @@ def picture(planes: list[Plane], per_pixel: int, settings: Settings | None = Non
     return LayeredReconstruction(settings or Settings()).reconstruct(samples, LENS).rgb
 
 
+def one_tile(slopes: np.ndarray, bucket: np.ndarray | None = None, cells_x: int = 1, cells: int = 1, depths: int = 40) -> Light:
+    """A picture of one tile whose samples all lie in its first block."""
+    count = len(slopes)
+    starts = np.full(17, count)
+    starts[0] = 0
+    where = np.zeros(count, np.int32) if bucket is None else bucket.astype(np.int32)
+    empty = np.zeros((count, 5), np.float32), slopes.astype(np.float32), np.zeros((count, 3), np.float32)
+    return Light(*empty, where, starts, 1, 32, cells_x, cells, depths, WINDOW, 1.0)
+
+
+def choice_of(settings: Settings, every: int) -> Choice:
+    return LayeredReconstruction(settings)._choice(1.0)._replace(every=every)
+
+
+def no_places(light: Light) -> np.ndarray:
+    return np.full(light.depths * light.cells, -1, np.int32)
+
+
 def sums_of(slopes: np.ndarray) -> np.ndarray:
-    sums = np.zeros((1, SUMS))
-    bucket_sums(sums, 0, len(slopes), 1, 1, np.zeros(len(slopes), np.int32), slopes.astype(np.float32))
-    return sums[0]
+    light = one_tile(slopes)
+    return rows_of_tile(0, light, choice_of(FULL, 1), no_places(light))[1][0]
 
 
 # The filter of a partition.
@@ -168,6 +187,22 @@ def test_four_look_ups_come_nearer_to_the_gaussian_than_one(v: tuple[float, floa
     assert errors[4] < 0.6
 
 
+@pytest.mark.parametrize("v", [(9.0, 0.0, 9.0), (25.0, 0.0, 2.0), (60.0, 0.0, 4.0)])
+def test_a_look_up_is_as_wide_along_both_axes(v: tuple[float, float, float]) -> None:
+    """A box of the width w = alpha sigma and the tent of the interpolation have w^2/4 = 1.25 sigma^2; trilinear blends of two
+    levels more, by the ratio of their widths. Four look-ups are scaled to sigma^2."""
+    guard, size, alpha = 40, 81, footprint_sigmas(0.95)
+    for taps, expected in ((1, alpha**2 / 4), (4, 1.0)):
+        mean = np.zeros((size, size, 1))
+        for shift in np.ndindex(8, 8):
+            out = np.empty((size, size, 1), np.float32)
+            texture_gaussian(out, np.roll(impulse(size + 2 * guard), shift, (0, 1)), guard, guard, *axes(*v), alpha, 0.33, taps)
+            mean += np.roll(out, (-shift[0], -shift[1]), (0, 1)) / 64.0
+        total, along, _, across = moments(mean)
+        assert total == pytest.approx(1.0, abs=0.02)
+        assert along / v[0] == pytest.approx(expected, rel=0.2) and across / v[2] == pytest.approx(expected, rel=0.25)
+
+
 @pytest.mark.parametrize("scale", [-5.3, 1.7, 9.0])
 @pytest.mark.parametrize("length", [(0.0, 0.0), (7.0, 3.0), (-4.0, 11.5)])
 def test_the_window_filter_is_chance_through_pupil_and_shutter(scale: float, length: tuple[float, float]) -> None:
@@ -208,10 +243,10 @@ def test_morton_order_interleaves_bits() -> None:
 
 def test_samples_are_sorted_by_tile_and_pixel() -> None:
     samples = sample_planes([Plane(even(0.5))], 40, 2)
-    order, starts = np.empty(samples.count, np.int64), np.empty(26, np.int64)
+    order, starts = np.empty(samples.count, np.int64), np.empty(25 * 16 + 1, np.int64)
     tile_order(samples.xy_px, 40, 40, 8, order, starts)
     np.testing.assert_array_equal(np.sort(order), np.arange(samples.count))
-    np.testing.assert_array_equal(starts, np.arange(26) * 128)
+    np.testing.assert_array_equal(starts, np.arange(25 * 16 + 1) * 8)
     x, y = (each[order] for each in samples.pixels())
     codes = np.array([morton(a, b) for a, b in zip(x % 8, y % 8, strict=True)]) + (y // 8 * 5 + x // 8) * 64
     assert (np.diff(codes) >= 0).all()
@@ -225,9 +260,44 @@ def test_xorshift_is_marsaglias() -> None:
 
 def test_sparse_statistics_take_one_of_every_so_many() -> None:
     slopes = np.column_stack([np.arange(1000) // 100, np.zeros((1000, 2))]).astype(np.float32)
-    sums = np.zeros((1, SUMS))
-    assert bucket_sums(sums, 0, 1000, 10, seeded(0, 0), np.zeros(1000, np.int32), slopes) == 100
+    light = one_tile(slopes)
+    _, sums = rows_of_tile(0, light, choice_of(FULL, 10), no_places(light))
     assert sums[0, 0] == 100 and sums[0, 1] == 10 * sum(range(10)), "stratified: ten from every hundred"
+
+
+def test_a_bucket_that_no_chosen_sample_saw_is_summed_over_all() -> None:
+    """3 of 1000 samples have a bucket of their own: it is there whatever is chosen, and weighs about as the chosen ones do."""
+    bucket = np.zeros(1000)
+    bucket[[17, 500, 501]] = 7
+    slopes = np.column_stack([bucket, np.zeros((1000, 2))])
+    light = one_tile(slopes, bucket)
+    buckets, sums = rows_of_tile(0, light, choice_of(FULL, 100), no_places(light))
+    assert buckets.tolist() == [0, 7]
+    assert sums[1, 1] / sums[1, 0] == 7.0 and 0.03 <= sums[1, 0] <= 2
+
+
+def test_motions_at_one_depth_become_partitions_and_every_bucket_has_its_place() -> None:
+    """Depth 5 holds what rests and what moves by 30 px; depth 20 rests. Between them is nothing, behind nobody knows."""
+    moves, far = np.arange(100) % 2 == 1, np.arange(100) >= 80
+    slopes = np.column_stack([np.where(far, 12.0, 4.0), np.where(moves & ~far, 30.0, 0.0), np.zeros(100)])
+    bucket = np.where(far, 20, 5) * 3 + np.where(moves & ~far, 2, 0)
+    light = one_tile(slopes, bucket, cells_x=3, cells=3)
+    partitions, touched, populated = partitions_of_tile(0, light, choice_of(Settings(), 1), place := no_places(light))
+    assert populated == 3 and len(partitions.sums) == 3
+    assert partitions.first.tolist() == [5, 5, 20]
+    assert [place[5 * 3], place[5 * 3 + 2], place[20 * 3]] == [0, 2, 4]
+    assert place[4 * 3] == place[6 * 3] == 0 and place[4 * 3 + 2] == 2, "free neighbours go with them"
+    assert [partitions.gaps[depth] for depth in (0, 10, 30)] == [-1, 3, 5]
+    place[touched] = -1
+    assert (place == -1).all()
+
+
+def test_cells_of_motion_have_the_side_asked_for() -> None:
+    motion_px = np.random.default_rng(0).uniform(-40.0, 40.0, (2000, 2)).astype(np.float32)
+    cell, across, count = motion_cells(motion_px, Settings(motion_step_px=16.0))
+    assert cell.min() >= 0 and cell.max() < count and count % across == 0
+    assert max(np.ptp(motion_px[cell == index], axis=0).max() for index in np.unique(cell)) <= 16.0
+    assert motion_cells(motion_px, Settings(motion=False))[2] == 1
 
 
 def test_buckets_grow_with_depth_and_cut_it_finely_near_the_focus() -> None:
@@ -237,9 +307,9 @@ def test_buckets_grow_with_depth_and_cut_it_finely_near_the_focus() -> None:
     assert (np.diff(bucket) >= 0).all() and bucket[0] == 0 and bucket[-1] == count - 1
     for index in np.unique(bucket):
         inside = coc_px[bucket == index]
-        assert np.ptp(inside) <= 2.0 + 1e-4 or inside.min() > 32.0 - 2.0 or inside.max() < -32.0 + 2.0
+        assert np.ptp(inside) <= 0.5 + 1e-4 or inside.min() > 64.0 - 0.5 or inside.max() < -64.0 + 0.5
         # The first and the last hold 1 % of 2.7 m more, beyond the percentiles.
-        assert np.ptp(depth_m[bucket == index]) <= (2.973 - 0.327) / 32 + 0.028
+        assert np.ptp(depth_m[bucket == index]) <= (2.973 - 0.327) / 128 + 0.028
 
 
 def test_without_defocus_depth_alone_makes_buckets_and_infinity_is_the_last() -> None:
@@ -288,7 +358,7 @@ def test_it_beats_the_raw_samples(planes: list[Plane], gain_db: float) -> None:
 def test_the_papers_filters_beat_the_raw_samples_where_texture_is_smooth(screen_filter: str, gain_db: float) -> None:
     planes = [Plane(waves(20.0), 8.0, motion_px=(6.0, 2.0))]
     exact, samples = truth(planes, SIZE_PX), sample_planes(planes, SIZE_PX, 8)
-    settings = replace(PAPER, screen_filter=screen_filter)
+    settings = replace(PAPER, screen_filter=screen_filter)  # type: ignore[arg-type]
     result = LayeredReconstruction(settings).reconstruct(samples, LENS).rgb
     assert psnr(result, exact) > psnr(samples.raw_picture(), exact) + gain_db
 
@@ -319,6 +389,29 @@ def test_a_lamp_that_no_chosen_sample_saw_is_there() -> None:
     for seed in range(3):
         result = LayeredReconstruction(seed=seed).reconstruct(sample_planes(planes, SIZE_PX, 8), LENS).rgb
         assert result.sum() == pytest.approx(light, rel=0.25)
+
+
+def test_a_resting_lamp_among_leaves_that_move_at_its_depth_stays_round() -> None:
+    """By depth alone both were one partition, and the lamp was drawn out along the leaf's 40 px."""
+    lamp = Plane(even(5.0), -8.0, covers=lambda x, y: (np.abs(x - 32.5) < 1.5) & (np.abs(y - 20.5) < 1.5))
+    leaf = Plane(even(0.5), -8.0, motion_px=(40.0, 0.0), covers=lambda _, y: y > 26.0)
+    planes = [lamp, leaf, Plane(even(0.1), 0.0)]
+    exact, samples = truth(planes, SIZE_PX), sample_planes(planes, SIZE_PX, 8)
+    split = LayeredReconstruction().reconstruct(samples, LENS).rgb
+    whole = LayeredReconstruction(Settings(motion_step_px=np.inf)).reconstruct(samples, LENS).rgb
+    beside = np.s_[8:24]
+    assert psnr(split[beside], exact[beside]) > psnr(whole[beside], exact[beside]) + 6.0
+    assert np.abs(split[8:21, 44:] - 0.1).max() < 0.05, "beyond 11.5 + 4 px from its middle there is no light of the lamp"
+
+
+@pytest.mark.parametrize("at_px", [30.1, 30.5, 30.9])
+def test_a_small_lamp_lies_where_it_is_within_its_pixel(at_px: float) -> None:
+    """Its light is shared out among the nearest pixels; counted in one alone it would lie at 30.5, 0.4 px away."""
+    lamp = Plane(even(100.0), -9.0, covers=lambda x, y: (np.abs(x - at_px) < 0.3) & (np.abs(y - 32.5) < 0.3))
+    planes = [lamp, Plane(even(0.0), 0.0)]
+    rgb = np.mean([LayeredReconstruction().reconstruct(sample_planes(planes, SIZE_PX, 8, seed), LENS).rgb for seed in range(4)], axis=0)
+    x = np.arange(SIZE_PX) + 0.5
+    assert (rgb[..., 0].sum(axis=0) * x).sum() / rgb[..., 0].sum() == pytest.approx(at_px, abs=0.15)
 
 
 def test_motion_left_out_is_the_same_where_nothing_moves() -> None:

@@ -2,7 +2,7 @@
 
 Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/layered_reconstruction.md derives the filter.
 
-1. Samples are sorted into tiles and depth buckets; neighbouring buckets of a tile with like filters become one partition.
+1. Samples are sorted into tiles, depth buckets and cells of motion; buckets of a tile with like filters become one partition.
 2. Mean and variance of the blur and of the motion of a partition give its sheared filter.
 3. The samples around the tile are reprojected to the middle of pupil and shutter along the partition's slopes. Those of the
    partition add colour and opacity, those behind it lower the opacity, for they were seen through it.
@@ -13,7 +13,6 @@ Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/layer
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -24,9 +23,10 @@ from mrbokeh.layer import Layer, flatten, opaque
 from mrbokeh.lens import Lens
 from mrbokeh.light_field_samples import LightFieldSamples
 from mrbokeh.renderers.layered_reconstruction._layer_samples import all_sharp, sample_layers
-from mrbokeh.renderers.layered_reconstruction._prepared import Prepared, prepared
+from mrbokeh.renderers.layered_reconstruction._prepared import prepared
 from mrbokeh.renderers.layered_reconstruction._pupil_spans import packed_pupil
 from mrbokeh.renderers.layered_reconstruction._settings import SCREEN_FILTERS, Settings, footprint_sigmas
+from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Choice, Pupil
 from mrbokeh.workers import cores
 
 __all__ = ["SCREEN_FILTERS", "LayeredReconstruction", "PartitionCounts", "Settings", "footprint_sigmas"]
@@ -70,7 +70,7 @@ class LayeredReconstruction:
         if all_sharp(layers, lens):
             return flat
         samples, values, coc_px, margin = sample_layers(layers, lens, self.per_pixel, self.seed, self.threads)
-        spread, _ = self._reconstructed(samples, values, coc_px, lens.aperture)
+        spread, _ = self._reconstructed(samples, values, coc_px, lens.aperture, shared_out=False)
         inside = np.ascontiguousarray(spread[margin : margin + flat.height_px, margin : margin + flat.width_px])
         extra, start = {}, 4
         for name, plane in layers[0].extra.items():
@@ -99,51 +99,31 @@ class LayeredReconstruction:
         values: Float32[np.ndarray, "samples channels"],
         coc_px: Float32[np.ndarray, " samples"],
         aperture: Aperture,
+        shared_out: bool = True,
     ) -> tuple[Float32[np.ndarray, "height width channels"], PartitionCounts]:
-        sorted_samples = prepared(samples, values, coc_px, self.settings)
-        partitions = self._survey(sorted_samples, samples.per_pixel)
+        from mrbokeh.renderers.layered_reconstruction._tiles_numba import reconstruct_tiles
+
+        light = prepared(samples, values, coc_px, self.settings)
+        choice, pupil = self._choice(samples.per_pixel, shared_out), Pupil(*packed_pupil(aperture))
+        tiles = (len(light.starts) - 1) // BLOCKS
+        counts = np.zeros((tiles, 2), np.int32)
         out = np.zeros((samples.height_px, samples.width_px, values.shape[1]), np.float32)
-        self._reconstruct_tiles(out, sorted_samples, partitions, aperture)
-        before, after = partitions[2][partitions[2][:, 0] > 0].mean(axis=0)
-        return out, PartitionCounts(float(before), float(after))
-
-    def _survey(self, samples: Prepared, per_pixel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Sums (T, B, 8), spans of buckets (T, B, 2) and counts before and after merging (T, 2) of all tiles."""
-        from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS
-        from mrbokeh.renderers.layered_reconstruction._statistics_numba import survey_tiles
-
-        chosen, tiles = self.settings, len(samples.starts) - 1
-        every = max(1, round(3 * per_pixel)) if chosen.sparse_statistics else 1
-        sums = np.empty((tiles, samples.buckets, SUMS))
-        spans, counts = np.zeros((tiles, samples.buckets, 2), np.int32), np.zeros((tiles, 2), np.int32)
-        choice = samples.window, chosen.sigma_x_px, chosen.bandwidth, (chosen.merge, chosen.merge_tolerance)
 
         def run(part: np.ndarray) -> None:
-            survey_tiles(part, samples.starts, samples.bucket, samples.slopes, every, self.seed, *choice, sums, spans, counts)
+            reconstruct_tiles(out, part, counts, light, choice, pupil, light.depths * light.cells)
 
         self._each(run, tiles)
-        return sums, spans, counts
+        before, after = counts[counts[:, 0] > 0].mean(axis=0)
+        return out, PartitionCounts(float(before), float(after))
 
-    def _reconstruct_tiles(
-        self,
-        out: Float32[np.ndarray, "height width channels"],
-        samples: Prepared,
-        partitions: tuple[np.ndarray, np.ndarray, np.ndarray],
-        aperture: Aperture,
-    ) -> None:
-        from mrbokeh.renderers.layered_reconstruction._tiles_numba import reconstruct_tile
-
-        chosen, (sums, spans, counts) = self.settings, partitions
-        how = np.array([chosen.support, chosen.recursive_passes, footprint_sigmas(chosen.energy), chosen.tap_distance, chosen.enough])
-        light: tuple[Any, ...] = (samples.geometry, samples.values, samples.bucket, samples.starts, samples.window, samples.pupil_radius)
-        rest: tuple[Any, ...] = (chosen.sigma_x_px, chosen.bandwidth, how, _KINDS[chosen.screen_filter], *packed_pupil(aperture))
-
-        def run(part: np.ndarray) -> None:
-            for tile in part.tolist():
-                own = sums[tile], spans[tile], int(counts[tile, 1])
-                reconstruct_tile(out, tile, samples.columns, chosen.tile_px, *own, *light, *rest)
-
-        self._each(run, len(sums))
+    def _choice(self, per_pixel: float, shared_out: bool = True) -> Choice:
+        chosen = self.settings
+        every = max(1, round(3 * per_pixel)) if chosen.sparse_statistics else 1
+        alpha = footprint_sigmas(chosen.energy)
+        return Choice(
+            every, self.seed, chosen.merge, chosen.merge_tolerance, chosen.sigma_x_px, chosen.bandwidth, _KINDS[chosen.screen_filter],
+            chosen.support, chosen.recursive_passes, alpha, chosen.tap_distance, chosen.enough, shared_out,
+        )  # fmt: skip
 
     def _each(self, run: Callable[[np.ndarray], None], tiles: int) -> None:
         """Tiles in groups; none touches another's pixels, so that their order and the number of threads change nothing."""

@@ -31,3 +31,14 @@ def bucket_of(
         index += np.where(np.isinf(depth_m), np.float32(steps), np.float32(0.0))
     index -= index.min()
     return index.astype(np.int32), int(index.max()) + 1
+
+
+def motion_cells(motion_px: Float32[np.ndarray, "samples 2"], settings: Settings) -> tuple[Int32[np.ndarray, " samples"], int, int]:
+    """The cell of motion of each sample, how many there are along x and in all."""
+    if not settings.motion or not np.isfinite(settings.motion_step_px):
+        return np.zeros(len(motion_px), np.int32), 1, 1
+    most = np.float32(settings.motion_step_px * 32)
+    at = np.rint(np.clip(motion_px, -most, most) / np.float32(settings.motion_step_px)).astype(np.int32)
+    at -= at.min(axis=0)
+    across, down = (at.max(axis=0) + 1).tolist()
+    return at[:, 1] * np.int32(across) + at[:, 0], across, across * down

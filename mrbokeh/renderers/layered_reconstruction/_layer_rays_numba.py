@@ -98,7 +98,15 @@ def meet(
             continue
         before = s - radius_px[row, column]
         if -0.5 * step - 1e-6 <= before <= max(_THICKNESS_PX, step):
-            return row, column, side
+            # There the ray is up to a step away from the surface; what counts is the pixel at that pixel's own depth.
+            own = radius_px[row, column]
+            side = 1 if own > 0.0 else 0
+            row, column = pinhole_place(
+                x - own * pupils[side, 0], y - own * pupils[side, 1], radius_px, covered, motion_px, fastest_px, tau
+            )
+            if row >= 0 and covered[row, column] > 0.0 and abs(radius_px[row, column] - own) <= _THICKNESS_PX:
+                return row, column, side
+            continue
         if before < 0.0:
             last_row, last_column, last_side = row, column, 1 if radius_px[row, column] > 0.0 else 0
     return (last_row, last_column, last_side) if fill else (-1, -1, 0)

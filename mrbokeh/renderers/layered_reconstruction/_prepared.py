@@ -1,31 +1,12 @@
 """Samples as the kernels want them: sorted by tile, centred, with their slopes, depth buckets and the window they fill."""
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64
 
 from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.renderers.layered_reconstruction._buckets import bucket_of
+from mrbokeh.renderers.layered_reconstruction._buckets import bucket_of, motion_cells
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """geometry: x, y, u, v, t - 1/2. slopes: half the signed circle of confusion, motion x, y. starts: of each tile, and the end.
-
-    window: second moments uu, uv, vv of the pupil and tt of the shutter, as the samples fill them. columns: of tiles.
-    """
-
-    geometry: Float32[np.ndarray, "samples 5"]
-    slopes: Float32[np.ndarray, "samples 3"]
-    values: Float32[np.ndarray, "samples channels"]
-    bucket: Int32[np.ndarray, " samples"]
-    buckets: int
-    starts: Int64[np.ndarray, " tiles_and_end"]
-    columns: int
-    window: Float64[np.ndarray, "4"]
-    pupil_radius: float
+from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Light
 
 
 def prepared(
@@ -33,20 +14,24 @@ def prepared(
     values: Float32[np.ndarray, "samples channels"],
     coc_px: Float32[np.ndarray, " samples"],
     settings: Settings,
-) -> Prepared:
+) -> Light:
     """values: (N, C) what is reconstructed, the samples' rgb or more. coc_px: their circles of confusion."""
     from mrbokeh.renderers.layered_reconstruction._samples_numba import gather, tile_order
 
     columns, rows = -(-samples.width_px // settings.tile_px), -(-samples.height_px // settings.tile_px)
-    order, starts = np.empty(samples.count, np.int64), np.empty(columns * rows + 1, np.int64)
+    order, starts = np.empty(samples.count, np.int64), np.empty(columns * rows * BLOCKS + 1, np.int64)
     tile_order(samples.xy_px, samples.width_px, samples.height_px, settings.tile_px, order, starts)
     bucket, buckets = bucket_of(coc_px, samples.depth_m, settings)
+    cell, across, cells = motion_cells(samples.motion_px, settings)
+    bucket = bucket * np.int32(cells) + cell
     geometry, slopes = np.empty((samples.count, 5), np.float32), np.empty((samples.count, 3), np.float32)
     sorted_values, sorted_bucket = np.empty(values.shape, np.float32), np.empty(samples.count, np.int32)
     rays = samples.xy_px, samples.lens_uv, samples.time, coc_px, samples.motion_px
     gather(order, *rays, values, bucket, settings.motion, geometry, slopes, sorted_values, sorted_bucket)
     reach = float(np.abs(samples.lens_uv).max())
-    return Prepared(geometry, slopes, sorted_values, sorted_bucket, buckets, starts, columns, _window(samples), reach)
+    return Light(
+        geometry, slopes, sorted_values, sorted_bucket, starts, columns, settings.tile_px, across, cells, buckets, _window(samples), reach
+    )
 
 
 def _window(samples: LightFieldSamples) -> Float64[np.ndarray, "4"]:

@@ -5,63 +5,101 @@ import math
 import numpy as np
 from numba import njit
 
+from mrbokeh.renderers.layered_reconstruction._samples_numba import morton
+from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, BLOCKS_ACROSS, Light, Partitions, Slope
+
+BESIDE_DEPTHS = 16
+"""Up to so many depth buckets in front of a partition may belong to the same slanted surface."""
+
+_SHARP_PX = 0.5
+
 
 @njit(cache=True, nogil=True)
 def reproject(
-    planes: np.ndarray,
-    left: int,
-    top: int,
-    pupil_radius: float,
-    slope: tuple[float, float, float],
-    span: np.ndarray,
-    light: tuple,
+    planes: np.ndarray, left: int, top: int, slope: Slope, j: int, partitions: Partitions, light: Light, shared_out: bool
 ) -> None:
-    """Add to planes (h, w, C + 2), whose top left pixel is (left, top), colour, opacity and weight.
+    """Add to planes (h, w, C + 3), whose top left pixel is (left, top), colour, opacity, weight and count of the partition j.
 
-    A sample within the span of buckets adds its values, an opacity of 1 and a weight of 1. One behind it adds a weight
-    only: it was seen through this place. One in front says nothing.
-    slope: a, b_x, b_y. light: samples sorted by tile: geometry, values, bucket, starts, then columns of tiles and their side.
+    A sample of the partition adds its values and an opacity, a weight and a count of 1. One behind adds a weight and a
+    count: it was seen through this place. One just in front adds a count alone, one far in front nothing.
     """
-    geometry, values, bucket, starts, columns, tile_px = light
-    reach_x = abs(slope[0]) * pupil_radius + 0.5 * abs(slope[1])
-    reach_y = abs(slope[0]) * pupil_radius + 0.5 * abs(slope[2])
-    height, width, channels = planes.shape
-    channels -= 2
-    rows = (len(starts) - 1) // columns
-    first_column = max(0, int(math.floor((left - reach_x) / tile_px)))
-    last_column = min(columns - 1, int(math.floor((left + width + reach_x) / tile_px)))
-    first_row = max(0, int(math.floor((top - reach_y) / tile_px)))
-    last_row = min(rows - 1, int(math.floor((top + height + reach_y) / tile_px)))
-    a, b_x, b_y = np.float32(slope[0]), np.float32(slope[1]), np.float32(slope[2])
-    front, behind = span[0], span[1]
-    off_x, off_y = np.float32(left), np.float32(top)
-    for row in range(first_row, last_row + 1):
-        for i in range(starts[row * columns + first_column], starts[row * columns + last_column + 1]):
-            if bucket[i] < front:
-                continue
-            x = geometry[i, 0] - a * geometry[i, 2] - b_x * geometry[i, 4] - off_x
-            y = geometry[i, 1] - a * geometry[i, 3] - b_y * geometry[i, 4] - off_y
-            if not (0.0 <= x < width and 0.0 <= y < height):
-                continue
-            place = planes[int(y), int(x)]
-            place[channels + 1] += np.float32(1.0)
-            if bucket[i] <= behind:
-                place[channels] += np.float32(1.0)
-                for c in range(channels):
-                    place[c] += values[i, c]
+    height, width, _ = planes.shape
+    reach_x = abs(slope.a) * light.pupil_radius + 0.5 * abs(slope.b_x)
+    reach_y = abs(slope.a) * light.pupil_radius + 0.5 * abs(slope.b_y)
+    sharp = not shared_out or (reach_x < _SHARP_PX and reach_y < _SHARP_PX)
+    side_px = light.tile_px // BLOCKS_ACROSS
+    rows = (len(light.starts) - 1) // BLOCKS // light.columns
+    first_x, last_x = block_range(left, width, reach_x, side_px, light.columns * BLOCKS_ACROSS)
+    first_y, last_y = block_range(top, height, reach_y, side_px, rows * BLOCKS_ACROSS)
+    for y in range(first_y, last_y + 1):
+        for x in range(first_x, last_x + 1):
+            tile = (y // BLOCKS_ACROSS) * light.columns + x // BLOCKS_ACROSS
+            block = tile * BLOCKS + morton(x % BLOCKS_ACROSS, y % BLOCKS_ACROSS)
+            add_block(planes, left, top, light.starts[block], light.starts[block + 1], sharp, slope, j, partitions, light)
 
 
 @njit(cache=True, nogil=True)
-def even_out(planes: np.ndarray, enough: float) -> None:
-    """Let no place of planes (h, w, C + 2) weigh more than `enough` samples do, with its colour and opacity kept in proportion.
+def block_range(from_px: int, size_px: int, reach_px: float, side_px: int, count: int) -> tuple[int, int]:
+    """The first and last block whose samples may land on the pixels from from_px on."""
+    first, last = int(math.floor((from_px - reach_px) / side_px)), int(math.floor((from_px + size_px + reach_px) / side_px))
+    return max(0, first), min(count - 1, last)
+
+
+@njit(cache=True, nogil=True)
+def add_block(
+    planes: np.ndarray, left: int, top: int, first: int, end: int, sharp: bool, slope: Slope, j: int, partitions: Partitions, light: Light
+) -> None:
+    """The samples from first to end. sharp: each counts for the pixel it is in; else it is shared out among the four nearest."""
+    height, width, channels = planes.shape
+    channels -= 3
+    a, b_x, b_y = np.float32(slope.a), np.float32(slope.b_x), np.float32(slope.b_y)
+    off_x, off_y = np.float32(left), np.float32(top)
+    if not sharp:
+        off_x, off_y, width, height = off_x + np.float32(0.5), off_y + np.float32(0.5), width - 1, height - 1
+    geometry, bucket, values, of, gaps, cells = light.geometry, light.bucket, light.values, partitions.place, partitions.gaps, light.cells
+    own, before = 2 * j, (partitions.first[j] - BESIDE_DEPTHS) * light.cells
+    for i in range(first, end):
+        if bucket[i] < before:
+            continue
+        x = geometry[i, 0] - a * geometry[i, 2] - b_x * geometry[i, 4] - off_x
+        y = geometry[i, 1] - a * geometry[i, 3] - b_y * geometry[i, 4] - off_y
+        if not (np.float32(0.0) <= x < width and np.float32(0.0) <= y < height):
+            continue
+        at = of[bucket[i]]
+        if at < 0:
+            at = gaps[bucket[i] // cells]
+        column, row = int(x), int(y)
+        if sharp:
+            right, below, taps = np.float32(0.0), np.float32(0.0), 1
+        else:
+            right, below, taps = x - np.float32(column), y - np.float32(row), 4
+        for tap in range(taps):
+            dx, dy = tap & 1, tap >> 1
+            share = (right if dx else np.float32(1.0) - right) * (below if dy else np.float32(1.0) - below)
+            py, px = row + dy, column + dx
+            planes[py, px, channels + 2] += share
+            if at >= own:
+                planes[py, px, channels + 1] += share
+                if at == own:
+                    planes[py, px, channels] += share
+                    for c in range(channels):
+                        planes[py, px, c] += share * values[i, c]
+
+
+@njit(cache=True, nogil=True)
+def evened_out(planes: np.ndarray, enough: float) -> np.ndarray:
+    """Planes (h, w, C + 2) without the count, in which no place weighs more than `enough` samples do, its colour and opacity in
+    proportion.
 
     Samples fall on places in uneven numbers by chance. Left so, that chance is noise in every mean over places.
     """
     height, width, channels = planes.shape
+    channels -= 1
+    even = np.empty((height, width, channels), np.float32)
     for y in range(height):
         for x in range(width):
-            place = planes[y, x]
-            if place[channels - 1] > enough:
-                share = np.float32(enough) / place[channels - 1]
-                for c in range(channels):
-                    place[c] *= share
+            count = planes[y, x, channels]
+            share = np.float32(enough) / count if count > enough else np.float32(1.0)
+            for c in range(channels):
+                even[y, x, c] = share * planes[y, x, c]
+    return even

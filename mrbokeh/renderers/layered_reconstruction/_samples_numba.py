@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS
+
 
 @njit(cache=True, nogil=True)
 def morton(x: int, y: int) -> int:
@@ -31,8 +33,8 @@ def tile_order(xy_px: np.ndarray, width_px: int, height_px: int, tile_px: int, o
         ends[keys[i] + 1] += 1
     for key in range(len(ends) - 1):
         ends[key + 1] += ends[key]
-    for tile in range(columns * rows + 1):
-        starts[tile] = ends[tile * per_tile]
+    for block in range(len(starts)):
+        starts[block] = ends[block * (per_tile // BLOCKS)]
     for i in range(len(keys)):
         order[ends[keys[i]]] = i
         ends[keys[i]] += 1

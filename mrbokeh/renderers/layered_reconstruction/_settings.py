@@ -19,11 +19,12 @@ class Settings:
     tile_px: side of a tile, a power of two from 4 to 256.
     coc_step_px, near_coc_px: depth buckets take equal steps of the circle of confusion up to near_coc_px on both sides of the focus.
     depth_buckets: and the range of depth is cut into so many equal buckets everywhere.
+    motion_step_px: samples at one depth are told apart by cells of motion of this side; inf leaves that to depth alone.
     bandwidth: how many standard deviations of the slopes within a partition the filter's passband spans; larger trusts fewer
       samples from elsewhere.
     sigma_x_px: the spatial filter, at least that of a pixel (0.289); larger hides streaks and loses sharpness (Fig. 9).
     sparse_statistics: statistics from one sample in 3 x spp, picked stratified in Morton order; else from all.
-    merge: put neighbouring buckets together whose common filter is at most the share merge_tolerance narrower than that of any of them.
+    merge: put buckets together whose common filter is at most the share merge_tolerance narrower than that of any of them.
     screen_filter: "windows" (not the paper's: pupil and shutter in their true shapes), or a Gaussian in their place: "sheared"
       (recursive along x, Eq. 9 and 10), "texture" (mip map, anisotropic, four taps), "texture_one_tap", "direct" (slow).
     recursive_passes: of Eq. 10, which share the variance; 1 is the paper's double exponential, more come nearer to a Gaussian.
@@ -34,9 +35,10 @@ class Settings:
     """
 
     tile_px: int = 32
-    coc_step_px: float = 2.0
-    near_coc_px: float = 32.0
-    depth_buckets: int = 32
+    coc_step_px: float = 0.5
+    near_coc_px: float = 64.0
+    depth_buckets: int = 128
+    motion_step_px: float = 16.0
     bandwidth: float = 1.0
     sigma_x_px: float = 0.33
     sparse_statistics: bool = True
@@ -46,7 +48,7 @@ class Settings:
     recursive_passes: int = 2
     tap_distance: float = 0.33
     energy: float = 0.95
-    enough: float = 1.0
+    enough: float = 0.5
     support: float = 3.0
     motion: bool = True
 
@@ -60,6 +62,8 @@ class Settings:
             )
         if not self.sigma_x_px >= _LEAST_SIGMA_PX:
             raise InputError(f"sigma_x_px must be at least that of a pixel, {_LEAST_SIGMA_PX:.3f} px, got {self.sigma_x_px}")
+        if not self.motion_step_px > 0:
+            raise InputError(f"motion_step_px must be above 0 (inf for one cell), got {self.motion_step_px}")
         if self.screen_filter not in SCREEN_FILTERS:
             raise InputError(f"screen_filter must be one of {', '.join(SCREEN_FILTERS)}, got {self.screen_filter!r}")
         if not (0 <= self.merge_tolerance < 1 and 0 < self.energy < 1 and 0 <= self.tap_distance < 1):

@@ -1,13 +1,22 @@
-"""Sums over the samples of each tile and depth bucket, from all samples or a sparse stratified choice, and their merging."""
+"""Sums over the samples of a tile for each bucket it holds, from all samples or a sparse stratified choice."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS, extents, slope_distance
+from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS
+from mrbokeh.renderers.layered_reconstruction._samples_numba import morton
+from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, BLOCKS_ACROSS, Choice, Light
 
-SLOPES = 2.0
-"""Slopes may differ by so many times the share by which filters may shrink. With 2, 4.0 partitions of a tile become 2.7 in the fence scene
-of the benchmark and 7.4 become 3.4 on its slanted plane, for 0.1 and 0.8 to 1.0 dB; with 1 fewer merge, for nearly nothing."""
+
+class Rows(NamedTuple):
+    """What was found so far: buckets (R,) and sums (R, SUMS), used[0] of which are in use; place (B,) is the row of a bucket or -1."""
+
+    buckets: np.ndarray
+    sums: np.ndarray
+    used: np.ndarray
+    place: np.ndarray
 
 
 @njit(cache=True, nogil=True)
@@ -30,123 +39,80 @@ def seeded(seed: int, tile: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def bucket_sums(sums: np.ndarray, first: int, end: int, every: int, state: int, bucket: np.ndarray, slopes: np.ndarray) -> int:
-    """Add one sample out of each `every` from first to end to sums (buckets, SUMS); returns how many.
+def rows_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Buckets (R,), in rising order, and sums (R, SUMS) of all that the tile and the blocks around it hold.
 
-    slopes: (N, 3) half the signed circle of confusion, motion x and y.
+    place: (B,) of -1; afterwards not, for these buckets. What none of the chosen samples saw is summed over all samples, and what
+    only the blocks around hold over those: a lamp must not vanish by chance, nor where its light leaves a tile's corner.
     """
-    taken = 0
+    first, end = light.starts[tile * BLOCKS], light.starts[(tile + 1) * BLOCKS]
+    beside = blocks_around(tile, light)
+    most = end - first
+    for block in beside:
+        most += light.starts[block + 1] - light.starts[block]
+    rows = Rows(np.empty(most, np.int64), np.empty((most, SUMS)), np.zeros(1, np.int64), place)
+    add_chosen(rows, first, end, choice.every, seeded(choice.seed, tile), light)
+    known = rows.used[0]
+    if choice.every > 1:
+        add_unknown(rows, known, first, end, light)
+    own = rows.used[0]
+    for block in beside:
+        add_unknown(rows, own, light.starts[block], light.starts[block + 1], light)
+    count = rows.used[0]
+    rows.sums[known:count] /= choice.every
+    order = np.argsort(rows.buckets[:count])
+    return rows.buckets[:count][order], rows.sums[:count][order]
+
+
+@njit(cache=True, nogil=True)
+def add_chosen(rows: Rows, first: int, end: int, every: int, state: int, light: Light) -> None:
+    """Add one sample, by chance, out of each `every` from first to end."""
     for begin in range(first, end, every):
         i = begin
         if every > 1:
             state = xorshift(state)
             i = begin + state % min(every, end - begin)
-        row = sums[bucket[i]]
-        r, m_x, m_y = np.float64(slopes[i, 0]), np.float64(slopes[i, 1]), np.float64(slopes[i, 2])
-        row[0] += 1.0
-        row[1] += r
-        row[2] += r * r
-        row[3] += m_x
-        row[4] += m_y
-        row[5] += m_x * m_x
-        row[6] += m_x * m_y
-        row[7] += m_y * m_y
-        taken += 1
-    return taken
+        add_sample(rows, light.bucket[i], light.slopes[i])
 
 
 @njit(cache=True, nogil=True)
-def add_missed(sums: np.ndarray, first: int, end: int, every: int, bucket: np.ndarray, slopes: np.ndarray) -> None:
-    """Sum buckets that hold samples, none of which was chosen, over all of them: a lamp must not vanish by chance."""
-    missed = np.zeros(len(sums), np.bool_)
-    some = False
+def add_unknown(rows: Rows, known: int, first: int, end: int, light: Light) -> None:
+    """Add all samples from first to end whose bucket is not among the first `known` rows."""
     for i in range(first, end):
-        if sums[bucket[i], 0] == 0.0:
-            missed[bucket[i]] = some = True
-    if some:
-        for i in range(first, end):
-            if missed[bucket[i]]:
-                bucket_sums(sums, i, i + 1, 1, 1, bucket, slopes)
-        for index in range(len(sums)):
-            if missed[index]:
-                sums[index] /= every
+        row = rows.place[light.bucket[i]]
+        if row < 0 or row >= known:
+            add_sample(rows, light.bucket[i], light.slopes[i])
 
 
 @njit(cache=True, nogil=True)
-def partitions_of(
-    sums: np.ndarray, merged: np.ndarray, spans: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: float, limit: tuple
-) -> tuple[int, int]:
-    """Sweep the populated buckets front to back and fill merged (P, SUMS) and spans (P, 2: first and last bucket).
-
-    limit: whether to merge, and the tolerance: the common filter may be by that share narrower, along either axis, than that
-    of any bucket in it, and its slopes may differ from those of its first and last by SLOPES times that share of their blur.
-    (The paper names the first only. By that alone a few sharp samples would vanish in many blurred ones behind them, whose
-    filter they hardly change.)
-    Returns the number of populated buckets and of partitions.
-    """
-    merge, tolerance = limit
-    populated, count = 0, 0
-    widest_u = widest_v = 0.0
-    for index in range(len(sums)):
-        if sums[index, 0] == 0.0:
-            continue
-        populated += 1
-        joins, one_u, one_v = False, 0.0, 0.0
-        if merge:
-            one_u, one_v = extents(sums[index], window, sigma_x_px, bandwidth)
-            if count > 0:
-                both = merged[count - 1] + sums[index]
-                both_u, both_v = extents(both, window, sigma_x_px, bandwidth)
-                joins = both_u >= (1.0 - tolerance) * max(widest_u, one_u) and both_v >= (1.0 - tolerance) * max(widest_v, one_v)
-                joins = joins and slope_distance(sums[spans[count - 1, 0]], both, window, sigma_x_px) <= SLOPES * tolerance
-                joins = joins and slope_distance(sums[index], both, window, sigma_x_px) <= SLOPES * tolerance
-        if joins:
-            merged[count - 1] += sums[index]
-            spans[count - 1, 1] = index
-            widest_u, widest_v = max(widest_u, one_u), max(widest_v, one_v)
-        else:
-            merged[count] = sums[index]
-            spans[count, 0], spans[count, 1] = index, index
-            widest_u, widest_v = one_u, one_v
-            count += 1
-    return populated, count
+def add_sample(rows: Rows, bucket: int, slope: np.ndarray) -> None:
+    """slope: half the signed circle of confusion, motion x and y."""
+    if rows.place[bucket] < 0:
+        new = rows.used[0]
+        rows.place[bucket], rows.buckets[new] = new, bucket
+        rows.sums[new] = 0.0
+        rows.used[0] = new + 1
+    row = rows.sums[rows.place[bucket]]
+    r, m_x, m_y = np.float64(slope[0]), np.float64(slope[1]), np.float64(slope[2])
+    row[0] += 1.0
+    row[1] += r
+    row[2] += r * r
+    row[3] += m_x
+    row[4] += m_y
+    row[5] += m_x * m_x
+    row[6] += m_x * m_y
+    row[7] += m_y * m_y
 
 
 @njit(cache=True, nogil=True)
-def widen(spans: np.ndarray, count: int) -> None:
-    """Each partition takes the empty bucket before and the one behind it, where they are free: a surface goes on beyond the tile."""
-    for j in range(count):
-        before = spans[j - 1, 1] if j > 0 else -2
-        if spans[j, 0] - before > 1:
-            spans[j, 0] -= 1
-        behind = spans[j + 1, 0] if j + 1 < count else spans[j, 1] + 2
-        if behind - spans[j, 1] > 1:
-            spans[j, 1] += 1
-
-
-@njit(cache=True, nogil=True)
-def survey_tiles(
-    tiles: np.ndarray,
-    starts: np.ndarray,
-    bucket: np.ndarray,
-    slopes: np.ndarray,
-    every: int,
-    seed: int,
-    window: np.ndarray,
-    sigma_x_px: float,
-    bandwidth: float,
-    limit: tuple,
-    partitions: np.ndarray,
-    spans: np.ndarray,
-    counts: np.ndarray,
-) -> None:
-    """Partitions (T, P, SUMS), spans (T, P, 2) and counts (T, 2: before and after merging) of the tiles named."""
-    sums = np.zeros((partitions.shape[1], SUMS))
-    for tile in tiles:
-        sums[:] = 0.0
-        bucket_sums(sums, starts[tile], starts[tile + 1], every, seeded(seed, tile), bucket, slopes)
-        if every > 1:
-            add_missed(sums, starts[tile], starts[tile + 1], every, bucket, slopes)
-        before, after = partitions_of(sums, partitions[tile], spans[tile], window, sigma_x_px, bandwidth, limit)
-        counts[tile, 0], counts[tile, 1] = before, after
-        widen(spans[tile], after)
+def blocks_around(tile: int, light: Light) -> list[int]:
+    """The blocks of other tiles that touch this one."""
+    rows, row, column = (len(light.starts) - 1) // BLOCKS // light.columns, tile // light.columns, tile % light.columns
+    blocks = []
+    for y in range(row * BLOCKS_ACROSS - 1, (row + 1) * BLOCKS_ACROSS + 1):
+        for x in range(column * BLOCKS_ACROSS - 1, (column + 1) * BLOCKS_ACROSS + 1):
+            at_row, at_column = y // BLOCKS_ACROSS, x // BLOCKS_ACROSS
+            inside = 0 <= at_row < rows and 0 <= at_column < light.columns
+            if inside and not (at_row == row and at_column == column):
+                blocks.append((at_row * light.columns + at_column) * BLOCKS + morton(x % BLOCKS_ACROSS, y % BLOCKS_ACROSS))
+    return blocks

@@ -63,19 +63,29 @@ def add_look_up(
     """One anisotropic look-up at the place (x, y) in pixels: trilinear probes side by side along the major axis.
 
     (major_x, major_y), minor_px: the footprint's axes as the derivatives ddx, ddy give them; at most 16 probes.
+    One probe of a texel's width w has the variance w^2 / 4 (a box and the tent of the interpolation), so that a round footprint
+    of the width ddx has ddx^2 / 4. The probes of a long one are weighted by a Gaussian (Heckbert's EWA) that gives it the same
+    along its major axis; equal weights over the length ddx would give a third of it.
     """
     major_px = math.hypot(major_x, major_y)
-    probes = min(_MOST_PROBES, max(1, int(math.ceil(major_px / max(minor_px, 1.0) - 1e-6))))
-    level = min(max(math.log2(max(major_px / probes, minor_px, 1.0)), 0.0), len(places) - 1.0)
+    least = max(minor_px, 1.0)
+    probes = min(_MOST_PROBES, max(1, int(math.ceil(2.0 * (major_px - least) / least - 1e-6))))
+    texel_px = max(2.0 * major_px / (probes + 2.0), least) if probes == _MOST_PROBES else least
+    level = min(max(math.log2(texel_px), 0.0), len(places) - 1.0)
     below = min(int(level), len(places) - 1)
-    above, share = min(below + 1, len(places) - 1), level - below
+    above, part_above = min(below + 1, len(places) - 1), level - below
+    rest = max(0.25 * (major_px * major_px - texel_px * texel_px), 1e-6)
+    gain = 0.0
     for probe in range(probes):
-        along = (probe + 0.5) / probes - 0.5
+        gain += math.exp(-0.5 * (major_px * ((2.0 * probe + 1.0) / probes - 1.0)) ** 2 / rest)
+    for probe in range(probes):
+        along = (2.0 * probe + 1.0) / probes - 1.0
         at_x, at_y = x + along * major_x, y + along * major_y
-        for which, part in ((below, 1.0 - share), (above, share)):
+        share = weight * math.exp(-0.5 * (along * major_px) ** 2 / rest) / gain
+        for which, part in ((below, 1.0 - part_above), (above, part_above)):
             if part > 0.0:
                 texel = 2.0**which
-                _add_bilinear(total, flat, places[which], at_x / texel - 0.5, at_y / texel - 0.5, weight * part / probes)
+                _add_bilinear(total, flat, places[which], at_x / texel - 0.5, at_y / texel - 0.5, share * part)
 
 
 @njit(cache=True, nogil=True)
@@ -95,7 +105,12 @@ def texture_gaussian(
     flat, places = mip_map(planes)
     cosine, sine = math.cos(theta), math.sin(theta)
     u_px, v_px = alpha * sigma_u, alpha * sigma_v
-    size = 1.0 - tap_distance if taps == 4 else 1.0
+    size = 1.0
+    if taps == 4:
+        # A look-up of the width w has the variance w^2 / 4: with the taps' distance that makes less than sigma^2, made good here.
+        size = 1.0 - tap_distance
+        widening = 1.0 / (alpha * math.sqrt(0.25 * size * size + 0.5 * tap_distance * tap_distance))
+        u_px, v_px = widening * u_px, widening * v_px
     height, width, channels = out.shape
     total = np.zeros(channels)
     for y in range(height):

@@ -5,11 +5,14 @@ import math
 import numpy as np
 from numba import njit
 
+from mrbokeh.renderers.layered_reconstruction._compositing_numba import composite, own_means, share_out
 from mrbokeh.renderers.layered_reconstruction._direct_gaussian_numba import direct_gaussian
 from mrbokeh.renderers.layered_reconstruction._filter_numba import axes, sheared_filter, sheared_slopes
-from mrbokeh.renderers.layered_reconstruction._reprojection_numba import even_out, reproject
+from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile
+from mrbokeh.renderers.layered_reconstruction._reprojection_numba import evened_out, reproject
 from mrbokeh.renderers.layered_reconstruction._sheared_gaussian_numba import sheared_gaussian
 from mrbokeh.renderers.layered_reconstruction._texture_gaussian_numba import texture_gaussian
+from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions, Pupil, Slope
 from mrbokeh.renderers.layered_reconstruction._window_numba import window_filter, window_guards
 
 DIRECT, SHEARED, TEXTURE, TEXTURE_ONE_TAP, WINDOWS = 0, 1, 2, 3, 4
@@ -23,19 +26,19 @@ _LEAST_VARIANCE = 1e-4
 
 
 @njit(cache=True, nogil=True)
-def filter_layer(
-    out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: int, v: tuple[float, float, float], how: np.ndarray, kind: int
-) -> None:
-    """how: (support, passes, alpha, tap distance, enough)."""
+def filter_layer(out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: int, v: tuple[float, float, float], choice: Choice) -> None:
+    kind = choice.kind
     if guard_x == 0 and guard_y == 0:
         out[:] = planes
     elif kind == SHEARED:
-        sheared_gaussian(out, planes, guard_x, guard_y, v[0], v[1], v[2], int(how[1]))
+        sheared_gaussian(out, planes, guard_x, guard_y, v[0], v[1], v[2], choice.passes)
     elif kind == DIRECT:
         direct_gaussian(out, planes, guard_x, guard_y, v[0], v[1], v[2])
     else:
         sigma_u, sigma_v, theta = axes(v[0], v[1], v[2])
-        texture_gaussian(out, planes, guard_x, guard_y, sigma_u, sigma_v, theta, how[2], how[3], 4 if kind == TEXTURE else 1)
+        texture_gaussian(
+            out, planes, guard_x, guard_y, sigma_u, sigma_v, theta, choice.alpha, choice.tap_distance, 4 if kind == TEXTURE else 1
+        )
 
 
 @njit(cache=True, nogil=True)
@@ -45,147 +48,76 @@ def guard_px(variance: float, support: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def composite(out: np.ndarray, seen_past: np.ndarray, layer: np.ndarray) -> None:
-    """Lay a filtered layer (h, w, C + 2) behind what out (h, w, C) holds; seen_past (h, w) is the product of 1 - alpha so far."""
-    height, width, channels = out.shape
-    for y in range(height):
-        for x in range(width):
-            weight = layer[y, x, channels + 1]
-            if weight <= 1e-6:
-                continue
-            share = seen_past[y, x] / weight
-            for c in range(channels):
-                out[y, x, c] += share * layer[y, x, c]
-            seen_past[y, x] *= max(0.0, 1.0 - layer[y, x, channels] / weight)
-
-
-@njit(cache=True, nogil=True)
-def gaussian_layer(
-    layer: np.ndarray,
-    left: int,
-    top: int,
-    sums: np.ndarray,
-    span: np.ndarray,
-    light: tuple,
-    window: np.ndarray,
-    pupil_radius: float,
-    sigma_x_px: float,
-    bandwidth: float,
-    how: np.ndarray,
-    kind: int,
-) -> None:
+def gaussian_layer(layer: np.ndarray, left: int, top: int, j: int, partitions: Partitions, light: Light, choice: Choice) -> None:
     """Fill layer (h, w, C + 2), whose top left pixel is (left, top), with the filtered colour, opacity and weight of a partition."""
     height, width, channels = layer.shape
-    a, b_x, b_y, v_xx, v_xy, v_yy = sheared_filter(sums, window, sigma_x_px, bandwidth)
+    a, b_x, b_y, v_xx, v_xy, v_yy = sheared_filter(partitions.sums[j], light.window, choice.sigma_x_px, choice.bandwidth)
     v_xx, v_yy = max(v_xx - PIXEL_VARIANCE, _LEAST_VARIANCE), max(v_yy - PIXEL_VARIANCE, _LEAST_VARIANCE)
-    guard_x, guard_y = guard_px(v_xx, how[0]), guard_px(v_yy, how[0])
-    planes = np.zeros((height + 2 * guard_y, width + 2 * guard_x, channels), np.float32)
-    reproject(planes, left - guard_x, top - guard_y, pupil_radius, (a, b_x, b_y), span, light)
-    even_out(planes, how[4])
-    filter_layer(layer, planes, guard_x, guard_y, (v_xx, v_xy, v_yy), how, kind)
+    guard_x, guard_y = guard_px(v_xx, choice.support), guard_px(v_yy, choice.support)
+    planes = np.zeros((height + 2 * guard_y, width + 2 * guard_x, channels + 1), np.float32)
+    reproject(planes, left - guard_x, top - guard_y, Slope(a, b_x, b_y), j, partitions, light, choice.shared_out)
+    planes = evened_out(planes, choice.enough)
+    filter_layer(layer, planes, guard_x, guard_y, (v_xx, v_xy, v_yy), choice)
 
 
 @njit(cache=True, nogil=True)
 def window_layer(
-    layer: np.ndarray,
-    left: int,
-    top: int,
-    sums: np.ndarray,
-    span: np.ndarray,
-    light: tuple,
-    window: np.ndarray,
-    pupil_radius: float,
-    sigma_x_px: float,
-    bandwidth: float,
-    how: np.ndarray,
-    pupil: np.ndarray,
-    pupil_starts: np.ndarray,
+    layer: np.ndarray, left: int, top: int, j: int, partitions: Partitions, light: Light, choice: Choice, pupil: Pupil
 ) -> None:
     """The same with the shapes of pupil and shutter, scaled to the variance that the shear leaves."""
     height, width, channels = layer.shape
-    r, m_x, m_y, kappa_u, kappa_t = sheared_slopes(sums, window, sigma_x_px, bandwidth)
+    r, m_x, m_y, kappa_u, kappa_t = sheared_slopes(partitions.sums[j], light.window, choice.sigma_x_px, choice.bandwidth)
     scale, share = r * math.sqrt(kappa_u * (2.0 - kappa_u)), math.sqrt(kappa_t * (2.0 - kappa_t))
-    rest = sigma_x_px**2 - PIXEL_VARIANCE
-    guards = window_guards(scale, pupil_radius, share * m_x, share * m_y, rest)
+    rest = choice.sigma_x_px**2 - PIXEL_VARIANCE
+    guards = window_guards(scale, light.pupil_radius, share * m_x, share * m_y, rest)
     guard_x, guard_y = guards[0] + guards[2] + guards[3], guards[1] + guards[2] + guards[3]
-    planes = np.zeros((height + 2 * guard_y, width + 2 * guard_x, channels), np.float32)
-    reproject(planes, left - guard_x, top - guard_y, pupil_radius, (kappa_u * r, kappa_t * m_x, kappa_t * m_y), span, light)
-    even_out(planes, how[4])
-    drawings = (len(pupil_starts) - 1) // 2
-    drawing = 0
-    while drawing < drawings - 1 and abs(scale) > STRIPS_FOR_PX * (1 << drawing):
-        drawing += 1
-    drawing += drawings if scale > 0.0 else 0
-    strips = pupil[pupil_starts[drawing] : pupil_starts[drawing + 1]]
-    window_filter(layer, planes, strips, scale, share * m_x, share * m_y, rest, guards)
+    planes = np.zeros((height + 2 * guard_y, width + 2 * guard_x, channels + 1), np.float32)
+    reproject(
+        planes, left - guard_x, top - guard_y, Slope(kappa_u * r, kappa_t * m_x, kappa_t * m_y), j, partitions, light, choice.shared_out
+    )
+    planes = evened_out(planes, choice.enough)
+    window_filter(layer, planes, drawing(pupil, scale), scale, share * m_x, share * m_y, rest, guards)
 
 
 @njit(cache=True, nogil=True)
-def reconstruct_tile(
-    out: np.ndarray,
-    tile: int,
-    columns: int,
-    tile_px: int,
-    partitions: np.ndarray,
-    spans: np.ndarray,
-    count: int,
-    geometry: np.ndarray,
-    values: np.ndarray,
-    bucket: np.ndarray,
-    starts: np.ndarray,
-    window: np.ndarray,
-    pupil_radius: float,
-    sigma_x_px: float,
-    bandwidth: float,
-    how: np.ndarray,
-    kind: int,
-    pupil: np.ndarray,
-    pupil_starts: np.ndarray,
+def drawing(pupil: Pupil, scale: float) -> np.ndarray:
+    """The strips that do for a pupil of this radius in pixels."""
+    drawings = (len(pupil.starts) - 1) // 2
+    k = 0
+    while k < drawings - 1 and abs(scale) > STRIPS_FOR_PX * (1 << k):
+        k += 1
+    k += drawings if scale > 0.0 else 0
+    return pupil.spans[pupil.starts[k] : pupil.starts[k + 1]]
+
+
+@njit(cache=True, nogil=True)
+def reconstruct_tiles(
+    out: np.ndarray, tiles: np.ndarray, counts: np.ndarray, light: Light, choice: Choice, pupil: Pupil, buckets: int
 ) -> None:
-    """Fill the tile's pixels of out (H, W, C)."""
-    left, top = (tile % columns) * tile_px, (tile // columns) * tile_px
+    """Fill the pixels of these tiles of out (H, W, C), and counts (T, 2) of populated buckets and partitions."""
+    place = np.full(buckets, -1, np.int32)
+    for tile in tiles:
+        partitions, touched, populated = partitions_of_tile(tile, light, choice, place)
+        counts[tile, 0], counts[tile, 1] = populated, len(partitions.sums)
+        reconstruct_tile(out, tile, partitions, light, choice, pupil)
+        for bucket in touched:
+            place[bucket] = -1
+
+
+@njit(cache=True, nogil=True)
+def reconstruct_tile(out: np.ndarray, tile: int, partitions: Partitions, light: Light, choice: Choice, pupil: Pupil) -> None:
+    tile_px = light.tile_px
+    left, top = (tile % light.columns) * tile_px, (tile // light.columns) * tile_px
     picture = out[top : top + tile_px, left : left + tile_px]
     height, width, channels = picture.shape
     seen_past = np.ones((height, width), np.float32)
     layer = np.empty((height, width, channels + 2), np.float32)
     picture[:] = 0.0
-    light = (geometry, values, bucket, starts, columns, tile_px)
-    for j in range(count):
-        if kind == WINDOWS:
-            window_layer(
-                layer, left, top, partitions[j], spans[j], light, window, pupil_radius, sigma_x_px, bandwidth, how, pupil, pupil_starts
-            )
+    for j in range(len(partitions.sums)):
+        if choice.kind == WINDOWS:
+            window_layer(layer, left, top, j, partitions, light, choice, pupil)
         else:
-            gaussian_layer(layer, left, top, partitions[j], spans[j], light, window, pupil_radius, sigma_x_px, bandwidth, how, kind)
+            gaussian_layer(layer, left, top, j, partitions, light, choice)
         composite(picture, seen_past, layer)
     share_out(picture, seen_past)
-    own_means(picture, seen_past, left, top, starts[tile], starts[tile + 1], geometry, values)
-
-
-@njit(cache=True, nogil=True)
-def share_out(out: np.ndarray, seen_past: np.ndarray) -> None:
-    """Behind the last layer is nothing that was sampled: what no layer claims belongs to those that were seen."""
-    height, width, channels = out.shape
-    for y in range(height):
-        for x in range(width):
-            taken = 1.0 - seen_past[y, x]
-            if taken > 1e-3:
-                for c in range(channels):
-                    out[y, x, c] /= taken
-
-
-@njit(cache=True, nogil=True)
-def own_means(
-    out: np.ndarray, seen_past: np.ndarray, left: int, top: int, first: int, end: int, geometry: np.ndarray, values: np.ndarray
-) -> None:
-    """A pixel that no layer reaches shows the mean of its own samples."""
-    height, width, channels = out.shape
-    counts = np.zeros((height, width), np.int32)
-    for i in range(first, end):
-        x, y = min(int(geometry[i, 0]) - left, width - 1), min(int(geometry[i, 1]) - top, height - 1)
-        if seen_past[y, x] >= 0.999:
-            if counts[y, x] == 0:
-                out[y, x, :] = 0.0
-            counts[y, x] += 1
-            for c in range(channels):
-                out[y, x, c] += (values[i, c] - out[y, x, c]) / counts[y, x]
+    own_means(picture, seen_past, left, top, light.starts[tile * 16], light.starts[tile * 16 + 16], light.geometry, light.values)
