@@ -48,6 +48,10 @@ class Sparsification:
             raise InputError(f"a sparsification needs a positive number of points and no negative steps, got {self}")
 
 
+UNRELAXED = Sparsification(lloyd_steps=0, annealing_steps=0)
+"""Darts and fitted values alone: a hundredth of the time, a tenth of the error more."""
+
+
 @dataclass(frozen=True)
 class Spreadlet:
     """Points (N, 2) x right, y down in whole pixels from the source pixel, and values (N, C), C 1 or 3."""

@@ -189,6 +189,18 @@ def test_samples_do_not_go_with_pictures_or_other_methods(folder: Path) -> None:
         run(folder, "--samples", str(scene / "samples.npz"), "--lens", str(scene / "lens.json"), "--method", "polygon")
 
 
+def test_a_device_gives_the_same_picture_or_one_sentence(folder: Path) -> None:
+    """torch on the CPU stands for any device: it sums in whole numbers, the compiled loops in floating point."""
+    pytest.importorskip("torch")
+    laplacian = (*PICTURE[:-1], "laplacian")
+    plain, on_device = (read_image(run(folder, *laplacian, *more, out=f"{i}.exr")) for i, more in enumerate([(), ("--device", "cpu")]))
+    assert psnr(on_device, plain) > 80.0
+    for words, said in (((*laplacian, "--device", "abacus"), "got 'abacus'"), ((*PICTURE, "--device", "cpu"), "--device is for --method")):
+        with pytest.raises(InputError, match=said):
+            run(folder, *words, out="none.exr")
+    assert not (folder / "none.exr").exists()
+
+
 def test_half_a_picture_and_alpha_in_a_png_are_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="belong together"):
         run(folder, "--rgb", "aif.exr", "--lens", "lens.json")

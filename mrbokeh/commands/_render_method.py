@@ -10,10 +10,10 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 
 
-def chosen_renderer(method: str, psf: Path | None, *, threads: int, layering: Layering) -> Renderer:
+def chosen_renderer(method: str, psf: Path | None, *, threads: int, layering: Layering, device: str) -> Renderer:
     """The renderer of that name; psf: a bank of kernels in place of the lens's opening."""
     if psf is None:
-        return make_renderer(method, threads=threads, layering=layering)
+        return make_renderer(method, threads=threads, layering=layering, device=device)
     if method != "laplacian":
         raise InputError(f"--psf is for --method laplacian, got --method {method}: other methods take the opening of the lens file")
     from mrbokeh.psf_bank_file import read_bank
@@ -21,7 +21,8 @@ def chosen_renderer(method: str, psf: Path | None, *, threads: int, layering: La
     from mrbokeh.spreadlets_file import spreadlets_beside
 
     bank = read_bank(psf)
-    return LaplacianSpreadlets(bank=bank, spreadlets=spreadlets_beside(psf, bank.kernels), threads=threads, layering=layering)
+    beside = spreadlets_beside(psf, bank.kernels)
+    return LaplacianSpreadlets(bank=bank, spreadlets=beside, threads=threads, layering=layering, device=device)
 
 
 def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) -> Layer:

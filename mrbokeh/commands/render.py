@@ -41,6 +41,9 @@ def render(
     alpha_out: Annotated[bool, typer.Option("--alpha-out", help="Write A, Z and all extra channels of the layers beside R, G, B.")] = False,
     slices: Annotated[int, typer.Option(help="How many slices of depth at most.", min=1)] = 16,
     threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0)] = 0,
+    device: Annotated[
+        str, typer.Option(help="cuda, cuda:1 or cpu: sums of --method laplacian by torch there; without it compiled loops on the CPU.")
+    ] = "",
     overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
 ) -> None:
     """Blur a picture with depth, or layers, as a lens does. Layers lie in front of the picture.
@@ -63,7 +66,7 @@ def render(
     if samples is not None and (sources.are_given or focus_distance_m is not None or focus_at is not None):
         raise InputError("--samples holds all there is to see, with its focus and its motion: leave out pictures, layers, motion and focus")
     with working("rendering (the first time on a machine it takes a minute to compile)"):
-        renderer = chosen_renderer(method, psf, threads=threads, layering=Layering(slices=slices))
+        renderer = chosen_renderer(method, psf, threads=threads, layering=Layering(slices=slices), device=device)
         blurred = renderer.render(list(sharp.values()), used) if samples is None else reconstructed(renderer, method, samples, used)
     _write(out, blurred, alpha_out)
     typer.echo(f"wrote {out}")

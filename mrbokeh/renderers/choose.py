@@ -45,11 +45,19 @@ def _lrdm(**settings: Any) -> Renderer:
 
 BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "lrdm": _lrdm, "scatter": _scatter}
 
+ON_DEVICES = ("laplacian",)
 
-def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None) -> Renderer:
-    """The renderer of that name, or the network in that .onnx file (which takes every layer as it is, without slices)."""
+
+def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:
+    """The renderer of that name, or the network in that .onnx file (which takes every layer as it is, without slices).
+
+    device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there, where the renderer has such a twin.
+    """
+    if device and name not in ON_DEVICES:
+        raise InputError(f"--device is for --method {' or '.join(ON_DEVICES)}, got {name!r}: the others run on the CPU, leave --device out")
     if name in BY_NAME:
-        return BY_NAME[name](threads=threads, layering=layering or Layering())
+        on = {"device": device} if device else {}
+        return BY_NAME[name](threads=threads, layering=layering or Layering(), **on)
     if name.lower().endswith(".onnx"):
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 

@@ -29,9 +29,9 @@ from mrbokeh.renderers._laplacian_layers import BankOptics
 from mrbokeh.renderers._laplacian_samples import reconstructed
 from mrbokeh.renderers._laplacian_sums import add_light
 from mrbokeh.renderers._laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out
-from mrbokeh.spreadlets import Sparsification, Spreadlets
+from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlets
 
-PLAIN_APERTURE = Sparsification(lloyd_steps=0, annealing_steps=0)
+PLAIN_APERTURE = UNRELAXED
 """For apertures that are sparsified while somebody waits: once values are fitted, relaxation and annealing gain nothing."""
 
 
@@ -42,7 +42,8 @@ class LaplacianSpreadlets:
     sparsification: how kernels become points; None takes the whole Laplacian (exact, about three times as slow at 40 px).
     dense_up_to_px: the fast track: kernels of apertures up to this diameter are splatted as they are; those of a bank with
     as few taps as a disc of 24 px. integration: "exact" or "pyramid", see mrbokeh.laplacian_integration. threads: 0 takes all.
-    bank: kernels to use instead of the lens's aperture; spreadlets: its own, if they have been computed before.
+    bank: kernels to use instead of the lens's aperture; spreadlets: its own, if they have been computed before. device: where
+    light is summed, "" by compiled loops, "cuda", "cuda:1" or "cpu" by torch (mrbokeh.renderers.torch_spreadlets).
     """
 
     bank: PsfBank | None = None
@@ -52,6 +53,8 @@ class LaplacianSpreadlets:
     sparsification: Sparsification | None = PLAIN_APERTURE
     dense_up_to_px: float = 24.0
     spreadlets: Spreadlets | None = field(default=None, repr=False)
+    device: str = ""
+    _add_light: Callable[..., None] = field(init=False, repr=False, compare=False)
     _tables: KernelTables = field(init=False, repr=False, compare=False)
     _bank_tables: BankTables | None = field(init=False, repr=False, compare=False)
 
@@ -63,6 +66,7 @@ class LaplacianSpreadlets:
         bank_tables = None if self.bank is None else BankTables(self.bank, self.sparsification, self.spreadlets)
         object.__setattr__(self, "_tables", KernelTables(self.dense_up_to_px, self.sparsification))
         object.__setattr__(self, "_bank_tables", bank_tables)
+        object.__setattr__(self, "_add_light", _adder_on(self.device))
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         if self._bank_tables is None or not layers:
@@ -142,8 +146,16 @@ class LaplacianSpreadlets:
                 cell_of = np.full(int(used[-1]) + 2, -1, np.int32)  # its last entry is that of code -1
                 cell_of[mine] = np.arange(mine.size)
                 cells, points = cell_of[codes], points_of(mine.tolist(), dense)
-                add_light(out, values, cells, points, None if dense else self.integration, self.threads)
+                self._add_light(out, values, cells, points, None if dense else self.integration, self.threads)
         return out
+
+
+def _adder_on(device: str) -> Callable[..., None]:
+    if not device:
+        return add_light
+    from mrbokeh.renderers.torch_spreadlets._sums import add_light_on
+
+    return add_light_on(device)
 
 
 def _used(codes: Int[np.ndarray, "height width"]) -> Int[np.ndarray, " codes"]:
