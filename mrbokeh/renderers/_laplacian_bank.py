@@ -47,14 +47,14 @@ class BankTables:
     spreadlets: Spreadlets | None = None
     _kept: dict[tuple[int, bool], Spreadlet] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def angles(self) -> int:
         """How many directions are told apart: an even number, so that half a turn is one of them."""
         if self.bank.turns == "none":
             return 2
         return int(np.clip(4 * self.bank.radius_px, _LEAST_ANGLES, _MOST_ANGLES)) // 2 * 2
 
-    @property
+    @cached_property
     def needed(self) -> frozenset[str]:
         """What a `Place` must hold: "motion", "field", "depth"."""
         of_axes = {"motion_px": "motion", "eccentricity": "field", "depth_m": "depth"}
