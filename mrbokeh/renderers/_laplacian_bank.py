@@ -140,11 +140,6 @@ class BankTables:
         return plane
 
 
-def spreadlets_of(bank: PsfBank, sparsification: Sparsification) -> Spreadlets:
-    """The spreadlets of all cells of a bank, under a progress bar; kept in files by mrbokeh.spreadlets_file."""
-    return Spreadlets.joined([sparsify(kernel, sparsification) for kernel in track(bank.kernels, "spreadlets of the bank")])
-
-
 def _reach_px(kernel: Float32[np.ndarray, "size size channels"], turns: bool) -> int:
     """To the farthest tap along rows or columns; of one that is turned as the crow flies, and what interpolation adds."""
     down, right = np.abs(np.argwhere(kernel.any(axis=2)) - kernel.shape[0] // 2).T
