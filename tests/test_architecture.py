@@ -121,8 +121,9 @@ def _one_room(a: str, b: str) -> bool:
 
 
 def test_renderers_do_not_import_their_siblings() -> None:
+    """Twins on devices (torch_*) are no siblings: each belongs to one renderer."""
     public = {name for name in MODULES if name.startswith("mrbokeh.renderers.") and not name.split(".")[-1].startswith("_")}
-    siblings = public - {"mrbokeh.renderers.base", "mrbokeh.renderers.choose"}
+    siblings = {name for name in public if ".torch_" not in name} - {"mrbokeh.renderers.base", "mrbokeh.renderers.choose"}
     assert not [f"{a} -> {b}" for a, b in arrows() if a in siblings and b in siblings]
 
 
@@ -156,7 +157,7 @@ def test_heavy_libraries_live_in_one_package(library: str, home: str) -> None:
         if isinstance(node, (ast.Import, ast.ImportFrom))
         and library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
-    twins = ("mrbokeh.renderers.torch_spreadlets", "mrbokeh.renderers.torch_reconstruction")
+    twins = ("mrbokeh.renderers.torch_", "mrbokeh.renderers._torch_device")
     assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= {home}
 
 

@@ -189,15 +189,16 @@ def test_samples_do_not_go_with_pictures_or_other_methods(folder: Path) -> None:
         run(folder, "--samples", str(scene / "samples.npz"), "--lens", str(scene / "lens.json"), "--method", "polygon")
 
 
-def test_a_device_gives_the_same_picture_or_one_sentence(folder: Path) -> None:
-    """torch on the CPU stands for any device: it sums in whole numbers, the compiled loops in floating point."""
+@pytest.mark.parametrize("method", ["laplacian", "lrdm"])
+def test_a_device_gives_the_same_picture_or_one_sentence(folder: Path, method: str) -> None:
+    """torch on the CPU stands for any device: it sums in another order than the compiled loops."""
     pytest.importorskip("torch")
-    laplacian = (*PICTURE[:-1], "laplacian")
-    plain, on_device = (read_image(run(folder, *laplacian, *more, out=f"{i}.exr")) for i, more in enumerate([(), ("--device", "cpu")]))
+    words = (*PICTURE[:-1], method)
+    plain, on_device = (read_image(run(folder, *words, *more, out=f"{i}.exr")) for i, more in enumerate([(), ("--device", "cpu")]))
     assert psnr(on_device, plain) > 80.0
-    for words, said in (((*laplacian, "--device", "abacus"), "got 'abacus'"), ((*PICTURE, "--device", "cpu"), "--device is for --method")):
+    for wrong, said in (((*words, "--device", "abacus"), "got 'abacus'"), ((*PICTURE, "--device", "cpu"), "--device is for --method")):
         with pytest.raises(InputError, match=said):
-            run(folder, *words, out="none.exr")
+            run(folder, *wrong, out="none.exr")
     assert not (folder / "none.exr").exists()
 
 

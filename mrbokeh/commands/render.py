@@ -42,7 +42,7 @@ def render(
     slices: Annotated[int, typer.Option(help="How many slices of depth at most.", min=1)] = 16,
     threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0)] = 0,
     device: Annotated[
-        str, typer.Option(help="cuda, cuda:1 or cpu: sums of --method laplacian by torch there; without it compiled loops on the CPU.")
+        str, typer.Option(help="cuda, cuda:1 or cpu: --method laplacian or lrdm by torch there; without it compiled loops on the CPU.")
     ] = "",
     overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
 ) -> None:

@@ -40,12 +40,12 @@ def _lrdm(**settings: Any) -> Renderer:
     """It makes layers of its own."""
     from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction
 
-    return LayeredReconstruction(threads=settings["threads"])
+    return LayeredReconstruction(threads=settings["threads"], device=settings.get("device", ""))
 
 
 BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "lrdm": _lrdm, "scatter": _scatter}
 
-ON_DEVICES = ("laplacian",)
+ON_DEVICES = ("laplacian", "lrdm")
 
 
 def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:

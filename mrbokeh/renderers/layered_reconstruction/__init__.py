@@ -48,13 +48,21 @@ class LayeredReconstruction:
     """Clean pictures from few samples, and a Renderer that takes samples of layers first.
 
     per_pixel: how many samples of layers are taken a pixel. threads: 0 takes all cores. seed: of these samples and of the choice
-    that the sparse statistics look at.
+    that the sparse statistics look at. device: "" for compiled loops; "cuda", "cuda:1" or "cpu" for torch there, without the
+    texture filter (mrbokeh.renderers.torch_reconstruction).
     """
 
     settings: Settings = field(default_factory=Settings)
     per_pixel: int = 64
     threads: int = 0
     seed: int = 0
+    device: str = ""
+
+    def __post_init__(self) -> None:
+        if self.device:
+            from mrbokeh.renderers.torch_reconstruction import TorchReconstruction
+
+            TorchReconstruction(self.settings, self.device, self.seed)  # refuses what is not there
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         """See Renderer. Extra channels `motion_px` (mrbokeh.motion) blur as well.
@@ -101,6 +109,12 @@ class LayeredReconstruction:
         aperture: Aperture,
         shared_out: bool = True,
     ) -> tuple[Float32[np.ndarray, "height width channels"], PartitionCounts]:
+        if self.device:
+            from mrbokeh.renderers.torch_reconstruction import TorchReconstruction
+
+            on_device = TorchReconstruction(self.settings, self.device, self.seed)
+            found, both = on_device.reconstruct_values(samples, values, coc_px, aperture, shared_out)
+            return found, PartitionCounts(*both)
         from mrbokeh.renderers.layered_reconstruction._tiles_numba import reconstruct_tiles
 
         light = prepared(samples, values, coc_px, self.settings)

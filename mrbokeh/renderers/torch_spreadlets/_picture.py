@@ -13,8 +13,8 @@ from mrbokeh.laplacian_integration import fast_width
 from mrbokeh.psf_bank import PsfBank
 from mrbokeh.renderers._laplacian_bank import BankTables
 from mrbokeh.renderers._laplacian_sums import FAR_FIELD_PX, Window
+from mrbokeh.renderers._torch_device import device_named
 from mrbokeh.renderers.torch_spreadlets._cells import BankCells, stands_out
-from mrbokeh.renderers.torch_spreadlets._device import device_named
 from mrbokeh.renderers.torch_spreadlets._integration import integrate
 from mrbokeh.renderers.torch_spreadlets._points import BankPoints, PointTable
 from mrbokeh.renderers.torch_spreadlets._splat import splat

@@ -2,8 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from functools import cache
-from importlib.util import find_spec
 
 import torch
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -11,6 +9,7 @@ from torch import Tensor
 
 from mrbokeh.errors import InputError
 from mrbokeh.renderers._laplacian_sums import Window
+from mrbokeh.renderers._torch_device import has_triton
 from mrbokeh.renderers.torch_spreadlets._points import PointTable
 
 AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 21}
@@ -42,11 +41,6 @@ def splat(
     else:
         splat_in_chunks(*task)
     return sums.permute(2, 0, 1).to(torch.float64, memory_format=torch.contiguous_format).mul_(math.ldexp(1.0, -exponent))
-
-
-@cache
-def has_triton() -> bool:
-    return find_spec("triton") is not None
 
 
 def splat_in_chunks(

@@ -1,4 +1,7 @@
-"""The device that a user names."""
+"""Devices of torch: the one that a user names, and whether Triton can write kernels for it."""
+
+from functools import cache
+from importlib.util import find_spec
 
 import torch
 
@@ -14,9 +17,14 @@ def device_named(name: str) -> torch.device:
     except RuntimeError:
         device = torch.device("meta")
     if device.type not in TYPES:
-        raise InputError(f"spreadlets need a device with double precision, 'cpu' or 'cuda' ('cuda:1' is the second), got {name!r}")
+        raise InputError(f"expected a device with double precision, 'cpu' or 'cuda' ('cuda:1' is the second), got {name!r}")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise InputError(
             f"the device {name!r} is not there: torch sees {torch.cuda.device_count()} NVIDIA GPUs; take 'cpu', or ask mrbokeh doctor"
         )
     return device
+
+
+@cache
+def has_triton() -> bool:
+    return find_spec("triton") is not None
