@@ -58,12 +58,11 @@ def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread | Optics, 
     spread: how kernels of the lens's aperture are summed, or an Optics that takes the aperture's place.
     """
     coc_px = [coc_px_of(layer, lens) for layer in _checked(layers)]
-    cells = layering.field_cells
-    optics = spread if isinstance(spread, Optics) else ThroughAperture.of(layers, lens.aperture, spread, cells)
+    optics = spread if isinstance(spread, Optics) else ThroughAperture.of(layers, lens.aperture, spread, layering.field_cells)
     margin = optics.margin_px(layers, coc_px)
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
-        slicing = Slicing(lens.aperture, optics, layering.slices, cells, frame, pool, ZeroedMemory())
+        slicing = Slicing(optics, layering.slices, frame, pool, ZeroedMemory())
         groups = _groups([sheet_of(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
         colour, taken = _rendered(groups[-1], layering, slicing)
         for group in reversed(groups[:-1]):

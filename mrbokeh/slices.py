@@ -3,18 +3,16 @@
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import chain
 
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.optics import Optics, ThroughAperture
+from mrbokeh.optics import Optics
 from mrbokeh.sheets import Pixels
 from mrbokeh.slice_islands import islands
 from mrbokeh.slice_sorting import Part, Shares, Window, sorted_slices, window_of
-from mrbokeh.spreading import Frame, Spread
+from mrbokeh.spreading import Frame
 from mrbokeh.workers import ahead, cores
 from mrbokeh.zeroed_memory import ZeroedMemory
 
@@ -31,21 +29,14 @@ Channels = Float32[np.ndarray, "height width _"]
 class Slicing:
     """What the light goes through, how many slices at most, and the place in the frame.
 
-    spread: an Optics, or a renderer's Spread through the aperture with its field cells (which say nothing to an Optics).
     frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them.
     """
 
-    aperture: Aperture
-    spread: Spread | Optics
+    optics: Optics
     slices: int
-    field_cells: tuple[int, int]
     frame: Frame
     pool: Executor
     memory: ZeroedMemory
-
-    @cached_property
-    def optics(self) -> Optics:
-        return self.spread if isinstance(self.spread, Optics) else ThroughAperture(self.aperture, self.spread, self.field_cells)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from mrbokeh.aperture import Aperture
 from mrbokeh.layer import Layer, clear
 from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
+from mrbokeh.optics import ThroughAperture
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.sheets import Pixels
 from mrbokeh.slice_islands import islands
@@ -40,7 +41,7 @@ def sheet(seed: int, covered: float, extra: int = 0) -> Pixels:
 
 
 def slicing(aperture: Aperture, spread: Spread = SPREAD, slices: int = 6) -> Slicing:
-    return Slicing(aperture, spread, slices, (4, 3), FRAME, CallingThread(), ZeroedMemory())
+    return Slicing(ThroughAperture(aperture, spread, (4, 3)), slices, FRAME, CallingThread(), ZeroedMemory())
 
 
 def plainly_composited(
