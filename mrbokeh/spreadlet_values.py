@@ -106,6 +106,8 @@ def _solved(
     Moments up to degree 3 are kept with at least 30 points; fewer points keep fewer moments, at least the charge. Points in few
     rows, as those of a line, cannot have all of them on their own (y^3 = y in rows -1, 0 and 1): `_independent`.
     """
+    from mrbokeh._spreadlets_numba import solve
+
     scale_px = float(max(np.abs(xy).max(), 1.0))
     degree = max(d for d in range(4) if d == 0 or (d + 1) * (d + 2) // 2 * _POINTS_PER_MOMENT <= len(points))
     held, wanted = _independent(points, xy, charges, degree)
@@ -114,7 +116,10 @@ def _solved(
     matrix = np.zeros((count + extra, count + extra))
     matrix[:count, :count] = table[apart[..., 1], apart[..., 0]] / scale_px**2
     matrix[:count, count:], matrix[count:, :count] = held, held.T
-    return np.linalg.solve(matrix, np.concatenate([potential / scale_px**2, wanted]))[:count]
+    values = np.concatenate([potential / scale_px**2, wanted])
+    if not solve(matrix, values):
+        raise np.linalg.LinAlgError(f"{count} points cannot hold {extra} moments")
+    return values[:count]
 
 
 def _independent(

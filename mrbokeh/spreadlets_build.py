@@ -10,7 +10,7 @@ from mrbokeh.progress import track
 from mrbokeh.psf_bank_file import SPREADLETS, SPREADLETS_PART, read_bank
 from mrbokeh.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify
 from mrbokeh.spreadlets_file import fingerprint, read_spreadlets, write_spreadlets
-from mrbokeh.workers import cores, one_blas_thread
+from mrbokeh.workers import cores
 
 
 def build_spreadlets(
@@ -27,7 +27,7 @@ def build_spreadlets(
     if not overwrite and read_spreadlets(folder / SPREADLETS, settings, whole) is not None:
         raise InputError(f"{folder / SPREADLETS} is there already and of these kernels: give --overwrite to compute it again")
 
-    with one_blas_thread(), ThreadPoolExecutor(threads or cores()) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         cells = [pool.submit(_of_cell, _part(folder, cell), kernel, settings) for cell, kernel in enumerate(bank.kernels)]
         try:
             made = [future.result() for future in (track(cells, "spreadlets") if progress else cells)]

@@ -3,13 +3,9 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import cache
 from os import cpu_count
-from threading import Lock
 from typing import Any, TypeVar
-
-from threadpoolctl import ThreadpoolController
 
 _FEW_PIXELS = 1 << 18
 """Handing pieces of smaller pictures to threads costs more than they save; slices of a small picture run side by side instead."""
@@ -51,25 +47,6 @@ def ahead(pool: Executor, work: Callable[[Any], _Result], tasks: Iterable[Any], 
             yield under_way.popleft().result()
     while under_way:
         yield under_way.popleft().result()
-
-
-_blas_lock = Lock()
-_blas_limits: list[Any] = []
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Linear algebra stays on the thread that asks for it: many small systems, solved side by side by threads of our own, are
-    70 times as slow (101 x 101 on two cores) if each calls all cores to help. For the whole process until the last one leaves."""
-    with _blas_lock:
-        _blas_limits.append(None if _blas_limits else ThreadpoolController().limit(limits=1, user_api="blas"))
-    try:
-        yield
-    finally:
-        with _blas_lock:
-            if len(_blas_limits) == 1:
-                _blas_limits[0].restore_original_limits()
-            _blas_limits.pop()
 
 
 class CallingThread(Executor):

@@ -157,7 +157,7 @@ def test_heavy_libraries_live_in_one_package(library: str, home: str) -> None:
         if isinstance(node, (ast.Import, ast.ImportFrom))
         and library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
-    twins = ("mrbokeh.renderers.torch_", "mrbokeh.renderers._torch_device")
+    twins = ("mrbokeh.renderers.torch_", "mrbokeh.renderers._torch_device", "mrbokeh.psf_models.torch_tracing")
     assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= {home}
 
 

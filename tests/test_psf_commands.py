@@ -27,7 +27,6 @@ from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify
 from mrbokeh.spreadlets_build import build_spreadlets
 from mrbokeh.spreadlets_file import spreadlets_beside
-from mrbokeh.workers import one_blas_thread
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 
@@ -193,8 +192,7 @@ def test_spreadlets_beside_a_bank(tmp_path: Path) -> None:
     found = spreadlets_beside(tmp_path / "bank", bank.kernels)
     assert found is not None and f"{len(found.points)} points of 3 kernels" in said and not (tmp_path / "bank" / "spreadlets.part").exists()
     for cell, kernel in enumerate(bank.kernels):
-        with one_blas_thread():
-            expected = sparsify(kernel, Sparsification(points_per_px=0.8, annealing_steps=0, seed=3))
+        expected = sparsify(kernel, Sparsification(points_per_px=0.8, annealing_steps=0, seed=3))
         np.testing.assert_array_equal(found[cell].points, expected.points)
         np.testing.assert_array_equal(found[cell].values, expected.values)
     with pytest.raises(InputError, match="there already"):

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh._spreadlets_numba import cell_sums, nearest, throw_darts
+from mrbokeh._spreadlets_numba import cell_sums, nearest, solve, throw_darts
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 from mrbokeh.laplacian_integration import integrate
@@ -237,3 +237,16 @@ def test_kernels_of_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
 def test_a_sparsification_without_points_is_refused() -> None:
     with pytest.raises(InputError, match="positive number of points"):
         Sparsification(points_per_px=0.0)
+
+
+def test_systems_are_solved_as_lapack_does() -> None:
+    """Symmetric with a block of zeros, as those of points and moments are, and a singular one."""
+    rng = np.random.default_rng(5)
+    matrix = rng.normal(size=(70, 70))
+    matrix += matrix.T
+    matrix[60:, 60:] = 0.0
+    right = rng.normal(size=(70, 3))
+    found = right.copy()
+    assert solve(matrix.copy(), found)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-9)
+    assert not solve(np.zeros((3, 3)), np.zeros((3, 1)))

@@ -14,7 +14,6 @@ from mrbokeh.psf_bank import PsfBank
 from mrbokeh.renderers._laplacian_tables import Points, by_rows, joined_points, taps_of
 from mrbokeh.spreadlet_values import turned
 from mrbokeh.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify, whole_laplacian
-from mrbokeh.workers import one_blas_thread
 
 _LEAST_ANGLES, _MOST_ANGLES = 16, 256
 _DENSE_TAPS = 452  # those of a disc of 24 px: fewer are splatted as they are
@@ -106,9 +105,8 @@ class BankTables:
             self._kept.clear()
         found = {code: self._kept.get((code, dense)) for code in codes}
         new = [code for code, spreadlet in found.items() if spreadlet is None]
-        with one_blas_thread():
-            for code in track(new, "spreadlets of the bank") if len(new) >= _SHOW_FROM else new:
-                found[code] = self._kept[code, dense] = by_rows(self._computed(code, dense))
+        for code in track(new, "spreadlets of the bank") if len(new) >= _SHOW_FROM else new:
+            found[code] = self._kept[code, dense] = by_rows(self._computed(code, dense))
         return joined_points([found[code] for code in codes], channel)
 
     def _computed(self, code: int, dense: bool) -> Spreadlet:

@@ -11,7 +11,7 @@ from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 from mrbokeh.progress import track
 from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify, whole_laplacian
-from mrbokeh.workers import cores, one_blas_thread, workers
+from mrbokeh.workers import cores, workers
 
 DENSE, SPARSE, WHOLE = 0, 1, 2
 DENSE_PER_PX = 32.0
@@ -75,7 +75,7 @@ class KernelTables:
         found = {code: self.kept.get((key, code, dense)) for code in codes}
         new = [code for code, spreadlet in found.items() if spreadlet is None]
         slow = not dense and sum(kind_of(code) == SPARSE for code in new) >= _SHOW_FROM
-        with one_blas_thread(), ThreadPoolExecutor(threads or cores()) as pool:
+        with ThreadPoolExecutor(threads or cores()) as pool:
             made = pool.map(lambda code: self._computed(code, aperture, dense), new)
             for code, spreadlet in zip(new, track(made, "spreadlets", len(new)) if slow else made, strict=True):
                 found[code] = self.kept[key, code, dense] = by_rows(spreadlet)
