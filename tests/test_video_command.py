@@ -126,6 +126,6 @@ def test_ctrl_c_leaves_no_half_file(tmp_path: Path, shared_data: Path) -> None:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=20)
-    assert process.returncode != 0
+    assert process.returncode != 0, errors
     assert "Traceback" not in errors
     assert list(out.parent.iterdir()) == []
