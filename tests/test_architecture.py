@@ -51,7 +51,7 @@ ROWS = (
     ("psf", "_polygon_coverage_numba", "psf_bank"),
     ("nested_grid", "proportional_grid", "psf_axis"),
     ("layer", "camera", "color", "image_metrics"),
-    ("atomic_files", "progress", "workers", "zeroed_memory"),
+    ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device"),
     ("errors",),
 )
 ALLOWED_ACROSS = {
@@ -157,7 +157,7 @@ def test_heavy_libraries_live_in_one_package(library: str, home: str) -> None:
         if isinstance(node, (ast.Import, ast.ImportFrom))
         and library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
-    twins = ("mrbokeh.renderers.torch_", "mrbokeh.renderers._torch_device", "mrbokeh.psf_models.torch_tracing")
+    twins = ("mrbokeh.renderers.torch_", "mrbokeh.torch_device", "mrbokeh.psf_models.torch_tracing")
     assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= {home}
 
 

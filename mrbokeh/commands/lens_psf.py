@@ -40,6 +40,9 @@ def psf(
         int | None, typer.Option(help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the rays.")] = 0,
+    device: Annotated[
+        str, typer.Option(help="cuda, cuda:1 or cpu: rays are traced by torch there; without it by compiled loops on the CPU.")
+    ] = "",
     overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False,
 ) -> None:
     """Build a bank of point spread functions. An interrupted build goes on when the same command is given again.
@@ -71,6 +74,7 @@ def psf(
         focal_px=focal_px,
         counts=None if counts is None else _steps(counts),
         cells=cells,
+        device=device or None,
     )
     bank = build_bank(choose_model(model, options), out, rays, seed, overwrite=overwrite)
     typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px")

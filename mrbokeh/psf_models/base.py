@@ -24,6 +24,7 @@ class PsfModel(Protocol):
     (nested) grid along each axis. knee_px: not None makes the grid a proportional one (`PsfBank`). channels: 1, or 3 for red,
     green, blue. near_side_turned: in front of the focus (negative diameter) the kernel is the one behind it, turned by half a turn.
     default_rays: rays per kernel of a bank unless the user says otherwise; 0 where the closed form is better.
+    device: of torch, on which rays are traced ("cuda", "cpu"; `torch_tracing`); "" takes the compiled loops. The light is the same.
     settings: what else the kernels depend on, as JSON values; a half-built bank is only gone on with where they agree.
     """
 
@@ -44,6 +45,8 @@ class PsfModel(Protocol):
     @property
     def default_rays(self) -> int: ...
     @property
+    def device(self) -> str: ...
+    @property
     def settings(self) -> dict[str, Any]: ...
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
@@ -51,8 +54,8 @@ class PsfModel(Protocol):
 
         The average is uniform over the box, along each axis in the measure of `Axis.between`: a ray takes the coordinates
         `axis.between(low, high, share)` for quasi-random shares in [0, 1). A box without extent gives one PSF.
-        rays: how many are traced; the same rays and seed give the same kernel to the last bit. 0: the closed form, averaged
-        (InputError where the model has none).
+        rays: how many are traced; the same rays and seed give the same kernel to the last bit (on one device). 0: the closed
+        form, averaged (InputError where the model has none).
         Returns (K, K, C), K odd, at least as large as the light reaches, >= 0; each channel sums to 1, or to the share of
         light that is not absorbed.
         """

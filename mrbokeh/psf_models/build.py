@@ -49,13 +49,16 @@ def build_bank(
     """Build (or go on building) a bank and read it.
 
     rays: per kernel; None is what suits the model, 0 its closed form. Cell i is traced with the seed `seed` + i, so that it
-    is the same whoever traces it, when and beside how many others. threads: 0 takes all cores.
+    is the same whoever traces it, when and beside how many others. threads: 0 takes all cores (on the
+    device 'cpu' one, as torch shares out each kernel itself).
     A folder that holds a part of the very same bank is completed; a finished bank, another one, or other files are an
     InputError unless `overwrite` (which only ever removes a bank).
     """
     rays = model.default_rays if rays is None else rays
     if rays < 0:
         raise InputError(f"a number of rays is 0 (closed form) or positive, got {rays}")
+    if model.device and not rays:
+        raise InputError(f"the closed form of {model.name} is not traced, so it has no use for the device {model.device!r}: give rays too")
     head = bank_head(model, rays, seed)
     boxes = physical_boxes(head.axes, head.grid)
     if overwrite or not _is_part_of(folder, head):
@@ -66,7 +69,8 @@ def build_bank(
         write_head(folder, head)
         write_cell(folder, 0, first)
 
-    with ThreadPoolExecutor(threads or cores()) as pool:
+    threads = threads or (1 if model.device.startswith("cpu") else cores())
+    with ThreadPoolExecutor(threads) as pool:
         building = [pool.submit(_build_cell, model, folder, cell, boxes[cell], rays, seed) for cell in missing_cells(folder, head)]
         try:
             for future in track(building, f"kernels of {model.name}") if progress else building:

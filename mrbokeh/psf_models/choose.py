@@ -14,7 +14,7 @@ class ModelOptions:
 
     lens: file of the lens whose aperture is swept over diameters. image: the picture of a stylised PSF. diameter_px, motion_px:
     the largest of the bank. prescription: a .dat file of lens surfaces. counts: steps of the grid along each axis. cells: of the
-    proportional grid.
+    proportional grid. device: of torch, on which rays are traced.
     """
 
     lens: Path | None = None
@@ -35,6 +35,7 @@ class ModelOptions:
     focal_px: float | None = None
     counts: tuple[int, ...] | None = None
     cells: int | None = None
+    device: str | None = None
 
 
 def _simple(options: ModelOptions) -> PsfModel:
@@ -43,7 +44,7 @@ def _simple(options: ModelOptions) -> PsfModel:
     from mrbokeh.psf_models.simple_lens import SimpleLens
 
     aperture = Aperture.disc() if options.lens is None else read_lens(options.lens).aperture
-    return SimpleLens(aperture, **_given(options, "diameter_px", "counts"))
+    return SimpleLens(aperture, **_given(options, "diameter_px", "counts", "device"))
 
 
 def _combined(options: ModelOptions) -> PsfModel:
@@ -51,7 +52,7 @@ def _combined(options: ModelOptions) -> PsfModel:
 
     if options.counts is not None and options.cells is not None:
         raise InputError("give either --counts (the paper's nested grid) or --cells (a proportional one), not both")
-    return Combined(**_given(options, "diameter_px", "motion_px", "counts", "cells"))
+    return Combined(**_given(options, "diameter_px", "motion_px", "counts", "cells", "device"))
 
 
 def _physical(options: ModelOptions) -> PsfModel:
@@ -74,18 +75,18 @@ def _stylized(options: ModelOptions) -> PsfModel:
 
     if options.image is None:
         raise InputError("a stylized PSF is made from a picture: give one with --image")
-    return Stylized(read_image(options.image), **_given(options, "diameter_px", "counts"))
+    return Stylized(read_image(options.image), **_given(options, "diameter_px", "counts", "device"))
 
 
 _SENSOR_WIDTH_MM = 36.0
-_PHYSICAL = ("prescription", "focus_distance_m", "f_number", "image_width_px", "nearest_m", "farthest_m", "vignetting", "counts")
-_VOLUME = ("density_per_m", "anisotropy", "focal_px", "farthest_m", "counts")
+_PHYSICAL = ("prescription", "focus_distance_m", "f_number", "image_width_px", "nearest_m", "farthest_m", "vignetting", "counts", "device")
+_VOLUME = ("density_per_m", "anisotropy", "focal_px", "farthest_m", "counts", "device")
 _MODELS: dict[str, tuple[Callable[[ModelOptions], PsfModel], frozenset[str]]] = {
-    "simple": (_simple, frozenset({"lens", "diameter_px", "counts"})),
-    "combined": (_combined, frozenset({"diameter_px", "motion_px", "counts", "cells"})),
+    "simple": (_simple, frozenset({"lens", "diameter_px", "counts", "device"})),
+    "combined": (_combined, frozenset({"diameter_px", "motion_px", "counts", "cells", "device"})),
     "physical": (_physical, frozenset({*_PHYSICAL, "sensor_width_mm", "sensor_height_mm"})),
     "volume": (_volume, frozenset(_VOLUME)),
-    "stylized": (_stylized, frozenset({"image", "diameter_px", "counts"})),
+    "stylized": (_stylized, frozenset({"image", "diameter_px", "counts", "device"})),
 }
 _FLAGS = {"diameter_px": "--diameter", "motion_px": "--motion"}
 MODEL_NAMES = tuple(_MODELS)

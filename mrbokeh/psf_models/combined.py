@@ -21,6 +21,8 @@ Where the paper's loses: mostly in the diameter (with the motion exact 0.934 are
 hardly move, of which it has many kernels that differ little.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,8 +59,14 @@ class Combined:
     default_rays = 0
 
     def __init__(
-        self, diameter_px: float = LARGEST_PX, motion_px: float = LARGEST_PX, counts: tuple[int, ...] | None = None, cells: int = CELLS
+        self,
+        diameter_px: float = LARGEST_PX,
+        motion_px: float = LARGEST_PX,
+        counts: tuple[int, ...] | None = None,
+        cells: int = CELLS,
+        device: str = "",
     ) -> None:
+        self.device = device
         largest_px = check_positive("the largest diameter of combined blur", diameter_px)
         longest_px = check_positive("the longest motion of combined blur", motion_px)
         exponents = (1.0, 1.0) if counts is None else PAPER_EXPONENTS
@@ -72,12 +80,13 @@ class Combined:
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
         """See `PsfModel.kernel`."""
-        from mrbokeh.psf_models._combined_numba import fill_capsule, trace_capsule
+        from mrbokeh.psf_models._combined_numba import fill_capsule
 
         size = _size(float(box[0, 1]), float(box[1, 1]))
         total = np.zeros((size, size))
         if rays:
-            total /= sum(trace_capsule(total, np.ascontiguousarray(box), shares) for shares in sobol_blocks(5, rays, seed))
+            trace, box = _tracer(self.device), np.ascontiguousarray(box)
+            total /= sum(trace(total, box, shares) for shares in sobol_blocks(5, rays, seed, self.device))
         else:
             diameters, motions = (
                 nodes(axis, low, high, _step_px(high - low)) for axis, (low, high) in zip(self.axes, box.tolist(), strict=True)
@@ -90,6 +99,16 @@ class Combined:
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel:
         """The capsule with its true profile: over a pixel, the light of the disc during the time in which it covers it."""
         return self.kernel(np.stack([coords, coords], axis=1), 0, 0)
+
+
+def _tracer(device: str) -> Callable[..., float]:
+    if device:
+        from mrbokeh.psf_models.torch_tracing import trace_capsule as trace_on
+
+        return partial(trace_on, device)
+    from mrbokeh.psf_models._combined_numba import trace_capsule
+
+    return trace_capsule
 
 
 def _step_px(width_px: float) -> float:

@@ -29,6 +29,7 @@ COUNTS = (554, 554)
 """Steps along depth and eccentricity that give the 4,000 cells of the paper's Table 1."""
 
 _LARGEST_RADIUS_PX = 1024
+_Through = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class PhysicalLens:
@@ -64,10 +65,11 @@ class PhysicalLens:
         farthest_m: float = 100.0,
         vignetting: bool = True,
         counts: tuple[int, ...] = COUNTS,
+        device: str = "",
     ) -> None:
         lens = read_prescription(prescription) if isinstance(prescription, (Path, str)) else prescription or biconvex_lens()
         self.lens = lens if f_number is None else lens.stopped_down(f_number)
-        self.focus_distance_m, self.vignetting, self.counts = focus_distance_m, vignetting, counts
+        self.focus_distance_m, self.vignetting, self.counts, self.device = focus_distance_m, vignetting, counts, device
         width_mm, height_mm = (check_positive("the sensor's width and height in mm", size) for size in sensor_mm)
         self.mm_per_px = width_mm / check_positive("the picture's width in pixels", float(image_width_px))
         self._depth = Axis("depth_m", check_positive("the nearest depth", nearest_m), farthest_m, EXPONENTS[0])
@@ -102,7 +104,7 @@ class PhysicalLens:
         """See `PsfModel.kernel`. Each of the rays is traced in three colours, its wavelengths spread over their bands."""
         if rays <= 0:
             raise InputError("a physical lens has no closed form: expected at least one ray")
-        return self._of_known_light(self.landed(box, rays, sobol_blocks(5, rays, seed)), rays)
+        return self._of_known_light(self.landed(box, rays, sobol_blocks(5, rays, seed, self.device)), rays)
 
     def landed(
         self, box: Float64[np.ndarray, "axes 2"], rays: int, blocks: Iterable[Float64[np.ndarray, "rays 5"]]
@@ -113,14 +115,27 @@ class PhysicalLens:
         ends = self._per_mm(np.unique(box[0]))[::-1]
         window = self.beam.window(ends, np.unique(np.append(box[1], box[1].mean())))
         areas_mm2 = np.array([self.beam.area_mm2(end, 0.0) for end in ends.tolist()])
-        kernel = np.zeros((1, 1, 3))
+        kernel, add = np.zeros((1, 1, 3)), self._added_on_device if self.device else self._added
         for shares in blocks:
             per_mm = self._per_mm(self._depth.between(box[0, 0], box[0, 1], shares[:, 3]))
-            landings, weights = self.beam.trace(chiefs, window, shares[:, :3], per_mm, shares[:, 4] * (len(chiefs) - 1))
-            weights *= (area_of(window) / rays / np.interp(per_mm, ends, areas_mm2))[:, None]
-            kernel = self._wide_enough(kernel, landings, weights)
-            compiled.add_landings(kernel, landings, weights, self.mm_per_px)
+            light = area_of(window) / rays / np.interp(per_mm, ends, areas_mm2)
+            kernel = add(kernel, (chiefs, window, shares[:, :3], per_mm, shares[:, 4] * (len(chiefs) - 1)), light)
         return kernel
+
+    def _added(self, kernel: np.ndarray, through: _Through, light: Float64[np.ndarray, " rays"]) -> np.ndarray:
+        """The kernel, wider where it has to be, with rays in it; through: what `LensBeam.trace` takes."""
+        landings, weights = self.beam.trace(*through)
+        weights *= light[:, None]
+        kernel = self._wide_enough(kernel, float(np.abs(landings[weights > 0.0]).max(initial=0.0)))
+        compiled.add_landings(kernel, landings, weights, self.mm_per_px)
+        return kernel
+
+    def _added_on_device(self, kernel: np.ndarray, through: _Through, light: Float64[np.ndarray, " rays"]) -> np.ndarray:
+        from mrbokeh.psf_models.torch_tracing import LandedRays
+
+        rays = LandedRays(self.device, self.beam, *through, light)
+        kernel = self._wide_enough(kernel, rays.reach_mm)
+        return kernel + rays.picture(len(kernel), self.mm_per_px)
 
     def throughput(self, depth_m: float, eccentricity: float) -> float:
         """The open share: cross-section of the beam across the axis that reaches the sensor, relative to the beam on the axis.
@@ -144,9 +159,8 @@ class PhysicalLens:
             raise InputError(f"expected depths in front of the lens, more than {least_m:.4g} m, got {np.min(depth_m):g} m")
         return np.asarray(0.001 / np.asarray(depth_m, np.float64))
 
-    def _wide_enough(self, kernel: np.ndarray, landings: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        reach_px = float(np.abs(landings[weights > 0.0]).max(initial=0.0)) / self.mm_per_px
-        radius = int(np.ceil(reach_px + 0.5))
+    def _wide_enough(self, kernel: np.ndarray, reach_mm: float) -> np.ndarray:
+        radius = int(np.ceil(reach_mm / self.mm_per_px + 0.5))
         if radius > _LARGEST_RADIUS_PX:
             raise InputError(f"light lands {radius} px from its source: choose a nearest depth farther off or fewer pixels")
         return kernel if 2 * radius + 1 <= len(kernel) else centred(kernel, 2 * radius + 1)

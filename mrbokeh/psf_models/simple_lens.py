@@ -1,6 +1,7 @@
 """SIMPLELENS: a thin lens with any opening; the coordinate is the circle of confusion (Leimkuehler 2018, Section 5.1)."""
 
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -35,7 +36,10 @@ class SimpleLens:
     turns: Turns = "none"
     default_rays = 0
 
-    def __init__(self, aperture: Aperture | None = None, diameter_px: float = LARGEST_PX, counts: tuple[int, ...] | None = None) -> None:
+    def __init__(
+        self, aperture: Aperture | None = None, diameter_px: float = LARGEST_PX, counts: tuple[int, ...] | None = None, device: str = ""
+    ) -> None:
+        self.device = device
         self.aperture = Aperture.disc() if aperture is None else aperture
         if self.aperture.varies_over_field:
             raise InputError("a simple lens looks the same all over the frame: give a lens without cat_eye and lateral_chromatic")
@@ -87,18 +91,27 @@ class SimpleLens:
         return np.stack([centred(kernel, size) for kernel in kernels], axis=2)
 
     def _traced(self, low: float, high: float, size: int, rays: int, seed: int) -> Float64[np.ndarray, "size size channels"]:
-        from mrbokeh.psf_models._simple_lens_numba import trace_lens
-
-        side = 1 if low + high >= 0.0 else -1
+        trace, side = _tracer(self.device), 1 if low + high >= 0.0 else -1
         extent = self.aperture.unit_radius
         opening = (extent, *banded_edges(self.aperture.seen(side), extent))
         traced = np.zeros((self.channels, size, size))
         for kernel, scale in zip(traced, self._scales(side), strict=True):
-            light = sum(trace_lens(kernel, low * scale, high * scale, block, *opening) for block in sobol_blocks(3, rays, seed))
+            blocks = sobol_blocks(3, rays, seed, self.device)
+            light = sum(trace(kernel, low * scale, high * scale, block, *opening) for block in blocks)
             if not light > 0.0:
                 raise InputError(f"none of {rays} rays found the opening: trace more of them")
             kernel /= light
         return traced.transpose(1, 2, 0)
+
+
+def _tracer(device: str) -> Callable[..., float]:
+    if device:
+        from mrbokeh.psf_models.torch_tracing import trace_lens as trace_on
+
+        return partial(trace_on, device)
+    from mrbokeh.psf_models._simple_lens_numba import trace_lens
+
+    return trace_lens
 
 
 def banded_edges(plain: Aperture, extent: float) -> tuple[Float64[np.ndarray, "edges 5"], Int64[np.ndarray, " bands_and_end"]]:

@@ -1,5 +1,7 @@
 """STYLIZED: any picture as a point spread function, a little larger or smaller in each colour (Leimkuehler 2018, Section 5.1)."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,7 +49,9 @@ class Stylized:
         diameter_px: float = LARGEST_PX,
         counts: tuple[int, ...] = (SAMPLES,),
         chromatic: tuple[float, float, float] = CHROMATIC,
+        device: str = "",
     ) -> None:
+        self.device = device
         if not all(abs(share) < 1.0 for share in chromatic):
             raise InputError(f"the chromatic scales of a stylized PSF are three numbers within (-1, 1), got {chromatic}")
         self.axes = (Axis("diameter_px", 0.0, check_positive("the largest diameter of a stylized PSF", diameter_px), EXPONENT),)
@@ -90,8 +94,7 @@ class Stylized:
         return kernel
 
     def _traced(self, low: float, high: float, size: int, rays: int, seed: int) -> Float64[np.ndarray, "size size 3"]:
-        from mrbokeh.psf_models._stylized_numba import trace_picture
-
+        trace = _tracer(self.device)
         kernel = np.zeros((3, size, size))
         for channel, scale in enumerate(self.scales):
             light = self._light[..., channel]
@@ -99,9 +102,19 @@ class Stylized:
             columns = np.pad(np.cumsum(light, axis=1), ((0, 0), (1, 0)))
             columns /= np.where(columns[:, -1:] > 0.0, columns[:, -1:], 1.0)
             places = (self._origin, self._unit, rows / rows[-1], columns)
-            blocks = sobol_blocks(3, rays, seed)
-            kernel[channel] /= sum(trace_picture(kernel[channel], low * scale, high * scale, block, *places) for block in blocks)
+            blocks = sobol_blocks(3, rays, seed, self.device)
+            kernel[channel] /= sum(trace(kernel[channel], low * scale, high * scale, block, *places) for block in blocks)
         return kernel.transpose(1, 2, 0)
+
+
+def _tracer(device: str) -> Callable[..., float]:
+    if device:
+        from mrbokeh.psf_models.torch_tracing import trace_picture as trace_on
+
+        return partial(trace_on, device)
+    from mrbokeh.psf_models._stylized_numba import trace_picture
+
+    return trace_picture
 
 
 def _shares(count: int, origin: float, px: float, size: int) -> "csr_array":

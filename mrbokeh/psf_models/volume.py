@@ -53,6 +53,7 @@ class Volume:
         size_px: int = 513,
         majorant_per_m: float | None = None,
         counts: tuple[int, ...] = (SAMPLES,),
+        device: str = "",
     ) -> None:
         if not (np.isfinite(density_per_m) and density_per_m >= 0.0):
             raise InputError(f"the density of a medium must be a number of at least 0 per metre, got {density_per_m}")
@@ -67,7 +68,7 @@ class Volume:
         if not density_per_m <= self.majorant_per_m < np.inf:
             raise InputError(f"the majorant must be at least the density {density_per_m} per metre, got {majorant_per_m}")
         self.focal_px, self._farthest_m = check_positive("the focal length in pixels", focal_px), farthest_m
-        self.counts = counts
+        self.counts, self.device = counts, device
 
     @cached_property
     def axes(self) -> tuple[Axis, ...]:
@@ -96,9 +97,12 @@ class Volume:
             raise InputError("scattering has no closed form: expected at least one ray")
         rings, albedo = self._rings(), np.array([*self.albedo, 1.0])
         first = 0
-        for shares in sobol_blocks(1, rays, seed):
-            cosines, collisions = self.trace(self.axes[0].between(box[0, 0], box[0, 1], shares[:, 0]), seed, first)
-            compiled.add_to_rings(rings, cosines, collisions, albedo, self.focal_px, _RING_PX)
+        for shares in sobol_blocks(1, rays, seed, self.device):
+            distances_m = self.axes[0].between(box[0, 0], box[0, 1], shares[:, 0])
+            if self.device:
+                rings += self._rings_on_device(distances_m, seed, first, albedo)
+            else:
+                compiled.add_to_rings(rings, *self.trace(distances_m, seed, first), albedo, self.focal_px, _RING_PX)
             first += len(shares)
         kernel = np.zeros((self.size_px, self.size_px, 4))
         compiled.spread_rings(rings, _RING_PX, kernel)
@@ -112,6 +116,15 @@ class Volume:
         medium = (self.density_per_m, self.majorant_per_m, self.anisotropy)
         compiled.trace_photons(first, seed, distances_m, *medium, cosines, collisions)
         return cosines, collisions
+
+    def _rings_on_device(
+        self, distances_m: Float64[np.ndarray, " rays"], seed: int, first: int, albedo: Float64[np.ndarray, "4"]
+    ) -> Float64[np.ndarray, "rings 4"]:
+        from mrbokeh.psf_models.torch_tracing import photons_in_rings, trace_photons
+
+        medium = (self.density_per_m, self.majorant_per_m, self.anisotropy)
+        photons = trace_photons(self.device, first, seed, distances_m, *medium)
+        return photons_in_rings(*photons, albedo, self.focal_px, _RING_PX, len(self._rings()))
 
     def _rings(self) -> Float64[np.ndarray, "rings 4"]:
         """As many as reach the corners of the window; the last channel loses nothing."""

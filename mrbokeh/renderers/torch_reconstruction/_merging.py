@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from mrbokeh.renderers._torch_device import has_triton
 from mrbokeh.renderers.layered_reconstruction._partitions_numba import LOOK_BACK, WIDEST_PX
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
 from mrbokeh.renderers.torch_reconstruction._filter import extents
 from mrbokeh.renderers.torch_reconstruction._light import TileLight
 from mrbokeh.renderers.torch_reconstruction._statistics import Rows
 from mrbokeh.renderers.torch_reconstruction._sweep import sweep_row_by_row
+from mrbokeh.torch_device import has_triton
 
 
 @dataclass(frozen=True)

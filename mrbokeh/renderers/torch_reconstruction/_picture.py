@@ -11,7 +11,6 @@ from mrbokeh.aperture import Aperture
 from mrbokeh.layer import Layer, opaque
 from mrbokeh.lens import Lens
 from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.renderers._torch_device import device_named
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
 from mrbokeh.renderers.torch_reconstruction._compositing import composited, own_means, put_together
 from mrbokeh.renderers.torch_reconstruction._filter import sheared_slopes
@@ -22,6 +21,7 @@ from mrbokeh.renderers.torch_reconstruction._reprojection import reprojected
 from mrbokeh.renderers.torch_reconstruction._samples import DeviceSamples
 from mrbokeh.renderers.torch_reconstruction._screen import ScreenFilter
 from mrbokeh.renderers.torch_reconstruction._statistics import tile_rows
+from mrbokeh.torch_device import device_named
 
 AT_ONCE = {"cpu": (1 << 15, 1 << 17, 1 << 22), "cuda": (1 << 22, 1 << 23, 1 << 26)}
 """What is in memory at a time: pairs of sample and job (300 bytes each; none where a kernel splats), pixels of windows (60 bytes for each

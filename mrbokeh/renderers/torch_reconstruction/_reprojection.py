@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from mrbokeh.renderers._torch_device import has_triton
 from mrbokeh.renderers.torch_reconstruction._jobs import Jobs, Task
 from mrbokeh.renderers.torch_reconstruction._light import TileLight
+from mrbokeh.torch_device import has_triton
 
 Windows = Float32[Tensor, "group side side planes"]
 

@@ -13,12 +13,12 @@ from mrbokeh.laplacian_integration import fast_width
 from mrbokeh.psf_bank import PsfBank
 from mrbokeh.renderers._laplacian_bank import BankTables
 from mrbokeh.renderers._laplacian_sums import FAR_FIELD_PX, Window
-from mrbokeh.renderers._torch_device import device_named
 from mrbokeh.renderers.torch_spreadlets._cells import BankCells, stands_out
 from mrbokeh.renderers.torch_spreadlets._integration import integrate
 from mrbokeh.renderers.torch_spreadlets._points import BankPoints, PointTable
 from mrbokeh.renderers.torch_spreadlets._splat import splat
 from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlets
+from mrbokeh.torch_device import device_named
 
 Channels = Float32[Tensor, "height width channels"]
 

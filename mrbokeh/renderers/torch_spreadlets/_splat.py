@@ -9,8 +9,8 @@ from torch import Tensor
 
 from mrbokeh.errors import InputError
 from mrbokeh.renderers._laplacian_sums import Window
-from mrbokeh.renderers._torch_device import has_triton
 from mrbokeh.renderers.torch_spreadlets._points import PointTable
+from mrbokeh.torch_device import has_triton
 
 AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 21}
 """Points that are splatted at a time without a kernel: what caches hold, or what keeps a GPU busy with some 400 MB."""

@@ -10,10 +10,10 @@ from jaxtyping import Float32, Int32
 from mrbokeh.errors import InputError
 from mrbokeh.renderers._laplacian_sums import window_of
 from mrbokeh.renderers._laplacian_tables import Points
-from mrbokeh.renderers._torch_device import device_named
 from mrbokeh.renderers.torch_spreadlets._integration import integrate
 from mrbokeh.renderers.torch_spreadlets._points import table_of
 from mrbokeh.renderers.torch_spreadlets._splat import splat
+from mrbokeh.torch_device import device_named
 
 
 def add_light_on(device: str) -> Callable[..., None]:

@@ -1,0 +1,226 @@
+"""Light tracing by torch against the compiled loops: the same rays land in the same places, with the same light.
+
+Where nothing else is said, tolerances are rounding: 1e-12 mm is some hundred roundings of a place some mm from the axis, and
+kernels are float32.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from math import inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from typer.testing import CliRunner
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.commands.lens import app
+from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.psf_bank_file import cell_path, read_bank
+from mrbokeh.psf_models import _volume_numba as compiled
+from mrbokeh.psf_models.base import PsfModel
+from mrbokeh.psf_models.build import bank_head, build_bank
+from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
+from mrbokeh.psf_models.physical_lens import PhysicalLens
+from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.psf_models.simple_lens import SimpleLens
+from mrbokeh.psf_models.stylized import Stylized
+from mrbokeh.psf_models.volume import Volume
+
+torch = pytest.importorskip("torch")
+
+from mrbokeh.psf_models.torch_tracing import LandedRays, photons_in_rings, trace_photons  # noqa: E402
+from mrbokeh.psf_models.torch_tracing._sums import summed  # noqa: E402
+from mrbokeh.psf_models.torch_tracing._volume import first_states, uniform  # noqa: E402
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+RAYS = 1 << 15
+Model = Callable[..., PsfModel]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Few rays gain nothing from threads, which wait for one another where tests run side by side."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def pair() -> LensPrescription:
+    """Two cemented achromats about a stop, with rims that cut the beam off the axis, and glass that disperses."""
+    half = (Surface(60.0, 6.0, 1.6204, 22.0, 60.3), Surface(-60.0, 2.0, 1.62, 22.0, 36.4), Surface(300.0, 12.0, 1.0, 22.0))
+    behind = (Surface(-300.0, 2.0, 1.62, 22.0, 36.4), Surface(60.0, 6.0, 1.6204, 22.0, 60.3), Surface(-60.0, 0.0, 1.0, 22.0))
+    return LensPrescription("pair", (*half, Surface(inf, 12.0, 1.0, 10.0, is_stop=True), *behind))
+
+
+def picture() -> np.ndarray:
+    """Rows without light, at the border and within, and every other pixel at random."""
+    light = np.random.default_rng(0).random((24, 37, 3)) ** 3
+    light[:4], light[10] = 0.0, 0.0
+    return light
+
+
+def seidel() -> Aperture:
+    """An opening whose sides of the focus differ, in three colours."""
+    return Aperture(Aperture.heart().outlines, Aperture.heart().weights, spherical_aberration=0.5, axial_chromatic=(0.1, 0.0, -0.1))
+
+
+physical = partial(PhysicalLens, pair(), image_width_px=1000)
+MODELS: dict[str, tuple[Model, list[list[float]]]] = {
+    "physical on the axis": (physical, [[1.0, 1.0], [0.0, 0.0]]),
+    "physical, cut by rims": (physical, [[0.7, 0.8], [0.5, 0.9]]),
+    "physical, biconvex": (PhysicalLens, [[1.0, 1.3], [0.2, 0.5]]),
+    "volume": (Volume, [[1.0, 1.5]]),
+    "volume, absorbing": (partial(Volume, albedo=(0.5, 0.9, 0.0), density_per_m=2.0, anisotropy=-0.3), [[1.0, 1.0]]),
+    "volume, tentative collisions": (partial(Volume, majorant_per_m=2.7), [[2.0, 2.0]]),
+    "simple": (SimpleLens, [[10.0, 40.0]]),
+    "simple, signed colours": (partial(SimpleLens, seidel()), [[-9.0, 4.0]]),
+    "simple, ring": (partial(SimpleLens, Aperture.ring(0.4)), [[30.0, 30.0]]),
+    "combined": (Combined, [[10.0, 40.0], [0.0, 30.0]]),
+    "combined, in focus at rest": (Combined, [[0.0, 0.0], [0.0, 0.0]]),
+    "stylized": (partial(Stylized, picture()), [[10.0, 40.0]]),
+}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", MODELS)
+def test_kernels_are_those_of_the_compiled_loops(name: str, device: str) -> None:
+    """To float32. Another seed gives another kernel (so that equality means something) where there is any blur."""
+    model, box = MODELS[name][0], np.array(MODELS[name][1])
+    expected = model().kernel(box, RAYS, 3)
+    traced = model(device=device).kernel(box, RAYS, 3)
+    assert traced.shape == expected.shape and traced.dtype == np.float32
+    assert_allclose(traced, expected, rtol=2e-6, atol=1e-9 * float(expected.max()))
+    if "focus" not in name:
+        other = model().kernel(box, RAYS, 4)
+        assert other.shape != expected.shape or np.abs(other - expected).sum() > 1e-3 * expected.sum()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_ray_of_a_lens_lands_where_the_compiled_one_does(device: str) -> None:
+    """Off the axis, where rims take a good part of the rays; the same rays are lost."""
+    model = physical()
+    (shares,) = sobol_blocks(5, 1 << 13, 0)
+    chiefs = model.beam.chief_rays(0.6, 0.8)
+    window = model.beam.window(np.array([1e-3]), np.array([0.6, 0.8]))
+    through = (chiefs, window, shares[:, :3], 0.001 / (1.0 + shares[:, 3]), shares[:, 4] * (len(chiefs) - 1))
+    landings, weights = model.beam.trace(*through)
+    rays = LandedRays(device, model.beam, *through, np.ones(len(shares)))
+    there = weights.T > 0.0
+    assert 0.2 < there.mean() < 0.9
+    assert_array_equal(rays.weights.cpu().numpy() > 0.0, there)
+    assert_allclose(rays.weights.cpu().numpy(), weights.T, rtol=1e-13)
+    for axis in range(2):
+        assert_allclose(rays.landings[axis].cpu().numpy()[there], landings[..., axis].T[there], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_blocks_are_no_matter(device: str) -> None:
+    """A GPU takes more points at once: they are the same points, and the light is the same."""
+    rays, box = 1 << 13, np.array([[0.7, 0.8], [0.5, 0.9]])
+    model = physical(device=device)
+    (shares,) = sobol_blocks(5, rays, 2)
+    whole, parts = model.landed(box, rays, [shares]), model.landed(box, rays, np.split(shares, 8))
+    assert_allclose(parts, whole, rtol=0.0, atol=1e-12 * whole.max())
+    few, many = (list(sobol_blocks(3, 300_000, 5, where)) for where in ("", "cuda"))
+    assert len(few) == 5 and len(many) == 2
+    assert_array_equal(np.concatenate(few), np.concatenate(many))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_sums_are_the_same_bits_in_any_order(device: str) -> None:
+    rng = np.random.default_rng(1)
+    bins, weights, order = rng.integers(0, 50, 20_000), rng.normal(size=20_000), rng.permutation(20_000)
+    first, second = (
+        summed(torch.from_numpy(bins[each]).to(device), torch.from_numpy(weights[each]).to(device), 50)
+        for each in (np.arange(20_000), order)
+    )
+    assert_array_equal(first, second)
+    assert_allclose(first, np.bincount(bins, weights, 50), atol=1e-11)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("seed", "first"), [(0, 0), (7, 1 << 20), (2**40 + 3, 12345)])
+def test_photons_have_the_random_numbers_of_the_compiled_ones(seed: int, first: int, device: str) -> None:
+    states, state = first_states(first, 3, seed, torch.device(device)), np.zeros(1, np.uint64)
+    numbers = []
+    for _ in range(50):
+        states, number = uniform(states)
+        numbers.append(number.cpu().numpy())
+    for photon in range(3):
+        compiled.start_photon(state, seed, first + photon)
+        assert_array_equal([each[photon] for each in numbers], [compiled.uniform(state) for _ in range(50)])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("majorant_per_m", [0.9, 2.0])
+def test_photons_go_the_way_of_the_compiled_ones(majorant_per_m: float, device: str) -> None:
+    """And as many as exp(-depth) go straight on (within 4 standard deviations of chance)."""
+    radii_m, medium = np.linspace(1e-3, 8.0, RAYS), (0.9, majorant_per_m, 0.8)
+    expected_cosines, expected_collisions = np.empty(RAYS), np.empty(RAYS, np.int64)
+    compiled.trace_photons(5, 1, radii_m, *medium, expected_cosines, expected_collisions)
+    cosines, collisions = (each.cpu().numpy() for each in trace_photons(device, 5, 1, radii_m, *medium))
+    assert expected_collisions.max() > 15
+    assert_array_equal(collisions, expected_collisions)
+    assert_allclose(cosines, expected_cosines, atol=1e-9)  # each collision may multiply a rounding by a few
+    straight = np.exp(-0.9 * radii_m)
+    assert abs((collisions == 0).sum() - straight.sum()) < 4.0 * np.sqrt((straight * (1.0 - straight)).sum())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_without_a_medium_all_light_comes_straight(device: str) -> None:
+    cosines, collisions = trace_photons(device, 0, 0, np.array([0.0, 1.0, 9.0]), 0.0, 1.0, 0.8)
+    rings = photons_in_rings(cosines, collisions, np.array([0.5, 1.0]), 1000.0, 0.125, 8)
+    assert_array_equal(rings, [[3.0, 3.0], *[[0.0, 0.0]] * 7])
+
+
+def test_a_half_built_bank_goes_on_on_a_device(tmp_path: Path) -> None:
+    """The head of a bank does not name the device, so cells that are there are kept, and the rest come out the same."""
+    model = partial(Combined, 9.0, 9.0, (5, 5))
+    assert bank_head(model(), 4000, 1) == bank_head(model(device="cpu"), 4000, 1)
+    whole = build_bank(model(), tmp_path / "bank", 4000, 1, progress=False, threads=1)
+    for cell in range(2, len(whole.kernels)):
+        cell_path(tmp_path / "bank", cell).unlink()
+    kept = cell_path(tmp_path / "bank", 1).stat().st_mtime_ns
+    resumed = build_bank(model(device="cpu"), tmp_path / "bank", 4000, 1, progress=False)
+    assert cell_path(tmp_path / "bank", 1).stat().st_mtime_ns == kept and len(resumed.kernels) == len(whole.kernels)
+    for first, second in zip(whole.kernels, resumed.kernels, strict=True):
+        assert_allclose(second, first, atol=1e-8)
+
+
+def run(*arguments: object) -> None:
+    CliRunner().invoke(app, ["psf", "volume", "--counts", "2", "--rays", "2048", *map(str, arguments)], catch_exceptions=False)
+
+
+def test_the_command_takes_a_device(tmp_path: Path) -> None:
+    run("--out", tmp_path / "compiled")
+    run("--out", tmp_path / "torch", "--device", "cpu")
+    for first, second in zip(read_bank(tmp_path / "compiled").kernels, read_bank(tmp_path / "torch").kernels, strict=True):
+        assert_allclose(second, first, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_device_that_is_not_there_is_a_mistake(name: str) -> None:
+    model, box = MODELS[name]
+    with pytest.raises(InputError, match=r"expected a device with double precision.*'gpu'"):
+        model(device="gpu").kernel(np.array(box), 1024, 0)
+    with pytest.raises(InputError, match="'cuda:99' is not there"):
+        model(device="cuda:99").kernel(np.array(box), 1024, 0)
+
+
+def test_a_closed_form_has_no_use_for_a_device(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="closed form of combined is not traced"):
+        build_bank(Combined(9.0, 9.0, (3, 3), device="cpu"), tmp_path / "bank", 0)
+    assert not (tmp_path / "bank").exists()
+
+
+def test_without_torch_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in [each for each in sys.modules if each.startswith("mrbokeh.psf_models.torch_tracing")]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MissingExtraError, match=r"mrbokeh\[train\]"):
+        SimpleLens(device="cpu").kernel(np.array([[3.0, 4.0]]), 1024, 0)
