@@ -117,7 +117,15 @@ def test_ctrl_c_leaves_no_half_file(tmp_path: Path, shared_data: Path) -> None:
     out = tmp_path / "results" / "out.mov"
     clip = shared_data / "video" / "ducks_720p.mp4"
     command = [sys.executable, "-m", "mrbokeh.cli", "video", clip, "--layer", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json"]
-    process = subprocess.Popen([*map(str, command), "--out", str(out)], cwd=Path(__file__).parent.parent, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*map(str, command), "--out", str(out)],
+        cwd=Path(__file__).parent.parent,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        ),  # tests in the background of a shell would pass on that it is ignored
+    )
     deadline_s = time.monotonic() + 40
     # A few frames are in the file under its temporary name: the command is in the middle of its work.
     while not any(file.stat().st_size > 500_000 for file in out.parent.glob(".*")):
