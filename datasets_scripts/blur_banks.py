@@ -37,7 +37,6 @@ SPARSIFICATIONS: Mapping[str, Sparsification] = {
     "physical": Sparsification(points_per_px=4.0, lloyd_steps=0, annealing_steps=0),
     "volume": Sparsification(points_per_px=60.0, lloyd_steps=0, annealing_steps=0),
 }
-PLAIN = Sparsification(lloyd_steps=0, annealing_steps=0)
 
 
 def _simple(lens: Lens, width_px: int, finer: int) -> PsfModel:  # noqa: ARG001

@@ -15,8 +15,8 @@ from mrbokeh.lens import Lens
 from mrbokeh.light_field_samples import LightFieldSamples
 from mrbokeh.psf_bank import PsfBank
 from mrbokeh.renderers._laplacian_bank import BankTables, Place
-from mrbokeh.renderers.laplacian_spreadlets import PLAIN_APERTURE, LaplacianSpreadlets
-from mrbokeh.spreadlets import Sparsification
+from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.spreadlets import UNRELAXED, Sparsification
 
 Light = Float32[np.ndarray, "height width _"]
 
@@ -32,7 +32,7 @@ class _Densely(LaplacianSpreadlets):
 class BlurMethods:
     """Tables of one bank; they are filled when a method first meets a kernel and kept."""
 
-    def __init__(self, bank: PsfBank, sparsification: Sparsification = PLAIN_APERTURE, threads: int = 0) -> None:
+    def __init__(self, bank: PsfBank, sparsification: Sparsification = UNRELAXED, threads: int = 0) -> None:
         self.bank, self.threads = bank, threads
         self._sparse = LaplacianSpreadlets(bank, threads=threads, sparsification=sparsification)
         self._dense = _Densely(bank, threads=threads)

@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from datasets_scripts.blur_banks import PLAIN, SPARSIFICATIONS, bank_of
+from datasets_scripts.blur_banks import SPARSIFICATIONS, bank_of
 from datasets_scripts.blur_methods import BlurMethods
 from datasets_scripts.blur_scenes import BlurScene
 from datasets_scripts.global_layers import composited, read_global_layers, read_moving_layers
 from datasets_scripts.samples_plan import SamplesPlan
 from mrbokeh.image_io import write_image
 from mrbokeh.image_metrics import psnr, ssim
+from mrbokeh.spreadlets import UNRELAXED
 
 _RIM_PX = 2
 _TRACED = ("simple", "combined")
@@ -68,7 +69,7 @@ class Methods:
         if key not in self._made:
             folder = self._out / "banks" / (f"{model}_{plan.width_px}" + ("_finer" if finer else ""))
             bank = bank_of(model, folder, plan.lens, plan.width_px, finer=finer)
-            self._made[key] = BlurMethods(bank, SPARSIFICATIONS.get(model, PLAIN))
+            self._made[key] = BlurMethods(bank, SPARSIFICATIONS.get(model, UNRELAXED))
         return self._made[key]
 
 

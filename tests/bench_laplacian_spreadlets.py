@@ -18,9 +18,9 @@ from mrbokeh.aperture import Aperture
 from mrbokeh.image_metrics import psnr, ssim
 from mrbokeh.laplacian_integration import integrate, integrate_by_pyramid, laplacian
 from mrbokeh.renderers._laplacian_tables import DENSE, WHOLE, kind_of
-from mrbokeh.renderers.laplacian_spreadlets import PLAIN_APERTURE, LaplacianSpreadlets
+from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.spreadlets import Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
+from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
 from tests.machine import machine_line, memory_line
 
 REPEATS = 3
@@ -104,7 +104,7 @@ def spread_rows(size: tuple[int, int]) -> None:
         coc_px = hills_px(size, mean_px)
         for name, changed in (
             ("spreadlets", {}),
-            ("half the points", {"sparsification": replace(PLAIN_APERTURE, points_per_px=0.5)}),
+            ("half the points", {"sparsification": replace(UNRELAXED, points_per_px=0.5)}),
             ("whole Laplacians", {"sparsification": None}),
             ("pyramid", {"integration": "pyramid"}),
         ):

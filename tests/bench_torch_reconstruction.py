@@ -6,9 +6,6 @@ same run, and both pictures are compared.
 
 import argparse
 import os
-import statistics
-import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,11 +15,11 @@ from mrbokeh.image_metrics import psnr
 from mrbokeh.light_field_samples import LightFieldSamples
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.renderers.torch_reconstruction import DeviceSamples, TorchReconstruction
-from mrbokeh.renderers.torch_reconstruction._samples import has_triton
+from mrbokeh.torch_device import has_triton
+from tests.device_timing import milliseconds
 from tests.machine import machine_line, memory_line
 from tests.sampled_planes import LENS, fence_scene, sample_planes
 
-WAIT_S = 20.0
 VARIANTS = {
     "all improvements": Settings(),
     "sheared recursive filter": Settings(screen_filter="sheared"),
@@ -37,24 +34,6 @@ def fence_samples(width_px: int, height_px: int, per_pixel: int) -> LightFieldSa
     kept = (samples.xy_px < (width_px, height_px)).all(axis=1)
     names = ("xy_px", "lens_uv", "time", "rgb", "depth_m", "motion_px")
     return LightFieldSamples(width_px, height_px, *(np.ascontiguousarray(getattr(samples, name)[kept]) for name in names))
-
-
-def milliseconds(run: Callable[[], object], device: torch.device) -> float:
-    """The median of as many as there is time for, once the first is done."""
-    took_ms: list[float] = []
-    until_s = time.perf_counter() + WAIT_S
-    while len(took_ms) < 30 and (not took_ms or time.perf_counter() < until_s):
-        wait_for(device)
-        started_s = time.perf_counter()
-        run()
-        wait_for(device)
-        took_ms.append(1e3 * (time.perf_counter() - started_s))
-    return statistics.median(took_ms)
-
-
-def wait_for(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def row(name: str, settings: Settings, samples: LightFieldSamples, on_device: DeviceSamples, device: torch.device) -> None:

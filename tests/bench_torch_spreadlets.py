@@ -6,9 +6,7 @@ in the same run, and both pictures are compared. Points of kernels are made befo
 
 import argparse
 import os
-import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,13 +23,13 @@ from mrbokeh.renderers._laplacian_bank import Place
 from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.torch_spreadlets import DeviceLayer, TorchSpreadlets
 from mrbokeh.renderers.torch_spreadlets._integration import integrate
-from mrbokeh.renderers.torch_spreadlets._splat import has_triton
+from mrbokeh.torch_device import has_triton
+from tests.device_timing import milliseconds
 from tests.machine import machine_line, memory_line
 
 LARGEST_PX, CELLS = 48.0, 60
 BALL_PX, WAYS = 64, 12
 LAMP = 1e3
-WAIT_S = 5.0
 
 Sheet = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -68,24 +66,6 @@ def in_front(size: int) -> Sheet:
 def by_the_cpu(renderer: LaplacianSpreadlets, sheets: list[Sheet]) -> np.ndarray:
     front, back = (renderer.spread_bank(values, coc_px, Place(motion_px=motion)) for values, coc_px, motion in sheets)
     return front + (1.0 - np.clip(front[..., 3:], 0.0, 1.0)) * back
-
-
-def milliseconds(run: Callable[[], object], device: torch.device) -> float:
-    """The median of as many as there is time for, once the first is done."""
-    took_ms: list[float] = []
-    until_s = time.perf_counter() + WAIT_S
-    while len(took_ms) < 30 and (not took_ms or time.perf_counter() < until_s):
-        wait_for(device)
-        started_s = time.perf_counter()
-        run()
-        wait_for(device)
-        took_ms.append(1e3 * (time.perf_counter() - started_s))
-    return statistics.median(took_ms)
-
-
-def wait_for(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def picture_rows(device_name: str, size: int) -> None:

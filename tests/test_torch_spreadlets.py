@@ -24,8 +24,8 @@ from mrbokeh.renderers._laplacian_bank import BankTables, Place
 from mrbokeh.renderers._laplacian_sums import add_light, splat_plainly, window_of
 from mrbokeh.renderers._laplacian_tables import Points, by_rows, joined_points, taps_of
 from mrbokeh.renderers._laplacian_tables import stands_out as stands_out_compiled
-from mrbokeh.renderers.laplacian_spreadlets import PLAIN_APERTURE, LaplacianSpreadlets
-from mrbokeh.spreadlets import sparsify, whole_laplacian
+from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.spreadlets import UNRELAXED, sparsify, whole_laplacian
 
 torch = pytest.importorskip("torch")
 
@@ -149,7 +149,7 @@ def test_each_pixel_takes_the_kernel_that_it_takes_on_the_cpu(name: str) -> None
     depth_m[0] = np.inf
     ways = rng.uniform(-14, 14, (2, *size, 2)).astype(np.float32)
     bright = rng.uniform(size=size) < 0.1
-    tables = BankTables(bank, PLAIN_APERTURE)
+    tables = BankTables(bank, UNRELAXED)
     known = tables.codes(coc_px, bright, Place(ways[0], ways[1] / 14, depth_m))
     on_device = [torch.from_numpy(each) for each in (bright, coc_px, ways[0], ways[1] / 14, depth_m)]
     np.testing.assert_array_equal(BankCells(tables, CPU).codes(*on_device).numpy(), known)

@@ -31,9 +31,6 @@ from mrbokeh.renderers._laplacian_sums import add_light
 from mrbokeh.renderers._laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out
 from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlets
 
-PLAIN_APERTURE = UNRELAXED
-"""For apertures that are sparsified while somebody waits: once values are fitted, relaxation and annealing gain nothing."""
-
 
 @dataclass(frozen=True)
 class LaplacianSpreadlets:
@@ -50,7 +47,7 @@ class LaplacianSpreadlets:
     layering: Layering = field(default_factory=Layering)
     threads: int = 0
     integration: str = "exact"
-    sparsification: Sparsification | None = PLAIN_APERTURE
+    sparsification: Sparsification | None = UNRELAXED
     dense_up_to_px: float = 24.0
     spreadlets: Spreadlets | None = field(default=None, repr=False)
     device: str = ""
