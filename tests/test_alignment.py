@@ -4,7 +4,17 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.alignment import about_centre, chained, farthest_corner_px, inverse, register_pair, register_stack, scale_of, structure, warp
+from capture.merging.alignment import (
+    about_centre,
+    chained,
+    farthest_corner_px,
+    inverse,
+    register_pair,
+    register_stack,
+    scale_of,
+    structure,
+    warp,
+)
 from mrbokeh.image_io import read_image
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from capture.focus_metadata import FocusReading
-from capture.grouping import Grouping, Photo, group_photos, of_one_camera
-from capture.photo_files import find_photos
-from capture.photo_metadata import PhotoMetadata
-from capture.sidecar import Sidecar
+from capture.photos.focus_metadata import FocusReading
+from capture.photos.photo_files import find_photos
+from capture.photos.photo_metadata import PhotoMetadata
+from capture.photos.sidecar import Sidecar
+from capture.stacks.grouping import Grouping, Photo, group_photos, of_one_camera
 from mrbokeh.errors import InputError
 
 

@@ -16,13 +16,14 @@ from jaxtyping import Float32
 from scipy.ndimage import affine_transform, gaussian_filter, uniform_filter
 from typer.testing import CliRunner
 
-import capture.stack_ingest
-from capture.cli import app, parse_white_balance
-from capture.exposure import ExposureGain, evened_out, low_frequency, measure_gain
-from capture.grouping import Grouping
-from capture.ingest import IngestReport, IngestSettings, ingest
-from capture.slice_files import find_slices
-from capture.stack_ingest import Development
+import capture.stacks.stack_ingest
+from capture.cli import app
+from capture.commands.ingest import parse_white_balance
+from capture.stacks.exposure import ExposureGain, evened_out, low_frequency, measure_gain
+from capture.stacks.grouping import Grouping
+from capture.stacks.ingest import IngestReport, IngestSettings, ingest
+from capture.stacks.slice_files import find_slices
+from capture.stacks.stack_ingest import Development
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
 from mrbokeh.errors import InputError
@@ -346,7 +347,7 @@ def test_only_what_changed_is_made_again(shoot: Path, tmp_path: Path) -> None:
 def test_an_interrupted_run_goes_on_and_ends_the_same(shoot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = only_stack(ingest([shoot], tmp_path / "whole"))
     developed: list[str] = []
-    real_develop = capture.stack_ingest.develop
+    real_develop = capture.stacks.stack_ingest.develop
 
     def counting(path: Path, *args: object, **kwargs: object) -> object:
         if len(developed) == 3:
@@ -355,7 +356,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(shoot: Path, tmp_path: Pat
         return real_develop(path, *args, **kwargs)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch:
-        patch.setattr(capture.stack_ingest, "develop", counting)
+        patch.setattr(capture.stacks.stack_ingest, "develop", counting)
         with pytest.raises(KeyboardInterrupt):
             ingest([shoot], tmp_path / "scene")
     assert developed == ["IMG_9.dng", "IMG_10.dng", "IMG_12.dng"]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from capture.exiftool_metadata import metadata_from_exiftool, read_with_exiftool
-from capture.focus_metadata import lens_distance_m, read_focus
-from capture.metadata import metadata_from_tags, read_metadata
-from capture.photo_metadata import PhotoMetadata
-from capture.sensor_metadata import SensorReading, read_sensor
-from capture.sidecar import Sidecar, find_sidecar, read_sidecar
+from capture.photos.exiftool_metadata import metadata_from_exiftool, read_with_exiftool
+from capture.photos.focus_metadata import lens_distance_m, read_focus
+from capture.photos.metadata import metadata_from_tags, read_metadata
+from capture.photos.photo_metadata import PhotoMetadata
+from capture.photos.sensor_metadata import SensorReading, read_sensor
+from capture.photos.sidecar import Sidecar, find_sidecar, read_sidecar
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from capture.raw import camera_white_balance, decode_raw, read_raw_metadata
+from capture.photos.raw import camera_white_balance, decode_raw, read_raw_metadata
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
 from mrbokeh.errors import InputError

@@ -3,10 +3,10 @@ import itertools
 import cv2
 import numpy as np
 
-from capture._semi_global_numba import aggregate_costs
-from capture.all_in_focus import all_in_focus, slice_weight
-from capture.depth_from_focus import FocusMap, depth_from_focus, peak_parabola
-from capture.lights import find_lights
+from capture.merging._semi_global_numba import aggregate_costs
+from capture.merging.all_in_focus import all_in_focus, slice_weight
+from capture.merging.depth_from_focus import FocusMap, depth_from_focus, peak_parabola
+from capture.merging.lights import find_lights
 from mrbokeh.aperture import Aperture
 from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import opaque

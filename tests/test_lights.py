@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from capture.all_in_focus import all_in_focus
-from capture.clipped_highlights import neutral_where_full
-from capture.depth_from_focus import depth_from_focus
-from capture.light_energy import with_light_energy
-from capture.lights import find_lights
+from capture.merging.all_in_focus import all_in_focus
+from capture.merging.depth_from_focus import depth_from_focus
+from capture.merging.light_energy import with_light_energy
+from capture.merging.lights import find_lights
+from capture.photos.clipped_highlights import neutral_where_full
 from mrbokeh.aperture import Aperture
 from mrbokeh.layer import opaque
 from mrbokeh.renderers.scatter_reference import blur_layer

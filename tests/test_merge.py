@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.grouping import Grouping
-from capture.ingest import IngestSettings, ingest
-from capture.merge import merge_scene
-from capture.stack_ingest import Development
+from capture.merging.merge import merge_scene
+from capture.stacks.grouping import Grouping
+from capture.stacks.ingest import IngestSettings, ingest
+from capture.stacks.stack_ingest import Development
 from mrbokeh.demo.plan import DATA
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from capture.lights import Lights
+from capture.merging.lights import Lights
 
 Rgb = Float32[np.ndarray, "height width 3"]
 

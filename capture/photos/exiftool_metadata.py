@@ -7,9 +7,9 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from capture.focus_metadata import FocusReading, canon_reading
-from capture.photo_metadata import PhotoMetadata, parse_time
-from capture.sensor_metadata import SensorReading
+from capture.photos.focus_metadata import FocusReading, canon_reading
+from capture.photos.photo_metadata import PhotoMetadata, parse_time
+from capture.photos.sensor_metadata import SensorReading
 
 _TAGS = (
     "FocalLength", "FNumber", "ExposureTime", "ISO", "DateTimeOriginal", "Make", "Model", "LensModel", "Orientation", "ImageWidth",

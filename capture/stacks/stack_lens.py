@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from capture.grouping import Photo
+from capture.stacks.grouping import Photo
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens

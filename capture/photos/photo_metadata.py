@@ -3,8 +3,8 @@
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 
-from capture.focus_metadata import FocusReading
-from capture.sensor_metadata import SensorReading
+from capture.photos.focus_metadata import FocusReading
+from capture.photos.sensor_metadata import SensorReading
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.lights import Lights
+from capture.merging.lights import Lights
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -53,7 +53,7 @@ def focus_map(energies: Volume, lights: Lights) -> FocusMap:
 
     Energies within the reach of a light have no say, but the light's own pixels are known to be sharp in its sharpest slice.
     """
-    from capture._semi_global_numba import aggregate_costs
+    from capture.merging._semi_global_numba import aggregate_costs
 
     floor = noise_floor(energies)
     log_energies = np.log(energies + floor)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.clipped_highlights import neutral_where_full
-from capture.libraw import MAX_16_BIT, WhiteBalance, matrix_used_by_libraw, opened_raw, processed, rec709_from_balanced_camera
-from capture.photo_metadata import PhotoMetadata
-from capture.whole_file import require_whole_tiff
+from capture.photos.clipped_highlights import neutral_where_full
+from capture.photos.libraw import MAX_16_BIT, WhiteBalance, matrix_used_by_libraw, opened_raw, processed, rec709_from_balanced_camera
+from capture.photos.photo_metadata import PhotoMetadata
+from capture.photos.whole_file import require_whole_tiff
 from mrbokeh.color import convert
 from mrbokeh.errors import InputError
 

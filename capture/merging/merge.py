@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from capture.alignment import Registration, register_stack, warp
-from capture.all_in_focus import all_in_focus
-from capture.depth_from_focus import FocusMap, depth_from_focus
-from capture.light_energy import with_light_energy
-from capture.lights import find_lights
+from capture.merging.alignment import Registration, register_stack, warp
+from capture.merging.all_in_focus import all_in_focus
+from capture.merging.depth_from_focus import FocusMap, depth_from_focus
+from capture.merging.light_energy import with_light_energy
+from capture.merging.lights import find_lights
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack, Slice, find_focal_stacks, write_focal_stack, write_merged

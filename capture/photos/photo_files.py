@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.raw import RAW_SUFFIXES
+from capture.photos.raw import RAW_SUFFIXES
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME as STACK_FILE_NAME
 from mrbokeh.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES

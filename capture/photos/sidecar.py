@@ -22,8 +22,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from capture.focus_metadata import FocusReading
-from capture.photo_metadata import PhotoMetadata
+from capture.photos.focus_metadata import FocusReading
+from capture.photos.photo_metadata import PhotoMetadata
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 

@@ -8,10 +8,10 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
-from capture.developing import is_raw
-from capture.photo_files import SkippedFile
-from capture.photo_metadata import PhotoMetadata
-from capture.sidecar import Sidecar
+from capture.photos.developing import is_raw
+from capture.photos.photo_files import SkippedFile
+from capture.photos.photo_metadata import PhotoMetadata
+from capture.photos.sidecar import Sidecar
 from mrbokeh.errors import InputError
 
 _PAUSE_TIMES_MEDIAN = 5.0

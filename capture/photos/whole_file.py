@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from capture.metadata import read_tags
+from capture.photos.metadata import read_tags
 from mrbokeh.errors import InputError
 
 _BLOCKS = (("TileOffsets", "TileByteCounts"), ("StripOffsets", "StripByteCounts"))

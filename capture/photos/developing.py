@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from capture.raw import RAW_SUFFIXES, DecodedPhoto, decode_raw
+from capture.photos.raw import RAW_SUFFIXES, DecodedPhoto, decode_raw
 from mrbokeh.image_io import INTEGER_SUFFIXES, read_image
 
 _LARGEST_HALF = 65504.0

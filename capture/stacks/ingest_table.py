@@ -5,9 +5,9 @@ import math
 from rich.console import Console
 from rich.table import Table
 
-from capture.ingest import IngestReport
-from capture.stack_description import StackReport
-from capture.stack_lens import lens_text
+from capture.stacks.ingest import IngestReport
+from capture.stacks.stack_description import StackReport
+from capture.stacks.stack_lens import lens_text
 from mrbokeh.focal_stack import FocalStack
 
 

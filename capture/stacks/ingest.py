@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from capture.developing import is_raw
-from capture.grouping import Grouping, Photo, PhotoGroup, group_photos, in_focus_order, of_one_camera
-from capture.metadata import read_metadata
-from capture.photo_files import PhotoFolder, SkippedFile, find_photos
-from capture.raw import read_raw_metadata
-from capture.sidecar import Sidecar, find_sidecar, read_sidecar
-from capture.stack_description import StackReport, finish_stack, finished_before, ingest_digest
-from capture.stack_ingest import Development, StackWork, stack_work
+from capture.photos.developing import is_raw
+from capture.photos.metadata import read_metadata
+from capture.photos.photo_files import PhotoFolder, SkippedFile, find_photos
+from capture.photos.raw import read_raw_metadata
+from capture.photos.sidecar import Sidecar, find_sidecar, read_sidecar
+from capture.stacks.grouping import Grouping, Photo, PhotoGroup, group_photos, in_focus_order, of_one_camera
+from capture.stacks.stack_description import StackReport, finish_stack, finished_before, ingest_digest
+from capture.stacks.stack_ingest import Development, StackWork, stack_work
 from mrbokeh.errors import InputError
 from mrbokeh.progress import progress_bars
 

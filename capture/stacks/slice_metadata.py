@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from capture.exposure import ExposureGain
-from capture.focus_metadata import FocusReading
-from capture.grouping import Photo
-from capture.raw import DecodedPhoto
+from capture.photos.focus_metadata import FocusReading
+from capture.photos.raw import DecodedPhoto
+from capture.stacks.exposure import ExposureGain
+from capture.stacks.grouping import Photo
 
 
 def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> dict[str, Any]:

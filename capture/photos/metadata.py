@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from capture.exiftool_metadata import read_with_exiftool
-from capture.focus_metadata import Tags, number, read_focus
-from capture.photo_metadata import PhotoMetadata, parse_time
-from capture.sensor_metadata import read_sensor
+from capture.photos.exiftool_metadata import read_with_exiftool
+from capture.photos.focus_metadata import Tags, number, read_focus
+from capture.photos.photo_metadata import PhotoMetadata, parse_time
+from capture.photos.sensor_metadata import read_sensor
 
 _NO_MESSAGES = 4
 

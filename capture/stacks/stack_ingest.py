@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from capture.developing import develop, is_raw, stored_as_half
-from capture.exposure import ExposureGain, LowFrequency, evened_out, low_frequency
-from capture.grouping import Photo
-from capture.libraw import WhiteBalance
-from capture.photo_files import SkippedFile
-from capture.raw import DecodedPhoto, camera_white_balance
-from capture.slice_files import FOLDER, find_slices, source_record, write_slice
-from capture.slice_metadata import slice_metadata
+from capture.photos.developing import develop, is_raw, stored_as_half
+from capture.photos.libraw import WhiteBalance
+from capture.photos.photo_files import SkippedFile
+from capture.photos.raw import DecodedPhoto, camera_white_balance
+from capture.stacks.exposure import ExposureGain, LowFrequency, evened_out, low_frequency
+from capture.stacks.grouping import Photo
+from capture.stacks.slice_files import FOLDER, find_slices, source_record, write_slice
+from capture.stacks.slice_metadata import slice_metadata
 from mrbokeh.errors import InputError
 
 # To be raised when the same photograph would become another slice, so that old slices are made again.

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from capture.grouping import Photo, in_focus_order
-from capture.photo_files import SkippedFile
-from capture.slice_files import FOLDER, arrange_slices, source_record
-from capture.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
-from capture.stack_lens import camera_of_lens, lens_of_photo, lens_remarks, reference_index
+from capture.photos.photo_files import SkippedFile
+from capture.stacks.grouping import Photo, in_focus_order
+from capture.stacks.slice_files import FOLDER, arrange_slices, source_record
+from capture.stacks.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
+from capture.stacks.stack_lens import camera_of_lens, lens_of_photo, lens_remarks, reference_index
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack
 from mrbokeh.lens import Lens

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from capture.focus_metadata import Tags, number, rational
+from capture.photos.focus_metadata import Tags, number, rational
 
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH_MM = 25.4

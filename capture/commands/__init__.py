@@ -1,0 +1,1 @@
+"""The commands of `mrbokeh capture`, one file each."""

@@ -1,0 +1,1 @@
+"""Photographs into the slices of focal stacks."""
