@@ -44,7 +44,11 @@ def desk_camera(index: int, width_px: int, height_px: int, lens: Lens) -> Camera
     """One of the viewpoints, tilted down to the table, with the lens's focal length in pixels."""
     if not 0 <= index < len(VIEWPOINTS):
         raise InputError(f"the desk scene has {len(VIEWPOINTS)} viewpoints, but number {index} was asked for")
-    view = VIEWPOINTS[index]
+    return camera_at(VIEWPOINTS[index], width_px, height_px, lens)
+
+
+def camera_at(view: Viewpoint, width_px: int, height_px: int, lens: Lens) -> Camera:
+    """A camera that stands at a viewpoint, tilted down to the table."""
     cos_p, sin_p, cos_y, sin_y = np.cos(_PITCH_RAD), np.sin(_PITCH_RAD), np.cos(view.yaw_rad), np.sin(view.yaw_rad)
     pitch = np.array([[1, 0, 0], [0, cos_p, -sin_p], [0, sin_p, cos_p]])
     yaw = np.array([[cos_y, 0, -sin_y], [0, 1, 0], [sin_y, 0, cos_y]])
@@ -58,11 +62,16 @@ def desk_camera(index: int, width_px: int, height_px: int, lens: Lens) -> Camera
 def desk_scene(seed: int) -> Scene:
     """The still life with baked light. The seed changes textures and lights; the furniture stays."""
     rng = np.random.default_rng([seed, 0])
-    sun = np.asarray(_SUN_TOWARDS) / np.linalg.norm(_SUN_TOWARDS)
-    quads = (*_room(rng), *_books(rng), *_boxes(rng), *_cards(rng))
-    scene = bake_lighting(Scene(quads, _balls(rng), (), _vector(sun), 0.46, 0.3, (0.05, 0.05, 0.06)), seed=seed)
+    scene = bake_lighting(desk_furniture(rng), seed=seed)
     cameras = [desk_camera(view, 144, 96, Lens(35.0, 2.8, NEAR_FOCUS_M, 23.5)) for view in range(_LIT_VIEWPOINTS)]
     return replace(scene, lights=tuple(fairy_lights(scene, cameras, rng)))
+
+
+def desk_furniture(rng: np.random.Generator) -> Scene:
+    """Room, books, boxes, cards and balls under the sun; no lamps, light not baked yet."""
+    sun = np.asarray(_SUN_TOWARDS) / np.linalg.norm(_SUN_TOWARDS)
+    quads = (*_room(rng), *_books(rng), *_boxes(rng), *_cards(rng))
+    return Scene(quads, _balls(rng), (), _vector(sun), 0.46, 0.3, (0.05, 0.05, 0.06))
 
 
 def _room(rng: np.random.Generator) -> tuple[Quad, ...]:

@@ -1,6 +1,8 @@
 """Make RAW focal stacks with known truth: a traced still life, photographed by a simulated camera into DNG files.
 
     python -m datasets_scripts.make_raw_stack --out DIR [--viewpoints 3 --slices 7 --width 576 --height 384 --seed 1 --samples 512]
+    python -m datasets_scripts.make_raw_stack --out DIR --scene lab --viewpoints 7 --stacks 1 --slices 12 --width 960 --height 640 \
+        --jitter-px 1.2 --jitter-deg 0.03 --full-well 10000 --samples 96
 
 DIR/view_V/slice_SS.dng are the photographs; DIR/truth.json, DIR/truth/view_V/all_in_focus.exr and depth.exr the truth.
 Finished files are kept, so an interrupted run goes on where it stopped.
@@ -16,10 +18,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from datasets_scripts.desk_scene import VIEWPOINTS, desk_camera, desk_scene
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.raw_stack_truth import StackPlan, truth_document
 from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.stack_scenes import STACK_SCENES
 from datasets_scripts.thin_lens_tracer import trace, trace_pinhole
 from datasets_scripts.traced_scene import Scene
 from mrbokeh.atomic_files import read_json, write_json
@@ -48,12 +50,13 @@ def make_raw_stack(out: Path, plan: StackPlan, *, force: bool = False, progress:
 
     Raises InputError where `out` holds something else, unless `force` says to replace it.
     """
-    if not 1 <= plan.viewpoints <= len(VIEWPOINTS) or plan.slices < 1:
-        raise InputError(f"expected 1 to {len(VIEWPOINTS)} viewpoints and at least 1 slice, got {plan.viewpoints} and {plan.slices}")
+    most = plan.stage.viewpoints
+    if not 1 <= plan.viewpoints <= most or plan.slices < 1:
+        raise InputError(f"expected 1 to {most} viewpoints and at least 1 slice, got {plan.viewpoints} and {plan.slices}")
     jobs = list(_jobs(out, plan))
     _claim_folder(out, plan, [path for job in jobs for path in job.paths], force)
     waiting = [job for job in jobs if not job.done]
-    scene = desk_scene(plan.seed) if waiting else Scene()
+    scene = plan.stage.build(plan.seed) if waiting else Scene()
     for index, job in enumerate(waiting):
         if progress:
             progress(len(jobs) - len(waiting) + index, len(jobs))
@@ -83,14 +86,13 @@ def _jobs(out: Path, plan: StackPlan) -> Iterator[_Job]:
         folder = out / "truth" / f"view_{view}"
         aif_path, depth_path = folder / "all_in_focus.exr", folder / "depth.exr"
         yield _Job((aif_path, depth_path), partial(_make_truth, plan=plan, view=view, aif_path=aif_path, depth_path=depth_path))
-        for index in range(plan.slices):
+        for index in range(plan.slices if view < plan.photographed else 0):
             path = out / f"view_{view}" / f"slice_{index:02d}.dng"
             yield _Job((path,), partial(_make_slice, plan=plan, view=view, index=index, path=path))
 
 
 def _make_truth(scene: Scene, plan: StackPlan, view: int, aif_path: Path, depth_path: Path) -> None:
-    camera = desk_camera(view, plan.width_px, plan.height_px, plan.lens_at(0))
-    rgb, depth_m = trace_pinhole(scene, camera, plan.samples, plan.seed, plan.sensor.footprint_px)
+    rgb, depth_m = trace_pinhole(scene, plan.reference_camera(view), plan.samples, plan.seed, plan.sensor.footprint_px)
     comment = "metres along the optical axis at pixel centres"
     write_exr(depth_path, ExrPart({"Z": depth_m.astype(np.float16)}, attributes={"comments": comment}))
     write_image(aif_path, rgb, half=True)
@@ -106,28 +108,38 @@ def _make_slice(scene: Scene, plan: StackPlan, view: int, index: int, path: Path
 
 def traced_slice(scene: Scene, plan: StackPlan, view: int, index: int) -> np.ndarray:
     """(H, W, 3) scene-linear Rec.709: what the sensor is given for one slice, before its colour filters and noise."""
-    lens = plan.lens_at(index)
-    camera = desk_camera(view, plan.width_px, plan.height_px, lens)
-    return trace(scene, camera, lens, plan.samples, plan.seed * 1000 + view * 100 + index, plan.sensor.footprint_px)
+    return trace(
+        scene,
+        plan.camera_at(view, index),
+        plan.lens_at(index),
+        plan.samples,
+        plan.seed * 1000 + view * 100 + index,
+        plan.sensor.footprint_px,
+    )
 
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the stack.")],
-    viewpoints: Annotated[int, typer.Option(help=f"1 to {len(VIEWPOINTS)}.")] = 3,
+    scene: Annotated[str, typer.Option(help=f"One of {', '.join(STACK_SCENES)}.")] = "desk",
+    viewpoints: Annotated[int, typer.Option(help="How many of the scene's viewpoints.")] = 3,
+    stacks: Annotated[int | None, typer.Option(help="How many of them are photographed; of the others only the truth is made.")] = None,
     slices: int = 9,
     width: int = 544,
     height: int = 360,
     seed: Annotated[int, typer.Option(help="Textures, lights, sampling and noise.")] = 1,
     samples: Annotated[int, typer.Option(help="Lens rays per pixel.")] = 512,
     bits: Annotated[int, typer.Option(help="12 to 16.")] = 14,
+    full_well: Annotated[float, typer.Option(help="Electrons at raw white: 10000 is 1 % photon noise there.")] = 60000.0,
+    jitter_px: Annotated[float, typer.Option(help="Slices are shifted by up to this much.")] = 0.0,
+    jitter_deg: Annotated[float, typer.Option(help="Slices are rolled by up to this much.")] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="Replace a stack made with other settings.")] = False,
 ) -> None:
     """Make DNG focal stacks of a still life with their all-in-focus image, depth and camera as truth."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     # The black level keeps its share of the range at every bit depth.
-    sensor = SensorModel(bits=bits, black_level=1008 * 2**bits // 2**14)
-    plan = StackPlan(viewpoints, slices, width, height, seed, samples, sensor)
+    sensor = SensorModel(bits=bits, black_level=1008 * 2**bits // 2**14, full_well_electrons=full_well)
+    plan = StackPlan(viewpoints, slices, width, height, seed, samples, sensor, scene, stacks, jitter_px, jitter_deg)
     try:
         with Progress("tracing", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar:
             task = bar.add_task("tracing", total=None)

@@ -1,16 +1,17 @@
 """What is known exactly about a made RAW stack, as the JSON file beside it."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from datasets_scripts.desk_scene import FAR_FOCUS_M, NEAR_FOCUS_M, desk_camera
 from datasets_scripts.dng_writer import film_plane_distance_m
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.aperture import Aperture
+from datasets_scripts.stack_scenes import STACK_SCENES, StackScene
+from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_to_json
+from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import lens_to_json
 
@@ -26,7 +27,7 @@ _RELATION = (
 _REFERENCE = (
     "all_in_focus.exr and depth.exr are seen by a pinhole in the middle of the lens with reference_camera: the focal length in "
     "pixels of slice 0, the nearest focus, which sees the narrowest field. Slice i maps onto it by scaling about principal_px by "
-    "focal_px(reference) / focal_px(slice i)."
+    "focal_px(reference) / focal_px(slice i), or where slices were jittered by views[V].reference_from_slice[i]."
 )
 
 
@@ -35,6 +36,9 @@ class StackPlan:
     """Everything that decides the pixels of a made stack.
 
     samples: lens rays per pixel; the truth takes as many pinhole rays.
+    stacks: how many of the viewpoints are photographed; of the others there is truth only.
+    jitter_px, jitter_deg: by how much slices (but the reference) are shifted and rolled about the middle, as by a loose tripod.
+    scene: a name of STACK_SCENES.
     """
 
     viewpoints: int = 3
@@ -44,15 +48,64 @@ class StackPlan:
     seed: int = 1
     samples: int = 256
     sensor: SensorModel = field(default_factory=SensorModel)
+    scene: str = "desk"
+    stacks: int | None = None
+    jitter_px: float = 0.0
+    jitter_deg: float = 0.0
+
+    @property
+    def stage(self) -> StackScene:
+        if self.scene not in STACK_SCENES:
+            raise InputError(f"expected one of the scenes {', '.join(STACK_SCENES)}, got {self.scene!r}")
+        return STACK_SCENES[self.scene]
+
+    @property
+    def photographed(self) -> int:
+        """Viewpoints with slices."""
+        return self.viewpoints if self.stacks is None else min(self.stacks, self.viewpoints)
 
     def lens_at(self, slice_index: int) -> Lens:
-        """Hexagonal iris on purpose: it is point-symmetric, so that front and back blur look alike to a network fed with |CoC|."""
-        return Lens(35.0, 2.0, float(self.focus_distances_m[slice_index]), 23.5, Aperture.disc().obstructed(0.5))
+        return self.stage.lens.focused_at(float(self.focus_distances_m[slice_index]))
 
     @property
     def focus_distances_m(self) -> Float[np.ndarray, " slices"]:
         """From the lens, near to far, equally spaced in dioptres so that the blur between neighbours is the same everywhere."""
-        return 1.0 / np.linspace(1.0 / NEAR_FOCUS_M, 1.0 / FAR_FOCUS_M, self.slices)
+        return 1.0 / np.linspace(1.0 / self.stage.near_m, 1.0 / self.stage.far_m, self.slices)
+
+    def reference_camera(self, view: int) -> Camera:
+        """Where the truth is seen from: the geometry of slice 0, the nearest focus, which sees the narrowest field."""
+        return self.stage.camera(view, self.width_px, self.height_px, self.lens_at(0))
+
+    def camera_at(self, view: int, slice_index: int) -> Camera:
+        """The camera of one slice: breathed, shifted and rolled."""
+        camera = self.stage.camera(view, self.width_px, self.height_px, self.lens_at(slice_index))
+        shift_px, roll_rad = self.jitter_of(view, slice_index)
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+        x_px, y_px = (float(middle + shift) for middle, shift in zip(camera.principal_px, shift_px, strict=True))
+        return replace(camera, principal_px=(x_px, y_px), camera_from_world=turn @ camera.camera_from_world)
+
+    def jitter_of(self, view: int, slice_index: int) -> tuple[Float[np.ndarray, "2"], float]:
+        """(shift in pixels, roll in radians) of a slice; none for the reference. The shift is at most jitter_px long."""
+        if slice_index == 0:
+            return np.zeros(2), 0.0
+        rng = np.random.default_rng([self.seed, view, slice_index, 7])
+        length_px, angle = self.jitter_px * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
+        roll_rad = np.deg2rad(self.jitter_deg) * rng.uniform(-1.0, 1.0)
+        return length_px * np.array([np.cos(angle), np.sin(angle)]), float(roll_rad)
+
+    def reference_from_slice(self, view: int, slice_index: int) -> Float[np.ndarray, "2 3"]:
+        """The similarity that takes pixel positions of a slice to those of the reference, exactly."""
+        slice_px, reference_px = (_pixels_from_plane(camera) for camera in (self.camera_at(view, slice_index), self.reference_camera(view)))
+        _, roll_rad = self.jitter_of(view, slice_index)
+        turn = np.eye(3)
+        turn[:2, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+        return (reference_px @ np.linalg.inv(slice_px @ turn))[:2]
+
+
+def _pixels_from_plane(camera: Camera) -> Float[np.ndarray, "3 3"]:
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def truth_document(plan: StackPlan) -> dict[str, Any]:
@@ -76,14 +129,20 @@ def truth_document(plan: StackPlan) -> dict[str, Any]:
         "reference_slice": 0,
         "reference": _REFERENCE,
         "views": [
-            {"reference_camera": camera_to_json(desk_camera(view, plan.width_px, plan.height_px, reference))}
+            {"reference_camera": camera_to_json(plan.reference_camera(view))} | _jitter_document(plan, view)
             for view in range(plan.viewpoints)
         ],
         "truth_units": "scene-linear Rec.709 RGB, 1.0 = raw white of green at exposure 1; Z in metres along the optical axis at pixel "
         "centres",
         "sensor": _sensor_document(sensor),
         "relation": _RELATION,
-    }
+    } | plan.stage.facts
+
+
+def _jitter_document(plan: StackPlan, view: int) -> dict[str, Any]:
+    if view >= plan.photographed or not (plan.jitter_px or plan.jitter_deg):
+        return {}
+    return {"reference_from_slice": [plan.reference_from_slice(view, index).tolist() for index in range(plan.slices)]}
 
 
 def _sensor_document(sensor: SensorModel) -> dict[str, Any]:
