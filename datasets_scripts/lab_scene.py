@@ -77,7 +77,7 @@ def lab_facts() -> dict[str, Any]:
     """What is known of the board and the dark card, for truth.json."""
     corners_m = [DARK_CARD.point_m(across, down).tolist() for across, down in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))]
     return {
-        "board": {"squares": BOARD_SQUARES, "square_m": BOARD_SQUARE_M, "marker_m": BOARD_MARKER_M, "dictionary": BOARD_DICTIONARY},
+        "board": {"squares": list(BOARD_SQUARES), "square_m": BOARD_SQUARE_M, "marker_m": BOARD_MARKER_M, "dictionary": BOARD_DICTIONARY},
         "dark_card_corners_m": corners_m,
     }
 
