@@ -1,4 +1,8 @@
-"""FocalStack: one viewpoint photographed at many focus distances, and the folder that holds it (contract 1)."""
+"""FocalStack: one viewpoint photographed at many focus distances, and the folder that holds it (contract 1).
+
+Pictures are stored in linear white-balanced camera RGB (1.0 is the raw white of green); `rec709_from_camera` leads from
+there to Rec.709, and is None where the pictures are Rec.709 already (JPEG, EXR). Methods named camera_rgb give what is stored.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,14 +15,15 @@ from jaxtyping import Bool, Float, Float32
 from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_from_json, camera_to_json
+from mrbokeh.camera_rgb import Matrix3x3, SliceMasks, matrix3x3, read_camera_rgb, read_masks, read_slice_masks, write_camera_rgb
+from mrbokeh.color import convert
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.image_io import read_image, write_image
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import lens_from_json, lens_to_json
 
 FORMAT = "mrbokeh-focal-stack"
-VERSION = 1
+VERSION = 2
 FILE_NAME = "stack.json"
 
 
@@ -26,7 +31,7 @@ FILE_NAME = "stack.json"
 class Slice:
     """One photograph of the stack.
 
-    path: relative to the folder of the stack; scene-linear EXR.
+    path: relative to the folder of the stack; linear EXR in the stack's camera RGB.
     focus_distance_m: from the lens to the plane in focus, or None where nobody knows.
     scale: how much registration enlarged the slice to match the reference (1 where it did nothing).
     metadata: what the source file told (exposure_time_s, iso, source, ...).
@@ -45,6 +50,7 @@ class FocalStack:
     lens: the lens with the focus of the reference slice, or None where focal length, f-number or sensor are unknown.
     camera: intrinsics of the registered pictures, or None.
     registered: the slices share the geometry of the all-in-focus image.
+    rec709_from_camera: linear Rec.709 from the camera RGB in which slices and all-in-focus image are stored; None: they are Rec.709.
     """
 
     folder: Path
@@ -55,6 +61,7 @@ class FocalStack:
     registered: bool = False
     merged: bool = False
     metadata: dict[str, Any] = field(default_factory=dict)
+    rec709_from_camera: Matrix3x3 | None = None
 
     def __len__(self) -> int:
         return len(self.slices)
@@ -68,11 +75,24 @@ class FocalStack:
         """Every focus distance is known, so that depth is in metres; else it is the index of the sharpest slice."""
         return all(distance is not None for distance in self.focus_distances_m)
 
+    def slice_camera_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
+        return read_camera_rgb(self.folder / self.slices[index].path)
+
+    def iter_camera_rgb(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
+        return (self.slice_camera_rgb(index) for index in range(len(self)))
+
     def slice_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
-        return read_image(self.folder / self.slices[index].path)
+        """Linear Rec.709; for strong colours of the camera's own a channel may be negative."""
+        return self.to_rec709(self.slice_camera_rgb(index))
 
     def iter_rgb(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
         return (self.slice_rgb(index) for index in range(len(self)))
+
+    def slice_masks(self, index: int) -> SliceMasks:
+        return read_slice_masks(self.folder / self.slices[index].path)
+
+    def to_rec709(self, camera_rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        return camera_rgb if self.rec709_from_camera is None else convert(camera_rgb, np.array(self.rec709_from_camera))
 
     @property
     def all_in_focus_path(self) -> Path:
@@ -82,9 +102,20 @@ class FocalStack:
     def depth_path(self) -> Path:
         return self.folder / "depth.exr"
 
-    def all_in_focus(self) -> Float32[np.ndarray, "height width 3"]:
+    @property
+    def exclusion_path(self) -> Path:
+        return self.folder / "exclusion.exr"
+
+    def all_in_focus_camera_rgb(self) -> Float32[np.ndarray, "height width 3"]:
         self._require_merged()
-        return read_image(self.all_in_focus_path)
+        return read_camera_rgb(self.all_in_focus_path)
+
+    def all_in_focus(self) -> Float32[np.ndarray, "height width 3"]:
+        return self.to_rec709(self.all_in_focus_camera_rgb())
+
+    def exclusions(self) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """(H, W) masks of what not to learn from, by reason: moving, saturated, border, low_confidence, board; {} if none are known."""
+        return read_masks(self.exclusion_path)
 
     def depth_m(self) -> Float32[np.ndarray, "height width"]:
         """(H, W) metres along the optical axis. Raises InputError where focus distances are unknown."""
@@ -135,9 +166,13 @@ def write_merged(
     focus_index: Float32[np.ndarray, "height width"],
     confidence: Float32[np.ndarray, "height width"],
     depth_m: Float32[np.ndarray, "height width"] | None,
+    rec709_from_camera: Matrix3x3 | None = None,
 ) -> None:
-    """The pictures of a merged stack: all_in_focus.exr and depth.exr (focus_index, confidence and, if metric, Z)."""
-    write_image(folder / "all_in_focus.exr", all_in_focus, half=False)
+    """The pictures of a merged stack: all_in_focus.exr and depth.exr (focus_index, confidence and, if metric, Z).
+
+    all_in_focus: in the RGB that rec709_from_camera leads from, which is the stack's.
+    """
+    write_camera_rgb(folder / "all_in_focus.exr", all_in_focus, rec709_from_camera, half=False)
     channels = {"focus_index": focus_index, "confidence": confidence} | ({} if depth_m is None else {"Z": depth_m})
     write_exr(folder / "depth.exr", ExrPart(channels))
 
@@ -150,6 +185,7 @@ def write_focal_stack(stack: FocalStack) -> None:
         "reference": stack.reference,
         "registered": stack.registered,
         "merged": stack.merged,
+        "rec709_from_camera": stack.rec709_from_camera,
         "lens": None if stack.lens is None else lens_to_json(stack.lens),
         "camera": None if stack.camera is None else camera_to_json(stack.camera),
         "slices": [vars(each) | {"focus_distance_m": _json_number(each.focus_distance_m)} for each in stack.slices],
@@ -164,8 +200,8 @@ def read_focal_stack(folder: Path | str) -> FocalStack:
     document = read_json(folder / FILE_NAME, "a focal stack")
     if document.get("format") != FORMAT or document.get("version") != VERSION:
         raise InputError(
-            f"{folder / FILE_NAME}: expected format {FORMAT!r} version {VERSION}, "
-            f"got {document.get('format')!r} version {document.get('version')!r}; ingest the photographs again"
+            f"{folder / FILE_NAME}: expected format {FORMAT!r} version {VERSION} (slices in camera RGB), got {document.get('format')!r} "
+            f"version {document.get('version')!r}: run `mrbokeh capture ingest` on the photographs again, then `mrbokeh capture merge`"
         )
     try:
         return FocalStack(
@@ -177,8 +213,9 @@ def read_focal_stack(folder: Path | str) -> FocalStack:
             registered=document["registered"],
             merged=document["merged"],
             metadata=document["metadata"],
+            rec709_from_camera=None if document["rec709_from_camera"] is None else matrix3x3(document["rec709_from_camera"]),
         )
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder / FILE_NAME} is incomplete ({error!r}): ingest the photographs again") from None
 
 

@@ -1,20 +1,20 @@
-"""Shooting data: known values of real files, vendors' sentinels, thin-lens conversion, sensor width, and lens.toml."""
+"""Shooting data: known values of real files through pyexiv2, exiftool and exifread."""
 
 import json
 import math
+import shutil
 import stat
 from pathlib import Path
 
 import pytest
 
+import capture.photos.metadata
+from capture.photos.exifread_metadata import read_tags_with_exifread
 from capture.photos.exiftool_metadata import metadata_from_exiftool, read_with_exiftool
-from capture.photos.focus_metadata import lens_distance_m, read_focus
 from capture.photos.metadata import metadata_from_tags, read_metadata
 from capture.photos.photo_metadata import PhotoMetadata
-from capture.photos.sensor_metadata import SensorReading, read_sensor
-from capture.photos.sidecar import Sidecar, find_sidecar, read_sidecar
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from capture.photos.sensor_metadata import read_sensor
+from tests.made_photographs import make_raw_photo, scene_rgb
 
 # file: (focal length mm, f-number, exposure s, film plane distance m, its interval or None)
 STATED = {
@@ -80,89 +80,6 @@ def test_files_without_metadata_tell_nothing(tmp_path: Path) -> None:
     assert read_metadata(tmp_path / "text.jpg") == PhotoMetadata()
 
 
-@pytest.mark.parametrize(
-    ("tags", "expected_m"),
-    [
-        ({"Exif.Photo.SubjectDistance": "0/1"}, None),
-        ({"Exif.Photo.SubjectDistance": "0/0"}, None),
-        ({"Exif.Photo.SubjectDistance": "5/0"}, None),
-        ({"Exif.Photo.SubjectDistance": "4294967295/1"}, math.inf),
-        ({"Exif.Photo.SubjectDistance": "4294967295/100"}, math.inf),
-        ({"Exif.Photo.SubjectDistance": "850/1000"}, 0.85),
-        ({"Exif.CanonFi.FocusDistanceUpper": "0", "Exif.CanonFi.FocusDistanceLower": "0"}, None),
-        ({"Exif.CanonFi.FocusDistanceUpper": "65535", "Exif.CanonFi.FocusDistanceLower": "65535"}, math.inf),
-        # Between 4 m and infinity the middle in dioptres is at 8 m.
-        ({"Exif.CanonFi.FocusDistanceUpper": "65535", "Exif.CanonFi.FocusDistanceLower": "400"}, 8.0),
-        ({"Exif.CanonFi.FocusDistanceUpper": "400", "Exif.CanonFi.FocusDistanceLower": "0"}, 4.0),
-        ({"Exif.CanonSi.SubjectDistance": "0"}, None),
-        ({"Exif.CanonSi.SubjectDistance": "65535"}, math.inf),
-        ({"Exif.CanonSi.SubjectDistance": "150", "Exif.Image.Model": "Canon EOS 20D"}, 1.5),
-        # EXIF goes before the maker's number, of which models differ in the unit.
-        ({"Exif.CanonSi.SubjectDistance": "1503", "Exif.Photo.SubjectDistance": "1503/1000"}, 1.503),
-        ({"Exif.NikonLd3.FocusDistance": "80"}, 1.0),
-        ({"Exif.NikonLd3.FocusDistance": "0"}, None),
-        ({"Exif.NikonLd3.FocusDistance": "4294967295"}, None),
-        # Nikon Z: 8 more bits, 80 * 256 is 1 m.
-        ({"Exif.NikonLd4.FocusDistance2": "20480"}, 1.0),
-        # Olympus counts mm in the numerator, whether the denominator is 1 or 10.
-        ({"Exif.OlympusFi.FocusDistance": "1250/1"}, 1.25),
-        ({"Exif.OlympusFi.FocusDistance": "1250/10"}, 1.25),
-        ({"Exif.OlympusFi.FocusDistance": "4294967295/1"}, math.inf),
-        ({"Exif.OlympusFi.FocusDistance": "0/1"}, None),
-        ({"Xmp.aux.ApproximateFocusDistance": "4294967295/1"}, math.inf),
-        ({}, None),
-    ],
-)
-def test_focus_tags_and_their_sentinels(tags: dict[str, str], expected_m: float | None) -> None:
-    reading = read_focus(tags)
-    assert (None if reading is None else reading.distance_m) == (None if expected_m is None else pytest.approx(expected_m, rel=1e-9))
-    if reading is not None:
-        assert reading.nearest_m <= reading.distance_m <= reading.farthest_m
-
-
-@pytest.mark.parametrize("focus_m", [0.1, 0.3, 1.0, 30.0, math.inf])
-@pytest.mark.parametrize("focal_length_mm", [7.0, 35.0, 49.9])
-def test_distance_from_the_lens_solves_the_thin_lens(focus_m: float, focal_length_mm: float) -> None:
-    """Film plane distance = focus distance + image distance of the thin lens; the way back must find the former (up to 1:1)."""
-    lens = Lens(focal_length_mm, 2.0, focus_m, 36.0)
-    film_plane_m = focus_m + lens.image_distance_mm / 1000.0
-    assert lens_distance_m(film_plane_m, focal_length_mm) == pytest.approx(focus_m, rel=1e-9)
-
-
-def test_nearer_than_four_focal_lengths_no_thin_lens_focuses() -> None:
-    assert lens_distance_m(0.19, 50.0) is None
-    assert lens_distance_m(0.2, 50.0) == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(
-    ("unit", "resolution"),
-    [("2", "25400/10"), ("3", "1000/1"), ("4", "100/1"), ("5", "1/10")],  # 100 px/mm in inches, cm, mm, micrometres
-)
-def test_focal_plane_units(unit: str, resolution: str) -> None:
-    tags = {"Exif.Photo.FocalPlaneXResolution": resolution, "Exif.Photo.FocalPlaneResolutionUnit": unit}
-    sensor = read_sensor(tags, None, (2400, 1600))
-    assert sensor is not None
-    assert sensor.width_mm(2400, 1600) == pytest.approx(24.0)
-
-
-def test_film_equivalent_compares_diagonals() -> None:
-    """50 mm that sees like 75 mm has a diagonal of 43.27 / 1.5 mm; at 3:2 that is a width of 24 mm."""
-    sensor = read_sensor({"Exif.Photo.FocalLengthIn35mmFilm": "75"}, 50.0, (6000, 4000))
-    assert sensor is not None
-    assert sensor.width_mm(6000, 4000) == pytest.approx(24.0)
-    assert read_sensor({"Exif.Photo.FocalLengthIn35mmFilm": "0"}, 50.0, (6000, 4000)) is None
-
-
-def test_sensor_width_of_resized_cut_and_turned_pictures() -> None:
-    sensor = SensorReading(0.006, (6000, 4000), "test")
-    assert sensor.width_mm(6000, 4000) == pytest.approx(36.0)
-    assert sensor.width_mm(6020, 4012) == pytest.approx(36.12)  # RAW margins
-    assert sensor.width_mm(1500, 1000) == pytest.approx(36.0)  # resized
-    assert sensor.width_mm(3000, 3000) == pytest.approx(18.0)  # cut
-    assert sensor.width_mm(4000, 6000) == pytest.approx(24.0)  # turned
-    assert sensor.width_mm(1000, 1500) == pytest.approx(24.0)  # turned and resized
-
-
 def test_nonsense_is_unknown() -> None:
     metadata = metadata_from_tags(
         {"Exif.Photo.FNumber": "0/10", "Exif.Photo.FocalLength": "x", "Exif.Photo.DateTimeOriginal": "0000:00:00 00:00:00"}
@@ -188,7 +105,8 @@ EXIFTOOL_ANSWER = {  # what exiftool 12.57 -n -j says of exif/nikon_d70_0.45m.jp
 def test_exiftool_fills_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stand-in on PATH that prints a recorded answer of the real program."""
     program = tmp_path / "exiftool"
-    program.write_text(f"#!/bin/sh\ncat <<'END'\n{json.dumps([EXIFTOOL_ANSWER])}\nEND\n")
+    answers = [EXIFTOOL_ANSWER | {"SourceFile": str(tmp_path / "unreadable.jpg")}]
+    program.write_text(f"#!/bin/sh\ncat <<'END'\n{json.dumps(answers)}\nEND\n")
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     (tmp_path / "unreadable.jpg").write_text("")
@@ -197,7 +115,63 @@ def test_exiftool_fills_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monk
     assert metadata.focus is not None
     assert metadata.focus.distance_m == pytest.approx(0.4467, rel=1e-4)
     program.write_text("#!/bin/sh\nexit 1\n")
-    assert read_with_exiftool(tmp_path / "unreadable.jpg") == PhotoMetadata()
+    assert read_with_exiftool([tmp_path / "unreadable.jpg"] * 2) == [PhotoMetadata()] * 2
+
+
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="exiftool is not on PATH")
+def test_the_real_exiftool_agrees_with_exiv2(shared_data: Path, tmp_path: Path) -> None:
+    """Where both decode the same tag; CRW's distances it reads as cm with no lower end, and they stay unknown."""
+    names = [name for name in STATED if not name.endswith(".crw")]
+    (tmp_path / "text.jpg").write_text("no photograph")
+    *found, unreadable = read_with_exiftool([*(shared_data / name for name in names), tmp_path / "text.jpg"])
+    assert unreadable == PhotoMetadata()
+    for name, metadata in zip(names, found, strict=True):
+        focal_length_mm, f_number, exposure_time_s, distance_m, _ = STATED[name]
+        stated = (metadata.focal_length_mm, metadata.f_number, metadata.exposure_time_s)
+        assert stated == pytest.approx((focal_length_mm, f_number, exposure_time_s), rel=1e-3)
+        assert metadata.focus is not None
+        assert metadata.focus.distance_m == pytest.approx(distance_m, rel=1e-4)
+    assert read_with_exiftool([shared_data / "raw" / "canon_g2_0304.crw"])[0].focus is None
+
+
+def test_exiftool_has_decoded_nikons_code() -> None:
+    """0.446684 m is code 66 of an F lens, half a step of 10^(1/40) either way; Z lenses have 256 times finer steps."""
+    focus = metadata_from_exiftool(EXIFTOOL_ANSWER).focus
+    assert focus is not None
+    assert (focus.nearest_m, focus.farthest_m) == pytest.approx((0.4340, 0.4597), rel=2e-4)
+    z_lens = metadata_from_exiftool(EXIFTOOL_ANSWER | {"FocusDistance": 0.4481, "LensPositionAbsolute": 41250})
+    assert z_lens.lens_position == 41250
+    assert z_lens.focus is not None
+    assert z_lens.focus.nearest_m == z_lens.focus.farthest_m == 0.4481
+
+
+def test_exifread_reads_what_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where exiv2 and exiftool say nothing; the same DNG through exiv2 must say the same."""
+    path = make_raw_photo(tmp_path / "0.dng", scene_rgb(24, 32), 0.8)
+    by_exiv2 = read_metadata(path)
+    monkeypatch.setattr(capture.photos.metadata, "read_tags", lambda _: {})
+    monkeypatch.setenv("PATH", str(tmp_path))
+    by_exifread = read_metadata(path)
+    assert by_exifread.focus is not None
+    assert by_exiv2.focus is not None
+    for name in ("focal_length_mm", "f_number", "exposure_time_s", "iso", "taken_at", "camera_model", "lens_model", "orientation"):
+        assert getattr(by_exifread, name) == getattr(by_exiv2, name), name
+    assert by_exifread.focus_distance_m == pytest.approx(0.8, rel=1e-4)
+    # It reduces fractions, and with them the digits that the interval comes from: it can only be wider.
+    assert by_exifread.focus_interval_m is not None
+    assert by_exiv2.focus_interval_m is not None
+    assert by_exifread.focus_interval_m[0] <= by_exiv2.focus_interval_m[0] < by_exiv2.focus_interval_m[1] <= by_exifread.focus_interval_m[1]
+    assert by_exifread.sensor is not None
+    assert by_exifread.sensor.pitch_mm == pytest.approx(23.5 / 32, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in STATED if not name.endswith(".crw")])
+def test_exifread_agrees_on_real_files(shared_data: Path, name: str) -> None:
+    """It knows no CRW; exposure and focal length of the others are in plain EXIF (or TIFF) tags."""
+    focal_length_mm, f_number, exposure_time_s, _, _ = STATED[name]
+    metadata = metadata_from_tags(read_tags_with_exifread(shared_data / name))
+    stated = (metadata.focal_length_mm, metadata.f_number, metadata.exposure_time_s)
+    assert stated == pytest.approx((focal_length_mm, f_number, exposure_time_s), rel=1e-3)
 
 
 def test_exiftool_sentinels() -> None:
@@ -210,70 +184,7 @@ def test_exiftool_sentinels() -> None:
     assert distance_m(SubjectDistance=4294967295) == math.inf
     assert distance_m(FocusDistanceLower=4.46, FocusDistanceUpper=4.84) == pytest.approx(4.6422, rel=1e-4)
     assert distance_m(FocusDistanceLower=4, FocusDistanceUpper=655.35) == pytest.approx(8.0)
+    assert distance_m(FocusDistance=1.5, LensPositionAbsolute=-3, Make="NIKON CORPORATION") == math.inf
+    assert distance_m(FocusDistance=1.5, LensPositionAbsolute=5210, Make="NIKON CORPORATION") == 1.5
     # In CRW files exiftool reads mm as cm and finds no lower end: no word at all is better.
     assert distance_m(FocusDistanceLower=0, FocusDistanceUpper=6.88) is None
-
-
-def write_sidecar(folder: Path, text: str) -> Path:
-    path = folder / "lens.toml"
-    path.write_text(text)
-    return path
-
-
-def test_sidecar_overrides_and_fills(tmp_path: Path) -> None:
-    path = write_sidecar(
-        tmp_path,
-        'focal_length_mm = 35\nf_number = 1.8\nsensor_width_mm = 23.5\nblades = 7\nfocus_distances_m = [0.5, inf]\nfocus_origin = "lens"',
-    )
-    sidecar = read_sidecar(path)
-    first, second = sidecar.applied(["a.jpg", "b.jpg"], [PhotoMetadata(f_number=4.0, iso=100.0), PhotoMetadata()])
-    assert (first.focal_length_mm, first.f_number, first.iso) == (35.0, 1.8, 100.0)
-    assert (first.focus_distance_m, second.focus_distance_m) == (0.5, math.inf)
-    assert len(sidecar.aperture.outlines[0]) == 7
-
-
-def test_sidecar_table_and_film_plane(tmp_path: Path) -> None:
-    text = 'focal_length_mm = 50\nfocus_origin = "film_plane"\n[focus_distances_m]\n"b.jpg" = 0.2\n"typo.jpg" = 1'
-    sidecar = read_sidecar(write_sidecar(tmp_path, text))
-    first, second = sidecar.applied(["a.jpg", "b.jpg"], [PhotoMetadata(), PhotoMetadata()])
-    assert first.focus_distance_m is None
-    # 50 mm at 1:1: lens and sensor 0.1 m apart, 0.1 m to the subject.
-    assert second.focus_distance_m == pytest.approx(0.1)
-    assert sidecar.unmatched_names(["a.jpg", "b.jpg"]) == ["typo.jpg"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("focal_lenght_mm = 35\naperture = 2", "unknown keys aperture, focal_lenght_mm. Known are focal_length_mm, f_number"),
-        ("f_number = 0", "f_number must be positive"),
-        ("f_number = inf", "f_number must be positive"),
-        ('f_number = "2.8"', "f_number must be a number"),
-        ("blades = 2", "blades must be a whole number of at least 3"),
-        ('focus_origin = "tripod"', "focus_origin must be one of lens, film_plane"),
-        ("focus_distances_m = 1.0", "focus_distances_m must be a list of metres or a table"),
-        ("focus_distances_m = [1.0, -2.0]", "focus_distances_m must be positive"),
-        ("f_number = ", "not valid TOML"),
-    ],
-)
-def test_sidecar_mistakes_are_named(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_sidecar(write_sidecar(tmp_path, text))
-
-
-def test_sidecar_with_too_few_distances(tmp_path: Path) -> None:
-    sidecar = read_sidecar(write_sidecar(tmp_path, "focus_distances_m = [1.0, 2.0]"))
-    with pytest.raises(InputError, match="lists 2 distances, but there are 3 photographs"):
-        sidecar.applied(["a", "b", "c"], [PhotoMetadata()] * 3)
-
-
-def test_nearest_sidecar_upwards_is_found(tmp_path: Path) -> None:
-    inner = tmp_path / "top" / "view_0"
-    inner.mkdir(parents=True)
-    outside = write_sidecar(tmp_path, "f_number = 1")
-    assert find_sidecar(inner, tmp_path / "top") is None, f"{outside} lies above the folder that was named"
-    top = write_sidecar(tmp_path / "top", "f_number = 2")
-    assert find_sidecar(inner, tmp_path / "top") == top
-    own = write_sidecar(inner, "f_number = 4")
-    assert find_sidecar(inner, tmp_path / "top") == own
-    assert Sidecar().applied(["a"], [PhotoMetadata()]) == [PhotoMetadata()]

@@ -13,6 +13,8 @@ from mrbokeh.focal_stack import FocalStack, find_focal_stacks
 from mrbokeh.lens import Lens
 
 _SAME = 1e-3
+# Low confidence and saturation have thresholds of their own.
+_LEFT_OUT = ("moving", "border", "board")
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class Pair:
     """One slice and what it was made of.
 
     all_in_focus, target: (H, W, 3) linear radiance. coc_px: (H, W) signed diameters.
-    weight: (H, W), 1 where the pixel counts, 0 where its depth or its radiance is not known.
+    weight: (H, W), 1 where the pixel counts, 0 where its depth or its radiance is not known or something moved.
     """
 
     all_in_focus: Float32[np.ndarray, "height width 3"]
@@ -67,6 +69,10 @@ class PairSet:
 def read_pair(stack: FocalStack, index: int, least_confidence: float = 0.1, saturation: float | None = None) -> Pair:
     target, depth_m = stack.slice_rgb(index), stack.depth_m()
     weight = (stack.depth_confidence() >= least_confidence).astype(np.float32)
+    weight[~stack.slice_masks(index).valid] = 0.0
+    for reason, excluded in stack.exclusions().items():
+        if reason in _LEFT_OUT:
+            weight[excluded] = 0.0
     if saturation is not None:
         weight[target.max(axis=2) >= saturation] = 0.0
     return Pair(stack.all_in_focus(), stack.coc_px(index, depth_m), target, weight)

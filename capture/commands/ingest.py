@@ -9,11 +9,13 @@ from mrbokeh.errors import InputError
 
 HELP = "\n\n".join(
     (
-        "Develop photographs into focal stacks: scene-linear Rec.709 slices, evened-out exposure, lens and focus distances.",
+        "Develop photographs into focal stacks: slices in linear camera RGB, one white balance and one exposure scale for all "
+        "stacks of the scene (kept in SCENE/session.json), lens and focus distances.",
         "A folder is a stack. A folder whose shots lie far apart in time, or in which the focus goes back, is split only with "
         "--group time or --group focus. Slices are ordered by focus distance, nearest first, where all distances are known, "
         "else by file name. Pictures are not rotated.",
-        "What metadata lacks is read from a lens.toml beside the photographs. Unusable files are named and skipped; slices that "
+        "What metadata lacks is read from a lens.toml (lens) and a focus.csv (file,focus_distance_m,nearest_m,farthest_m) beside "
+        "the photographs. Unusable files are named and skipped; slices that "
         "are there already are kept.",
         "Example:  mrbokeh capture ingest shoot/ --out scene/",
         "Example:  mrbokeh capture ingest a.NEF b.NEF c.NEF --out scene/ --sidecar lens.toml --max-width 1500",
@@ -26,9 +28,11 @@ def ingest_command(
     out: Annotated[Path, typer.Option(metavar="SCENE", help="folder for the stacks, one folder each")],
     group: Annotated[str, typer.Option(help="what makes a stack: folder, time (pauses), focus (sweeps) or none (all in one)")] = "folder",
     white_balance: Annotated[
-        str, typer.Option(metavar="camera|R,G,B", help="for RAW: the camera's of the first slice, for the whole stack; or multipliers")
+        str, typer.Option(metavar="camera|R,G,B", help="for RAW: the camera's of the scene's first file, for all stacks; or multipliers")
     ] = "camera",
-    sidecar: Annotated[Path | None, typer.Option(metavar="lens.toml", help="for all photographs, instead of those beside them")] = None,
+    sidecar: Annotated[
+        Path | None, typer.Option(metavar="lens.toml|focus.csv", help="for all photographs, instead of those beside them")
+    ] = None,
     half_size: Annotated[bool, typer.Option("--half-size", help="half the size, without demosaicing: a quick look")] = False,
     max_width: Annotated[int | None, typer.Option(min=16, metavar="N", help="reduce wider pictures to N pixels (area averages)")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="make all slices again")] = False,

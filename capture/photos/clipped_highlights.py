@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 NEARLY_FULL = 0.95
+_ROWS_AT_ONCE = 256
 
 
 def neutral_where_full(
@@ -18,6 +19,10 @@ def neutral_where_full(
     ceilings: what a full red, green and blue read (the white balance multipliers). From 95 % of its ceiling on a channel
     moves over smoothly, so that demosaicing leaves no seam. Coloured lights, whose other channels are not full, keep their hue.
     """
-    fullness = np.clip((camera_rgb / np.asarray(ceilings, np.float32) - NEARLY_FULL) / (1.0 - NEARLY_FULL), 0.0, 1.0)
-    brightest = camera_rgb.max(axis=2, keepdims=True)
-    return (camera_rgb + fullness * (brightest - camera_rgb)).astype(np.float32)
+    result = np.empty_like(camera_rgb)
+    # Strips, because the steps between take several times the memory of what they are made from.
+    for first in range(0, len(camera_rgb), _ROWS_AT_ONCE):
+        rows = camera_rgb[first : first + _ROWS_AT_ONCE]
+        fullness = np.clip((rows / np.asarray(ceilings, np.float32) - NEARLY_FULL) / (1.0 - NEARLY_FULL), 0.0, 1.0)
+        result[first : first + _ROWS_AT_ONCE] = rows + fullness * (rows.max(axis=2, keepdims=True) - rows)
+    return result

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from capture.photos.raw import RAW_SUFFIXES, DecodedPhoto, decode_raw
+from capture.photos.decoded_photo import DecodedPhoto, Photosites
+from capture.photos.raw import RAW_SUFFIXES, decode_raw
+from capture.photos.saturation import dilated, resized_share
 from mrbokeh.image_io import INTEGER_SUFFIXES, read_image
 
 _LARGEST_HALF = 65504.0
@@ -28,36 +30,44 @@ def stored_as_half(path: Path) -> bool:
 def develop(
     path: Path, white_balance: tuple[float, float, float] | None, *, half_size: bool = False, max_width: int | None = None
 ) -> DecodedPhoto:
-    """A photograph in scene-linear Rec.709, the way up in which it is stored (EXIF orientation is not applied).
+    """A photograph in linear light, the way up in which it is stored (EXIF orientation is not applied).
 
-    RAW through `decode_raw`; PNG, TIFF and JPEG as sRGB; EXR and HDR as they are. Smaller sizes are area averages of light.
+    RAW through `decode_raw` in camera RGB; PNG, TIFF and JPEG as sRGB, EXR and HDR as they are, both in Rec.709. Smaller
+    sizes are area averages of light, and of the share that is saturated.
     """
     if is_raw(path):
         decoded = decode_raw(path, white_balance, half_size=half_size)
     else:
         decoded = _picture(path)
         if half_size:
-            decoded = replace(decoded, rgb=_no_wider(decoded.rgb, max(1, decoded.rgb.shape[1] // 2)))
-    return decoded if max_width is None else replace(decoded, rgb=_no_wider(decoded.rgb, max_width))
+            decoded = _no_wider(decoded, max(1, decoded.rgb.shape[1] // 2))
+    return decoded if max_width is None else _no_wider(decoded, max_width)
 
 
 def _picture(path: Path) -> DecodedPhoto:
     rgb = read_image(path)
+    height, width = rgb.shape[:2]
     if path.suffix.lower() in INTEGER_SUFFIXES:
-        return DecodedPhoto(rgb, np.any(rgb >= _FULL, axis=-1))
+        full = np.any(rgb >= _FULL, axis=-1)
+        return DecodedPhoto(rgb, None, dilated(full).astype(np.float32), Photosites(width, height, int(np.count_nonzero(full))))
     finite = np.isfinite(rgb)
     remarks: tuple[str, ...] = ()
     if not finite.all():
         remarks = (f"{np.count_nonzero(~finite.all(axis=-1))} pixels were not finite: NaN became 0, infinity {_LARGEST_HALF:g}",)
         rgb = np.nan_to_num(rgb, nan=0.0, posinf=_LARGEST_HALF, neginf=0.0)
-    return DecodedPhoto(rgb, np.zeros(rgb.shape[:2], bool), saturation_level=None, remarks=remarks)
+    return DecodedPhoto(rgb, None, np.zeros((height, width), np.float32), Photosites(width, height), saturation_level=None, remarks=remarks)
 
 
-def _no_wider(rgb: Float32[np.ndarray, "height width 3"], width: int) -> Float32[np.ndarray, "new_height new_width 3"]:
+def _no_wider(decoded: DecodedPhoto, width: int) -> DecodedPhoto:
     """Area averages in linear light, so that small lights keep their energy."""
+    height_now, width_now = decoded.rgb.shape[:2]
+    if width_now <= width:
+        return decoded
+    height = max(1, round(height_now * width / width_now))
+    return replace(decoded, rgb=_reduced(decoded.rgb, width, height), saturated=resized_share(decoded.saturated, width, height))
+
+
+def _reduced(rgb: Float32[np.ndarray, "height width 3"], width: int, height: int) -> Float32[np.ndarray, "new_height new_width 3"]:
     import cv2
 
-    height_now, width_now = rgb.shape[:2]
-    if width_now <= width:
-        return rgb
-    return cv2.resize(rgb, (width, max(1, round(height_now * width / width_now))), interpolation=cv2.INTER_AREA)
+    return cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)

@@ -1,19 +1,12 @@
-"""The focus distance that a photograph states: EXIF, Canon, Nikon and Olympus maker notes, XMP; and how far to trust it.
-
-Cameras count from the film plane, are coarse (Nikon: steps of 5.9 %) and use sentinels for "unknown" and "infinity".
-"""
+"""FocusReading: a focus distance as somebody stated it, and the way from there to the distance from the lens; numbers in exiv2's tags."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mrbokeh.lens import MM_PER_M
 
 Tags = Mapping[str, str]
-
-UINT32_MAX = 0xFFFFFFFF
-_CM_PER_M = 100.0
-_CANON_INFINITY_CM = 65535.0
 
 
 @dataclass(frozen=True)
@@ -30,23 +23,38 @@ class FocusReading:
     origin: str
     source: str
 
-    def lens_distance_m(self, focal_length_mm: float | None) -> float | None:
-        """Distance from the lens, or None where the focal length is needed and unknown or no thin lens fits."""
-        if self.origin == "lens" or math.isinf(self.distance_m):
-            return self.distance_m
-        return None if focal_length_mm is None else lens_distance_m(self.distance_m, focal_length_mm)
+    def lens_distance_m(self, focal_length_mm: float | None, hiatus_mm: float = 0.0) -> float | None:
+        """Distance from the front principal plane, or None where the focal length is needed and unknown or no lens of it fits."""
+        return self._from_lens(self.distance_m, focal_length_mm, hiatus_mm)
+
+    def lens_interval_m(self, focal_length_mm: float | None, hiatus_mm: float = 0.0) -> tuple[float, float] | None:
+        """(nearest, farthest) from the front principal plane; None where the distance itself is not known from there."""
+        distance_m = self.lens_distance_m(focal_length_mm, hiatus_mm)
+        farthest_m = self._from_lens(self.farthest_m, focal_length_mm, hiatus_mm)
+        if distance_m is None or farthest_m is None:
+            return None
+        nearest_m = self._from_lens(self.nearest_m, focal_length_mm, hiatus_mm)
+        # Nearer than a lens of this focal length reaches: it ends at 1:1, two focal lengths before the lens.
+        shortest_m = min(distance_m, 2.0 * (focal_length_mm or 0.0) / MM_PER_M)
+        return (shortest_m if nearest_m is None else nearest_m), farthest_m
+
+    def _from_lens(self, stated_m: float, focal_length_mm: float | None, hiatus_mm: float) -> float | None:
+        if self.origin == "lens" or math.isinf(stated_m):
+            return stated_m
+        return None if focal_length_mm is None else lens_distance_m(stated_m, focal_length_mm, hiatus_mm)
 
 
-def lens_distance_m(film_plane_m: float, focal_length_mm: float) -> float | None:
-    """The distance d_f from a thin lens for a distance D = d_f + d_s from the film plane, d_s = f d_f / (d_f - f).
+def lens_distance_m(film_plane_m: float, focal_length_mm: float, hiatus_mm: float = 0.0) -> float | None:
+    """The distance d_f from the front principal plane for a distance D = d_f + h + d_s from the film plane, d_s = f d_f / (d_f - f).
 
-    d_f is the far root of d_f^2 - D d_f + D f = 0. None below D = 4 f, which no thin lens of that focal length reaches.
+    h is the hiatus, the distance between the principal planes (0 for a thin lens). d_f is the far root of
+    d_f^2 - (D - h) d_f + (D - h) f = 0. None below D = 4 f + h, which no lens of that focal length reaches.
     """
     if math.isinf(film_plane_m):
         return film_plane_m
-    focal_m = focal_length_mm / MM_PER_M
-    discriminant = film_plane_m * (film_plane_m - 4.0 * focal_m)
-    return 0.5 * (film_plane_m + math.sqrt(discriminant)) if discriminant >= 0.0 else None
+    focal_m, conjugates_m = focal_length_mm / MM_PER_M, film_plane_m - hiatus_mm / MM_PER_M
+    discriminant = conjugates_m * (conjugates_m - 4.0 * focal_m)
+    return 0.5 * (conjugates_m + math.sqrt(discriminant)) if conjugates_m > 0.0 and discriminant >= 0.0 else None
 
 
 def rational(text: str | None) -> tuple[int, int] | None:
@@ -64,97 +72,3 @@ def number(text: str | None) -> float | None:
     """The first number of a tag as float; None for nothing, 0/0 and x/0."""
     parts = rational(text)
     return None if parts is None or parts[1] == 0 else parts[0] / parts[1]
-
-
-def read_focus(tags: Tags) -> FocusReading | None:
-    """The focus distance stated by exiv2's tags, from the most to the least trustworthy source; None where unknown."""
-    readers: tuple[Callable[[Tags], FocusReading | None], ...] = (_canon_interval, _subject_distance, _nikon, _olympus, _canon_shot, _adobe)
-    return next((reading for reader in readers if (reading := reader(tags)) is not None), None)
-
-
-def _at_infinity(source: str) -> FocusReading:
-    return FocusReading(math.inf, math.inf, math.inf, "film_plane", source)
-
-
-def _subject_distance(tags: Tags) -> FocusReading | None:
-    return _rational_distance(tags, ("Exif.Photo.SubjectDistance", "Exif.Image.SubjectDistance"))
-
-
-def _adobe(tags: Tags) -> FocusReading | None:
-    """Adobe's converters copy the maker note's distance here."""
-    return _rational_distance(tags, ("Xmp.aux.ApproximateFocusDistance",))
-
-
-def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | None:
-    """Metres as a fraction, good to half a unit of its last digit; 0 and 0/0 are unknown, 0xFFFFFFFF is infinity."""
-    for name in names:
-        parts = rational(tags.get(name))
-        if parts is None or parts[0] <= 0:
-            continue
-        numerator, denominator = parts
-        source = f"{name} = {tags[name]}"
-        if numerator == UINT32_MAX:
-            return _at_infinity(source)
-        if denominator > 0:
-            return FocusReading(
-                numerator / denominator, (numerator - 0.5) / denominator, (numerator + 0.5) / denominator, "film_plane", source
-            )
-    return None
-
-
-def _canon_interval(tags: Tags) -> FocusReading | None:
-    """Canon file info: the farthest and the nearest distance in cm. The middle is taken in dioptres, in which blur is linear."""
-    farthest_cm = number(tags.get("Exif.CanonFi.FocusDistanceUpper")) or 0.0
-    nearest_cm = number(tags.get("Exif.CanonFi.FocusDistanceLower")) or 0.0
-    source = f"Exif.CanonFi.FocusDistanceLower, Upper = {nearest_cm:g}, {farthest_cm:g} cm"
-    return canon_reading(nearest_cm / _CM_PER_M, farthest_cm / _CM_PER_M, source)
-
-
-def canon_reading(nearest_m: float, farthest_m: float, source: str) -> FocusReading | None:
-    """Between two distances in metres: an upper one of 0 says nothing, 655.35 is infinity, a lower one of 0 is missing."""
-    if farthest_m <= 0.0:
-        return None
-    nearest_m, farthest_m = (math.inf if each >= _CANON_INFINITY_CM / _CM_PER_M - 1e-6 else each for each in (nearest_m, farthest_m))
-    nearest_m = min(nearest_m, farthest_m) if nearest_m > 0.0 else farthest_m
-    middle_dioptres = 0.5 * (1.0 / nearest_m + 1.0 / farthest_m)
-    return FocusReading(1.0 / middle_dioptres if middle_dioptres else math.inf, nearest_m, farthest_m, "film_plane", source)
-
-
-def _canon_shot(tags: Tags) -> FocusReading | None:
-    """Canon shot info: cm, but mm in the PowerShots that write CRW.
-
-    exiv2 and exiftool read cm throughout. A G2's JPEG says 1.50 m in EXIF and 1503 here; an S40 that fills its frame
-    (7.1 mm lens, 7.26 mm sensor) with a box of 0.2 m says 188.
-    """
-    name = "Exif.CanonSi.SubjectDistance"
-    value = number(tags.get(name))
-    if value is None or value <= 0:
-        return None
-    if value >= _CANON_INFINITY_CM:
-        return _at_infinity(f"{name} = {value:g}")
-    in_mm = tags.get("mime_type") == "image/x-canon-crw" and "PowerShot" in tags.get("Exif.Image.Model", "")
-    per_m, unit = (MM_PER_M, "mm") if in_mm else (_CM_PER_M, "cm")
-    return FocusReading(value / per_m, (value - 0.5) / per_m, (value + 0.5) / per_m, "film_plane", f"{name} = {value:g} {unit}")
-
-
-def _nikon(tags: Tags) -> FocusReading | None:
-    """Nikon lens data: d = 0.01 * 10^(v / 40) m with an 8-bit v; Z lenses add 8 bits of fraction (v / 256)."""
-    for name, units in (("Ld4.FocusDistance2", 256), ("Ld4.FocusDistance", 1), ("Ld3.FocusDistance", 1), ("Ld2.FocusDistance", 1)):
-        value = number(tags.get(f"Exif.Nikon{name}"))
-        if value is not None and 0 < value < UINT32_MAX:
-            code, half_step = value / units, 0.5 / units
-            nearest_m, distance_m, farthest_m = (0.01 * 10.0 ** (each / 40.0) for each in (code - half_step, code, code + half_step))
-            return FocusReading(distance_m, nearest_m, farthest_m, "film_plane", f"Exif.Nikon{name} = {value:g}")
-    return None
-
-
-def _olympus(tags: Tags) -> FocusReading | None:
-    """Olympus: the numerator counts mm whatever the denominator says (E-1 writes 1, E-300 writes 10); 0xFFFFFFFF is infinity."""
-    name = "Exif.OlympusFi.FocusDistance"
-    parts = rational(tags.get(name))
-    if parts is None or parts[0] <= 0:
-        return None
-    if parts[0] == UINT32_MAX:
-        return _at_infinity(f"{name} = {tags[name]}")
-    distance_m = parts[0] / MM_PER_M
-    return FocusReading(distance_m, distance_m - 0.5 / MM_PER_M, distance_m + 0.5 / MM_PER_M, "film_plane", f"{name} = {tags[name]}")

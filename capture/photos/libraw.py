@@ -5,7 +5,7 @@ brightest pixel, and defocused slices drift by up to a third; HighlightMode.Igno
 back out, else a white-balanced red clips at half its range; no auto-brightening, no gamma, no rotation; AAHD
 demosaicing, then one median over the colour differences, which takes the coloured fringes off small bright lights (0.4 dB
 for the merged picture of a traced desk with lamps). LibRaw cuts off below the black level, so the noise of black areas is
-one-sided.
+one-sided. Files without a mosaic (linear DNG, sRAW) are not filtered.
 """
 
 from collections.abc import Iterator
@@ -43,10 +43,15 @@ def opened_raw(path: Path) -> Iterator["rawpy.RawPy"]:
             raise InputError(f"{path}: expected a sensor with red, green and blue, but its colours are {raw.color_desc.decode()!r}")
         yield raw
     except rawpy.LibRawError as error:
-        reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
-        raise InputError(f"{path} cannot be decoded as RAW: {reason}") from None
+        raise InputError(f"{path} cannot be decoded as RAW: {_reason(path, error)}") from None
     finally:
         raw.close()
+
+
+def _reason(path: Path, error: Exception) -> str:
+    if path.suffix.lower() == ".gpr":
+        return "GoPro's GPR needs GoPro's own decoder, which LibRaw comes without: convert it with Adobe DNG Converter"
+    return error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
 
 
 def processed(raw: "rawpy.RawPy", multipliers: tuple[float, float, float], space: "rawpy.ColorSpace", half_size: bool) -> np.ndarray:
@@ -54,9 +59,10 @@ def processed(raw: "rawpy.RawPy", multipliers: tuple[float, float, float], space
     import rawpy
 
     red, green, blue = multipliers
+    demosaiced_here = raw.raw_type == rawpy.RawType.Flat and not half_size
     return raw.postprocess(
         user_wb=[red, green, blue, green], output_color=space, gamma=(1, 1), output_bps=16, no_auto_bright=True, bright=1.0,
-        median_filter_passes=0 if half_size else 1,
+        median_filter_passes=1 if demosaiced_here else 0,
         adjust_maximum_thr=0.0, highlight_mode=rawpy.HighlightMode.Ignore, user_flip=0,
         demosaic_algorithm=rawpy.DemosaicAlgorithm.AAHD, half_size=half_size,
     )  # fmt: skip

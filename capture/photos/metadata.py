@@ -1,11 +1,13 @@
-"""What a photograph tells about how it was taken: through pyexiv2, and where that leaves gaps through exiftool if it is installed."""
+"""What a photograph tells about how it was taken: through pyexiv2, then for what is still open exiftool and exifread."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 
+from capture.photos.exifread_metadata import read_tags_with_exifread
 from capture.photos.exiftool_metadata import read_with_exiftool
-from capture.photos.focus_metadata import Tags, number, read_focus
+from capture.photos.focus_metadata import Tags, number
+from capture.photos.focus_tags import read_focus
 from capture.photos.photo_metadata import PhotoMetadata, parse_time
 from capture.photos.sensor_metadata import read_sensor
 
@@ -14,11 +16,25 @@ _NO_MESSAGES = 4
 
 def read_metadata(path: Path) -> PhotoMetadata:
     """The shooting data of a photograph; all None where the file has none or cannot be read."""
-    tags = read_tags(path)
-    metadata = metadata_from_tags(tags)
-    if None in (metadata.focal_length_mm, metadata.f_number, metadata.focus, metadata.exposure_time_s):
-        metadata = metadata.filled_from(read_with_exiftool(path))
-    return metadata
+    return read_metadata_of([path])[0]
+
+
+def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda: None) -> list[PhotoMetadata]:
+    """The shooting data of photographs; `advance` is called after each."""
+    found = []
+    for path in paths:
+        found.append(metadata_from_tags(read_tags(path)))
+        advance()
+    gaps = [index for index, metadata in enumerate(found) if _has_gaps(metadata)]
+    for index, more in zip(gaps, read_with_exiftool([paths[index] for index in gaps]), strict=True):
+        found[index] = found[index].filled_from(more)
+        if _has_gaps(found[index]):
+            found[index] = found[index].filled_from(metadata_from_tags(read_tags_with_exifread(paths[index])))
+    return found
+
+
+def _has_gaps(metadata: PhotoMetadata) -> bool:
+    return None in (metadata.focal_length_mm, metadata.f_number, metadata.focus, metadata.exposure_time_s)
 
 
 def read_tags(path: Path) -> dict[str, str]:

@@ -4,12 +4,36 @@ from dataclasses import dataclass, fields, replace
 from datetime import datetime
 
 from capture.photos.focus_metadata import FocusReading
-from capture.photos.sensor_metadata import SensorReading
+from capture.photos.sensor_reading import SensorReading
+
+
+@dataclass(frozen=True)
+class StatedExposure:
+    """What the signal of a scene is proportional to, so far as the camera keeps its word: time_s x ISO / f-number squared.
+
+    f_number: None with lenses that do not tell the camera, whose aperture is taken to stay as it is.
+    """
+
+    time_iso_s: float
+    f_number: float | None = None
+
+    def gain_to(self, other: "StatedExposure") -> float | None:
+        """The factor from this exposure to another; None where only one of them states its f-number."""
+        if self.f_number is None and other.f_number is None:
+            return other.time_iso_s / self.time_iso_s
+        if self.f_number is None or other.f_number is None:
+            return None
+        return other.time_iso_s / self.time_iso_s * (self.f_number / other.f_number) ** 2
 
 
 @dataclass(frozen=True)
 class PhotoMetadata:
-    """The shooting data of one photograph; None is unknown. orientation: the EXIF tag (1 is upright), which nobody applies here."""
+    """The shooting data of one photograph; None is unknown.
+
+    orientation: the EXIF tag (1 is upright), which nobody applies here.
+    lens_position: where the focus drive of the lens stood, in the maker's steps (Nikon Z), finer than its distances.
+    hiatus_mm: distance between the principal planes of the lens, which no file states.
+    """
 
     focal_length_mm: float | None = None
     f_number: float | None = None
@@ -21,6 +45,8 @@ class PhotoMetadata:
     focus: FocusReading | None = None
     sensor: SensorReading | None = None
     orientation: int | None = None
+    lens_position: int | None = None
+    hiatus_mm: float = 0.0
 
     def filled_from(self, other: "PhotoMetadata") -> "PhotoMetadata":
         """What is unknown here, taken from another source."""
@@ -28,16 +54,20 @@ class PhotoMetadata:
         return replace(self, **gaps)
 
     @property
-    def relative_exposure(self) -> float | None:
-        """Exposure time x ISO / f-number squared: proportional to the signal of a scene, so far as the camera keeps its word."""
-        if not self.exposure_time_s or not self.iso or not self.f_number:
+    def exposure(self) -> "StatedExposure | None":
+        if not self.exposure_time_s or not self.iso:
             return None
-        return self.exposure_time_s * self.iso / self.f_number**2
+        return StatedExposure(self.exposure_time_s * self.iso, self.f_number or None)
 
     @property
     def focus_distance_m(self) -> float | None:
-        """From the lens, or None."""
-        return None if self.focus is None else self.focus.lens_distance_m(self.focal_length_mm)
+        """From the front principal plane of the lens, or None."""
+        return None if self.focus is None else self.focus.lens_distance_m(self.focal_length_mm, self.hiatus_mm)
+
+    @property
+    def focus_interval_m(self) -> tuple[float, float] | None:
+        """(nearest, farthest) from there: what the statement may stand for."""
+        return None if self.focus is None else self.focus.lens_interval_m(self.focal_length_mm, self.hiatus_mm)
 
 
 def parse_time(text: str | None) -> datetime | None:

@@ -1,11 +1,6 @@
-"""Camera RAW to scene-linear Rec.709, unclipped, on one exposure scale: 1.0 is where the raw green channel saturates.
-
-X-Trans: LibRaw's parallel decoding of compressed RAF is not reproducible to the last bit (LibRaw issue 845); with
-OMP_NUM_THREADS=1 in the environment it is.
-"""
+"""Camera RAW to linear white-balanced camera RGB, unclipped, on one exposure scale: 1.0 is where the raw green channel saturates."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,10 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from capture.photos.clipped_highlights import neutral_where_full
+from capture.photos.decoded_photo import DecodedPhoto, Photosites
 from capture.photos.libraw import MAX_16_BIT, WhiteBalance, matrix_used_by_libraw, opened_raw, processed, rec709_from_balanced_camera
 from capture.photos.photo_metadata import PhotoMetadata
+from capture.photos.saturation import full_photosites, saturated_share
 from capture.photos.whole_file import require_whole_tiff
-from mrbokeh.color import convert
+from capture.photos.x_trans import X_TRANS_SIZE, decode_in_one_thread, decodes_reproducibly
+from mrbokeh.camera_rgb import matrix3x3
 from mrbokeh.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,46 +26,40 @@ RAW_SUFFIXES = (
     ".erf", ".fff", ".gpr", ".iiq", ".k25", ".kdc", ".mdc", ".mef", ".mos", ".mrw", ".nef", ".nrw",
     ".orf", ".pef", ".ptx", ".pxn", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
 )  # fmt: skip
-_X_TRANS_SIZE = (6, 6)
-
-
-@dataclass(frozen=True)
-class DecodedPhoto:
-    """One photograph in linear light.
-
-    rgb: (H, W, 3) scene-linear Rec.709.
-    saturated: (h, w) where the sensor gave no more than "full", on the sensor's own grid, which may be finer than rgb.
-    white_balance: multipliers of red, green, blue, green being 1; None where it was applied before (JPEG, EXR).
-    saturation_level: the linear value of a saturated green or grey; None where there is no such thing (EXR).
-    remarks: what a reader of the result should know.
-    """
-
-    rgb: Float32[np.ndarray, "height width 3"]
-    saturated: Bool[np.ndarray, "sensor_height sensor_width"]
-    white_balance: WhiteBalance | None = None
-    saturation_level: float | None = 1.0
-    remarks: tuple[str, ...] = ()
 
 
 def decode_raw(path: Path, white_balance: WhiteBalance | None = None, *, half_size: bool = False) -> DecodedPhoto:
-    """A RAW file in linear Rec.709. white_balance: multipliers of red, green, blue, or None for the camera's own.
+    """A RAW file in linear camera RGB. white_balance: multipliers of red, green, blue, or None for the camera's own.
 
-    half_size: one pixel per 2x2 photosites, without demosaicing: fast, for a quick look.
+    half_size: one pixel per 2x2 photosites, without demosaicing: fast, for a quick look. X-Trans is decoded in a process
+    of its own (capture.photos.x_trans), so that it comes out the same every time.
     Raises InputError where LibRaw cannot decode the file, the file is cut short, or the sensor does not see RGB.
     """
     require_whole_tiff(path)
     with opened_raw(path) as raw:
         raw.unpack()
-        # The pattern changes once a half-size picture was made, hence everything about the mosaic is asked before.
-        remarks = list(_remarks(raw))
-        multipliers = _normalised(white_balance) if white_balance is not None else _camera_white_balance(raw)
-        matrix = rec709_from_balanced_camera(np.array(raw.color_matrix), np.array(raw.rgb_xyz_matrix))
-        saturated = _saturated(raw)
-        camera_rgb = neutral_where_full(_balanced_camera_rgb(raw, multipliers, half_size), multipliers)
-        if matrix is None:
-            matrix = matrix_used_by_libraw(raw)
-            remarks += ["LibRaw has no colour matrix for this camera: its own primaries are kept"] if np.allclose(matrix, np.eye(3)) else []
-    return DecodedPhoto(convert(camera_rgb, matrix), saturated, multipliers, 1.0, tuple(remarks))
+        apart = raw.raw_pattern is not None and raw.raw_pattern.shape == X_TRANS_SIZE and not decodes_reproducibly()
+        if not apart:
+            return _decoded(raw, white_balance, half_size)
+    return decode_in_one_thread(path, white_balance, half_size)
+
+
+def _decoded(raw: "rawpy.RawPy", white_balance: WhiteBalance | None, half_size: bool) -> DecodedPhoto:
+    # The pattern changes once a half-size picture was made, hence everything about the mosaic is asked before.
+    remarks = list(_remarks(raw))
+    multipliers = _normalised(white_balance) if white_balance is not None else _camera_white_balance(raw)
+    matrix = rec709_from_balanced_camera(np.array(raw.color_matrix), np.array(raw.rgb_xyz_matrix))
+    full = full_photosites(raw)
+    camera_rgb = neutral_where_full(_balanced_camera_rgb(raw, multipliers, half_size), multipliers)
+    if matrix is None:
+        matrix = matrix_used_by_libraw(raw)
+        remarks += ["LibRaw has no colour matrix for this camera: its own primaries are kept"] if np.allclose(matrix, np.eye(3)) else []
+    share = saturated_share(full, camera_rgb, multipliers)
+    return DecodedPhoto(camera_rgb, matrix3x3(matrix), share, _count(full), multipliers, 1.0, tuple(remarks))
+
+
+def _count(full: Bool[np.ndarray, "sensor_height sensor_width"]) -> Photosites:
+    return Photosites(full.shape[1], full.shape[0], int(np.count_nonzero(full)))
 
 
 def camera_white_balance(path: Path) -> WhiteBalance:
@@ -110,18 +102,8 @@ def _remarks(raw: "rawpy.RawPy") -> Iterator[str]:
         yield "the file states no white balance: LibRaw's daylight multipliers stand in unless others are given"
     if pattern is None and raw.num_colors == 3:
         yield "the file holds RGB without a mosaic (linear DNG, sRAW): it was demosaiced, perhaps reduced, before"
-    if pattern is not None and pattern.shape == _X_TRANS_SIZE:
-        yield "X-Trans: decoded again, values may differ in the last bits unless OMP_NUM_THREADS=1 is set"
     if abs(aspect - 1.0) > 1e-3:
         yield f"the sensor's pixels are {aspect:.3f} times as wide as high: the picture was resampled to square pixels"
-
-
-def _saturated(raw: "rawpy.RawPy") -> Bool[np.ndarray, "sensor_height sensor_width"]:
-    """Where the raw number stands at the white level (of its channel, where the camera states one)."""
-    values, white = raw.raw_image_visible, int(raw.white_level)
-    stated = [int(each) for each in (raw.camera_white_level_per_channel or []) if 0 < int(each) < white]
-    full: np.ndarray = np.asarray(values >= min([white, *stated]))
-    return full if full.ndim == 2 else np.any(full[..., :3], axis=-1)
 
 
 def _balanced_camera_rgb(raw: "rawpy.RawPy", multipliers: WhiteBalance, half_size: bool) -> Float32[np.ndarray, "height width 3"]:

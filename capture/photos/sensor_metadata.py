@@ -1,45 +1,19 @@
-"""The width of the sensor from what a photograph states: pixel pitch, size of the picture it belongs to, 35 mm equivalent."""
+"""The width of the sensor from what a photograph states: pixel pitch, size of the picture it belongs to, model, 35 mm equivalent."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from capture.photos.focus_metadata import Tags, number, rational
+from capture.photos.sensor_reading import SensorReading
+from capture.photos.sensor_table import FULL_FRAME_DIAGONAL_MM, sensor_of_model
 
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH_MM = 25.4
-_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _PLAUSIBLE_WIDTH_MM = (1.0, 80.0)
-# A RAW shows a few pixels more than the JPEG of its camera; a picture that differs by more was resized or cut.
-_MARGIN = 0.05
-_SAME_ASPECT = 0.01
-
-
-@dataclass(frozen=True)
-class SensorReading:
-    """Millimetres per pixel in a picture of full_size_px (width, height), if that size is known; source: the tag it came from."""
-
-    pitch_mm: float
-    full_size_px: tuple[int, int] | None
-    source: str
-
-    def width_mm(self, width_px: int, height_px: int) -> float:
-        """Width on the sensor of a picture as it is stored.
-
-        The full size, or nearly (RAW margins): pitch times width. Another size but the same shape: the picture was
-        resized and shows the full width. Another shape: it was cut out, at full resolution as far as anyone can tell.
-        """
-        if self.full_size_px is None:
-            return self.pitch_mm * width_px
-        upright = (width_px < height_px) != (self.full_size_px[0] < self.full_size_px[1])
-        full_width, full_height = self.full_size_px[::-1] if upright else self.full_size_px
-        resized = abs(width_px / full_width - 1.0) > _MARGIN
-        same_shape = abs(width_px / height_px * full_height / full_width - 1.0) < _SAME_ASPECT
-        return self.pitch_mm * (full_width if resized and same_shape else width_px)
 
 
 def read_sensor(tags: Tags, focal_length_mm: float | None, stored_size_px: tuple[int, int] | None) -> SensorReading | None:
-    """The sensor according to exiv2's tags: FocalPlaneXResolution, Nikon's pixel size, Canon's focal plane, 35 mm equivalent.
+    """The sensor by exiv2's tags: FocalPlaneXResolution, Nikon's pixel size, Canon's focal plane, the model, 35 mm equivalent.
 
     stored_size_px: (width, height) of the file, for tags that speak of the whole frame where EXIF does not state its size.
     """
@@ -48,6 +22,7 @@ def read_sensor(tags: Tags, focal_length_mm: float | None, stored_size_px: tuple
         lambda: _focal_plane_resolution(tags, _stated_size_px(tags)),
         lambda: _nikon_pixel_size(tags, _stated_size_px(tags)),
         lambda: _canon_focal_plane(tags, size_px),
+        lambda: sensor_of_model(tags.get("Exif.Image.Make"), tags.get("Exif.Image.Model"), size_px),
         lambda: _film_equivalent(tags, focal_length_mm, size_px),
     )
     return next((reading for reader in readers if (reading := reader()) is not None and _is_plausible(reading, size_px)), None)
@@ -97,5 +72,5 @@ def _film_equivalent(tags: Tags, focal_length_mm: float | None, size_px: tuple[i
     equivalent = rational(tags.get(name))
     if not equivalent or equivalent[0] <= 0 or not focal_length_mm or size_px is None:
         return None
-    diagonal_mm = _FULL_FRAME_DIAGONAL_MM * focal_length_mm / (equivalent[0] / (equivalent[1] or 1))
+    diagonal_mm = FULL_FRAME_DIAGONAL_MM * focal_length_mm / (equivalent[0] / (equivalent[1] or 1))
     return SensorReading(diagonal_mm / math.hypot(*size_px), size_px, name)

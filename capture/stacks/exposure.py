@@ -1,49 +1,23 @@
-"""Exposure differences within a focal stack, from what defocus leaves alone: the light of large areas.
-
-Blur moves light around but conserves it, so that heavily blurred slices differ by focus breathing (a small scale and
-shift) and by one gain. Both are fitted together, or breathing would pass for exposure: log R(A x + t) = log S(x) + log g,
-Gauss-Newton with Tukey's weights on pictures 96 px long, over the centre only, since vignetting changes with focus and blur
-brings in light from outside at the borders.
-"""
+"""Exposure differences within a focal stack and between the stacks of a scene, from what defocus leaves alone: the light of large areas."""
 
 import math
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from capture.stacks.gain_fit import LARGEST_SCALE_CHANGE, LowFrequency, fit_gain
 
-from mrbokeh.color import luminance
-
-LONG_SIDE_PX = 96
-_BLUR_SIGMAS_PX = (6.0, 3.0)
-_STEPS = 12
-_CENTRE_RADIUS = 0.8
-_LARGEST_SATURATED_SHARE = 0.01
-_TUKEY = 4.685
-_MAD_TO_SIGMA = 1.4826
-_LEAST_SPREAD = 1e-3
-_LARGEST_SCALE_CHANGE = 0.15
-_FEWEST_PIXELS = 200
 _DEAD_ZONE = 0.01
 _RESIDUAL_LIMIT = 1.26
 _UNSTATED_LIMIT = 2.0
-_SMALLEST_STEP = 1e-5
-_TINY = 1e-9
-_PULL = (1e-4, 1e-4, 1e-4)
-
-
-@dataclass(frozen=True)
-class LowFrequency:
-    """A slice reduced to large areas. luminance: (h, w) linear, positive; usable: (h, w) neither saturated nor black."""
-
-    luminance: Float32[np.ndarray, "h w"]
-    usable: Bool[np.ndarray, "h w"]
+_LARGEST_SPREAD = 0.08
+_OVERLAP_DEAD_ZONE = 0.03
 
 
 @dataclass(frozen=True)
 class ExposureGain:
-    """The factor that brings a slice to the exposure of the reference.
+    """The factor that brings a slice to the exposure of the session.
 
+    session: brings the reference of the stack there, 1 where neither metadata nor pictures tell.
+    The others bring the slice to that reference. session_from: what told: "metadata", "overlap" (pictures) or "nothing".
     stated: from exposure time, ISO and f-number, 1 where they are unknown or equal.
     residual: what was found in the pictures on top of that. measured: the same before limits, None where nothing could be.
     """
@@ -51,29 +25,17 @@ class ExposureGain:
     stated: float = 1.0
     residual: float = 1.0
     measured: float | None = None
+    session: float = 1.0
+    session_from: str = "metadata"
 
     @property
     def total(self) -> float:
-        return self.stated * self.residual
+        return self.session * self.stated * self.residual
 
     @property
     def was_limited(self) -> bool:
         """More was measured than applied, by more than the error of measurement."""
         return self.measured is not None and abs(math.log(self.measured / self.residual)) > math.log1p(_DEAD_ZONE)
-
-
-def low_frequency(rgb: Float32[np.ndarray, "height width 3"], saturated: Bool[np.ndarray, "sensor_h sensor_w"]) -> LowFrequency:
-    """Area averages of a slice on a grid LONG_SIDE_PX long, and which of them are free of saturated photosites."""
-    import cv2
-
-    scale = LONG_SIDE_PX / max(rgb.shape[:2])
-    size = max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale))
-    light = cv2.resize(luminance(rgb), size, interpolation=cv2.INTER_AREA)
-    full = cv2.resize(saturated.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    # What is saturated here is spread over its neighbours in the other slices.
-    full = cv2.dilate(full, np.ones((5, 5), np.uint8))
-    floor = max(1e-3 * float(np.median(light)), 1e-7)
-    return LowFrequency(np.maximum(light, floor), (full <= _LARGEST_SATURATED_SHARE) & (light > floor))
 
 
 def evened_out(reference: LowFrequency, slice_: LowFrequency, stated: float | None) -> ExposureGain:
@@ -93,75 +55,17 @@ def evened_out(reference: LowFrequency, slice_: LowFrequency, stated: float | No
 
 def measure_gain(reference: LowFrequency, slice_: LowFrequency) -> float | None:
     """The gain g that brings the slice's light to the reference's, or None where too little of both is usable."""
-    if reference.luminance.shape != slice_.luminance.shape:
+    fit = fit_gain(reference, slice_)
+    return None if fit is None else fit.gain
+
+
+def overlap_gain(reference: LowFrequency, other: LowFrequency) -> float | None:
+    """The gain between two viewpoints of a scene whose files state no exposure; None where they show too different things.
+
+    Parallax is no blur: it is trusted only where little is left once gain, scale and shift are taken out. On traced views of
+    equal exposure that is so in 6 of 10 pairs, off by 1 % at most; the other four would be off by 9 to 16 %.
+    """
+    fit = fit_gain(reference, other)
+    if fit is None or fit.spread > _LARGEST_SPREAD or abs(fit.log_scale) > 0.99 * LARGEST_SCALE_CHANGE:
         return None
-    parameters = np.zeros(4)
-    for sigma_px in _BLUR_SIGMAS_PX:
-        for _ in range(_STEPS):
-            step = _gauss_newton_step(reference, slice_, parameters, sigma_px)
-            if step is None:
-                return None
-            parameters = parameters + step
-            parameters[1] = np.clip(parameters[1], -_LARGEST_SCALE_CHANGE, _LARGEST_SCALE_CHANGE)
-            if np.abs(step).max() < _SMALLEST_STEP:
-                break
-    return float(np.exp(parameters[0]))
-
-
-def _gauss_newton_step(
-    reference: LowFrequency, slice_: LowFrequency, parameters: Float64[np.ndarray, "4"], sigma_px: float
-) -> Float64[np.ndarray, "4"] | None:
-    """One weighted step for (log gain, log scale, shift x, shift y; shifts as a share of half the long side)."""
-    light, usable, x, y = _breathed(reference, parameters)
-    mask = (usable & slice_.usable).astype(np.float64)
-    share = _blurred(mask, sigma_px)
-    inside = (np.hypot(x / np.abs(x).max(), y / np.abs(y).max()) < _CENTRE_RADIUS) & (share > 0.5) & (mask > 0)
-    if np.count_nonzero(inside) < _FEWEST_PIXELS:
-        return None
-    # Both are averaged over the same usable pixels, so that a saturated lamp in one is missing in both.
-    reference_light, slice_light = (_blurred(each * mask, sigma_px) / np.maximum(share, 1e-6) for each in (light, slice_.luminance))
-    reference_log, slice_log = np.log(np.maximum(reference_light, _TINY)), np.log(np.maximum(slice_light, _TINY))
-    slope_y, slope_x = np.gradient(reference_log, y[1, 0] - y[0, 0], x[0, 1] - x[0, 0])
-    jacobian = np.stack([np.full_like(x, -1.0), slope_x * x + slope_y * y, slope_x, slope_y], axis=-1)[inside]
-    error = (reference_log - slice_log)[inside] - parameters[0]
-    # Flare and a wrong black level matter most in the dark.
-    trust = slice_light[inside] / (slice_light[inside] + 0.1 * np.median(slice_light[inside]))
-    return _weighted_solution(jacobian, -error, trust * _tukey(error))
-
-
-def _breathed(
-    low: LowFrequency, parameters: Float64[np.ndarray, "4"]
-) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-    """(light, usable) scaled and shifted, and the grid (x, y) from the centre in units of half the long side."""
-    import cv2
-
-    height, width = low.luminance.shape
-    half = max(height, width) / 2.0
-    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2.0) / half, (np.arange(height) + 0.5 - height / 2.0) / half)
-    scale = math.exp(parameters[1])
-    map_x = ((x * scale + parameters[2]) * half + width / 2.0 - 0.5).astype(np.float32)
-    map_y = ((y * scale + parameters[3]) * half + height / 2.0 - 0.5).astype(np.float32)
-    light = cv2.remap(low.luminance, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    usable = cv2.remap(low.usable.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return light.astype(np.float64), usable > 0.99, x, y
-
-
-def _blurred(values: Float[np.ndarray, "h w"], sigma_px: float) -> Float64[np.ndarray, "h w"]:
-    from scipy.ndimage import gaussian_filter
-
-    return gaussian_filter(np.asarray(values, np.float64), sigma_px, mode="constant")
-
-
-def _tukey(error: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Tukey's biweight around the median: what lies far off (moving things, spread highlights) counts nothing."""
-    spread = max(_MAD_TO_SIGMA * float(np.median(np.abs(error - np.median(error)))), _LEAST_SPREAD)
-    return np.clip(1.0 - ((error - np.median(error)) / (_TUKEY * spread)) ** 2, 0.0, None) ** 2
-
-
-def _weighted_solution(
-    jacobian: Float64[np.ndarray, "n 4"], target: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
-) -> Float64[np.ndarray, "4"]:
-    """Least squares with a slight pull of scale and shift towards no change, for pictures without structure."""
-    normal = jacobian.T @ (jacobian * weights[:, None])
-    normal[np.diag_indices(4)] += weights.sum() * np.array([0.0, *_PULL])
-    return np.linalg.solve(normal, jacobian.T @ (target * weights))
+    return 1.0 if abs(math.log(fit.gain)) <= math.log1p(_OVERLAP_DEAD_ZONE) else fit.gain

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.exr_io import ExrPart, write_exr
+from capture.stacks.disk_space import told_when_full
+from mrbokeh.camera_rgb import Matrix3x3, write_camera_rgb
 
 FOLDER = "slices"
 _ATTRIBUTE = "mrbokehIngest"
@@ -21,11 +22,19 @@ def source_record(path: Path) -> dict[str, Any]:
     return {"source": path.name, "source_size_bytes": status.st_size, "source_mtime_ns": status.st_mtime_ns}
 
 
-def write_slice(path: Path, rgb: Float32[np.ndarray, "height width 3"], record: dict[str, Any], *, half: bool) -> None:
-    """A scene-linear slice with its record, atomically."""
-    dtype = np.float16 if half else np.float32
-    channels = {name: rgb[..., index].astype(dtype) for index, name in enumerate("RGB")}
-    write_exr(path, ExrPart(channels, attributes={_ATTRIBUTE: json.dumps(record)}))
+def write_slice(
+    path: Path,
+    rgb: Float32[np.ndarray, "height width 3"],
+    saturated: Float32[np.ndarray, "height width"],
+    rec709_from_camera: Matrix3x3 | None,
+    record: dict[str, Any],
+    *,
+    half: bool,
+) -> None:
+    """A linear slice with its saturation mask and its record, atomically. Raises DiskFullError."""
+    attributes = {_ATTRIBUTE: json.dumps(record)}
+    with told_when_full(path, rgb.nbytes + saturated.nbytes):
+        write_camera_rgb(path, rgb, rec709_from_camera, saturated=saturated, half=half, attributes=attributes)
 
 
 def read_slice_record(path: Path) -> dict[str, Any] | None:

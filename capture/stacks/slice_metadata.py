@@ -2,8 +2,9 @@
 
 from typing import Any
 
+from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.focus_metadata import FocusReading
-from capture.photos.raw import DecodedPhoto
+from capture.photos.photo_metadata import PhotoMetadata
 from capture.stacks.exposure import ExposureGain
 from capture.stacks.grouping import Photo
 
@@ -24,21 +25,31 @@ def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> d
         "camera_model": metadata.camera_model,
         "lens_model": metadata.lens_model,
         "orientation": metadata.orientation,
-        "focus": None if metadata.focus is None else focus_record(metadata.focus),
+        "lens_position": metadata.lens_position,
+        "focus": None if metadata.focus is None else focus_record(metadata.focus, metadata),
         "white_balance": None if decoded.white_balance is None else list(decoded.white_balance),
         "exposure_gain": gain.total,
+        "exposure_gain_session": gain.session,
+        "exposure_gain_session_from": gain.session_from,
         "exposure_gain_stated": gain.stated,
         "exposure_gain_measured": None if gain.measured is None else gain.stated * gain.measured,
-        "saturated_fraction": float(decoded.saturated.mean()) if level is not None else None,
+        "saturated_fraction": decoded.photosites.full_fraction if level is not None else None,
         "saturation_level": None if level is None else level * gain.total,
     }
 
 
-def focus_record(focus: FocusReading) -> dict[str, Any]:
-    """The focus distance as the file stated it, before it was counted from the lens."""
+def focus_record(focus: FocusReading, metadata: PhotoMetadata) -> dict[str, Any]:
+    """The focus distance as the file stated it, and counted from the lens; intervals are what the statement may stand for.
+
+    The lens's are None where its focal length is unknown or no lens of that length focuses so near.
+    """
+    distance_m, interval_m = metadata.focus_distance_m, metadata.focus_interval_m
     return {
         "source": focus.source,
         "origin": focus.origin,
         "stated_dioptre": 1.0 / focus.distance_m,
         "interval_dioptre": [1.0 / focus.farthest_m, 1.0 / focus.nearest_m],
+        "hiatus_mm": metadata.hiatus_mm,
+        "lens_dioptre": None if distance_m is None else 1.0 / distance_m,
+        "lens_interval_dioptre": None if interval_m is None else [1.0 / interval_m[1], 1.0 / interval_m[0]],
     }

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,12 +9,16 @@ from typing import Any
 
 from capture.photos.photo_files import SkippedFile
 from capture.stacks.grouping import Photo, in_focus_order
+from capture.stacks.session import CameraChoice
 from capture.stacks.slice_files import FOLDER, arrange_slices, source_record
 from capture.stacks.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
-from capture.stacks.stack_lens import camera_of_lens, lens_of_photo, lens_remarks, reference_index
+from capture.stacks.stack_lens import camera_of_lens, lens_of_photo, reference_index
+from capture.stacks.stack_remarks import stack_remarks
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack
-from mrbokeh.lens import Lens
+
+_RAW_COLOUR = "linear white-balanced camera RGB; 1.0 is the white level of green at the exposure of the session"
+_DEVELOPED_COLOUR = "scene-linear Rec.709; 1.0 is white"
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,12 @@ class StackReport:
     remarks: tuple[str, ...] = ()
 
 
-def ingest_digest(photos: Sequence[Photo], development: Development) -> str:
-    """A fingerprint of all that a stack depends on: the files, what they and lens.toml tell, and the settings."""
-    sources = [[source_record(photo.path), repr(photo.metadata), repr(replace(photo.sidecar, where=""))] for photo in photos]
-    text = json.dumps([PROCESS_VERSION, asdict(development), sources], sort_keys=True)
+def ingest_digest(photos: Sequence[Photo], development: Development, choice: CameraChoice) -> str:
+    """A fingerprint of all that a stack depends on: the files, what they and lens.toml tell, the settings and the session's choice."""
+    sources = [
+        [source_record(photo.path), repr(photo.metadata), repr(replace(photo.sidecar, where="", focus_where=""))] for photo in photos
+    ]
+    text = json.dumps([PROCESS_VERSION, asdict(replace(development, white_balance=None)), asdict(choice), sources], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -66,7 +71,7 @@ def finish_stack(name: str, work: StackWork, digest: str) -> StackReport:
     width_px, height_px = chosen.record["size_px"]
     native_width_px, native_height_px = chosen.record["native_size_px"]
     lens, missing = lens_of_photo(chosen.photo, (native_width_px, native_height_px))
-    remarks = _remarks(work, chosen.photo, lens, missing)
+    remarks = stack_remarks(work, chosen.photo, lens, missing)
     if was_merged:
         remarks.append("the stack changed since it was merged: merge it again")
     stack = FocalStack(
@@ -76,6 +81,7 @@ def finish_stack(name: str, work: StackWork, digest: str) -> StackReport:
         camera=None if lens is None else camera_of_lens(lens, width_px, height_px),
         reference=reference,
         metadata=_stack_metadata(work, digest, remarks),
+        rec709_from_camera=work.rec709_from_camera,
     )
     write_focal_stack(stack)
     return StackReport(name, stack, (width_px, height_px), work.kept, tuple(work.skipped), tuple(remarks))
@@ -90,8 +96,9 @@ def _slice(path: Path, finished: FinishedSlice) -> Slice:
 def _stack_metadata(work: StackWork, digest: str, remarks: Sequence[str]) -> dict[str, Any]:
     return {
         "ingest_digest": digest,
-        "colour": "scene-linear Rec.709; 1.0 is the white level of green in RAW files, white in others",
-        "white_balance": None if work.white_balance is None else list(work.white_balance),
+        "colour": _RAW_COLOUR if work.rec709_from_camera else _DEVELOPED_COLOUR,
+        "white_balance": None if work.choice.white_balance is None else list(work.choice.white_balance),
+        "session_reference": f"{work.choice.reference_stack}/{work.choice.reference_source}",
         "exposure_reference": work.finished[0].photo.path.name,
         "size_px": work.finished[0].record["size_px"],
         "skipped": [{"source": str(each.path), "reason": each.reason} for each in work.skipped],
@@ -104,30 +111,3 @@ def _was_merged(folder: Path) -> bool:
         return read_focal_stack(folder).merged
     except InputError:
         return False
-
-
-def _remarks(work: StackWork, reference: Photo, lens: Lens | None, missing: str | None) -> list[str]:
-    photos = [each.photo for each in work.finished]
-    counted = Counter(remark for each in work.finished for remark in each.record["remarks"])
-    remarks = [remark if count == 1 or count == len(photos) else f"{remark} ({count} slices)" for remark, count in counted.items()]
-    if work.white_balance is not None:
-        multipliers = ",".join(f"{each:.4g}" for each in work.white_balance)
-        whose = "the one given" if work.development.white_balance else f"the camera's of {work.white_balance_source}"
-        remarks.append(f"one white balance for all RAW slices: {whose}. For the same in other stacks: --white-balance {multipliers}")
-    if any((photo.metadata.orientation or 1) != 1 for photo in photos):
-        remarks.append("EXIF asks to turn pictures of this stack: they are left as the sensor saw them")
-    remarks += _sidecar_remarks(photos)
-    if lens is None:
-        remarks.append(f"no lens: {missing}. Give what is missing in a lens.toml beside the photographs and ingest again")
-    elif reference.sidecar.sensor_width_mm is None and (sensor := reference.metadata.sensor) is not None:
-        remarks.append(f"sensor width {lens.sensor_width_mm:.4g} mm from {sensor.source}")
-    return remarks + lens_remarks(photos)
-
-
-def _sidecar_remarks(photos: Sequence[Photo]) -> list[str]:
-    sidecar = photos[0].sidecar
-    if not sidecar.where:
-        return []
-    unmatched = sidecar.unmatched_names([photo.path.name for photo in photos])
-    note = f"; it names files that are not in this stack: {', '.join(unmatched)}" if unmatched else ""
-    return [f"{Path(sidecar.where).name} was read{note}"]

@@ -3,28 +3,36 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float32
+
+from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.developing import develop, is_raw, stored_as_half
 from capture.photos.libraw import WhiteBalance
 from capture.photos.photo_files import SkippedFile
-from capture.photos.raw import DecodedPhoto, camera_white_balance
-from capture.stacks.exposure import ExposureGain, LowFrequency, evened_out, low_frequency
+from capture.stacks.disk_space import DiskFullError
+from capture.stacks.exposure import ExposureGain, evened_out
+from capture.stacks.gain_fit import LowFrequency
 from capture.stacks.grouping import Photo
+from capture.stacks.session import CameraChoice
+from capture.stacks.session_exposure import gain_to_session, light_of, stated_gain
 from capture.stacks.slice_files import FOLDER, find_slices, source_record, write_slice
 from capture.stacks.slice_metadata import slice_metadata
+from mrbokeh.camera_rgb import Matrix3x3, matrix3x3
+from mrbokeh.color import convert
 from mrbokeh.errors import InputError
 
 # To be raised when the same photograph would become another slice, so that old slices are made again.
-PROCESS_VERSION = 1
+PROCESS_VERSION = 3
 
 
 @dataclass(frozen=True)
 class Development:
-    """How photographs are developed. white_balance: multipliers of red, green, blue, or None for the camera's."""
+    """How photographs are developed. white_balance: multipliers of red, green, blue, or None for the session's."""
 
     white_balance: WhiteBalance | None = None
     half_size: bool = False
@@ -44,14 +52,13 @@ class FinishedSlice:
 class StackWork:
     """The slices of a stack while they are made; one picture is in memory at a time.
 
-    white_balance: one for the whole stack, None where no photograph is RAW. The first photograph that can be developed
-    is the reference of the exposure.
+    choice: white balance and exposure, which the stack shares with all others of its scene. The first photograph that can
+    be developed is the reference for the exposure of the rest, and its primaries are those of the stack.
     """
 
     folder: Path
     development: Development
-    white_balance: WhiteBalance | None
-    white_balance_source: str = ""
+    choice: CameraChoice = field(default_factory=CameraChoice)
     existing: dict[str, tuple[Path, dict[str, Any]]] = field(default_factory=dict)
     finished: list[FinishedSlice] = field(default_factory=list)
     skipped: list[SkippedFile] = field(default_factory=list)
@@ -69,6 +76,8 @@ class StackWork:
                 self.finished.append(FinishedSlice(photo, *found))
             else:
                 self.finished.append(self._made(photo, request))
+        except DiskFullError:
+            raise
         except InputError as error:
             self.skipped.append(SkippedFile(photo.path, str(error).replace(str(photo.path), "it", 1)))
 
@@ -90,65 +99,73 @@ class StackWork:
         return {
             **source_record(photo.path),
             "version": PROCESS_VERSION,
-            "white_balance": list(self.white_balance) if self.white_balance and is_raw(photo.path) else None,
+            "white_balance": list(self.choice.white_balance) if self.choice.white_balance and is_raw(photo.path) else None,
             "half_size": self.development.half_size,
             "max_width": self.development.max_width,
             "exposure_reference": reference.path.name,
-            "stated_gain": _stated_gain(reference, photo),
+            "session_gain": stated_gain(self.choice.exposure, reference.metadata),
+            "stated_gain": stated_gain(reference.metadata.exposure, photo.metadata),
         }
+
+    @property
+    def rec709_from_camera(self) -> Matrix3x3 | None:
+        """From the RGB of the finished slices; None where that is Rec.709."""
+        matrix = self.finished[0].record["rec709_from_camera"]
+        return None if matrix is None else matrix3x3(matrix)
 
     def _made(self, photo: Photo, request: dict[str, Any]) -> FinishedSlice:
         decoded = self._developed(photo)
-        gain = self._gain(decoded, request["stated_gain"])
-        rgb = decoded.rgb if gain.total == 1.0 else decoded.rgb * decoded.rgb.dtype.type(gain.total)
+        primaries = self.rec709_from_camera if self.finished else decoded.rec709_from_camera
+        gain = self._gain(decoded, request)
+        rgb = in_primaries(decoded, primaries)
+        if gain.total != 1.0:
+            rgb = rgb * np.float32(gain.total)
         record = {
             "request": request,
             "size_px": [rgb.shape[1], rgb.shape[0]],
-            "native_size_px": [decoded.saturated.shape[1], decoded.saturated.shape[0]],
+            "native_size_px": [decoded.photosites.width, decoded.photosites.height],
+            "rec709_from_camera": primaries,
             "metadata": slice_metadata(photo, decoded, gain),
             "remarks": [*decoded.remarks, *_gain_remarks(photo, gain)],
         }
         # Slices get their numbers when all are there: an unreadable photograph must leave no gap.
         fingerprint = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:12]
         path = self.folder / FOLDER / f"made_{len(self.finished):03d}_{fingerprint}.exr"
-        write_slice(path, rgb, record, half=stored_as_half(photo.path))
+        write_slice(path, rgb, decoded.saturated, primaries, record, half=stored_as_half(photo.path))
         return FinishedSlice(photo, path, record)
 
     def _developed(self, photo: Photo) -> DecodedPhoto:
-        return develop(photo.path, self.white_balance, half_size=self.development.half_size, max_width=self.development.max_width)
+        return develop(photo.path, self.choice.white_balance, half_size=self.development.half_size, max_width=self.development.max_width)
 
-    def _gain(self, decoded: DecodedPhoto, stated: float | None) -> ExposureGain:
+    def _gain(self, decoded: DecodedPhoto, request: dict[str, Any]) -> ExposureGain:
         """Relative to the reference, which is developed again if an earlier run made its slice."""
         if not self.finished:
-            self._reference = low_frequency(decoded.rgb, decoded.saturated)
-            return ExposureGain()
+            self._reference = light_of(decoded)
+            return gain_to_session(decoded, self._reference, request["session_gain"], self._scale_stack())
         if self._reference is None:
-            reference = self._developed(self.finished[0].photo)
-            self._reference = low_frequency(reference.rgb, reference.saturated)
-        return evened_out(self._reference, low_frequency(decoded.rgb, decoded.saturated), stated)
+            self._reference = light_of(self._developed(self.finished[0].photo))
+        base = self.finished[0].record["metadata"]
+        gain = evened_out(self._reference, light_of(decoded), request["stated_gain"])
+        return replace(gain, session=base["exposure_gain_session"], session_from=base["exposure_gain_session_from"])
+
+    def _scale_stack(self) -> Path | None:
+        """The stack that set the scale of the session, unless it is this one."""
+        name = self.choice.reference_stack
+        return self.folder.parent / name if name and name != self.folder.name else None
 
 
-def stack_work(folder: Path, photos: Sequence[Photo], development: Development, *, overwrite: bool) -> StackWork:
-    """The work on a stack, with the white balance chosen and the slices of earlier runs found."""
+def stack_work(folder: Path, development: Development, choice: CameraChoice, *, overwrite: bool) -> StackWork:
+    """The work on a stack, with the slices of earlier runs found."""
     existing = {} if overwrite else {json.dumps(record["request"], sort_keys=True): (path, record) for path, record in find_slices(folder)}
-    white_balance, source = _white_balance(photos, development)
-    return StackWork(folder, development, white_balance, source, existing)
+    return StackWork(folder, development, choice, existing)
 
 
-def _white_balance(photos: Sequence[Photo], development: Development) -> tuple[WhiteBalance | None, str]:
-    """The one asked for, else the camera's of the first RAW (by name) that opens, and whose it is; None without RAW."""
-    for photo in (each for each in photos if is_raw(each.path)):
-        try:
-            return development.white_balance or camera_white_balance(photo.path), photo.path.name
-        except InputError:
-            continue
-    return None, ""
-
-
-def _stated_gain(reference: Photo, photo: Photo) -> float | None:
-    """The ratio of their exposures according to metadata, None where one does not tell."""
-    wanted, own = reference.metadata.relative_exposure, photo.metadata.relative_exposure
-    return wanted / own if wanted and own else None
+def in_primaries(decoded: DecodedPhoto, rec709_from_camera: Matrix3x3 | None) -> Float32[np.ndarray, "height width 3"]:
+    """The photograph in the RGB that rec709_from_camera leads from: developed pictures and RAW can share a stack."""
+    if decoded.rec709_from_camera == rec709_from_camera:
+        return decoded.rgb
+    wanted, own = (np.eye(3) if each is None else np.array(each) for each in (rec709_from_camera, decoded.rec709_from_camera))
+    return convert(decoded.rgb, np.linalg.solve(wanted, own))
 
 
 def _gain_remarks(photo: Photo, gain: ExposureGain) -> list[str]:

@@ -1,0 +1,153 @@
+"""One gain between two pictures of a scene, fitted together with the scale and the shift between them.
+
+Blur moves light around but conserves it, so that heavily blurred slices differ by focus breathing (a small scale and
+shift) and by one gain. Both are fitted together, or breathing would pass for exposure: log R(A x + t) = log S(x) + log g,
+Gauss-Newton with Tukey's weights on pictures 96 px long, over the centre only, since vignetting changes with focus and blur
+brings in light from outside at the borders.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64
+
+from mrbokeh.camera_rgb import Matrix3x3
+from mrbokeh.color import convert, luminance
+
+LONG_SIDE_PX = 96
+LARGEST_SCALE_CHANGE = 0.15
+_BLUR_SIGMAS_PX = (6.0, 3.0)
+_STEPS = 12
+_CENTRE_RADIUS = 0.8
+_LARGEST_SATURATED_SHARE = 0.01
+_TUKEY = 4.685
+_MAD_TO_SIGMA = 1.4826
+_LEAST_SPREAD = 1e-3
+_FEWEST_PIXELS = 200
+_SMALLEST_STEP = 1e-5
+_TINY = 1e-9
+_PULL = (1e-4, 1e-4, 1e-4)
+
+
+@dataclass(frozen=True)
+class LowFrequency:
+    """A slice reduced to large areas. luminance: (h, w) linear, positive; usable: (h, w) neither saturated nor black."""
+
+    luminance: Float32[np.ndarray, "h w"]
+    usable: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class GainFit:
+    """gain: brings the slice's light to the reference's. log_scale: between the two pictures.
+
+    spread: what is left of the difference, as the standard deviation (by the median) of the logarithm of light.
+    """
+
+    gain: float
+    log_scale: float
+    spread: float
+
+
+def low_frequency(
+    rgb: Float32[np.ndarray, "height width 3"],
+    saturated: Float32[np.ndarray, "height width"] | Bool[np.ndarray, "height width"],
+    rec709_from_camera: Matrix3x3 | None = None,
+) -> LowFrequency:
+    """Area averages of a slice on a grid LONG_SIDE_PX long, and which of them are free of saturated photosites.
+
+    rec709_from_camera: from the RGB of the slice, None where that is Rec.709.
+    """
+    import cv2
+
+    scale = LONG_SIDE_PX / max(rgb.shape[:2])
+    size = max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale))
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    light = luminance(small if rec709_from_camera is None else convert(small, np.array(rec709_from_camera)))
+    full = cv2.resize(saturated.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    # What is saturated here is spread over its neighbours in the other slices.
+    full = cv2.dilate(full, np.ones((5, 5), np.uint8))
+    floor = max(1e-3 * float(np.median(light)), 1e-7)
+    return LowFrequency(np.maximum(light, floor), (full <= _LARGEST_SATURATED_SHARE) & (light > floor))
+
+
+def fit_gain(reference: LowFrequency, slice_: LowFrequency) -> GainFit | None:
+    """The gain between two pictures, or None where too little of both is usable."""
+    if reference.luminance.shape != slice_.luminance.shape:
+        return None
+    parameters, spread = np.zeros(4), 0.0
+    for sigma_px in _BLUR_SIGMAS_PX:
+        for _ in range(_STEPS):
+            found = _gauss_newton_step(reference, slice_, parameters, sigma_px)
+            if found is None:
+                return None
+            step, spread = found
+            parameters = parameters + step
+            parameters[1] = np.clip(parameters[1], -LARGEST_SCALE_CHANGE, LARGEST_SCALE_CHANGE)
+            if np.abs(step).max() < _SMALLEST_STEP:
+                break
+    return GainFit(float(np.exp(parameters[0])), float(parameters[1]), spread)
+
+
+def _gauss_newton_step(
+    reference: LowFrequency, slice_: LowFrequency, parameters: Float64[np.ndarray, "4"], sigma_px: float
+) -> tuple[Float64[np.ndarray, "4"], float] | None:
+    """One weighted step for (log gain, log scale, shift x, shift y; shifts as a share of half the long side), and the spread before it."""
+    light, usable, x, y = _breathed(reference, parameters)
+    mask = (usable & slice_.usable).astype(np.float64)
+    share = _blurred(mask, sigma_px)
+    inside = (np.hypot(x / np.abs(x).max(), y / np.abs(y).max()) < _CENTRE_RADIUS) & (share > 0.5) & (mask > 0)
+    if np.count_nonzero(inside) < _FEWEST_PIXELS:
+        return None
+    # Both are averaged over the same usable pixels, so that a saturated lamp in one is missing in both.
+    reference_light, slice_light = (_blurred(each * mask, sigma_px) / np.maximum(share, 1e-6) for each in (light, slice_.luminance))
+    reference_log, slice_log = np.log(np.maximum(reference_light, _TINY)), np.log(np.maximum(slice_light, _TINY))
+    slope_y, slope_x = np.gradient(reference_log, y[1, 0] - y[0, 0], x[0, 1] - x[0, 0])
+    jacobian = np.stack([np.full_like(x, -1.0), slope_x * x + slope_y * y, slope_x, slope_y], axis=-1)[inside]
+    error = (reference_log - slice_log)[inside] - parameters[0]
+    # Flare and a wrong black level matter most in the dark.
+    trust = slice_light[inside] / (slice_light[inside] + 0.1 * np.median(slice_light[inside]))
+    return _weighted_solution(jacobian, -error, trust * _tukey(error)), _spread(error)
+
+
+def _breathed(
+    low: LowFrequency, parameters: Float64[np.ndarray, "4"]
+) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
+    """(light, usable) scaled and shifted, and the grid (x, y) from the centre in units of half the long side."""
+    import cv2
+
+    height, width = low.luminance.shape
+    half = max(height, width) / 2.0
+    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2.0) / half, (np.arange(height) + 0.5 - height / 2.0) / half)
+    scale = math.exp(parameters[1])
+    map_x = ((x * scale + parameters[2]) * half + width / 2.0 - 0.5).astype(np.float32)
+    map_y = ((y * scale + parameters[3]) * half + height / 2.0 - 0.5).astype(np.float32)
+    light = cv2.remap(low.luminance, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    usable = cv2.remap(low.usable.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return light.astype(np.float64), usable > 0.99, x, y
+
+
+def _blurred(values: Float[np.ndarray, "h w"], sigma_px: float) -> Float64[np.ndarray, "h w"]:
+    from scipy.ndimage import gaussian_filter
+
+    return gaussian_filter(np.asarray(values, np.float64), sigma_px, mode="constant")
+
+
+def _spread(error: Float64[np.ndarray, " n"]) -> float:
+    return _MAD_TO_SIGMA * float(np.median(np.abs(error - np.median(error))))
+
+
+def _tukey(error: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Tukey's biweight around the median: what lies far off (moving things, spread highlights) counts nothing."""
+    spread = max(_spread(error), _LEAST_SPREAD)
+    return np.clip(1.0 - ((error - np.median(error)) / (_TUKEY * spread)) ** 2, 0.0, None) ** 2
+
+
+def _weighted_solution(
+    jacobian: Float64[np.ndarray, "n 4"], target: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, "4"]:
+    """Least squares with a slight pull of scale and shift towards no change, for pictures without structure."""
+    normal = jacobian.T @ (jacobian * weights[:, None])
+    normal[np.diag_indices(4)] += weights.sum() * np.array([0.0, *_PULL])
+    return np.linalg.solve(normal, jacobian.T @ (target * weights))

@@ -1,0 +1,101 @@
+"""Pictures of a focal stack as EXR: linear white-balanced camera RGB that states its primaries, with masks as layers.
+
+Channels of the sensor stay apart as long as they can: each has its own blur and its own white level, which a conversion
+to Rec.709 would mix. The header's chromaticities tell other programs what the numbers mean.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from mrbokeh.color import XYZ_from_rec709
+from mrbokeh.exr_io import ExrPart, read_exr, write_exr
+
+Matrix3x3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+SATURATED = "mask.saturated"
+VALID = "mask.valid"
+MASK_PREFIX = "mask."
+_LEAST_SUM = 1e-3
+
+
+@dataclass(frozen=True)
+class SliceMasks:
+    """saturated: (H, W) light from a full photosite is in the pixel. valid: (H, W) the slice has data there."""
+
+    saturated: Bool[np.ndarray, "height width"]
+    valid: Bool[np.ndarray, "height width"]
+
+
+def matrix3x3(values: Float[np.ndarray, "3 3"] | Sequence[Sequence[float]]) -> Matrix3x3:
+    """A 3x3 matrix as nested tuples, which compare and go into JSON."""
+    first, second, third = (tuple(float(each) for each in row) for row in np.asarray(values, np.float64))
+    return first, second, third  # type: ignore[return-value]
+
+
+def chromaticities(rec709_from_camera: Matrix3x3) -> tuple[float, ...] | None:
+    """CIE x, y of red, green, blue and white, as EXR's header wants them; None where a primary has none (its X + Y + Z is 0).
+
+    Camera primaries are no real colours: x and y may lie outside the locus or be negative, which EXR allows.
+    """
+    XYZ_from_camera = XYZ_from_rec709 @ np.asarray(rec709_from_camera)
+    columns = [*XYZ_from_camera.T, XYZ_from_camera.sum(axis=1)]
+    if min(abs(each.sum()) for each in columns) < _LEAST_SUM:
+        return None
+    return tuple(float(part) for each in columns for part in each[:2] / each.sum())
+
+
+def write_camera_rgb(
+    path: Path,
+    rgb: Float[np.ndarray, "height width 3"],
+    rec709_from_camera: Matrix3x3 | None,
+    *,
+    saturated: Float32[np.ndarray, "height width"] | Bool[np.ndarray, "height width"] | None = None,
+    valid: Bool[np.ndarray, "height width"] | None = None,
+    half: bool = True,
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a slice or an all-in-focus picture, atomically. rec709_from_camera: None where the picture is Rec.709 already.
+
+    saturated: the share of each pixel that was full, 0 to 1. valid: where the slice has data. Both are left out if None.
+    """
+    dtype = np.float16 if half else np.float32
+    channels = {name: rgb[..., index].astype(dtype) for index, name in enumerate("RGB")}
+    masks = {SATURATED: saturated, VALID: valid}
+    channels |= {name: mask.astype(np.float16) for name, mask in masks.items() if mask is not None}
+    primaries = None if rec709_from_camera is None else chromaticities(rec709_from_camera)
+    header = dict(attributes or {}) | ({} if primaries is None else {"chromaticities": primaries})
+    write_exr(path, ExrPart(channels, attributes=header))
+
+
+def read_camera_rgb(path: Path) -> Float32[np.ndarray, "height width 3"]:
+    """The numbers as they are stored, in whatever RGB the file is."""
+    return read_exr(path)[0].stacked("RGB")
+
+
+def read_slice_masks(path: Path) -> SliceMasks:
+    """The masks of a slice; without layers none of it is saturated and all is valid."""
+    part = read_exr(path)[0]
+    shape = next(iter(part.channels.values())).shape
+    saturated, valid = part.channels.get(SATURATED), part.channels.get(VALID)
+    return SliceMasks(
+        np.zeros(shape, bool) if saturated is None else saturated > 0,
+        np.ones(shape, bool) if valid is None else valid > 0.5,
+    )
+
+
+def write_masks(path: Path, masks: Mapping[str, Bool[np.ndarray, "height width"]]) -> None:
+    """Masks by name as layers mask.NAME (half float, 0 or 1) of one EXR file."""
+    write_exr(path, ExrPart({MASK_PREFIX + name: mask.astype(np.float16) for name, mask in masks.items()}))
+
+
+def read_masks(path: Path) -> dict[str, Bool[np.ndarray, "height width"]]:
+    """The masks of a file by name; {} where there is no such file."""
+    if not path.is_file():
+        return {}
+    channels = read_exr(path)[0].channels
+    return {name.removeprefix(MASK_PREFIX): mask > 0.5 for name, mask in channels.items() if name.startswith(MASK_PREFIX)}

@@ -1,0 +1,84 @@
+"""Runs again and interrupted runs: what is finished is kept, what changed is made again."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capture.stacks.stack_ingest
+from capture.stacks.grouping import Grouping
+from capture.stacks.ingest import IngestSettings, ingest
+from capture.stacks.slice_files import find_slices
+from capture.stacks.stack_ingest import Development
+from tests.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
+
+
+@pytest.fixture
+def shoot(tmp_path: Path) -> Path:
+    return make_shoot(tmp_path / "shoot")
+
+
+def test_a_rerun_keeps_everything_and_a_merged_stack_too(shoot: Path, tmp_path: Path) -> None:
+    from mrbokeh.focal_stack import write_focal_stack
+
+    stack = only_stack(ingest([shoot], tmp_path / "scene"))
+    write_focal_stack(replace(stack, merged=True))
+    before = {path: path.stat().st_mtime_ns for path in stack.folder.rglob("*") if path.is_file()}
+    report = ingest([shoot], tmp_path / "scene")
+    assert report.stacks[0].kept == 5
+    assert {path: path.stat().st_mtime_ns for path in stack.folder.rglob("*") if path.is_file()} == before
+    assert only_stack(report).merged
+    report = ingest([shoot], tmp_path / "scene", IngestSettings(overwrite=True))
+    assert report.stacks[0].kept == 0
+    assert not only_stack(report).merged
+    assert all(path.stat().st_mtime_ns > before[path] for path in (stack.folder / "slices").iterdir())
+
+
+def test_only_what_changed_is_made_again(shoot: Path, tmp_path: Path) -> None:
+    stack = only_stack(ingest([shoot], tmp_path / "scene"))
+    (shoot / "IMG_10.dng").unlink()
+    os.utime(shoot / "IMG_8.dng", ns=(1, 1))
+    make_raw_photo(shoot / "IMG_7.dng", scene_rgb(72, 96), 0.7)
+    report = ingest([shoot], tmp_path / "scene")
+    assert report.stacks[0].kept == 3
+    assert sources(only_stack(report)) == ["IMG_9.dng", "IMG_7.dng", "IMG_12.dng", "IMG_8.dng", "IMG_11.dng"]
+    assert len(list((stack.folder / "slices").iterdir())) == 5, "the slice of the deleted photograph is gone"
+
+
+def test_an_interrupted_run_goes_on_and_ends_the_same(shoot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = only_stack(ingest([shoot], tmp_path / "whole"))
+    developed: list[str] = []
+    real_develop = capture.stacks.stack_ingest.develop
+
+    def counting(path: Path, *args: object, **kwargs: object) -> object:
+        if len(developed) == 3:
+            raise KeyboardInterrupt
+        developed.append(path.name)
+        return real_develop(path, *args, **kwargs)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(capture.stacks.stack_ingest, "develop", counting)
+        with pytest.raises(KeyboardInterrupt):
+            ingest([shoot], tmp_path / "scene")
+    assert developed == ["IMG_9.dng", "IMG_10.dng", "IMG_12.dng"]
+    assert len(find_slices(tmp_path / "scene" / "shoot")) == 3
+    report = ingest([shoot], tmp_path / "scene")
+    stack = only_stack(report)
+    assert report.stacks[0].kept == 3
+    assert (stack.slices, stack.metadata) == (whole.slices, whole.metadata)
+    assert all(np.array_equal(stack.slice_rgb(index), whole.slice_rgb(index)) for index in range(5))
+    assert not [path for path in stack.folder.rglob("*") if path.name.startswith((".", "made_", "moving_"))]
+
+
+def test_copies_of_one_photograph_stay_apart(tmp_path: Path) -> None:
+    """Same name, size and time in two folders, put into one stack: two slices, also on the next run."""
+    path = make_raw_photo(tmp_path / "a" / "0.dng", scene_rgb(24, 32), 0.6)
+    (tmp_path / "b").mkdir()
+    shutil.copy2(path, tmp_path / "b" / "0.dng")
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for max_width in (None, 16, None):
+        settings = IngestSettings(grouping=Grouping.none, development=Development(max_width=max_width))
+        assert len(only_stack(ingest(folders, tmp_path / "scene", settings))) == 2
