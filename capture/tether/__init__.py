@@ -1,0 +1,1 @@
+"""Focus bracketing: how many slices, and a camera that takes them one after another."""

@@ -1,0 +1,96 @@
+"""What the steps of a focus motor mean, measured: sweep the focus over targets at known distances and see where each is sharp."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from capture.tether.camera_driver import CameraDriver
+from capture.tether.focus_axis import FocusAxis, TravelEndError
+from capture.tether.focus_steps import FocusSteps
+from capture.tether.live_reading import Spot, sharpness
+from mrbokeh.errors import InputError
+
+_MOST_POSITIONS = 2000
+_LEVEL = 0.5
+_HIGHEST_LEVEL = 0.9
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something with detail, at a known distance from the lens, at a known place of the picture."""
+
+    spot: Spot
+    distance_m: float
+
+    def __str__(self) -> str:
+        return f"the target at {self.spot.x:g},{self.spot.y:g} ({self.distance_m:g} m)"
+
+
+@dataclass(frozen=True)
+class FocusSweep:
+    """steps: (P,) positions from the stop; sharpness: (T, P) of each target there."""
+
+    steps: Float64[np.ndarray, " positions"]
+    sharpness: Float64[np.ndarray, "targets positions"]
+
+
+def measure_focus_steps(
+    axis: FocusAxis,
+    camera: CameraDriver,
+    targets: Sequence[Target],
+    *,
+    step: int,
+    frames: int = 3,
+    advance: Callable[[], None] = lambda: None,
+) -> FocusSteps:
+    """The scale of a motor from two or more targets at different distances. step: between two readings of the sweep.
+
+    Raises InputError where a target is never sharp, or where their order does not fit the stop.
+    """
+    if len({target.distance_m for target in targets}) < 2:
+        raise InputError(f"measuring the steps of a motor needs targets at two distances or more, got {len(targets)}: add a target")
+    if not all(target.distance_m > 0.0 for target in targets) or step < 1:
+        raise InputError(f"expected targets at positive distances and a positive step, got {[t.distance_m for t in targets]} m, {step}")
+    sweep = sweep_focus(axis, camera, targets, step=step, frames=frames, advance=advance)
+    found = [(peak_steps(sweep, index, target), 1.0 / target.distance_m) for index, target in enumerate(targets)]
+    return FocusSteps(axis.stop, tuple(sorted(found)))
+
+
+def sweep_focus(
+    axis: FocusAxis, camera: CameraDriver, targets: Sequence[Target], *, step: int, frames: int, advance: Callable[[], None]
+) -> FocusSweep:
+    """From the stop to the other end of the travel, in the direction in which slices are approached."""
+    axis.home()
+    steps, values = [], []
+    for position in range(_MOST_POSITIONS):
+        if position:
+            try:
+                axis.move_to(position * step)
+            except TravelEndError:
+                # The far end of the travel: how far that is, nobody knows before.
+                break
+        previews = [camera.preview() for _ in range(frames)]
+        steps.append(float(position * step))
+        values.append([np.mean([sharpness(target.spot.cut(each)) for each in previews]) for target in targets])
+        advance()
+    return FocusSweep(np.array(steps), np.array(values, np.float64).T.reshape(len(targets), len(steps)))
+
+
+def peak_steps(sweep: FocusSweep, index: int, target: Target) -> float:
+    """Where one target is sharpest: the middle of what lies above half of its largest sharpness, weighted by how far above.
+
+    A live view has few pixels, so that the top is flat and its largest reading is noise; its slopes tell the middle.
+    Near an end of the travel a higher level is taken, of which both slopes are there.
+    """
+    values = sweep.sharpness[index] / max(float(sweep.sharpness[index].max()), _TINY)
+    top = int(np.argmax(values))
+    level = max(_LEVEL, float(values[: top + 1].min()), float(values[top:].min()))
+    if level > _HIGHEST_LEVEL:
+        raise InputError(f"{target} is sharpest at the end of the focus travel: choose one within it, or correct its distance or place")
+    below = np.flatnonzero(values <= level)
+    first, last = int(below[below < top].max()), int(below[below > top].min())
+    weights = np.maximum(values[first : last + 1] - level, 0.0)
+    return float((weights * sweep.steps[first : last + 1]).sum() / weights.sum())

@@ -1,0 +1,74 @@
+"""What a frame of the live view tells: how sharp it is, and whether its exposure fits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from capture.merging.depth_from_focus import focus_energy
+from capture.tether.camera_driver import Preview
+from mrbokeh.color import luminance, srgb_to_linear
+from mrbokeh.errors import InputError
+
+HISTOGRAM_BINS = 32
+_CLIPPED = 254
+_BLACK = 1
+_WINDOW_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A square part of the picture: its middle in shares of width and height, its side in shares of the width."""
+
+    x: float = 0.5
+    y: float = 0.5
+    side: float = 0.12
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.x <= 1.0 and 0.0 <= self.y <= 1.0 and 0.0 < self.side <= 1.0):
+            raise InputError(f"a spot needs x, y and a side from 0 to 1, got {self.x:g}, {self.y:g}, {self.side:g}")
+
+    def cut(self, preview: Preview) -> UInt8[np.ndarray, "side_y side_x 3"]:
+        """The pixels of the spot, at least 8 x 8."""
+        height, width = preview.shape[:2]
+        half = max(4, round(0.5 * self.side * width))
+        column, row = (
+            int(np.clip(round(share * size), half, max(half, size - half))) for share, size in ((self.x, width), (self.y, height))
+        )
+        return preview[max(0, row - half) : row + half, max(0, column - half) : column + half]
+
+
+@dataclass(frozen=True)
+class LiveReading:
+    """sharpness: focus energy over mean light, so that exposure does not matter; no unit, to be compared within a scene.
+
+    clipped, black: shares of the pixels with a channel at its end. histogram: shares of the pixels by encoded brightness.
+    """
+
+    sharpness: float
+    clipped: float
+    black: float
+    histogram: Float64[np.ndarray, " bins"]
+
+    def bars(self) -> str:
+        """The histogram as text, one character per bin."""
+        top = float(self.histogram.max()) or 1.0
+        return "".join(" ▁▂▃▄▅▆▇█"[int(np.ceil(8.0 * each / top))] for each in self.histogram)
+
+
+def read_live(preview: Preview, spot: Spot | None = None) -> LiveReading:
+    """Sharpness is that of the spot, or of the whole frame; exposure always that of the frame."""
+    brightest, mean = preview.max(axis=2), preview.mean(axis=2)
+    counts = np.histogram(mean, HISTOGRAM_BINS, (0.0, 256.0))[0]
+    return LiveReading(
+        sharpness(preview if spot is None else spot.cut(preview)),
+        float(np.mean(brightest >= _CLIPPED)),
+        float(np.mean(brightest <= _BLACK)),
+        counts / mean.size,
+    )
+
+
+def sharpness(preview: Preview) -> float:
+    """Mean energy of fine detail over mean light. Energy of the root of light grows with light, so the ratio does not."""
+    light = srgb_to_linear(np.ascontiguousarray(preview).astype(np.float32) / np.float32(255.0)).astype(np.float32)
+    return float(focus_energy(light, _WINDOW_PX).mean() / max(float(luminance(light).mean()), 1e-4))
