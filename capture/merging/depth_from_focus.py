@@ -1,25 +1,36 @@
 """Depth from focus: in which slice, and between which two, every pixel is sharp, and how sure that is."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, Int
 
+from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, focus_volume, noise_floor, share_above
 from capture.merging.lights import Lights
+
+__all__ = ["FocusMap", "depth_from_focus", "focus_energy", "focus_map", "noise_floor", "peak_parabola", "share_above"]
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
-Volume = Float32[np.ndarray, "slices height width"]
+Labels = Int[np.ndarray, "height width"]
 
 # A jump of the depth by more than one slice costs as much as this many e-folds of focus energy.
 SMALL_STEP_COST = 0.3
 LARGE_STEP_COST = 3.0
 LARGEST_COST = 4.0
 # Detail has half its say in the labelling, and half its confidence, where its energy is this many times that of the noise.
-LABELLING_NOISE_FLOORS = 100.0
+LABELLING_NOISE_FLOORS = 60.0
 CONFIDENCE_NOISE_FLOORS = 10.0
+# Pixels this near to one that is full see its clipped rim, not detail.
+SATURATION_REACH_PX = 5
+# Where the log energy bends by this much at its peak it tells depth as well as it can.
+SHARP_CURVATURE = 0.2
+# The window of the energy sees this far: beside a jump in depth it sees two surfaces.
+WINDOW_REACH_PX = 6
+# Neighbouring pixels whose depths differ by more slices than this belong to two surfaces.
+SURFACE_STEP = 1.5
 
 
 @dataclass(frozen=True)
@@ -35,50 +46,71 @@ class FocusMap:
     confidence: Plane
     merge_index: Plane
 
-
-def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
-    """Local energy of fine detail (sum of squared Laplacians), in the square root of light where shot noise is even."""
-    encoded = cv2.GaussianBlur(np.sqrt(np.maximum(rgb, 0.0)), (0, 0), 0.7)
-    detail = cv2.Laplacian(encoded, cv2.CV_32F, ksize=1)
-    return cv2.GaussianBlur((detail * detail).sum(axis=2), (0, 0), window_px)
+    def dioptres(self, focus_dioptres: Sequence[float]) -> Plane:
+        """(H, W) 1 / depth in metres, interpolated between the focus of the slices (1 / metres each)."""
+        return np.interp(self.focus_index, np.arange(len(focus_dioptres)), focus_dioptres).astype(np.float32)
 
 
 def depth_from_focus(registered: Iterable[Rgb], lights: Lights) -> FocusMap:
     """The focus map of registered slices in the order of their focus; slices are read once."""
-    return focus_map(np.stack([focus_energy(rgb) for rgb in registered]), lights)
+    return focus_map(focus_volume(registered), lights)
 
 
-def focus_map(energies: Volume, lights: Lights) -> FocusMap:
+def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "height width"] | None = None) -> FocusMap:
     """Semi-global labelling (Hirschmueller 2008) of log focus energies, then a parabola through the peak.
 
     Energies within the reach of a light have no say, but the light's own pixels are known to be sharp in its sharpest slice.
+    saturated: (H, W) full in some slice: no confidence there and beside it.
     """
     from capture.merging._semi_global_numba import aggregate_costs
 
-    floor = noise_floor(energies)
-    log_energies = np.log(energies + floor)
-    say = share_above(energies.max(axis=0), LABELLING_NOISE_FLOORS * floor)
-    costs = say * np.minimum(log_energies.max(axis=0) - log_energies, np.float32(LARGEST_COST))
     by_light = lights.slice_index()
-    costs[:, by_light >= 0] = 0.0
-    costs[:, lights.core] = LARGEST_COST * (np.arange(len(energies))[:, None] != by_light[lights.core])
+    energies = volume.calmed()
+    strongest = energies.max(axis=0)
+    log_energies = np.log(energies + np.float32(volume.floor), out=energies)
+    costs = _costs(log_energies, share_above(strongest, LABELLING_NOISE_FLOORS * volume.floor))
+    _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
-    offset, curvature = peak_parabola(log_energies, labels)
-    index = np.where(by_light >= 0, labels, labels + offset)
+    offset, _ = peak_parabola(log_energies, labels)
+    index = volume.enlarged(np.where(volume.reduced(by_light) >= 0, labels, labels + offset).astype(np.float32), SURFACE_STEP)
+    trust = share_above(strongest, CONFIDENCE_NOISE_FLOORS * volume.floor) * _confidence(volume, labels)
+    trust = volume.enlarged(trust) * _share_of_one_surface(index)
+    confidence = np.where(_vetoed(by_light, saturated), 0.0, trust).astype(np.float32)
     index[lights.core] = lights.focus_index[lights.zone[lights.core] - 1]
-    trusted = share_above(energies.max(axis=0), CONFIDENCE_NOISE_FLOORS * floor) * confidence_of(log_energies, labels, curvature)
-    confidence = np.where(by_light >= 0, 0.0, trusted).astype(np.float32)
-    return FocusMap(index.astype(np.float32), confidence, np.where(by_light >= 0, by_light, index).astype(np.float32))
+    return FocusMap(index, confidence, np.where(by_light >= 0, by_light, index).astype(np.float32))
 
 
-def share_above(energy: Plane, half_at: float) -> Plane:
-    """From 0 to 1 with the energy, one half at `half_at`."""
-    return (energy / (energy + np.float32(half_at))).astype(np.float32)
+def _costs(log_energies: Volume, say: Plane) -> Volume:
+    """How many e-folds the energy of each slice is below the strongest, times the say of the pixel."""
+    costs = log_energies.max(axis=0) - log_energies
+    np.minimum(costs, np.float32(LARGEST_COST), out=costs)
+    return np.multiply(costs, say, out=costs)
 
 
-def noise_floor(energies: Volume) -> float:
-    """The focus energy that noise alone has: what the smoothest places of the least sharp slice show."""
-    return float(np.percentile(energies.min(axis=0), 5)) + 1e-9
+def _let_lights_decide(costs: Volume, by_light: Labels, core: Bool[np.ndarray, "height width"]) -> None:
+    costs[:, by_light >= 0] = 0.0
+    costs[:, core] = LARGEST_COST * (np.arange(len(costs))[:, None] != by_light[core])
+
+
+def _vetoed(by_light: Labels, saturated: Bool[np.ndarray, "height width"] | None) -> Bool[np.ndarray, "height width"]:
+    if saturated is None or not saturated.any():
+        return by_light >= 0
+    size = 2 * SATURATION_REACH_PX + 1
+    near = cv2.dilate(saturated.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    return (by_light >= 0) | (near > 0)
+
+
+def _confidence(volume: FocusVolume, labels: np.ndarray) -> Plane:
+    """From the energies as they are: averaged over slices every peak is flatter."""
+    log_energies = np.log(volume.energies + np.float32(volume.floor))
+    return confidence_of(log_energies, labels, peak_parabola(log_energies, labels)[1])
+
+
+def _share_of_one_surface(index: Plane) -> Plane:
+    """1 where the window of the energy sees one surface, down to 1/4 where it sees a jump of SURFACE_STEP slices or more."""
+    box = np.ones((2 * WINDOW_REACH_PX + 1,) * 2, np.uint8)
+    jump = cv2.dilate(index, box) - cv2.erode(index, box)
+    return (1.0 - 0.75 * np.clip(jump / SURFACE_STEP - 0.5, 0.0, 1.0)).astype(np.float32)
 
 
 def peak_parabola(log_energies: Volume, labels: np.ndarray) -> tuple[Plane, Plane]:
@@ -104,4 +136,4 @@ def confidence_of(log_energies: Volume, labels: np.ndarray, curvature: Plane) ->
     off_peak = log_energies.max(axis=0) - at_label
     contrast = at_label - np.median(log_energies, axis=0)
     agreement = np.exp(-2.0 * off_peak)
-    return (agreement * (1.0 - np.exp(-np.maximum(contrast, 0.0))) * np.clip(curvature / 0.3, 0.0, 1.0)).astype(np.float32)
+    return (agreement * (1.0 - np.exp(-np.maximum(contrast, 0.0))) * np.clip(curvature / SHARP_CURVATURE, 0.0, 1.0)).astype(np.float32)

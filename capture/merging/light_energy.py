@@ -1,62 +1,122 @@
-"""The true energy of lights that the sensor could not hold, read from the slices in which they are out of focus.
+"""Lights that the sensor could not hold: drawn anew in the all-in-focus picture with the flux and the place that their discs tell.
 
-A light in focus saturates a few pixels and its radiance is lost. Out of focus the same energy lies spread over its disc,
-below the saturation. Its flux there, less the background, is what the sharp pixels should have held.
+The size of a light comes from the slice in which it is sharpest: of discs with the known flux at the known place, the one that
+explains what is seen there below saturation. Where discs tell no flux (large lamps, lights that overlap) the sharp pixels of
+the light are raised to the flux of its widest disc instead.
 """
 
-from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 
-from capture.merging.lights import Lights
+from capture.merging.light_discs import LightDiscs
+from capture.merging.lights import OVER_RANGE, Lights
 
 Rgb = Float32[np.ndarray, "height width 3"]
 
 CORE_SHARE = 0.7
+# Radii of lights that are drawn as discs. Larger lamps, and those that saturated less, show their own shape and keep it.
+RADII_PX = np.arange(0.0, 2.51, 0.125)
+LARGEST_AREA_PX = 30.0
+LARGEST_HELD_SHARE = 0.65
+ALL_HELD_SHARE = 0.8
+# A point light behind a low-pass filter covers about this; demosaicing of full pixels hides smaller differences, which
+# count as much as this squared radiance per squared pixel of the radius.
+USUAL_RADIUS_PX = 1.0
+USUAL_WEIGHT = 10.0
+SUBPIXELS = 8
+MARGIN_PX = 3
 
 
-def with_light_energy(merged: Rgb, slices: Iterable[Rgb], lights: Lights) -> Rgb:
-    """The all-in-focus picture with every light's flux raised to what the slice shows in which it is spread widest."""
-    if len(lights) == 0:
-        return merged
-    background = _background(merged, lights)
-    held = _flux(merged - background, lights)
-    seen = np.stack([_flux(rgb - background, lights) for rgb in slices])
-    missing = np.maximum(seen[lights.widest, np.arange(len(lights))] - held, 0.0)
-    core = _brightest(merged, lights)
-    pixels = np.bincount(lights.zone[core], minlength=len(lights) + 1)[1:]
-    share = np.concatenate([np.zeros((1, 3)), missing / np.maximum(pixels, 1)[:, None]])
-    restored = merged.copy()
-    restored[core] += share[lights.zone[core]].astype(np.float32)
+@dataclass(frozen=True)
+class _Patch:
+    """The pixels around a light: their place in the picture, and its centre in subpixels of the patch."""
+
+    box: tuple[slice, slice]
+    distance_px: Float[np.ndarray, "height width"]
+    centre_px: Float[np.ndarray, "2"]
+
+    @classmethod
+    def around(cls, xy_px: Float[np.ndarray, "2"], reach_px: int, shape: tuple[int, ...]) -> "_Patch":
+        left, top = (max(int(each) - reach_px, 0) for each in xy_px)
+        right, bottom = min(int(xy_px[0]) + reach_px + 1, shape[1]), min(int(xy_px[1]) + reach_px + 1, shape[0])
+        y, x = np.mgrid[top:bottom, left:right] + 0.5
+        return cls(np.s_[top:bottom, left:right], np.hypot(x - xy_px[0], y - xy_px[1]), xy_px - [left, top])
+
+    def disc(self, radius_px: float) -> Float[np.ndarray, "height width"]:
+        """The share of a disc's light in each pixel; below the grid of subpixels it is a point."""
+        height, width = self.distance_px.shape
+        y, x = (np.mgrid[: height * SUBPIXELS, : width * SUBPIXELS] + 0.5) / SUBPIXELS
+        squared = (x - self.centre_px[0]) ** 2 + (y - self.centre_px[1]) ** 2
+        inside = squared <= max(radius_px**2, float(squared.min()))
+        return inside.reshape(height, SUBPIXELS, width, SUBPIXELS).mean(axis=(1, 3)) / inside.mean() / (height * width)
+
+
+def with_light_energy(merged: Rgb, discs: LightDiscs, lights: Lights, sharpest: Rgb | None = None) -> Rgb:
+    """The all-in-focus picture with all lights.
+
+    sharpest: around each light the slice in which it is most concentrated; None: the picture was merged so.
+    """
+    from scipy.ndimage import find_objects
+
+    restored, boxes = merged.copy(), find_objects(lights.zone, len(lights))
+    sharpest = merged if sharpest is None else sharpest
+    for light in range(len(lights)):
+        believable = discs.believable(light)
+        if believable.any() and _mostly_lost(light, believable, discs, lights):
+            _draw(restored, sharpest, lights, discs, light, believable)
+        else:
+            _raise(restored, lights, discs, light, boxes[light])
     return restored
 
 
-def _flux(excess: Rgb, lights: Lights) -> Float[np.ndarray, "lights 3"]:
-    """Sum of the light over its zone, per channel."""
-    count = len(lights) + 1
-    return np.stack([np.bincount(lights.zone.ravel(), excess[..., c].ravel(), count)[1:] for c in range(3)], axis=1)
+def _mostly_lost(light: int, believable: Bool[np.ndarray, " slices"], discs: LightDiscs, lights: Lights) -> bool:
+    """A small light whose sharp pixels hold so little of its flux that they do not show its shape either."""
+    held, flux = discs.flux[lights.sharpest[light], light].sum(), np.median(discs.flux[believable, light].sum(axis=1))
+    return bool(lights.areas_px[lights.sharpest[light], light] < LARGEST_AREA_PX and held < LARGEST_HELD_SHARE * flux)
 
 
-def _background(merged: Rgb, lights: Lights) -> Rgb:
-    """The merged picture with each light and its rim replaced by the mean of the rest of its zone."""
-    from scipy.ndimage import binary_dilation
+def _draw(restored: Rgb, sharpest: Rgb, lights: Lights, discs: LightDiscs, light: int, use: Bool[np.ndarray, " slices"]) -> None:
+    """Replace what is left of a light by a disc with its flux, and its stray light by what surrounds it."""
+    certainty = 1.0 / np.maximum(discs.variance_px2[use, light], 0.5)
+    xy_px = np.average(discs.xy_px[use, light], axis=0, weights=certainty)
+    flux = np.average(discs.flux[use, light], axis=0, weights=certainty)
+    clear_px = 1.15 * np.sqrt(lights.areas_px[lights.sharpest[light], light] / np.pi) + 2.0
+    patch = _Patch.around(xy_px, int(np.ceil(clear_px)) + MARGIN_PX, restored.shape)
+    around = patch.distance_px > clear_px
+    picture = restored[patch.box]
+    surroundings = np.median(picture[around], axis=0)
+    disc = patch.disc(_radius_px(sharpest[patch.box], patch, flux))
+    stray = ~around & ((picture > picture[around].max(axis=0)) | (picture < picture[around].min(axis=0))).any(axis=2)
+    picture[stray] = surroundings
+    cover = (disc / disc.max())[..., None]
+    picture[:] = (1.0 - cover) * picture + disc[..., None] * flux
 
-    lit = binary_dilation(lights.core, iterations=2)
-    count = len(lights) + 1
-    around = (lights.zone > 0) & ~lit
-    pixels = np.maximum(np.bincount(lights.zone[around], minlength=count), 1)
-    means = np.stack([np.bincount(lights.zone[around], merged[around][:, c], count) / pixels for c in range(3)], axis=1)
-    replaced = lit & (lights.zone > 0)
-    result = merged.copy()
-    result[replaced] = means[lights.zone[replaced]].astype(np.float32)
-    return result
+
+def _radius_px(seen: Rgb, patch: _Patch, flux: Float[np.ndarray, "3"]) -> float:
+    """The radius of the disc that explains what is seen of a light where nothing is full."""
+    surroundings = np.median(seen[patch.distance_px > patch.distance_px.max() / 2], axis=0)
+    unsaturated = np.minimum(seen, OVER_RANGE)
+
+    def miss(radius_px: float) -> float:
+        expected = np.minimum(surroundings + patch.disc(radius_px)[..., None] * flux, OVER_RANGE)
+        return float(((expected - unsaturated) ** 2).sum() + USUAL_WEIGHT * (radius_px - USUAL_RADIUS_PX) ** 2)
+
+    return float(min(RADII_PX, key=miss))
 
 
-def _brightest(merged: Rgb, lights: Lights) -> Bool[np.ndarray, "height width"]:
-    """The pixels of each light that come near its maximum: those that saturated."""
-    brightness = merged.max(axis=2)
-    peaks = np.zeros(len(lights) + 1, np.float32)
-    zone: Int[np.ndarray, "height width"] = lights.zone
-    np.maximum.at(peaks, zone.ravel(), brightness.ravel())
-    return (zone > 0) & lights.core & (brightness >= CORE_SHARE * peaks[zone])
+def _raise(restored: Rgb, lights: Lights, discs: LightDiscs, light: int, box: tuple[slice, slice]) -> None:
+    """Raise the sharp pixels of a light by the flux that its widest disc has and they have not."""
+    mine = (lights.zone[box] == light + 1) & lights.core[box]
+    if not mine.any():
+        return
+    brightness = restored[box].max(axis=2)
+    brightest = mine & (brightness >= CORE_SHARE * brightness[mine].max())
+    believable = discs.believable(light)
+    held = discs.flux[lights.sharpest[light], light]
+    flux = np.median(discs.flux[believable, light], axis=0) if believable.any() else discs.flux[lights.widest[light], light]
+    if held.sum() > ALL_HELD_SHARE * flux.sum():
+        return
+    missing = np.maximum(flux - held, 0.0)
+    restored[box][brightest] += (missing / np.count_nonzero(brightest)).astype(np.float32)

@@ -5,7 +5,7 @@ around it points at the wrong slice, and the merged picture gets ghost rings. Ar
 chosen by the light itself: the one in which its energy is most concentrated throws least of it on its surroundings.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 PerLight = Float[np.ndarray, " lights"]
+PerPixel = Float[np.ndarray, " pixels"]
 
 OVER_RANGE = 0.9
 TIMES_SURROUNDINGS = 5.0
@@ -30,6 +31,7 @@ class Lights:
     sharpest: for light 1, 2, ... the index of the slice in which it is most concentrated.
     focus_index: the fractional index at which each is in focus, from the growth of its disc.
     widest: the slice in which each is spread widest and still seen.
+    areas_px: how many pixels each covers in each slice.
     """
 
     zone: Int[np.ndarray, "height width"]
@@ -37,6 +39,7 @@ class Lights:
     sharpest: Int[np.ndarray, " lights"]
     focus_index: Float[np.ndarray, " lights"]
     widest: Int[np.ndarray, " lights"]
+    areas_px: Float[np.ndarray, "slices lights"]
 
     def __len__(self) -> int:
         return len(self.sharpest)
@@ -46,16 +49,50 @@ class Lights:
         return np.concatenate([[-1], self.sharpest]).astype(np.int64)[self.zone]
 
 
-def find_lights(slices: Callable[[], Iterable[Rgb]]) -> Lights:
-    """Lights of registered slices. slices: gives a fresh pass over them; three passes are made, one slice held at a time."""
-    darkest, brightest = _extremes(_brightness(rgb) for rgb in slices())
+@dataclass
+class Extremes:
+    """The darkest and the brightest that each pixel gets in any slice, gathered while the slices pass by."""
+
+    darkest: Plane | None = None
+    brightest: Plane | None = None
+
+    def watching(self, slices: Iterable[Rgb]) -> Iterator[Rgb]:
+        """The slices as they come; each is looked at."""
+        for rgb in slices:
+            plane = _brightness(rgb)
+            if self.darkest is None or self.brightest is None:
+                self.darkest, self.brightest = plane, plane.copy()
+            else:
+                cv2.min(self.darkest, plane, dst=self.darkest)
+                cv2.max(self.brightest, plane, dst=self.brightest)
+            yield rgb
+
+
+def find_lights(slices: Callable[[], Iterable[Rgb]], extremes: Extremes | None = None) -> Lights:
+    """Lights of registered slices. slices: gives a fresh pass over them, one slice held at a time.
+
+    extremes: what an earlier pass has gathered. Up to two passes are made, the second only where there are lights.
+    """
+    if extremes is None:
+        extremes = Extremes()
+        for _ in extremes.watching(slices()):
+            pass
+    darkest, brightest = extremes.darkest, extremes.brightest
+    assert darkest is not None and brightest is not None, "a stack has slices"
     reach_px = int(np.ceil(WIDEST_SHARE * darkest.shape[1]))
     surroundings = cv2.blur(darkest, (2 * reach_px + 1, 2 * reach_px + 1))
     spots = (brightest > OVER_RANGE) & (brightest > TIMES_SURROUNDINGS * surroundings)
+    if not spots.any():
+        return no_lights(darkest.shape)
     nearest, distance_px = _nearest_spot(spots)
-    count = int(nearest.max(initial=0))
     near = np.where(distance_px <= reach_px, nearest, 0)
-    spreads = [_spread(_brightness(rgb), surroundings + CLEARLY_BRIGHTER, near, count) for rgb in slices()]
+    members = np.flatnonzero(near)
+    numbers, floor, count = near.ravel()[members], (surroundings + CLEARLY_BRIGHTER).ravel()[members], int(nearest.max())
+    spreads, over = [], []
+    for rgb in slices():
+        brightness = rgb.reshape(-1, 3)[members].max(axis=1)
+        spreads.append(_spread(brightness, floor, numbers, count))
+        over.append(np.packbits(brightness > OVER_RANGE))
     light, areas_px, peaks = (np.array(each) for each in zip(*spreads, strict=True))
     # Far out of focus a light drowns in its surroundings; in focus most of it may be lost, but its peak is not.
     seen = (light >= LEAST_SHARE_OF_LIGHT * light.max(axis=0)) | (peaks > OVER_RANGE)
@@ -63,10 +100,17 @@ def find_lights(slices: Callable[[], Iterable[Rgb]]) -> Lights:
     radius_px = np.concatenate([[0.0], 1.3 * np.sqrt(np.where(seen, areas_px, 0.0).max(axis=0) / np.pi) + 2.0])
     zone = np.where(distance_px <= np.minimum(radius_px, reach_px)[near], near, 0)
     core = np.zeros(zone.shape, bool)
-    for index, rgb in enumerate(slices()):
-        mine = np.concatenate([[-1], sharpest])[zone] == index
-        core |= mine & (_brightness(rgb) > OVER_RANGE)
-    return Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), np.where(seen, areas_px, -1.0).argmax(axis=0))
+    owner = np.concatenate([[-1], sharpest])[zone].ravel()[members]
+    for index, packed in enumerate(over):
+        mine = owner == index
+        core.ravel()[members[mine]] = np.unpackbits(packed, count=len(members)).view(bool)[mine]
+    widest = np.where(seen, areas_px, -1.0).argmax(axis=0)
+    return Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), widest, areas_px)
+
+
+def no_lights(shape: tuple[int, ...]) -> Lights:
+    nothing = np.zeros(0, np.int64)
+    return Lights(np.zeros(shape, np.int64), np.zeros(shape, bool), nothing, nothing.astype(np.float64), nothing, np.zeros((0, 0)))
 
 
 def _between_slices(areas_px: np.ndarray, seen: np.ndarray, sharpest: Int[np.ndarray, " lights"]) -> PerLight:
@@ -86,39 +130,29 @@ def _between_slices(areas_px: np.ndarray, seen: np.ndarray, sharpest: Int[np.nda
 
 def _brightness(rgb: Rgb) -> Plane:
     """The brightest channel: coloured lights count too."""
-    return rgb.max(axis=2)
+    red, green, blue = cv2.split(rgb)
+    return cv2.max(cv2.max(red, green, dst=red), blue, dst=red)
 
 
-def _extremes(planes: Iterable[Plane]) -> tuple[Plane, Plane]:
-    darkest: Plane | None = None
-    for plane in planes:
-        if darkest is None:
-            darkest, brightest = plane.copy(), plane.copy()
-        else:
-            np.minimum(darkest, plane, out=darkest)
-            np.maximum(brightest, plane, out=brightest)
-    assert darkest is not None, "a stack has slices"
-    return darkest, brightest
+def _nearest_spot(spots: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray, "height width"], Float32[np.ndarray, "height width"]]:
+    """(number of the nearest spot, distance to it in pixels); there is at least one spot."""
+    _, labels = cv2.connectedComponents(spots.astype(np.uint8), connectivity=8)
+    distance_px, cells = cv2.distanceTransformWithLabels(
+        (~spots).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_CCOMP
+    )
+    number_of_cell = np.zeros(int(cells.max()) + 1, labels.dtype)
+    number_of_cell[cells[spots]] = labels[spots]
+    return number_of_cell[cells], distance_px
 
 
-def _nearest_spot(spots: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """(number of the nearest spot, 0 where there is none at all; distance to it in pixels)."""
-    from scipy.ndimage import distance_transform_edt, label
+def _spread(brightness: PerPixel, floor: PerPixel, numbers: Int[np.ndarray, " pixels"], count: int) -> tuple[PerLight, PerLight, PerLight]:
+    """For each light (how much is seen of it, over how many pixels, its peak); the area of an even disc is (sum)^2 / sum of squares.
 
-    labels, count = label(spots, structure=np.ones((3, 3)))
-    if count == 0:
-        return np.zeros(spots.shape, np.int64), np.full(spots.shape, np.inf)
-    distance_px, (rows, columns) = distance_transform_edt(~spots, return_indices=True)
-    return labels[rows, columns].astype(np.int64), distance_px
-
-
-def _spread(
-    brightness: Plane, surroundings: Plane, near: Int[np.ndarray, "height width"], count: int
-) -> tuple[PerLight, PerLight, PerLight]:
-    """For each light (how much is seen of it, over how many pixels, its peak); the area of an even disc is (sum)^2 / sum of squares."""
-    excess = np.maximum(brightness - surroundings, 0.0)
-    total = np.bincount(near.ravel(), excess.ravel(), count + 1)[1:]
-    squares = np.bincount(near.ravel(), (excess * excess).ravel(), count + 1)[1:]
+    Of the pixels near lights; numbers: which light each is near, from 1 to count.
+    """
+    excess = np.maximum(brightness - floor, 0.0)
+    total = np.bincount(numbers, excess, count + 1)[1:]
+    squares = np.bincount(numbers, excess * excess, count + 1)[1:]
     peaks = np.zeros(count + 1)
-    np.maximum.at(peaks, near.ravel(), brightness.ravel())
+    np.maximum.at(peaks, numbers, brightness)
     return total, total**2 / np.maximum(squares, 1e-12), peaks[1:]

@@ -1,103 +1,109 @@
 """`mrbokeh capture merge`: registered slices, all-in-focus picture and depth for every stack of a scene."""
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
-from capture.merging.alignment import Registration, register_stack, warp
-from capture.merging.all_in_focus import all_in_focus
-from capture.merging.depth_from_focus import FocusMap, depth_from_focus
+from capture.merging.alignment import Registration, register_stack
+from capture.merging.all_in_focus import NARROW_CROSSOVER, all_in_focus, crossover_of
+from capture.merging.depth_from_focus import FocusMap, focus_map
+from capture.merging.focus_volume import focus_volume
+from capture.merging.light_discs import DiscMeasurement
 from capture.merging.light_energy import with_light_energy
-from capture.merging.lights import find_lights
+from capture.merging.lights import Extremes, find_lights
+from capture.merging.registered_slices import RegisteredSlices, newer, read_slice, source_path
+from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
+from capture.merging.registration_file import read_registration, write_registration
+from capture.merging.second_pass import FIRST_PASS_FOLDER
+from capture.merging.slice_optics import SliceOptics
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, find_focal_stacks, write_focal_stack, write_merged
-from mrbokeh.image_io import read_image, write_image
+from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
 from mrbokeh.lens import Lens
 from mrbokeh.progress import track
 from mrbokeh.stack_pictures import write_merge_sheet
 
-REGISTERED_FOLDER = "registered"
 FEWEST_SLICES = 3
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 
-def merge_scene(scene: Path, overwrite: bool = False) -> list[FocalStack]:
-    """Merge every stack of a scene that is not merged yet (or all, to overwrite)."""
-    return [stack if stack.merged and not overwrite else merge_stack(stack) for stack in find_focal_stacks(scene)]
+def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None = None) -> list[FocalStack]:
+    """Merge every stack of a scene that is not merged yet (or all, to overwrite).
+
+    registration: a file that says how the slices of every stack fit together, instead of finding it out.
+    """
+    stacks = find_focal_stacks(scene)
+    return [stack if stack.merged and not overwrite else merge_stack(stack, overwrite, registration) for stack in stacks]
 
 
-def merge_stack(stack: FocalStack) -> FocalStack:
-    """Register, find depth, merge; writes the pictures first and stack.json last, so that an interrupted run starts anew."""
+def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None) -> FocalStack:
+    """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
     if len(stack) < FEWEST_SLICES:
         raise InputError(f"{stack.folder} has {len(stack)} slices: merging needs at least {FEWEST_SLICES}, focused at different distances")
-    registration = _register(stack)
-    slices = _write_registered(stack, registration)
-    registered = _with_registration(stack, slices, registration)
-
-    def passes(purpose: str) -> Iterator[Rgb]:
-        return track(registered.iter_rgb(), f"{stack.folder.name}: {purpose}", len(stack))
-
-    lights = find_lights(lambda: passes("lights"))
-    focus = depth_from_focus(passes("focus"), lights)
-    sharp = all_in_focus(passes("all in focus"), focus.merge_index)
-    picture = with_light_energy(sharp, passes("energy of lights"), lights)
-    write_merged(stack.folder, picture, focus.focus_index, focus.confidence, depth_m_of(registered, focus))
-    merged = replace(registered, merged=True)
+    name = stack.folder.name
+    slices = RegisteredSlices(stack, _registration_of(stack, overwrite, registration))
+    extremes = Extremes()
+    made = extremes.watching(track(slices.made(keep=not overwrite), f"{name}: register", len(stack)))
+    volume = focus_volume(made, slices.valid, len(stack))
+    lights = find_lights(slices.passing, extremes)
+    focus = focus_map(volume, lights, slices.saturated)
+    merged, measurement = _with_registration(stack, slices), DiscMeasurement(lights)
+    passing = measurement.watching(track(slices.passing(), f"{name}: all in focus", len(stack)))
+    blended = all_in_focus(passing, focus.merge_index, _crossover(merged, volume.shape[1]))
+    sharp = with_light_energy(blended, measurement.discs, lights)
+    write_merged(stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus), stack.rec709_from_camera)
+    shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
     write_focal_stack(merged)
     write_merge_sheet(merged)
     return merged
+
+
+def _crossover(stack: FocalStack, width_px: int) -> float:
+    if stack.lens is None or not stack.is_metric:
+        return NARROW_CROSSOVER
+    optics = SliceOptics.of_stack(stack, width_px)
+    return crossover_of(float(np.median(np.abs(np.diff(optics.focus_dioptres)))) * max(optics.px_per_dioptre))
 
 
 def depth_m_of(stack: FocalStack, focus: FocusMap) -> Plane | None:
     """The focus index in metres, interpolated in dioptres; None where a focus distance is unknown."""
     if not stack.is_metric:
         return None
-    dioptres = np.array([1.0 / distance for distance in stack.focus_distances_m if distance is not None])
-    interpolated = np.interp(focus.focus_index, np.arange(len(stack)), dioptres)
-    return (1.0 / np.maximum(interpolated, 1e-6)).astype(np.float32)
+    dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
+    return (1.0 / np.maximum(focus.dioptres(dioptres), 1e-6)).astype(np.float32)
 
 
-def source_path(each: Slice) -> str:
-    """The slice as it was ingested, also after registration has put a resampled one in its place."""
-    return str(each.metadata.get("ingested", each.path))
+def _registration_of(stack: FocalStack, overwrite: bool, given: Path | None) -> Registration:
+    """As given, as an interrupted run has left it, or found out; in every case it is written beside stack.json."""
+    own, sources = stack.folder / REGISTRATION_NAME, [stack.folder / source_path(each) for each in stack.slices]
+    if given is None and not overwrite and newer(own, *sources):
+        return read_registration(own, len(stack))
+    found = _registered(stack, sources) if given is None else read_registration(given, len(stack))
+    write_registration(own, found)
+    return found
 
 
-def _register(stack: FocalStack) -> Registration:
-    def read(index: int) -> Rgb:
-        return read_image(stack.folder / source_path(stack.slices[index]))
-
+def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
     knows_lens = stack.lens is not None and stack.is_metric
     prior = [stack.lens_of(i).image_distance_mm for i in range(len(stack))] if knows_lens else None
-    return register_stack(read, len(stack), prior)
+    read = lru_cache(maxsize=1)(lambda index: read_slice(sources[index]))
+    return register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0)
 
 
-def _write_registered(stack: FocalStack, registration: Registration) -> tuple[Slice, ...]:
-    """Resample every slice to the reference; half float keeps 11 bits, far below the noise of a photograph."""
-    written = []
-    for index, each in enumerate(track(stack.slices, f"{stack.folder.name}: register")):
-        path = f"{REGISTERED_FOLDER}/{index:02d}.exr"
-        rgb = read_image(stack.folder / source_path(each))
-        write_image(stack.folder / path, warp(rgb, registration.reference_from_slice[index]))
-        metadata = each.metadata | {
-            "ingested": source_path(each),
-            "reference_from_slice": registration.reference_from_slice[index].tolist(),
-        }
-        written.append(replace(each, path=path, scale=registration.scales[index], metadata=metadata))
-    return tuple(written)
-
-
-def _with_registration(stack: FocalStack, slices: tuple[Slice, ...], registration: Registration) -> FocalStack:
-    """The stack in the geometry of its reference: lens focused there, camera of that focus."""
-    changed = replace(stack, slices=slices, registered=True, reference=registration.reference)
-    if stack.lens is None or slices[registration.reference].focus_distance_m is None:
+def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:
+    """The merged stack in the geometry of its reference: lens focused there, camera of that focus."""
+    reference = slices.registration.reference
+    changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference)
+    if stack.lens is None or stack.slices[reference].focus_distance_m is None:
         return changed
-    lens = changed.lens_of(registration.reference)
+    lens = changed.lens_of(reference)
     return replace(changed, lens=lens, camera=_breathed(stack.camera, lens) if stack.camera else None)
 
 
