@@ -2,8 +2,15 @@
 
 import typer
 
-from capture.commands import ingest, merge
+from capture.commands import cameras, depth, ingest, merge, plan, poses, report, scale, shoot
 
-app = typer.Typer(no_args_is_help=True, help="Photographs to focal stacks: ingest RAW or pictures, then merge them.")
+app = typer.Typer(no_args_is_help=True, help="Photographs to focal stacks: shoot, ingest, merge, poses, scale, depth, report, dataset.")
+app.command("plan", help=plan.HELP)(plan.plan_command)
+app.command("cameras", help=cameras.HELP)(cameras.cameras_command)
+app.command("shoot", help=shoot.HELP)(shoot.shoot_command)
 app.command("ingest", help=ingest.HELP)(ingest.ingest_command)
 app.command("merge", help=merge.HELP)(merge.merge_command)
+app.command("poses", help=poses.HELP)(poses.poses_command)
+app.command("scale", help=scale.HELP)(scale.scale_command)
+app.command("depth", help=depth.HELP)(depth.depth_command)
+app.command("report", help=report.HELP)(report.report_command)

@@ -15,6 +15,10 @@ from mrbokeh.errors import InputError, MissingExtraError
 EXTRA_OF_MODULE = {
     "rawpy": "capture",
     "pyexiv2": "capture",
+    "exifread": "capture",
+    "lensfunpy": "capture",
+    "pycolmap": "capture",
+    "gphoto2": "tether",
     "torch": "train",
     "onnx": "train",
     "onnxscript": "train",

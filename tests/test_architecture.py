@@ -21,12 +21,13 @@ ROWS = (
     ("renderers.base",),
     ("psf_models.", "spreadlets_build"),
     ("psf_bank_export",),
+    ("focal_stack_dataset",),
     ("focal_stack", "video_io", "scene.", "contact_sheet", "psf_bank_file", "light_field_samples_file", "motion_file"),
     ("video_frames", "video_audio"),
     ("video_color", "_video_frames_numba"),
     ("lens_file", "camera_file"),
     ("lens_file_values",),
-    ("image_io",),
+    ("image_io", "camera_rgb"),
     ("exr_io",),
     ("layering",),
     ("other_view",),
@@ -51,6 +52,7 @@ ROWS = (
     ("psf", "_polygon_coverage_numba", "psf_bank"),
     ("nested_grid", "proportional_grid", "psf_axis"),
     ("layer", "camera", "color", "image_metrics"),
+    ("html_page",),
     ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device"),
     ("errors",),
 )
@@ -145,7 +147,9 @@ def test_no_cycles() -> None:
 
 
 @pytest.mark.parametrize(
-    ("library", "home"), [("torch", "training"), ("rawpy", "capture"), ("aiohttp", "viewfinder"), ("pyexiv2", "capture")]
+    ("library", "home"),
+    [("torch", "training"), ("aiohttp", "viewfinder")]
+    + [(name, "capture") for name in ("rawpy", "pyexiv2", "exifread", "pycolmap", "lensfunpy", "gphoto2")],
 )
 def test_heavy_libraries_live_in_one_package(library: str, home: str) -> None:
     """commands/doctor.py may ask torch for a GPU; two renderers have twins on devices; data sets may write metadata."""
@@ -157,7 +161,7 @@ def test_heavy_libraries_live_in_one_package(library: str, home: str) -> None:
         if isinstance(node, (ast.Import, ast.ImportFrom))
         and library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
-    twins = ("mrbokeh.renderers.torch_", "mrbokeh.torch_device", "mrbokeh.psf_models.torch_tracing")
+    twins = ("mrbokeh.renderers.torch_", "mrbokeh.torch_device", "mrbokeh.psf_models.torch_tracing", "capture.views.torch_plane_sweep")
     assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= {home}
 
 

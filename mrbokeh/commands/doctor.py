@@ -27,6 +27,10 @@ class Finding(NamedTuple):
 PACKAGES = (
     ("rawpy", "reading RAW photographs", "pip install 'mrbokeh[capture]'"),
     ("pyexiv2", "focus distance, focal length and f-number from photographs", "pip install 'mrbokeh[capture]'"),
+    ("exifread", "metadata of photographs that pyexiv2 cannot open", "pip install 'mrbokeh[capture]'"),
+    ("lensfunpy", "sensor sizes of cameras that do not state theirs", "pip install 'mrbokeh[capture]'"),
+    ("pycolmap", "camera poses and depth from several viewpoints", "pip install 'mrbokeh[capture]'"),
+    ("gphoto2", "shooting focal stacks with a tethered camera", "pip install 'mrbokeh[tether]'"),
     ("torch", "training networks", "pip install 'mrbokeh[train]'"),
     ("onnx", "exporting networks", "pip install 'mrbokeh[train]'"),
     ("onnxruntime", "rendering with trained networks", "pip install mrbokeh"),
@@ -37,7 +41,6 @@ PACKAGES = (
 PROGRAMS = (
     ("exiftool", "metadata of more cameras (49 of 54 files are read without it)", "install exiftool with your system's package manager"),
     ("nvidia-smi", "training and rendering on an NVIDIA GPU", "install the GPU driver; everything works without one, slower"),
-    ("gphoto2", "tethered cameras by the command line", "install gphoto2 with your system's package manager"),
 )
 
 

@@ -1,0 +1,31 @@
+"""`mrbokeh capture depth`: dense metric depth from neighbouring views and focus, and the all-in-focus picture made with it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+HELP = "\n\n".join(
+    (
+        "Find dense depth in metres for every stack that has a pose, from neighbouring views and focus together, and make its "
+        "all-in-focus picture again with it: no rings around lights, for this depth does not come from blur.",
+        "Needs `mrbokeh capture poses` and `scale`. The first picture and depth are kept in first_pass/; finished stacks are left "
+        "alone unless --overwrite is given. Stacks without a pose keep their depth from focus.",
+        "Example:  mrbokeh capture depth scene/",
+    )
+)
+
+
+def depth_command(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder that `mrbokeh capture scale` worked on")],
+    neighbours: Annotated[int, typer.Option(min=1, help="how many other views each stack is compared with")] = 6,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
+) -> None:
+    from capture.views.scene_depth import SceneDepthSettings, deepen_scene
+    from mrbokeh.stack_pictures import SHEET_NAME
+
+    result = deepen_scene(scene, SceneDepthSettings(neighbours, overwrite))
+    for stack in result.stacks:
+        typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
+    if result.left_out:
+        typer.echo(f"without a pose, depth from focus only: {', '.join(result.left_out)}")
