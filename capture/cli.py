@@ -2,7 +2,7 @@
 
 import typer
 
-from capture.commands import cameras, depth, ingest, merge, plan, poses, report, scale, shoot
+from capture.commands import cameras, dataset, depth, ingest, merge, plan, poses, process, report, scale, shoot
 
 app = typer.Typer(no_args_is_help=True, help="Photographs to focal stacks: shoot, ingest, merge, poses, scale, depth, report, dataset.")
 app.command("plan", help=plan.HELP)(plan.plan_command)
@@ -13,4 +13,6 @@ app.command("merge", help=merge.HELP)(merge.merge_command)
 app.command("poses", help=poses.HELP)(poses.poses_command)
 app.command("scale", help=scale.HELP)(scale.scale_command)
 app.command("depth", help=depth.HELP)(depth.depth_command)
+app.command("dataset", help=dataset.HELP)(dataset.dataset_command)
 app.command("report", help=report.HELP)(report.report_command)
+app.command("process", help=process.HELP)(process.process_command)

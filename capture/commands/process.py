@@ -1,0 +1,50 @@
+"""`mrbokeh capture process`: everything from photographs to a report in one go."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+HELP = "\n\n".join(
+    (
+        "Run ingest, merge, poses, scale, depth and report one after the other. Finished stages are kept, an interrupted one goes on. "
+        "With one viewpoint, or where camera poses cannot be found, depth comes from focus alone, and the report says so.",
+        "Example:  mrbokeh capture process shoot/ --out scene/",
+        "Example:  mrbokeh capture process shoot/ --out scene/ --board 8x6 --square-mm 30 --marker-mm 22 --strict",
+    )
+)
+
+
+def process_command(
+    photographs: Annotated[list[Path], typer.Argument(metavar="FILES|DIR...", help="photographs, or folders to search for them")],
+    out: Annotated[Path, typer.Option(metavar="SCENE", help="folder for the stacks, one folder each")],
+    sidecar: Annotated[Path | None, typer.Option(metavar="lens.toml", help="for all photographs, instead of those beside them")] = None,
+    max_width: Annotated[int | None, typer.Option(min=16, metavar="N", help="reduce wider pictures to N pixels (area averages)")] = None,
+    board: Annotated[str | None, typer.Option(metavar="COLUMNSxROWS|board.toml", help="squares of a ChArUco board in the scene")] = None,
+    square_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a square as measured on the print")] = None,
+    marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
+    distance: Annotated[str | None, typer.Option(metavar="VIEW_A,VIEW_B,METRES", help="between two camera centres")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="exit with 1 when a gate of the report fails")] = False,
+) -> None:
+    from capture.commands.depth import depth_command
+    from capture.commands.ingest import ingest_command
+    from capture.commands.merge import merge_command
+    from capture.commands.poses import poses_command
+    from capture.commands.report import report_command
+    from capture.commands.scale import scale_command
+    from mrbokeh.errors import InputError
+    from mrbokeh.focal_stack import find_focal_stacks
+
+    ingest_command(photographs, out, sidecar=sidecar, max_width=max_width)
+    merge_command(out)
+    if len(find_focal_stacks(out)) < 2:
+        typer.echo("one viewpoint: depth comes from focus alone (photograph five or more for depth from several views)")
+    else:
+        try:
+            poses_command(out)
+        except InputError as error:
+            typer.echo(f"no camera poses, so depth comes from focus alone: {error}")
+        else:
+            scale_command(out, board=board, square_mm=square_mm, marker_mm=marker_mm, distance=distance)
+            depth_command(out)
+    report_command(out, strict=strict)

@@ -1,0 +1,40 @@
+"""`mrbokeh capture report`: what proves or disproves the stacks of a scene, on one page."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mrbokeh.errors import InputError
+
+HELP = "\n\n".join(
+    (
+        "Judge the stacks of a scene: re-blur the all-in-focus picture and compare it with every photograph, look for missing and swapped "
+        "slices, drift of exposure and registration, movement, wrong focus distances, depth or scale.",
+        "Writes SCENE/report.html (one file, pictures and 3D view inside), SCENE/report.json with the same numbers, and each stack's "
+        "exclusion.exr. What is not there yet (poses, scale, depth in metres) is named as absent.",
+        "Example:  mrbokeh capture report scene/",
+        "Example:  mrbokeh capture report scene/ --strict && mrbokeh train fit scene/",
+    )
+)
+
+
+def report_command(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder with merged stacks")],
+    strict: Annotated[bool, typer.Option("--strict", help="exit with 1 when a gate fails")] = False,
+    renderer: Annotated[str, typer.Option(help="that re-blurs: polygon, scatter (exact, slow) or another of mrbokeh's")] = "polygon",
+    width: Annotated[int, typer.Option(min=64, help="wider pictures are judged at this width, in pixels; blur is then smaller too")] = 960,
+) -> None:
+    from capture.report.reblur import Reblur
+    from capture.report.scene_page import HTML_NAME
+    from capture.report.scene_report import report_scene
+    from mrbokeh.renderers.choose import make_renderer
+
+    if not scene.is_dir():
+        raise InputError(f"expected a folder with focal stacks, but {scene} is none")
+    report = report_scene(scene, Reblur(make_renderer(renderer)), width)
+    for each in report.failures:
+        typer.echo(f"failed: {each.where}: {each.name}: {each.measured} (wanted: {each.limit})")
+    typer.echo(f"{scene / HTML_NAME}: {len(report.gates)} gates, {len(report.failures)} failed")
+    if strict and report.failures:
+        raise typer.Exit(1)

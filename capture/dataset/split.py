@@ -1,0 +1,32 @@
+"""Which stacks are for training and which for testing: whole viewpoints, the same ones on every machine."""
+
+import hashlib
+from collections.abc import Sequence
+
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack_dataset import Part
+
+
+def split_by_viewpoint(names: Sequence[str], test: Sequence[str] = (), test_share: float = 0.2, seed: int = 0) -> dict[str, Part]:
+    """The part of each stack. names: SCENE/VIEW.
+
+    test: names (or VIEW alone) to test on; without any, those whose hash with the seed is smallest, test_share of all and at least one
+    where there are two. Raises InputError where a name is unknown or nothing is left to train on.
+    """
+    unknown = [name for name in test if not any(_is_called(full, name) for full in names)]
+    if unknown:
+        raise InputError(f"cannot test on {', '.join(unknown)}: expected viewpoints among {', '.join(sorted(names))}")
+    if test:
+        apart = {full for full in names if any(_is_called(full, name) for name in test)}
+    else:
+        if not 0.0 <= test_share < 1.0:
+            raise InputError(f"the share of test viewpoints must lie in [0, 1), got {test_share:g}")
+        count = max(1, round(test_share * len(names))) if len(names) > 1 and test_share > 0 else 0
+        apart = set(sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).hexdigest())[:count])
+    if len(apart) == len(names):
+        raise InputError(f"all {len(names)} viewpoints are for testing, none is left to train on: test on fewer or give more scenes")
+    return {name: "test" if name in apart else "train" for name in names}
+
+
+def _is_called(full: str, name: str) -> bool:
+    return name in (full, full.rsplit("/", 1)[-1])

@@ -1,0 +1,105 @@
+"""`mrbokeh capture dataset`: the stacks of some scenes as one data set. Stacks are written one by one, pictures read one by one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+from capture.dataset.split import split_by_viewpoint
+from capture.dataset.stack_writer import StackWriting, require_usable, write_stack
+from mrbokeh import __version__
+from mrbokeh.atomic_files import write_json
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.focal_stack_dataset import FILE_NAME, FocalStackDataset, StackRecord, write_focal_stack_dataset
+from mrbokeh.progress import track
+
+UNFINISHED_NAME = "unfinished.json"
+MAXIMUM = "maximum"
+
+
+@dataclass(frozen=True)
+class DatasetPlan:
+    """licence: the text. test, test_share, seed: see `split_by_viewpoint`.
+
+    radiance_scale: "maximum", a share of the pixels such as "0.9999" (what is brighter lies beyond 1 in the network's range), or a
+    radiance such as "radiance 12.5".
+    """
+
+    licence: str
+    test: tuple[str, ...] = ()
+    test_share: float = 0.2
+    seed: int = 0
+    radiance_scale: str = MAXIMUM
+    writing: StackWriting = field(default_factory=StackWriting)
+
+
+def write_dataset(scenes: Sequence[Path], out: Path, plan: DatasetPlan, overwrite: bool = False) -> FocalStackDataset:
+    """Write the stacks of all scenes and, last, dataset.json. An interrupted run goes on where it stopped.
+
+    Raises InputError where a stack cannot be learned from, and where `out` holds something else or is finished (unless to overwrite).
+    """
+    if not plan.licence.strip():
+        raise InputError("a data set needs a licence note: give --licence with a text such as 'CC BY 4.0, Jane Doe' or a file")
+    stacks = named_stacks(scenes)
+    parts = split_by_viewpoint(list(stacks), plan.test, plan.test_share, plan.seed)
+    for stack in stacks.values():
+        require_usable(stack)
+    _claim(out, overwrite)
+    records = tuple(
+        write_stack(stack, out, name, parts[name], plan.writing) for name, stack in track(stacks.items(), "data set", len(stacks))
+    )
+    scale = radiance_scale(records, plan.radiance_scale)
+    metadata = {
+        "made_by": f"mrbokeh {__version__}",
+        "made_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "radiance_scale_is": plan.radiance_scale,
+        "split_seed": plan.seed,
+        "split_by": "names" if plan.test else "hash of seed and name",
+    }
+    dataset = FocalStackDataset(out, plan.licence, scale, records, metadata)
+    (out / "LICENCE.txt").write_text(plan.licence.rstrip() + "\n", encoding="utf-8")
+    write_focal_stack_dataset(dataset)
+    (out / UNFINISHED_NAME).unlink()
+    return dataset
+
+
+def named_stacks(scenes: Sequence[Path]) -> dict[str, FocalStack]:
+    """By SCENE/VIEW. Raises InputError where two would have one name."""
+    named: dict[str, FocalStack] = {}
+    for scene in scenes:
+        for stack in find_focal_stacks(scene):
+            folder = stack.folder.resolve()
+            name = f"{folder.parent.name}/{folder.name}"
+            if name in named:
+                raise InputError(f"two stacks are called {name}: {named[name].folder} and {stack.folder}; rename one of their scenes")
+            named[name] = stack
+    return named
+
+
+def radiance_scale(records: Sequence[StackRecord], choice: str) -> float:
+    """One number for the whole data set; a share is answered by the stack in which it is brightest."""
+    try:
+        if choice == MAXIMUM:
+            scale = max(each.radiance.largest for each in records)
+        elif choice.startswith("radiance "):
+            scale = float(choice.removeprefix("radiance "))
+        else:
+            scale = max(each.radiance.quantiles[choice] for each in records)
+    except (KeyError, ValueError):
+        shares = ", ".join(records[0].radiance.quantiles)
+        message = f"--radiance-scale must be {MAXIMUM}, one of the shares {shares}, or 'radiance X', got {choice!r}"
+        raise InputError(message) from None
+    if not 0.0 < scale < float("inf"):
+        raise InputError(f"the radiance scale must be a positive number, but came out as {scale}: are all pictures black?")
+    return scale
+
+
+def _claim(out: Path, overwrite: bool) -> None:
+    """Go on only in a folder that is new, ours and unfinished, or to be overwritten."""
+    if (out / FILE_NAME).exists():
+        if not overwrite:
+            raise InputError(f"{out / FILE_NAME} exists already: give another name, or --overwrite to bring it up to date")
+    elif out.exists() and any(out.iterdir()) and not (out / UNFINISHED_NAME).exists():
+        raise InputError(f"{out} holds something else than a data set: give the name of a new folder")
+    write_json(out / UNFINISHED_NAME, {"what": f"a data set being written; {FILE_NAME} comes last"})

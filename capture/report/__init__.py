@@ -1,0 +1,1 @@
+"""What proves or disproves a focal stack, measured and put on one page."""

@@ -1,0 +1,137 @@
+"""One pass over a merged stack: predicts every slice, compares, and keeps what gates, pictures and masks need."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from capture.report.depth_check import DepthCheck, DepthEvidence
+from capture.report.exposure_drift import low_frequency_gain
+from capture.report.focus_curve import FocusCurve, focus_curve
+from capture.report.focus_spacing import FocusSpacing, focus_spacing
+from capture.report.moving_objects import Disagreement, moving
+from capture.report.reblur import Reblur
+from capture.report.registration_drift import RegistrationDrift, registration_drift
+from capture.report.slice_fit import Prediction, SliceFit, fit_slice
+from capture.report.stack_view import StackView
+from mrbokeh.color import luminance
+from mrbokeh.focal_stack import FocalStack
+from mrbokeh.image_metrics import psnr
+from mrbokeh.progress import track
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+
+STEP_PX = 1.0
+LEAST_CONFIDENCE = 0.1
+_WIDEST_BORDER = 0.1
+
+
+@dataclass(frozen=True)
+class SliceFindings:
+    """psnr_db: prediction against slice; unblurred_db: all-in-focus picture against slice (linear, clipped to 1, counted pixels).
+
+    gain: brightness against the all-in-focus picture. What has None as its default is so where nothing can be predicted.
+    """
+
+    index: int
+    gain: float
+    saturated: float
+    counted: float
+    largest_coc_px: float | None = None
+    psnr_db: float | None = None
+    unblurred_db: float | None = None
+    fit: SliceFit | None = None
+
+
+@dataclass(frozen=True)
+class StackFindings:
+    """What is None could not be found: spacing without focus distances, drift without registration, predictions without lens and depth.
+
+    moving: (H, W) at the width of the report.
+    """
+
+    stack: FocalStack
+    width_px: int
+    height_px: int
+    slices: tuple[SliceFindings, ...]
+    curve: FocusCurve | None
+    spacing: FocusSpacing | None
+    drift: RegistrationDrift | None
+    depth: DepthCheck | None
+    moving: Mask | None
+
+    @property
+    def name(self) -> str:
+        return self.stack.folder.name
+
+
+Watch = Callable[[int, Rgb, Rgb], None]
+"""Is told the number of a slice, the slice and its prediction, while they are at hand."""
+
+
+def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> StackFindings:
+    """Raises InputError where the stack is not merged."""
+    height, width = view.all_in_focus.shape[:2]
+    found, disagreements, evidence = [], [], DepthEvidence()
+    for index in track(range(len(view)), f"{view.stack.folder.name}: re-blur"):
+        findings, kept = _examine_slice(view, index, reblur, evidence, watch)
+        found.append(findings)
+        if kept is not None:
+            disagreements.append(kept)
+    depth = evidence.check() if view.is_explained else None
+    return StackFindings(
+        view.stack,
+        width,
+        height,
+        tuple(found),
+        focus_curve(view.focus_index, view.confidence, len(view)),
+        focus_spacing([each for each in view.stack.focus_distances_m if each is not None]) if view.stack.is_metric else None,
+        registration_drift(view.stack, *view.full_size_px),
+        depth,
+        None if depth is None else moving(disagreements, depth.off_px),
+    )
+
+
+def _examine_slice(
+    view: StackView, index: int, reblur: Reblur, evidence: DepthEvidence, watch: Watch | None
+) -> tuple[SliceFindings, Disagreement | None]:
+    rgb, usable = view.slice_rgb(index), view.usable(index)
+    gain = low_frequency_gain(rgb, view.all_in_focus, usable)
+    saturated = float(view.saturated(index).mean())
+    if not view.is_explained:
+        return SliceFindings(index, gain, saturated, float(usable.mean())), None
+    prediction = predict(view, index, reblur)
+    if watch is not None:
+        watch(index, rgb, prediction.rgb)
+    counted = usable & (view.confidence >= LEAST_CONFIDENCE) & _inside(prediction.coc_px)
+    fit, remaining = fit_slice(rgb, prediction, counted)
+    evidence.add(remaining, prediction, counted)
+    residual, level, per_px = (luminance(each).astype(np.float16) for each in (remaining, prediction.rgb, prediction.per_px))
+    findings = SliceFindings(
+        index,
+        gain,
+        saturated,
+        float(counted.mean()),
+        float(np.abs(prediction.coc_px)[counted].max(initial=0.0)),
+        psnr(prediction.rgb, rgb, mask=counted) if counted.any() else None,
+        psnr(view.all_in_focus, rgb, mask=counted) if counted.any() else None,
+        fit,
+    )
+    return findings, Disagreement(residual, level, per_px, usable & _inside(prediction.coc_px))
+
+
+def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
+    coc_px = view.coc_px(index)
+    rgb, less, more = (reblur(view.all_in_focus, coc_px + np.float32(step_px), view.aperture) for step_px in (0.0, -STEP_PX, STEP_PX))
+    return Prediction(rgb, less, more, coc_px, STEP_PX)
+
+
+def _inside(coc_px: Plane) -> Mask:
+    """Pixels that no light from beyond the picture reaches."""
+    reach = int(min(0.5 * float(np.abs(coc_px).max()) + 2, _WIDEST_BORDER * min(coc_px.shape)))
+    inside = np.zeros(coc_px.shape, bool)
+    inside[reach : coc_px.shape[0] - reach, reach : coc_px.shape[1] - reach] = True
+    return inside

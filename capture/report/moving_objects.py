@@ -1,0 +1,101 @@
+"""What moved between slices: where a slice disagrees with its prediction otherwise than its neighbours do.
+
+A wrong depth, a ghost or hidden background leave a residual that changes slowly from slice to slice, for blur does. What moves
+leaves one that jumps between two slices. So jumps count, beyond what noise explains, what other slices show at the same
+pixel, what a diameter that is a little off would do there, and a share of the radiance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float16, Float32
+
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+
+FEWEST_SLICES = 4
+_SOFTENED_PX = 1.5
+_NOISES = 6.0
+_OTHERS = 4.0
+_BLUR_PX = 1.0
+_SHARE = 0.04
+_DARK = 0.02
+_LEAST_AREA = 2e-4
+_LEAST_AREA_PX = 12
+_GROWN_PX = 2
+_BINS = 8
+# The kernel of Immerkaer, Fast noise variance estimation (1996): blind to planes; its response to white noise of 1 is 6.
+_NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+_NOISE_RESPONSE = 6.0
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """How a slice and its prediction disagree, in luminance and half precision, for all slices are held at once.
+
+    residual: slice minus prediction. level: of the prediction. per_px: how the prediction changes for each pixel of diameter.
+    counted: pixels to judge by.
+    """
+
+    residual: Float16[np.ndarray, "height width"]
+    level: Float16[np.ndarray, "height width"]
+    per_px: Float16[np.ndarray, "height width"]
+    counted: Mask
+
+
+def moving(slices: Sequence[Disagreement], depth_off_px: Plane) -> Mask:
+    """(H, W) where something moved during the stack. depth_off_px: by how much diameters are known to be wrong (see `depth_check`)."""
+    if len(slices) < FEWEST_SLICES:
+        return np.zeros(depth_off_px.shape, bool)
+    blur_px = _BLUR_PX + np.abs(depth_off_px)
+    jumps, allowed = zip(*(_jump(first, second, blur_px) for first, second in pairwise(slices)), strict=True)
+    sizes = np.stack(jumps)
+    # A third and not the median: something that comes and goes again jumps twice.
+    usual = np.quantile(sizes, 1.0 / 3.0, axis=0).astype(np.float32)
+    jumped = np.zeros(usual.shape, bool)
+    for size, limit in zip(sizes, allowed, strict=True):
+        jumped |= size > limit + _OTHERS * usual
+    return _areas(jumped)
+
+
+def _jump(first: Disagreement, second: Disagreement, blur_px: Plane) -> tuple[Plane, Plane]:
+    """How far the residual jumps between a slice and the next, and what noise, a diameter off by blur_px and radiance allow."""
+    both = (first.counted & second.counted).astype(np.float32)
+    residuals = [each.residual.astype(np.float32) for each in (first, second)]
+    levels = [each.level.astype(np.float32) for each in (first, second)]
+    weight = np.maximum(_softened(both), 1e-3)
+    size = np.abs(_softened((residuals[1] - residuals[0]) * both)) / weight * (weight > 0.5)
+    noise = np.hypot(*(noise_deviation(residual, level) for residual, level in zip(residuals, levels, strict=True)))
+    left = 1.0 / (2.0 * np.sqrt(np.pi) * _SOFTENED_PX)
+    blur = _softened(np.maximum(*(np.abs(each.per_px.astype(np.float32)) for each in (first, second)))) * blur_px
+    radiance = _SHARE * (np.maximum(np.minimum(*levels), 0.0) + _DARK)
+    return size.astype(np.float32), (_NOISES * left * noise + blur + radiance).astype(np.float32)
+
+
+def noise_deviation(residual: Plane, level: Plane) -> Plane:
+    """(H, W) standard deviation of the noise, a function of radiance, measured where the residual has nothing but noise: its fine grain."""
+    grain = np.abs(cv2.filter2D(residual, -1, _NOISE_KERNEL)) / _NOISE_RESPONSE
+    edges = np.quantile(level, np.linspace(0.0, 1.0, _BINS + 1))
+    middles, deviations = [], []
+    for low, high in pairwise(edges):
+        within = (level >= low) & (level <= high)
+        if within.any():
+            middles.append(float(np.median(level[within])))
+            deviations.append(1.4826 * float(np.median(grain[within])))
+    return np.interp(level, middles, deviations).astype(np.float32)
+
+
+def _softened(plane: Plane) -> Plane:
+    return cv2.GaussianBlur(plane, (0, 0), _SOFTENED_PX)
+
+
+def _areas(jumped: Mask) -> Mask:
+    """Connected areas that are not specks, grown a little."""
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(jumped.astype(np.uint8), connectivity=8)
+    large = statistics[:, cv2.CC_STAT_AREA] >= max(_LEAST_AREA_PX, _LEAST_AREA * jumped.size)
+    large[0] = False
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _GROWN_PX + 1, 2 * _GROWN_PX + 1))
+    return cv2.dilate(large[labels].astype(np.uint8), kernel) > 0

@@ -1,0 +1,98 @@
+"""What the gates of one stack ask, and their limits.
+
+Limits were set between what right stacks reach and what faulty ones show (tests/test_capture_reblur.py): on traced stacks with truth the
+fit of a right one finds focus within 0.4 px, blur within 1 %, place within 0.03 px and exposure within 0.1 %. What merging leaves of
+blur in the all-in-focus picture, and its depth from focus, make up to 5 % of blur; a tenth of f-number too much reads as 8.7 %.
+"""
+
+from capture.report.gates import Rule
+
+LEAST_DB = 30.0
+LARGEST_FOCUS_PX = 0.6
+LARGEST_BLUR_GAIN = 0.07
+LARGEST_SHIFT_PX = 0.3
+LARGEST_EXPOSURE = 0.01
+LARGEST_GAIN_DRIFT = 0.02
+DEPTH_OFF_PX = 1.0
+LARGEST_DEPTH_SHARE = 0.05
+LARGEST_MOVING = 0.02
+LARGEST_SATURATED = 0.02
+LARGEST_BEYOND = 0.25
+LEAST_CORRELATION = 0.8
+LARGEST_JUMP = 0.01
+LEAST_TRUSTED = 0.2
+
+NO_PREDICTION = "needs a merged stack with lens and focus distances: add them to lens.toml, ingest and merge again"
+
+SPACING = Rule(
+    "no slice missing",
+    "even steps in dioptres, each once and in order",
+    "What lies in focus between two distant slices is sharp in neither: the all-in-focus picture keeps blur there.",
+    "Photograph the missing distances again, or correct focus_distances_m in lens.toml if the photographs are there.",
+)
+RANGE = Rule(
+    "focus reaches the whole scene",
+    f"at most {LARGEST_BEYOND:.0%} of the picture sharpest at either end of the stack",
+    "What lies beyond the first or last focus is never sharp, and its depth is cut off there.",
+    "Add slices at the near or far end (`mrbokeh capture plan` says where).",
+)
+TEXTURE = Rule(
+    "depth is known",
+    f"at least {LEAST_TRUSTED:.0%} of the picture with confidence 0.3 or more",
+    "Where nothing has texture, depth is a guess from its neighbours and teaches nothing.",
+    "Choose scenes with texture, or add viewpoints and run `mrbokeh capture depth`.",
+)
+REGISTRATION = Rule(
+    "registration held",
+    f"correlation of neighbours at least {LEAST_CORRELATION:g}, no jump beyond {LARGEST_JUMP:.0%} of the width",
+    "A pair of slices that does not correlate was placed by the lens model alone, or wrongly; a camera that was pushed sees another view.",
+    "Look at the two slices: smaller focus steps, a tripod, no wind; merge again with --overwrite.",
+)
+EXPOSURE = Rule(
+    "exposure is constant",
+    f"slices within {LARGEST_EXPOSURE:.0%} of the prediction ({LARGEST_GAIN_DRIFT:.0%} where there is none)",
+    "A slice that is brighter teaches the lens to make light.",
+    "Lock exposure and white balance, avoid flickering lamps; leave the slice out or photograph it again.",
+)
+RESIDUAL = Rule(
+    "re-blurred picture is the slice",
+    f"PSNR at least {LEAST_DB:g} dB in every slice",
+    "The all-in-focus picture, blurred by the circles of confusion, must give each photograph: this proves depth, focus and lens at once.",
+    "Read the gates below, which say what is wrong with the worst slices; the difference pictures show where.",
+)
+FOCUS = Rule(
+    "focus distances are right",
+    f"circles of confusion within {LARGEST_FOCUS_PX:g} px in every slice",
+    "A focus distance that is off, or a slice at another's place, gives the network blur of the wrong size.",
+    "Correct focus_distances_m (or the order of the slices); `mrbokeh capture depth` calibrates them.",
+)
+BLUR = Rule(
+    "blur has the right size",
+    f"within {LARGEST_BLUR_GAIN:.0%} over the stack",
+    "Focal length, f-number, sensor width or the scale of depth are off when all blur is too small or too large.",
+    "Check f_number, focal_length_mm and sensor_width_mm in lens.toml, and the scale (`mrbokeh capture scale`).",
+)
+PLACE = Rule(
+    "slices lie on the picture",
+    f"within {LARGEST_SHIFT_PX:g} px, also in the corners",
+    "A shift looks like blur to the one side, and training learns it.",
+    "Merge again with --overwrite; check that nothing shook the tripod.",
+)
+DEPTH = Rule(
+    "depth agrees with the slices",
+    f"at most {LARGEST_DEPTH_SHARE:.0%} of the picture off by more than {DEPTH_OFF_PX:g} px of blur",
+    "Wrong depth gives blur of the wrong size there, whatever the lens.",
+    "Run `mrbokeh capture depth` over several viewpoints, or leave it to the exclusion masks if it is little.",
+)
+MOTION = Rule(
+    "nothing moved",
+    f"at most {LARGEST_MOVING:.0%} of the picture",
+    "What moved is at one place in the all-in-focus picture and at another in the slice.",
+    "Photograph again without wind and people, or train with exclusion masks (`mrbokeh capture dataset` writes them).",
+)
+SATURATION = Rule(
+    "highlights are not clipped",
+    f"at most {LARGEST_SATURATED:.0%} of any slice saturated",
+    "Clipped highlights give bokeh discs that are too dark, the most visible part of the blur.",
+    "Expose so that the brightest lights just fit where they are out of focus.",
+)

@@ -1,0 +1,107 @@
+"""A merged stack as the report looks at it: registered pictures at a bounded width, read one at a time."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from capture.merging.slice_optics import SliceOptics
+from mrbokeh.aperture import Aperture
+from mrbokeh.focal_stack import FocalStack
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+
+DEFAULT_WIDTH_PX = 960
+_UNTOUCHED = 0.999
+
+
+@dataclass(frozen=True)
+class StackView:
+    """Pictures of a merged stack, at most `widest_px` wide. Circles of confusion shrink with the pictures.
+
+    Colours are averaged over areas in linear light; masks keep what is untouched by what they exclude; depth is sampled, for a mean of
+    two depths is neither.
+    """
+
+    stack: FocalStack
+    widest_px: int = DEFAULT_WIDTH_PX
+
+    def __len__(self) -> int:
+        return len(self.stack)
+
+    @cached_property
+    def all_in_focus(self) -> Rgb:
+        return self._shrunk(self.stack.all_in_focus())
+
+    def slice_rgb(self, index: int) -> Rgb:
+        return self._shrunk(self.stack.slice_rgb(index))
+
+    def usable(self, index: int) -> Mask:
+        """Where a slice has data and none of it is saturated."""
+        masks = self.stack.slice_masks(index)
+        return self._shrunk_mask(masks.valid & ~masks.saturated)
+
+    def saturated(self, index: int) -> Mask:
+        return ~self._shrunk_mask(~self.stack.slice_masks(index).saturated)
+
+    @cached_property
+    def confidence(self) -> Plane:
+        return self._shrunk(self.stack.depth_confidence())
+
+    @cached_property
+    def focus_index(self) -> Plane:
+        return self._sampled(self.stack.focus_index())
+
+    @cached_property
+    def full_size_px(self) -> tuple[int, int]:
+        """Width and height of the pictures as they are stored."""
+        height, width = self.stack.depth_confidence().shape
+        return width, height
+
+    @cached_property
+    def dioptres(self) -> Plane:
+        """1 / metres. Raises InputError where focus distances are unknown."""
+        depth_m = self._sampled(self.stack.depth_m())
+        return (1.0 / np.maximum(depth_m, 1e-3)).astype(np.float32)
+
+    @cached_property
+    def optics(self) -> SliceOptics:
+        """In pixels of these pictures. Raises InputError where the lens or a focus distance is unknown."""
+        return SliceOptics.of_stack(self.stack, self.width_px)
+
+    @property
+    def aperture(self) -> Aperture:
+        return self.optics.aperture
+
+    def coc_px(self, index: int) -> Plane:
+        """Signed diameters, in pixels of these pictures."""
+        return self.optics.coc_px(index, self.dioptres)
+
+    @cached_property
+    def width_px(self) -> int:
+        return int(self.all_in_focus.shape[1])
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether there is all that a prediction of the slices needs."""
+        return self.stack.merged and self.stack.registered and self.stack.is_metric and self.stack.lens is not None
+
+    def _shrunk(self, picture: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+        size = self._size(picture)
+        return picture if size is None else cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+
+    def _shrunk_mask(self, mask: Bool[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
+        return self._shrunk(mask.astype(np.float32)) > _UNTOUCHED
+
+    def _sampled(self, plane: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+        size = self._size(plane)
+        return plane if size is None else cv2.resize(plane, size, interpolation=cv2.INTER_NEAREST).astype(np.float32)
+
+    def _size(self, picture: np.ndarray) -> tuple[int, int] | None:
+        """(width, height) to shrink to, None where the picture is small enough."""
+        height, width = picture.shape[:2]
+        return None if width <= self.widest_px else (self.widest_px, round(height * self.widest_px / width))
