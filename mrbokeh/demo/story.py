@@ -6,9 +6,10 @@ from pathlib import Path
 from mrbokeh.atomic_files import write_json
 from mrbokeh.demo.measurements import Measurement, merge_measurements, network_measurements, parity_measurement
 from mrbokeh.demo.plan import BOARD, DATA, DESK, HELD_OUT_VIEW, VIEWS, Placement
-from mrbokeh.demo.report import figure, section, write_report
+from mrbokeh.demo.report import figure, write_report
 from mrbokeh.demo.stages import Done
 from mrbokeh.focal_stack import read_focal_stack
+from mrbokeh.html_page import section
 from mrbokeh.stack_pictures import write_stack_pictures
 
 

@@ -1,0 +1,1 @@
+"""Many viewpoints of one scene: camera poses, metric scale, calibration of focus, dense depth."""

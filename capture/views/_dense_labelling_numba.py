@@ -1,0 +1,84 @@
+"""Semi-global aggregation of costs in 0..255 along eight directions with penalties that bend to a guide picture, compiled."""
+
+import numpy as np
+from numba import njit
+
+_FAR = np.float32(1e9)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(before: np.ndarray, cost: np.ndarray, small: np.float32, large: np.float32, path: np.ndarray) -> None:
+    """Cheapest way to each label of this pixel from any of the previous one; both carry a margin of one on either side, and the
+    cheapest of all at their end."""
+    count = cost.shape[0]
+    cheapest = before[count + 2]
+    jump = cheapest + large
+    least = _FAR
+    for label in range(count):
+        best = min(min(before[label + 1], jump), min(before[label], before[label + 2]) + small)
+        value = np.float32(cost[label]) + best - cheapest
+        path[label + 1] = value
+        least = min(least, value)
+    path[count + 2] = least
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sweep(
+    costs: np.ndarray, guide: np.ndarray, direction: tuple[int, int], small: float, large: float, contrast: float, total: np.ndarray
+) -> None:
+    """Add the path costs of one direction; costs and total are (H, W, L)."""
+    height, width, labels = costs.shape
+    dx, dy = direction
+    small32, large32 = np.float32(small), np.float32(large)
+    above = np.full((width, labels + 3), _FAR, np.float32)
+    row = np.full((width, labels + 3), _FAR, np.float32)
+    start = np.full(labels + 3, np.float32(0.0))
+    start[0], start[labels + 1] = _FAR, _FAR
+    for step_y in range(height):
+        y = step_y if dy >= 0 else height - 1 - step_y
+        for step_x in range(width):
+            x = step_x if dx >= 0 else width - 1 - step_x
+            from_x, from_y = x - dx, y - dy
+            if from_x < 0 or from_x >= width or from_y < 0 or from_y >= height:
+                _step(start, costs[y, x], small32, large32, row[x])
+            else:
+                edge = abs(guide[y, x] - guide[from_y, from_x])
+                penalty = max(large32 / (np.float32(1.0) + edge / np.float32(contrast)), small32)
+                _step(row[from_x] if dy == 0 else above[from_x], costs[y, x], small32, penalty, row[x])
+            for label in range(labels):
+                total[y, x, label] += np.uint16(row[x, label + 1])
+        above, row = row, above
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def aggregate(costs: np.ndarray, guide: np.ndarray, small: float, large: float, contrast: float) -> np.ndarray:
+    """(H, W, L) uint8 costs to their sums over eight paths, uint16, rounded down path by path."""
+    total = np.zeros(costs.shape, np.uint16)
+    for direction in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)):
+        _sweep(costs, guide, direction, small, large, contrast, total)
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def winners(total: np.ndarray, apart: int, index: np.ndarray, margin: np.ndarray) -> None:
+    """Per pixel the fractional index of the cheapest label, and how much dearer the cheapest one more than `apart` labels away is."""
+    height, width, labels = total.shape
+    for y in range(height):
+        for x in range(width):
+            cost = total[y, x]
+            best = 0
+            for label in range(1, labels):
+                if cost[label] < cost[best]:
+                    best = label
+            rival = np.float32(65535.0)
+            for label in range(labels):
+                if abs(label - best) > apart:
+                    rival = min(rival, np.float32(cost[label]))
+            here = np.float32(cost[best])
+            margin[y, x] = rival - here
+            index[y, x] = best
+            if 0 < best < labels - 1:
+                before, after = np.float32(cost[best - 1]), np.float32(cost[best + 1])
+                bend = before + after - np.float32(2.0) * here
+                if bend > 0:
+                    index[y, x] += min(max(np.float32(0.5) * (before - after) / bend, np.float32(-0.5)), np.float32(0.5))

@@ -1,0 +1,169 @@
+"""Dense metric depth of one viewpoint: neighbouring views and focus, each where it deserves trust, edges kept, gaps filled.
+
+A sweep over planes (at a resolution that bounds memory) and a semi-global labelling find the surfaces; sweeps of a few steps
+around them, level by level up to the full picture, make them exact; edges are moved onto those of the picture; what neither
+views nor focus know is filled from its surroundings and has no confidence.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from capture.views.dense_clues import Clues, SparseDepths
+from capture.views.dense_confidence import either, sweep_trust, with_consistency
+from capture.views.dense_consistency import consistency
+from capture.views.dense_edges import near_steps, weighted_medians
+from capture.views.dense_labelling import Penalties, label_planes
+from capture.views.dense_levels import halvings, level_sizes, scaled_size
+from capture.views.dense_smoothing import interpolate
+from capture.views.depth_fusion import add_focus_votes, agreement
+from capture.views.plane_sweep import Costs, Matching, plane_sweep
+from capture.views.plane_sweep_planes import dioptre_planes, pixels_per_dioptre
+from capture.views.plane_sweep_refinement import Refined, refine
+from capture.views.plane_sweep_view import BRIGHTEST, SweepView
+
+Plane = Float32[np.ndarray, "height width"]
+Rgb = Float32[np.ndarray, "height width 3"]
+
+SWEEP, FOCUS, FILLED = 0, 1, 2
+"""What a pixel's depth came from."""
+# In gaps the labelling is a better guess than far surroundings, the more it prefers one plane.
+_SAY_OF_LABELLING = 0.05
+_MARGIN_OF_HALF_SAY = 5.0
+_LEAST_SAY = 1e-6
+_LEAST_DIOPTRE = np.float32(1e-4)  # 10 km: nothing lies beyond infinity
+
+
+@dataclass(frozen=True)
+class DenseSettings:
+    """step_px: between planes, in the widest neighbour; most_planes caps their number (the sweeps around the surface are finer).
+
+    most_cells: pixels times planes of the coarse level, at 3 bytes each. edge_radius_px: how far windows may spill over an edge.
+    step_dioptre: a step of depth between neighbouring pixels that counts as an edge. fill_px: how far gaps are filled evenly.
+    device: of torch, for the sweep over all planes ('cuda'); None takes the compiled loops.
+    """
+
+    step_px: float = 0.5
+    finest_step_px: float = 1.0
+    most_planes: int = 128
+    coarse_neighbours: int = 4
+    most_cells: int = 1 << 27
+    matching: Matching = field(default_factory=lambda: Matching(radius_px=2, noise=0.01))
+    fine_matching: Matching = field(default_factory=lambda: Matching(radius_px=3))
+    penalties: Penalties = field(default_factory=Penalties)
+    edge_radius_px: int = 6
+    step_dioptre: float = 0.03
+    fill_px: float = 20.0
+    device: str | None = None
+
+
+@dataclass(frozen=True)
+class DenseDepth:
+    """depth_m (H, W) along the axis, everywhere; confidence (H, W) in [0, 1]; source (H, W): SWEEP, FOCUS or FILLED."""
+
+    depth_m: Plane
+    confidence: Plane
+    source: UInt8[np.ndarray, "height width"]
+
+
+def dense_depth(
+    rgb: Rgb,
+    reference: SweepView,
+    neighbours: Sequence[SweepView],
+    dioptre_range: tuple[float, float],
+    clues: Clues | None = None,
+    settings: DenseSettings | None = None,
+) -> DenseDepth:
+    """Depth of the reference. rgb: its all-in-focus picture, linear Rec.709; dioptre_range: (farthest, nearest) in 1 / metres.
+
+    neighbours: nearest first (see `choose_neighbours`).
+
+    Raises InputError where no neighbour shows parallax.
+    """
+    clues, settings = clues or Clues(), settings or DenseSettings()
+    planes = dioptre_planes(reference, neighbours, dioptre_range, settings.step_px, settings.most_planes)
+    height, width = reference.structure.shape
+    sizes = level_sizes(width, height, len(planes), settings.most_cells)
+    dioptre, margin = _coarse(reference, neighbours[: settings.coarse_neighbours], planes, sizes[0], clues, settings)
+    step = float(planes[1] - planes[0])
+    finest = settings.finest_step_px / max(pixels_per_dioptre(reference, each, dioptre_range[1], dioptre_range[0]) for each in neighbours)
+    for size in sizes:
+        dioptre, margin = (_resized(each, size) for each in (dioptre, margin))
+        views = [_at(each, width, size) for each in neighbours]
+        for finer in halvings(step, finest * width / size[0]):
+            fine = _refined(_at(reference, width, size), views, cv2.medianBlur(dioptre, 5), finer, settings)
+            dioptre, step = fine.dioptre, finer
+    return _finished(rgb, reference, fine, margin, clues, settings)
+
+
+def _coarse(
+    reference: SweepView, neighbours: Sequence[SweepView], planes: np.ndarray, size: tuple[int, int], clues: Clues, settings: DenseSettings
+) -> tuple[Plane, Plane]:
+    """(dioptre, margin) of the labelling of all planes at the coarsest level."""
+    width = reference.structure.shape[1]
+    small = _at(reference, width, size)
+    costs = _sweep_of(settings.device)(small, [_at(each, width, size) for each in neighbours], planes, settings.matching)
+    if clues.focus is not None:
+        add_focus_votes(costs, planes, clues.focus.resized(*size))
+    if clues.sparse is not None:
+        clues.sparse.add_anchors(costs, planes, size[0] / width)
+    labels = label_planes(costs, small.structure, settings.penalties)
+    return np.interp(labels.index, np.arange(len(planes)), planes).astype(np.float32), labels.margin
+
+
+def _sweep_of(device: str | None) -> Callable[..., Costs]:
+    if device is None:
+        return plane_sweep
+    from capture.views.torch_plane_sweep import plane_sweep_on
+
+    return partial(plane_sweep_on, device)
+
+
+def _at(view: SweepView, full_width_px: int, size: tuple[int, int]) -> SweepView:
+    """A view at the scale of a level, whose width comes from the reference's."""
+    if size[0] == full_width_px:
+        return view
+    height, width = view.structure.shape
+    return view.resized(*scaled_size((width, height), size[0] / full_width_px))
+
+
+def _resized(values: Plane, size: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
+    """Depths are never averaged over an edge."""
+    return values if values.shape == size[::-1] else cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
+
+
+def _refined(reference: SweepView, neighbours: Sequence[SweepView], dioptre: Plane, step: float, settings: DenseSettings) -> Refined:
+    """A finer sweep around the surface; where views agree on nothing it stays as it was."""
+    fine = refine(reference, neighbours, dioptre, step, matching=settings.fine_matching)
+    return replace(fine, dioptre=np.maximum(np.where(fine.score > 0.0, fine.dioptre, dioptre), _LEAST_DIOPTRE))
+
+
+def _finished(rgb: Rgb, reference: SweepView, fine: Refined, margin: Plane, clues: Clues, settings: DenseSettings) -> DenseDepth:
+    """Edges on those of the picture, trust in each pixel, gaps filled."""
+    guide = cv2.bilateralFilter(np.sqrt(np.clip(rgb, 0.0, BRIGHTEST)), 5, 0.05, 1.5)
+    edges = near_steps(fine.dioptre, settings.edge_radius_px - 1, settings.step_dioptre)
+    dioptre = weighted_medians(fine.dioptre, np.ones_like(margin), guide, edges, settings.edge_radius_px, 0.07)
+    moved = np.abs(dioptre - fine.dioptre) > 0.5 * settings.step_dioptre
+    by_views = np.where(moved, 0.5, 1.0).astype(np.float32) * sweep_trust(fine.score, margin)
+    by_focus = np.zeros_like(margin) if clues.focus is None else agreement(clues.focus, dioptre)
+    trust = either(by_views, by_focus)
+    if clues.views:
+        trust = with_consistency(trust, consistency(reference, dioptre, clues.views, 0.5 * settings.step_dioptre))
+    keep = np.clip((trust - 0.05) / 0.2, 0.0, 1.0)
+    filled = _filled(dioptre, trust, margin, guide, clues.sparse, settings.fill_px)
+    source = np.where(keep < 0.5, FILLED, np.where(by_focus > by_views, FOCUS, SWEEP)).astype(np.uint8)
+    return DenseDepth((1.0 / (keep * dioptre + (1.0 - keep) * filled)).astype(np.float32), trust, source)
+
+
+def _filled(dioptre: Plane, trust: Plane, margin: Plane, guide: Rgb, sparse: SparseDepths | None, fill_px: float) -> Plane:
+    """Trusted pixels spread over the others, up to the edges of the guide; known points count in full."""
+    weights = trust**2 + _SAY_OF_LABELLING * margin / (margin + _MARGIN_OF_HALF_SAY) + _LEAST_SAY
+    known = dioptre.copy()
+    if sparse is not None:
+        row, column, chosen = sparse.pixels(dioptre.shape)
+        known[row, column], weights[row, column] = 1.0 / sparse.depth_m[chosen], 1.0
+    return interpolate(known, weights.astype(np.float32), guide, fill_px**2, 0.03)

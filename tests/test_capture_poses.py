@@ -1,0 +1,201 @@
+"""Poses: what COLMAP is given, how its deaths and failures reach the user, and real pictures with and without parallax."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from capture.commands import poses
+from capture.views import colmap_process
+from capture.views.colmap import PoseSettings, find_picture_poses, find_scene_poses
+from capture.views.colmap_job import ColmapJob, ColmapPicture, camera_model_for, job_from_json, job_to_json
+from capture.views.colmap_matches import failure_message, median_parallax_deg, weak_model_message
+from capture.views.colmap_pictures import common_exposure_stops, picture_cameras, pictures_in, stack_cameras, write_stack_pictures
+from capture.views.colmap_process import run_colmap
+from capture.views.sparse_model import SparseModel, SparseView
+from capture.views.sparse_model_file import write_sparse_model
+from mrbokeh.atomic_files import write_json
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.image_io import write_image
+from mrbokeh.lens import Lens
+
+needs_colmap = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap (extra `capture`) is not installed")
+
+
+def stack_in(folder: Path, grey: float = 0.1, focus_m: float | None = 0.6) -> FocalStack:
+    lens = None if focus_m is None else Lens(35.0, 2.0, focus_m, 23.5)
+    camera = None if lens is None else Camera(64, 48, (lens.focal_px(64),) * 2, (32.0, 24.0))
+    write_image(folder / "all_in_focus.exr", np.full((48, 64, 3), grey, np.float32))
+    stack = FocalStack(folder, (Slice("00.exr", focus_m),), lens, camera, merged=True)
+    write_focal_stack(stack)
+    return stack
+
+
+def test_views_of_one_reference_focus_share_a_camera(tmp_path: Path) -> None:
+    """Their focal length in pixels is the same; another focus has another, f d / (d - f)."""
+    stacks = [stack_in(tmp_path / name, focus_m=focus) for name, focus in (("a", 0.6), ("b", 0.8), ("c", 0.6))]
+    numbers, priors = stack_cameras(stacks, "auto")
+    assert numbers == [0, 1, 0]
+    assert priors[0] is not None and priors[0] == pytest.approx((35.0 / (1.0 - 0.035 / 0.6) * 64 / 23.5, 32.0, 24.0))
+    assert stack_cameras(stacks, "separate")[0] == [0, 1, 2]
+    assert stack_cameras(stacks, "shared")[0] == [0, 0, 0]
+    unknown = [stack_in(tmp_path / name, focus_m=None) for name in ("d", "e")]
+    assert stack_cameras(unknown, "auto") == ([0, 0], [None])
+
+
+def test_a_calibrated_focus_does_not_part_cameras(tmp_path: Path) -> None:
+    """Calibration moves the focus of each stack a little; what was stated decides."""
+    stacks = []
+    for name, found_m in (("a", 0.612), ("b", 0.618)):
+        stack = stack_in(tmp_path / name, focus_m=0.6)
+        assert stack.lens is not None
+        moved = Slice("00.exr", found_m, metadata={"stated_focus_distance_m": 0.6})
+        stacks.append(replace(stack, slices=(moved,), lens=stack.lens.focused_at(found_m)))
+    assert stack_cameras(stacks, "auto")[0] == [0, 0]
+
+
+def test_pictures_of_one_size_share_a_camera(tmp_path: Path) -> None:
+    for name, width in (("a", 40), ("b", 40), ("c", 50)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((30, width, 3), np.uint8))
+    files = pictures_in(tmp_path)
+    assert picture_cameras(files[:2], "auto")[0] == [0, 0]
+    assert picture_cameras(files, "auto")[0] == [0, 1, 2]
+    with pytest.raises(InputError, match="pictures of one size"):
+        picture_cameras(files, "shared")
+
+
+def test_two_terms_of_distortion_need_five_pictures_of_a_camera() -> None:
+    assert camera_model_for([0] * 5, "auto") == "RADIAL"
+    assert camera_model_for([0] * 5 + [1], "auto") == "SIMPLE_RADIAL"
+    assert camera_model_for([0], "RADIAL") == "RADIAL"
+
+
+def test_pictures_of_all_views_have_one_exposure(tmp_path: Path) -> None:
+    """Half of the pixels at 0.02 and half at 0.08: the median of all, 0.05, becomes 0.18, by log2(3.6) stops."""
+    stacks = [stack_in(tmp_path / "a", 0.02), stack_in(tmp_path / "b", 0.08)]
+    assert common_exposure_stops(stacks) == pytest.approx(np.log2(3.6), abs=0.01)
+    files = write_stack_pictures(tmp_path, stacks, tmp_path / "images")
+    values = [cv2.imread(str(tmp_path / "images" / file))[0, 0, 0] for file in files]
+    encoded = [1.055 * (grey * 3.6) ** (1 / 2.4) - 0.055 for grey in (0.02, 0.08)]
+    np.testing.assert_allclose(values, 255 * np.array(encoded), atol=1.5)
+    bright = [stack_in(tmp_path / "c", 0.9)]
+    assert common_exposure_stops(bright) == pytest.approx(np.log2(0.2), abs=0.01)
+
+
+def test_jobs_survive_json_and_know_what_features_depend_on() -> None:
+    job = ColmapJob((ColmapPicture("a", "a.png", "00", 0),), ((100.0, 32.0, 24.0),))
+    assert job_from_json(job_to_json(job)) == job
+    assert replace(job, mapper="global", threads=2).features_key() == job.features_key()
+    assert replace(job, seed=1).features_key() != job.features_key()
+
+
+def seen_from(positions_m: list[tuple[float, float, float]], points: np.ndarray, left_out: tuple[str, ...] = ()) -> SparseModel:
+    views = []
+    for index, position in enumerate(positions_m):
+        pose = np.eye(4)
+        pose[:3, 3] = -np.asarray(position)
+        views.append(SparseView(f"v{index}", Camera(640, 480, (500.0, 500.0), (320.0, 240.0), pose)))
+    observations = np.array([(view, point) for view in range(len(views)) for point in range(len(points))])
+    return SparseModel(tuple(views), points, np.zeros(len(points)), observations, np.zeros((len(observations), 2)), None, left_out)
+
+
+def test_parallax_is_the_widest_angle_at_a_point() -> None:
+    """From 1 to the left and 1 to the right, at a distance of 10, a point is seen under 2 atan 0.1."""
+    model = seen_from([(-1.0, 0.0, 0.0), (0.2, 0.0, 0.0), (1.0, 0.0, 0.0)], np.array([[0.0, 0.0, 10.0]] * 3))
+    assert median_parallax_deg(model) == pytest.approx(np.degrees(2.0 * np.arctan(0.1)))
+    assert weak_model_message(model) is None
+
+
+def test_weak_models_are_refused_in_words() -> None:
+    points = np.array([[0.0, 0.0, 100.0]])
+    narrow = seen_from([(0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 9.0)], points)
+    assert "farther sideways" in str(weak_model_message(narrow))
+    few = seen_from([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0)], points, ("a", "b", "c"))
+    assert "only 3 of 6 pictures (v0, v1, v2)" in str(weak_model_message(few))
+
+
+@pytest.mark.parametrize(
+    ("seen", "message"),
+    [
+        ({"good_pairs": 3, "forward": 0.0, "low_parallax": 0.0}, "only 3 of 28 pairs"),
+        ({"good_pairs": 20, "forward": 0.9, "low_parallax": 0.2}, "90 % move along the line of sight"),
+        ({"good_pairs": 20, "forward": 0.0, "low_parallax": 0.1}, "--mapper global"),
+    ],
+)
+def test_failures_say_why_and_what_to_do(seen: dict[str, float], message: str) -> None:
+    assert message in failure_message({"pictures": 8, "pairs": 28} | seen)
+
+
+@needs_colmap
+def test_the_death_of_colmap_is_one_sentence(tmp_path: Path) -> None:
+    """A file that is no database makes COLMAP's SQLite give up."""
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), np.zeros((30, 40, 3), np.uint8))
+    write_json(tmp_path / "colmap_job.json", job_to_json(ColmapJob((ColmapPicture("a", "a.png", "00", 0),), (None,))))
+    (tmp_path / "database.db").write_bytes(b"this is no database" * 100)
+    with pytest.raises(InputError, match=r"COLMAP stopped with .* while finding features .*database"):
+        run_colmap(tmp_path, 1)
+
+
+def test_an_abort_is_named_by_its_signal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "dying_worker.py").write_text('import os\nprint(\'{"stage": "matches", "done": 1, "total": 3}\', flush=True)\nos.abort()\n')
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(colmap_process, "_WORKER", "dying_worker")
+    monkeypatch.setattr(colmap_process, "find_spec", lambda name: name)
+    with pytest.raises(InputError, match="COLMAP stopped with SIGABRT while matching"):
+        run_colmap(tmp_path, 3)
+
+
+def test_without_pycolmap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(colmap_process, "find_spec", {}.get)
+    with pytest.raises(MissingExtraError, match=r"mrbokeh\[capture\]"):
+        run_colmap(tmp_path, 3)
+
+
+def test_finished_poses_are_kept(tmp_path: Path) -> None:
+    """Nothing else is in the folder, so anything but reading would fail."""
+    write_sparse_model(tmp_path / "reconstruction", seen_from([(0.0, 0.0, 0.0)], np.array([[0.0, 0.0, 1.0]])))
+    assert find_scene_poses(tmp_path).views[0].name == "v0"
+    with pytest.raises(InputError, match="capture ingest"):
+        find_scene_poses(tmp_path, PoseSettings(overwrite=True))
+
+
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    stack_in(tmp_path / "a")
+    with pytest.raises(InputError, match="one stack: camera poses need at least 2"):
+        find_scene_poses(tmp_path)
+    with pytest.raises(InputError, match="found 0"):
+        find_picture_poses(tmp_path, tmp_path / "out")
+    with pytest.raises(InputError, match="there is none"):
+        find_picture_poses(tmp_path / "nowhere", tmp_path / "out")
+    with pytest.raises(InputError, match="--mapper must be one of incremental, global"):
+        PoseSettings(mapper="sequential")
+    app = typer.Typer()
+    app.command()(poses.poses_command)
+    answer = CliRunner().invoke(app, [str(tmp_path), "--images", str(tmp_path)])
+    assert isinstance(answer.exception, InputError) and "either a SCENE" in str(answer.exception)
+
+
+@needs_colmap
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "count"), [("fox", 25), ("sacre_coeur", 10)])
+def test_real_pictures_are_all_placed(shared_data: Path, tmp_path: Path, name: str, count: int) -> None:
+    model = find_picture_poses(shared_data / "multiview" / name / "images", tmp_path, PoseSettings(max_image_size_px=1000))
+    assert len(model.views) == count and not model.left_out
+    assert np.median(model.errors_px) < 1.0
+    if name == "fox":  # transforms.json: fl_x 1375.52
+        assert model.views[0].camera.focal_px[0] == pytest.approx(1375.5, rel=0.01)
+
+
+@needs_colmap
+@pytest.mark.slow
+def test_a_walk_forward_fails_with_a_reason(shared_data: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"move along the line of sight .* sideways"):
+        find_picture_poses(shared_data / "multiview" / "lund_forward" / "images", tmp_path)

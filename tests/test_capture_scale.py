@@ -1,0 +1,257 @@
+"""The three ways to the scale, each on synthetic views whose metres are known."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture.views.charuco_board import CharucoBoard, board_from_options, read_board
+from capture.views.scale_answer import ScaleAnswer
+from capture.views.scale_board import POSES_SIGMA, BoardDetections, detect_board, scale_of_detections, triangulate, umeyama
+from capture.views.scale_distance import distance_scale, parse_distance
+from capture.views.scale_file import ScaleResult, read_scale, write_scale
+from capture.views.scale_focus import FocusSample, focus_scale, stated_sigma_dioptre
+from capture.views.scale_robust import squared_under_cauchy, squared_under_cauchy_slope
+from capture.views.scale_sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
+from capture.views.sparse_model import SparseModel, SparseView
+from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FocalStack, Slice
+
+METRES_PER_UNIT = 0.2
+BOARD = CharucoBoard((8, 6), 0.03, 0.022)
+
+
+def ring_of_views(count: int = 5) -> tuple[SparseView, ...]:
+    """Views 1 m before the origin (5 units), 20 degrees apart, that look at it, with some distortion."""
+    views = []
+    for index in range(count):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("yx", [20 * (index - count // 2), 12 * (index % 2)], degrees=True).as_matrix()
+        pose[2, 3] = 1.0 / METRES_PER_UNIT
+        views.append(SparseView(f"view_{index}", Camera(800, 600, (900.0, 900.0), (400.0, 300.0), pose), (-0.05, 0.01)))
+    return tuple(views)
+
+
+def model_of(views: tuple[SparseView, ...]) -> SparseModel:
+    return SparseModel(views, np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64), np.zeros((0, 2)))
+
+
+MODEL = model_of(ring_of_views())
+
+
+def board_points() -> np.ndarray:
+    """The board about the origin, oblique, in model units."""
+    turn = Rotation.from_euler("x", 35, degrees=True).as_matrix()
+    return (BOARD.corners_m - BOARD.corners_m.mean(axis=0)) @ turn.T / METRES_PER_UNIT
+
+
+def detections(noise_px: float, wrong: int = 0) -> BoardDetections:
+    rng = np.random.default_rng(3)
+    views = np.repeat(np.arange(5), 35)
+    corners = np.tile(np.arange(35), 5)
+    xy_px = np.concatenate([view.project(board_points())[0] for view in MODEL.views]) + rng.normal(0, noise_px, (175, 2))
+    xy_px[:wrong] += 12.0
+    return BoardDetections(views, corners, xy_px)
+
+
+def test_umeyama_finds_a_known_similarity() -> None:
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix()
+    found = umeyama(points, 3.5 * points @ turn.T + [1.0, -2.0, 0.5])
+    assert found.scale == pytest.approx(3.5, rel=1e-12)
+    np.testing.assert_allclose(found.rotation, turn, atol=1e-12)
+    np.testing.assert_allclose(found(points), 3.5 * points @ turn.T + [1.0, -2.0, 0.5], atol=1e-12)
+
+
+def test_rays_meet_at_the_point() -> None:
+    point = np.array([0.3, -0.2, 0.4])
+    seen = np.array([view.project(point)[0] for view in MODEL.views])
+    np.testing.assert_allclose(triangulate(MODEL.views, seen), point, atol=1e-9)
+
+
+def test_a_perfect_board_gives_the_exact_scale() -> None:
+    answer = scale_of_detections(MODEL, BOARD, detections(0.0))
+    assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-7)
+    assert answer.facts["residual_mm"] < 1e-6 and answer.facts["detections"] == 175
+
+
+def test_the_uncertainty_of_a_board_is_that_of_its_corners() -> None:
+    """0.2 px on 900 px at 1 m are 0.22 mm; 175 sightings of a board 0.1 m about its middle leave some 0.02 %."""
+    answer = scale_of_detections(MODEL, BOARD, detections(0.2))
+    error = abs(answer.metres_per_unit / METRES_PER_UNIT - 1.0)
+    sigma = answer.facts["uncertainty_of_corners"]
+    assert error < 4.0 * sigma and 5e-5 < sigma < 5e-4
+    assert answer.uncertainty == pytest.approx(np.hypot(sigma, POSES_SIGMA))
+    assert answer.facts["residual_px"] == pytest.approx(0.2 * np.sqrt(2), rel=0.15)
+
+
+def test_wrong_corners_do_not_pull_the_board() -> None:
+    answer = scale_of_detections(MODEL, BOARD, detections(0.1, wrong=6))
+    assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=5e-4)
+    assert answer.facts["detections"] == 169
+
+
+def test_a_board_that_is_not_there_says_what_was_looked_for() -> None:
+    empty = np.zeros((60, 80, 3), np.uint8)
+    with pytest.raises(InputError, match=r"8x6 squares \(DICT_4X4_50\) in 5 views and found 0 corners"):
+        scale_of_detections(MODEL, BOARD, detect_board(BOARD, iter([empty] * 5)))
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_corners_are_found_where_they_are_printed(legacy: bool) -> None:
+    """32 texels a square and a margin of 40: inner corner (i, j) lies at 40 + 32 (i, j), counted from the picture's corner."""
+    printed = BOARD.opencv_board(legacy).generateImage((32 * 8, 32 * 6), marginSize=0)
+    picture = np.full((32 * 6 + 80, 32 * 8 + 80, 3), 255, np.uint8)
+    picture[40:-40, 40:-40] = printed[..., None]
+    ids, xy_px = BOARD.detect(picture)
+    assert len(ids) == 35
+    np.testing.assert_allclose(xy_px, 40.0 + 32.0 * BOARD.corners_m[ids, :2] / BOARD.square_m, atol=0.03)
+
+
+def test_boards_come_from_options_and_files(tmp_path: Path) -> None:
+    path = tmp_path / "board.toml"
+    path.write_text('squares = [8, 6]\nsquare_mm = 30.0\nmarker_mm = 22.0\ndictionary = "DICT_5X5_100"\n')
+    assert read_board(path) == board_from_options(str(path), None, None, "DICT_4X4_50")
+    assert board_from_options("8x6", 30.0, 22.0, "DICT_4X4_50") == BOARD
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: board_from_options("8", 30.0, 22.0, "DICT_4X4_50"), "COLUMNSxROWS"),
+        (lambda: board_from_options("8x6", 30.0, None, "DICT_4X4_50"), "--marker-mm"),
+        (lambda: board_from_options("8x6", 30.0, 31.0, "DICT_4X4_50"), "marker < square"),
+        (lambda: board_from_options("8x6", 30.0, 22.0, "DICT_9X9"), "dictionary of cv2"),
+        (lambda: board_from_options("2x6", 30.0, 22.0, "DICT_4X4_50"), "at least 3x3"),
+        (lambda: read_board(Path("nowhere.toml")), "no such file"),
+        (lambda: parse_distance("a,b"), "VIEW_A,VIEW_B,METRES"),
+        (lambda: distance_scale(MODEL, "view_0", "view_9", 1.0), "view_9"),
+        (lambda: distance_scale(MODEL, "view_0", "view_0", 1.0), "two different"),
+        (lambda: distance_scale(MODEL, "view_0", "view_1", -1.0), "positive"),
+    ],
+)
+def test_mistakes_are_named(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_a_distance_between_two_cameras() -> None:
+    """Views 0 and 2 stand on a circle of 5 units, seen under a known angle: their chord is measured to be its length in metres."""
+    units = float(np.linalg.norm(MODEL.views[0].centre - MODEL.views[2].centre))
+    answer = distance_scale(MODEL, "view_0", "view_2", units * METRES_PER_UNIT)
+    assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT)
+    assert answer.uncertainty == pytest.approx(0.001 / (units * METRES_PER_UNIT))
+
+
+FOCUS_DIOPTRES = np.linspace(1.6, 0.5, 12)
+
+
+def sample(stated: np.ndarray, noise: float = 0.05, wrong: float = 0.0, sigma: np.ndarray | None = None) -> FocusSample:
+    """Points between the first and last focus, whose log energy is a parabola about their true dioptre."""
+    rng, points = np.random.default_rng(4), 800
+    dioptre = rng.uniform(0.58, 1.52, points)
+    seen = np.where(rng.random(points) < wrong, rng.uniform(0.58, 1.52, points), dioptre)
+    curves = np.exp(8.0 - 30.0 * (FOCUS_DIOPTRES[:, None] - seen) ** 2 + rng.normal(0, noise, (12, points)))
+    peaks = sharpness_peaks(curves)
+    depth = 1.0 / dioptre[peaks.points] / METRES_PER_UNIT
+    return FocusSample("view_0", peaks, np.zeros((len(peaks.points), 2)), depth, stated, np.zeros(12) if sigma is None else sigma)
+
+
+def test_peaks_of_parabolas_are_their_vertices() -> None:
+    true = np.array([0.9, 1.2312])
+    curves = np.exp(5.0 - 20.0 * (FOCUS_DIOPTRES[:, None] - true) ** 2)
+    np.testing.assert_allclose(sharpness_peaks(curves).dioptres(FOCUS_DIOPTRES), true, atol=1e-9)
+
+
+def test_points_without_a_peak_inside_the_stack_do_not_count() -> None:
+    nearer_than_all = np.exp(-20.0 * (FOCUS_DIOPTRES - 2.0) ** 2)
+    without_texture = np.full(12, 0.3)
+    peaks = sharpness_peaks(np.stack([nearer_than_all, without_texture, np.exp(-20.0 * (FOCUS_DIOPTRES - 1.0) ** 2)], axis=1))
+    np.testing.assert_array_equal(peaks.points, [2])
+
+
+def test_sharpness_is_taken_where_the_point_is() -> None:
+    """Texture on the left is sharp in the first slice only, on the right in the second only."""
+    rng = np.random.default_rng(0)
+    slices = np.full((2, 40, 80, 3), 0.5, np.float32)
+    slices[0, :, :30] += rng.normal(0, 0.1, (40, 30, 1)).astype(np.float32)
+    slices[1, :, 50:] += rng.normal(0, 0.1, (40, 30, 1)).astype(np.float32)
+    curves = sharpness_curves(iter(slices), np.array([[12.5, 20.5], [66.5, 20.5]]))
+    np.testing.assert_array_equal(np.argmax(curves, axis=0), [0, 1])
+
+
+def test_focus_distances_give_the_scale() -> None:
+    answer = focus_scale([sample(FOCUS_DIOPTRES)])
+    assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-3)
+    assert answer.facts["offset_m"] == 0.0, "an offset that is not told apart from 0 is 0"
+
+
+def test_a_third_of_wrong_points_does_not_pull_the_focus() -> None:
+    assert focus_scale([sample(FOCUS_DIOPTRES, wrong=0.33)]).metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=3e-3)
+
+
+def test_distances_from_the_film_plane_are_found_out() -> None:
+    """What is stated 45 mm too long, for it counts from the film plane: 4.5 % at 1 m, were it not for the offset."""
+    stated = 1.0 / (1.0 / FOCUS_DIOPTRES + 0.045)
+    answer = focus_scale([sample(stated)])
+    assert answer.facts["offset_m"] == pytest.approx(0.045, abs=0.004)
+    assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=4e-3)
+    assert answer.facts["metres_per_unit_without_offset"] / METRES_PER_UNIT > 1.03
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.25, 0.5, 0.75])
+def test_coarse_distances_are_known_to_be_coarse(phase: float) -> None:
+    """Nikon's d = 0.01 m * 10^(v / 40) has steps of 5.9 %, which the intervals of the stated distances tell."""
+    coarse = 1.0 / (0.01 * 10 ** ((np.round(40 * np.log10(100.0 / FOCUS_DIOPTRES) + phase) - phase) / 40))
+    sigma = 0.059 * FOCUS_DIOPTRES / np.sqrt(12.0)
+    fine, answer = focus_scale([sample(FOCUS_DIOPTRES)]), focus_scale([sample(coarse, sigma=sigma)])
+    error = abs(answer.metres_per_unit / METRES_PER_UNIT - 1.0)
+    assert error < 0.02 and error < 2.0 * answer.uncertainty
+    assert answer.uncertainty > 3.0 * fine.uncertainty
+
+
+def test_intervals_of_stated_distances_are_read(tmp_path: Path) -> None:
+    told = Slice("0.exr", 1.0, metadata={"focus": {"lens_interval_dioptre": [0.97, 1.03]}})
+    stack = FocalStack(tmp_path, (told, Slice("1.exr", 2.0), Slice("2.exr", 3.0, metadata={"focus": None})))
+    np.testing.assert_allclose(stated_sigma_dioptre(stack), [0.06 / np.sqrt(12.0), 0.0, 0.0])
+
+
+def test_unknown_focus_distances_are_no_answer() -> None:
+    with pytest.raises(InputError, match="found 0 in 1 stacks"):
+        focus_scale([sample(np.full(12, np.nan))])
+
+
+def test_a_prior_stays_quadratic_under_cauchy() -> None:
+    values = np.array([-2.0, 0.0, 0.5, 3.0])
+    np.testing.assert_allclose(np.log1p(squared_under_cauchy(values) ** 2), values**2)
+    numeric = (squared_under_cauchy(values + 1e-6) - squared_under_cauchy(values - 1e-6)) / 2e-6
+    np.testing.assert_allclose(squared_under_cauchy_slope(values), numeric, rtol=1e-5)
+
+
+def test_the_board_counts_most_and_the_others_are_kept(tmp_path: Path) -> None:
+    write_sparse_model(tmp_path, MODEL)
+    answers = [ScaleAnswer("focus", 0.21, 0.005), ScaleAnswer("board", 0.2, 0.0003)]
+    result = ScaleResult.of(answers, {"distance": "none was given"})
+    write_scale(tmp_path, result)
+    assert read_sparse_model(tmp_path).metres_per_unit == 0.2
+    read = read_scale(tmp_path)
+    assert read.used.method == "board" and read.missing == {"distance": "none was given"}
+    assert read.disagreement == pytest.approx({"focus": 0.05})
+    assert read.contradictions == ("focus",), "5 % are more than 2 % and ten deviations"
+    unsure = ScaleResult.of([replace(answers[0], uncertainty=0.03), answers[1]], {})
+    assert unsure.contradictions == (), "5 % are less than two deviations"
+
+
+def test_no_answer_at_all_tells_what_each_looked_for() -> None:
+    with pytest.raises(InputError, match="board: none was given; focus: unknown"):
+        ScaleResult.of([], {"focus": "unknown", "board": "none was given"})
+
+
+def test_peaks_remember_their_points() -> None:
+    peaks = SharpnessPeaks(np.array([4]), np.log([[1.0], [2.0], [1.0]]), np.array([1]))
+    np.testing.assert_allclose(peaks.dioptres(np.array([1.5, 1.0, 0.5])), [1.0])
