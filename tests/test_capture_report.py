@@ -241,7 +241,8 @@ def test_exclusion_masks_by_reason(tmp_path: Path) -> None:
     confidence = np.ones((6, 8), np.float32)
     confidence[5] = 0.0
     write_exr(folder / "depth.exr", ExrPart({"confidence": confidence}))
-    write_json(tmp_path / "reconstruction" / "board.json", {"views": {"view_0": [[1.0, 1.0], [4.0, 1.0], [4.0, 3.0], [1.0, 3.0]]}})
+    answers = [{"method": "focus"}, {"method": "board", "outlines_px": {"view_0": [[1.0, 1.0], [4.0, 1.0], [4.0, 3.0], [1.0, 3.0]]}}]
+    write_json(tmp_path / "reconstruction" / "scale.json", {"answers": answers})
     stack = FocalStack(folder, (Slice("0.exr", 1.0), Slice("1.exr", 2.0)), registered=True, merged=True)
     moving = np.zeros((3, 4), bool)
     moving[0, 0] = True

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -78,6 +79,11 @@ def test_a_perfect_board_gives_the_exact_scale() -> None:
     answer = scale_of_detections(MODEL, BOARD, detections(0.0))
     assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-7)
     assert answer.facts["residual_mm"] < 1e-6 and answer.facts["detections"] == 175
+    assert set(answer.outlines_px) == {view.name for view in MODEL.views}
+    corner_seen = {view: detections(0.0).xy_px[(detections(0.0).views == view) & (detections(0.0).corners == 0)][0] for view in (0, 1)}
+    for view, inner in corner_seen.items():
+        outline = np.array(answer.outlines_px[MODEL.views[view].name], np.float32)
+        assert cv2.pointPolygonTest(outline, tuple(map(float, inner)), measureDist=True) > 0.0, "an inner corner lies within"
 
 
 def test_the_uncertainty_of_a_board_is_that_of_its_corners() -> None:

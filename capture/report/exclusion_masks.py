@@ -14,7 +14,7 @@ from mrbokeh.focal_stack import FocalStack
 Mask = Bool[np.ndarray, "height width"]
 
 REASONS = ("moving", "saturated", "border", "low_confidence", "board")
-BOARD_FILE = "reconstruction/board.json"
+SCALE_FILE = "reconstruction/scale.json"
 LEAST_CONFIDENCE = 0.1
 
 
@@ -23,8 +23,8 @@ def exclusion_masks(
 ) -> dict[str, Mask]:
     """Masks by reason, at the size of the stack. Slices are read one at a time.
 
-    moving: at any size, None where nobody looked. saturated: in any slice. border: no data in some slice. board: the hull of a calibration
-    board that `mrbokeh capture scale` found, as SCENE/reconstruction/board.json says.
+    moving: at any size, None where nobody looked. saturated: in any slice. border: no data in some slice. board: where
+    `mrbokeh capture scale` found a calibration board, as SCENE/reconstruction/scale.json says.
     """
     low_confidence = stack.depth_confidence() < least_confidence
     saturated, border = np.zeros_like(low_confidence), np.zeros_like(low_confidence)
@@ -43,26 +43,24 @@ def write_exclusions(stack: FocalStack, masks: dict[str, Mask]) -> Path:
 
 def has_fresh_exclusions(stack: FocalStack) -> bool:
     """Whether exclusion.exr is there and no older than what it was made from."""
-    made_from = [path for path in (stack.all_in_focus_path, stack.depth_path, stack.folder.parent / BOARD_FILE) if path.is_file()]
+    made_from = [path for path in (stack.all_in_focus_path, stack.depth_path, stack.folder.parent / SCALE_FILE) if path.is_file()]
     path = stack.exclusion_path
     return path.is_file() and all(path.stat().st_mtime_ns >= each.stat().st_mtime_ns for each in made_from)
 
 
 def board_mask(stack: FocalStack, shape: tuple[int, ...]) -> Mask:
-    """Pixels of the calibration board and up to one around it; none where no board was found.
-
-    board.json: {"views": {"VIEW": [[x_px, y_px], ...]}}, the hull in pixels of the registered pictures.
-    """
+    """Pixels of the calibration board and up to one around it; none where no board was found (see `capture.views.scale_file`)."""
     mask = np.zeros(shape, np.uint8)
-    path = stack.folder.parent / BOARD_FILE
+    path = stack.folder.parent / SCALE_FILE
     if not path.is_file():
         return mask > 0
     try:
-        hull = read_json(path, "the hulls of a calibration board")["views"].get(stack.folder.name, [])
-        corners = np.asarray(hull, np.float64).reshape(-1, 2)
+        answers = read_json(path, "the metric scale")["answers"]
+        outlines = [each.get("outlines_px", {}).get(stack.folder.name, []) for each in answers if each["method"] == "board"]
+        corners = np.asarray(outlines, np.float64).reshape(-1, 2)
     except (KeyError, AttributeError, ValueError, TypeError):
         raise InputError(
-            f'{path}: expected {{"views": {{"VIEW": [[x_px, y_px], ...]}}}}: run `mrbokeh capture scale --overwrite`'
+            f"{path}: expected the outline of the board in each view as x, y pairs: run `mrbokeh capture scale --overwrite`"
         ) from None
     if len(corners) >= 3:
         # OpenCV's pixel (0, 0) has its centre at (0, 0).

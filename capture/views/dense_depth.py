@@ -22,7 +22,7 @@ from capture.views.dense_levels import halvings, level_sizes, scaled_size
 from capture.views.dense_smoothing import interpolate
 from capture.views.depth_fusion import add_focus_votes, agreement
 from capture.views.plane_sweep import Costs, Matching, plane_sweep
-from capture.views.plane_sweep_planes import dioptre_planes, pixels_per_dioptre
+from capture.views.plane_sweep_planes import by_parallax, dioptre_planes, pixels_per_dioptre
 from capture.views.plane_sweep_refinement import Refined, refine
 from capture.views.plane_sweep_view import BRIGHTEST, SweepView
 
@@ -80,12 +80,11 @@ def dense_depth(
 ) -> DenseDepth:
     """Depth of the reference. rgb: its all-in-focus picture, linear Rec.709; dioptre_range: (farthest, nearest) in 1 / metres.
 
-    neighbours: nearest first (see `choose_neighbours`).
-
     Raises InputError where no neighbour shows parallax.
     """
     clues, settings = clues or Clues(), settings or DenseSettings()
     planes = dioptre_planes(reference, neighbours, dioptre_range, settings.step_px, settings.most_planes)
+    neighbours = by_parallax(reference, neighbours, dioptre_range)
     height, width = reference.structure.shape
     sizes = level_sizes(width, height, len(planes), settings.most_cells)
     dioptre, margin = _coarse(reference, neighbours[: settings.coarse_neighbours], planes, sizes[0], clues, settings)

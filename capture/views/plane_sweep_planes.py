@@ -8,6 +8,7 @@ from jaxtyping import Float
 from capture.views.plane_sweep_view import SweepView, neighbour_from_reference
 from mrbokeh.errors import InputError
 
+LEAST_PARALLAX_PX = 8.0
 _PROBES = 5
 
 
@@ -48,3 +49,14 @@ def dioptre_planes(
         )
     count = int(np.ceil(travel_px / step_px)) + 1
     return np.linspace(farthest, nearest, min(count, most) if most else count)
+
+
+def by_parallax(reference: SweepView, neighbours: Sequence[SweepView], dioptre_range: tuple[float, float]) -> list[SweepView]:
+    """The neighbours, least parallax first, for in those planes lie densest; but last those that show too little to tell depth."""
+    farthest, nearest = dioptre_range
+
+    def place(neighbour: SweepView) -> tuple[bool, float]:
+        travel_px = pixels_per_dioptre(reference, neighbour, nearest, farthest) * (nearest - farthest)
+        return travel_px < LEAST_PARALLAX_PX, travel_px
+
+    return sorted(neighbours, key=place)

@@ -9,9 +9,13 @@ METHODS = ("board", "distance", "focus")
 
 @dataclass(frozen=True)
 class ScaleAnswer:
-    """metres_per_unit; uncertainty: one standard deviation, relative. facts: counts and residuals, for people to judge by."""
+    """metres_per_unit; uncertainty: one standard deviation, relative. facts: counts and residuals, for people to judge by.
+
+    outlines_px: by view, the corners (x, y) of a board in the picture, so that training can leave it out.
+    """
 
     method: str
     metres_per_unit: float
     uncertainty: float
     facts: dict[str, Any] = field(default_factory=dict)
+    outlines_px: dict[str, list[list[float]]] = field(default_factory=dict)

@@ -88,7 +88,15 @@ def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDete
         "uncertainty_of_corners": sigma,
         "metres_per_unit_of_triangulated_corners": 1.0 / start.scale,
     }
-    return ScaleAnswer("board", 1.0 / fit.scale, float(np.hypot(sigma, POSES_SIGMA)), facts)
+    return ScaleAnswer("board", 1.0 / fit.scale, float(np.hypot(sigma, POSES_SIGMA)), facts, board_outlines(model, board, seen, fit))
+
+
+def board_outlines(model: SparseModel, board: CharucoBoard, seen: BoardDetections, fit: Similarity) -> dict[str, list[list[float]]]:
+    """The four corners of the board in the picture of every view that saw it; beyond the frame where the board is."""
+    columns, rows = board.squares
+    corners_m = board.square_m * np.array([(0.0, 0.0, 0.0), (columns, 0.0, 0.0), (columns, rows, 0.0), (0.0, rows, 0.0)])
+    views = [model.views[index] for index in np.unique(seen.views)]
+    return {view.name: view.project(fit(corners_m))[0].tolist() for view in views}
 
 
 def _seen_twice(seen: BoardDetections) -> np.ndarray:

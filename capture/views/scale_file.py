@@ -1,7 +1,7 @@
 """scale.json: what every way to find the scale answered, how far they disagree, and which one counts.
 
 {"format": "mrbokeh-scale", "version": 1, "metres_per_unit", "used": method, "answers": [{"method", "metres_per_unit", "uncertainty",
-"facts"}], "disagreement": {method: relative difference from the one used}, "missing": {method: why there is no answer}}
+"facts", "outlines_px"}], "disagreement": {method: relative difference from the one used}, "missing": {method: why there is no answer}}
 """
 
 from collections.abc import Mapping, Sequence
