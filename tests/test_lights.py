@@ -5,6 +5,7 @@ import pytest
 
 from capture.merging.all_in_focus import all_in_focus
 from capture.merging.depth_from_focus import depth_from_focus
+from capture.merging.light_discs import measure_discs
 from capture.merging.light_energy import with_light_energy
 from capture.merging.lights import find_lights
 from capture.photos.clipped_highlights import neutral_where_full
@@ -56,7 +57,7 @@ def test_a_stack_without_lights_has_none() -> None:
     stack = [texture()] * 3
     lights = find_lights(lambda: stack)
     assert len(lights.sharpest) == 0 and lights.zone.max() == 0 and not lights.core.any()
-    assert with_light_energy(texture(), stack, lights).tobytes() == texture().tobytes()
+    assert with_light_energy(texture(), measure_discs(stack, lights), lights).tobytes() == texture().tobytes()
 
 
 def test_white_paper_is_not_a_light() -> None:
@@ -80,7 +81,7 @@ def test_energy_lost_to_saturation_is_found_in_the_discs() -> None:
     lights = find_lights(lambda: stack)
     merged = all_in_focus(stack, depth_from_focus(stack, find_lights(lambda: stack)).merge_index)
     assert merged.max() <= FULL
-    restored = with_light_energy(merged, stack, lights)
+    restored = with_light_energy(merged, measure_discs(stack, lights), lights)
     # In slice 4 the disc of 12 px spreads the light over 94 px, 0.95 above the wall: nothing is full there.
     np.testing.assert_allclose(restored[LIGHT_AT], RADIANCE, rtol=0.03)
     away = lights.zone == 0
@@ -92,7 +93,7 @@ def test_a_light_that_fits_the_sensor_is_left_alone() -> None:
     stack = slices(scene(dim))
     lights = find_lights(lambda: stack)
     merged = all_in_focus(stack, depth_from_focus(stack, find_lights(lambda: stack)).merge_index)
-    np.testing.assert_allclose(with_light_energy(merged, stack, lights)[LIGHT_AT], dim, rtol=0.15)
+    np.testing.assert_allclose(with_light_energy(merged, measure_discs(stack, lights), lights)[LIGHT_AT], dim, rtol=0.15)
 
 
 @pytest.mark.parametrize(("pixel", "expected"), [

@@ -8,19 +8,25 @@ import typer
 HELP = "\n\n".join(
     (
         "Register the slices of every stack, merge an all-in-focus picture and find depth from focus.",
-        "Stacks that are merged already are left alone unless --overwrite is given.",
+        "Stacks that are merged already are left alone unless --overwrite is given; an interrupted run goes on where it stopped. "
+        "registration.json in the folder of each stack says how its slices fit together. --registration uses such a file for all "
+        "stacks instead: those taken with the same lens and the same focus distances from a firm tripod.",
         "Example:  mrbokeh capture merge scene/",
+        "Example:  mrbokeh capture merge scene/ --registration scene/view_0/registration.json --overwrite",
     )
 )
 
 
 def merge_command(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder with stacks that `mrbokeh capture ingest` made")],
+    registration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="a registration.json to use for every stack instead of finding one")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="merge again what is merged already")] = False,
 ) -> None:
     from capture.merging.merge import merge_scene
     from mrbokeh.stack_pictures import SHEET_NAME
 
-    for stack in merge_scene(scene, overwrite):
+    for stack in merge_scene(scene, overwrite, registration):
         depth = "depth in metres" if stack.is_metric else "focus distances unknown: depth is the index of the sharpest slice, not metres"
         typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {SHEET_NAME}")

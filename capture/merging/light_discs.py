@@ -26,12 +26,14 @@ RING_PX = 3.0
 
 @dataclass(frozen=True)
 class LightDiscs:
-    """Per slice and light: flux (slices, lights, 3) above the surroundings, xy_px (slices, lights, 2) centroid, variance_px2
+    """Per slice and light: flux (slices, lights, 3) above the surroundings within the light's disc; zone_flux the same within the
+    largest of its discs, where texture adds the same to every slice; xy_px (slices, lights, 2) centroid, variance_px2
     (slices, lights) mean of both axes, peak (slices, lights), whole (slices, lights) whether the disc is all within the
     light's zone and the picture.
     """
 
     flux: Float[np.ndarray, "slices lights 3"]
+    zone_flux: Float[np.ndarray, "slices lights 3"]
     xy_px: Float[np.ndarray, "slices lights 2"]
     variance_px2: Float[np.ndarray, "slices lights"]
     peak: Float[np.ndarray, "slices lights"]
@@ -62,8 +64,8 @@ class DiscMeasurement:
 
     @property
     def discs(self) -> LightDiscs:
-        table = np.array(self._rows, np.float64).reshape(len(self._rows), len(self.lights), 8)
-        return LightDiscs(table[..., 0:3], table[..., 3:5], table[..., 5], table[..., 6], table[..., 7] > 0)
+        table = np.array(self._rows, np.float64).reshape(len(self._rows), len(self.lights), 11)
+        return LightDiscs(table[..., 0:3], table[..., 3:6], table[..., 6:8], table[..., 8], table[..., 9], table[..., 10] > 0)
 
 
 def measure_discs(slices: Iterable[Rgb], lights: Lights) -> LightDiscs:
@@ -88,10 +90,7 @@ def _core_centres(lights: Lights) -> Float[np.ndarray, "lights 2"]:
 
 
 def _measured(rgb: Rgb, lights: Lights, light: int, index: int, centre: Float[np.ndarray, "2"]) -> tuple[float, ...]:
-    """(flux r, g, b, x, y, variance, peak, whole) of one light in one slice.
-
-    The flux is summed over the same pixels in every slice, so that what texture adds to it is the same too.
-    """
+    """(flux r, g, b, zone flux r, g, b, x, y, variance, peak, whole) of one light in one slice."""
     largest_px, radius_px = (_radius_px(area) for area in (lights.areas_px[:, light].max(), lights.areas_px[index, light]))
     reach = int(np.ceil(largest_px + RING_PX))
     left, top = max(int(centre[0]) - reach, 0), max(int(centre[1]) - reach, 0)
@@ -99,16 +98,22 @@ def _measured(rgb: Rgb, lights: Lights, light: int, index: int, centre: Float[np
     patch, zone = rgb[box], lights.zone[box]
     y, x = np.mgrid[top : top + patch.shape[0], left : left + patch.shape[1]] + 0.5
     distance = np.hypot(x - centre[0], y - centre[1])
-    ring = (distance >= largest_px) & (distance < largest_px + RING_PX)
-    excess = patch - (np.median(patch[ring], axis=0) if ring.any() else 0.0)
     inside, everywhere = distance < radius_px, distance < largest_px
+    excess = patch - _level(patch, distance, radius_px)
+    zone_flux = ((patch - _level(patch, distance, largest_px)) * everywhere[..., None]).sum(axis=(0, 1)).tolist()
     whole = bool((zone[inside] == light + 1).all()) and inside.sum() > 0.97 * np.pi * radius_px**2
     weight = np.maximum(excess.sum(axis=2), 0.0) * inside
     total = max(float(weight.sum()), 1e-9)
     mean_x, mean_y = float((weight * x).sum() / total), float((weight * y).sum() / total)
     variance = 0.5 * float((weight * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum() / total)
-    flux = (excess * everywhere[..., None]).sum(axis=(0, 1)).tolist()
-    return (*flux, mean_x, mean_y, variance, float(patch[inside].max(initial=0.0)), float(whole))
+    flux = (excess * inside[..., None]).sum(axis=(0, 1)).tolist()
+    return (*flux, *zone_flux, mean_x, mean_y, variance, float(patch[inside].max(initial=0.0)), float(whole))
+
+
+def _level(patch: Rgb, distance: Float[np.ndarray, "height width"], radius_px: float) -> Float32[np.ndarray, "3"]:
+    """What surrounds a disc: the median of a ring."""
+    ring = (distance >= radius_px) & (distance < radius_px + RING_PX)
+    return np.median(patch[ring], axis=0).astype(np.float32) if ring.any() else np.zeros(3, np.float32)
 
 
 def _radius_px(area_px: float) -> float:

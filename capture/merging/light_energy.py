@@ -114,8 +114,8 @@ def _raise(restored: Rgb, lights: Lights, discs: LightDiscs, light: int, box: tu
     brightness = restored[box].max(axis=2)
     brightest = mine & (brightness >= CORE_SHARE * brightness[mine].max())
     believable = discs.believable(light)
-    held = discs.flux[lights.sharpest[light], light]
-    flux = np.median(discs.flux[believable, light], axis=0) if believable.any() else discs.flux[lights.widest[light], light]
+    held = discs.zone_flux[lights.sharpest[light], light]
+    flux = np.median(discs.zone_flux[believable, light], axis=0) if believable.any() else discs.zone_flux[lights.widest[light], light]
     if held.sum() > ALL_HELD_SHARE * flux.sum():
         return
     missing = np.maximum(flux - held, 0.0)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -87,23 +87,25 @@ def find_lights(slices: Callable[[], Iterable[Rgb]], extremes: Extremes | None =
     nearest, distance_px = _nearest_spot(spots)
     near = np.where(distance_px <= reach_px, nearest, 0)
     members = np.flatnonzero(near)
-    numbers, floor, count = near.ravel()[members], (surroundings + CLEARLY_BRIGHTER).ravel()[members], int(nearest.max())
-    spreads, over = [], []
+    spreads = _Spreads(near.ravel()[members], (surroundings + CLEARLY_BRIGHTER).ravel()[members])
     for rgb in slices():
-        brightness = rgb.reshape(-1, 3)[members].max(axis=1)
-        spreads.append(_spread(brightness, floor, numbers, count))
-        over.append(np.packbits(brightness > OVER_RANGE))
-    light, areas_px, peaks = (np.array(each) for each in zip(*spreads, strict=True))
+        spreads.add(rgb.reshape(-1, 3)[members].max(axis=1))
+    return _lights(spreads, near, distance_px, reach_px)
+
+
+def _lights(spreads: "_Spreads", near: Int[np.ndarray, "height width"], distance_px: Plane, reach_px: int) -> Lights:
+    """The zone of each light is a little larger than its widest disc; its core is what is over range where it is sharpest."""
+    light, areas_px, peaks = (np.array(each) for each in zip(*spreads.rows, strict=True))
     # Far out of focus a light drowns in its surroundings; in focus most of it may be lost, but its peak is not.
     seen = (light >= LEAST_SHARE_OF_LIGHT * light.max(axis=0)) | (peaks > OVER_RANGE)
     sharpest = np.where(seen, areas_px, np.inf).argmin(axis=0)
     radius_px = np.concatenate([[0.0], 1.3 * np.sqrt(np.where(seen, areas_px, 0.0).max(axis=0) / np.pi) + 2.0])
     zone = np.where(distance_px <= np.minimum(radius_px, reach_px)[near], near, 0)
-    core = np.zeros(zone.shape, bool)
+    core, members = np.zeros(zone.shape, bool), np.flatnonzero(near)
     owner = np.concatenate([[-1], sharpest])[zone].ravel()[members]
-    for index, packed in enumerate(over):
+    for index in range(len(areas_px)):
         mine = owner == index
-        core.ravel()[members[mine]] = np.unpackbits(packed, count=len(members)).view(bool)[mine]
+        core.ravel()[members[mine]] = spreads.over_range(index)[mine]
     widest = np.where(seen, areas_px, -1.0).argmax(axis=0)
     return Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), widest, areas_px)
 
@@ -145,14 +147,26 @@ def _nearest_spot(spots: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarr
     return number_of_cell[cells], distance_px
 
 
-def _spread(brightness: PerPixel, floor: PerPixel, numbers: Int[np.ndarray, " pixels"], count: int) -> tuple[PerLight, PerLight, PerLight]:
-    """For each light (how much is seen of it, over how many pixels, its peak); the area of an even disc is (sum)^2 / sum of squares.
+class _Spreads:
+    """How far each light is spread in each slice, and which pixels near lights are over range there.
 
-    Of the pixels near lights; numbers: which light each is near, from 1 to count.
+    numbers: which light each pixel is near, from 1. floor: above this brightness it is light.
     """
-    excess = np.maximum(brightness - floor, 0.0)
-    total = np.bincount(numbers, excess, count + 1)[1:]
-    squares = np.bincount(numbers, excess * excess, count + 1)[1:]
-    peaks = np.zeros(count + 1)
-    np.maximum.at(peaks, numbers, brightness)
-    return total, total**2 / np.maximum(squares, 1e-12), peaks[1:]
+
+    def __init__(self, numbers: Int[np.ndarray, " pixels"], floor: PerPixel) -> None:
+        self.numbers, self.floor, self.count = numbers, floor, int(numbers.max())
+        self.rows: list[tuple[PerLight, PerLight, PerLight]] = []
+        self._over: list[UInt8[np.ndarray, " packed"]] = []
+
+    def add(self, brightness: PerPixel) -> None:
+        """For each light (how much is seen of it, over how many pixels, its peak); the area of an even disc is (sum)^2 / sum of squares."""
+        excess = np.maximum(brightness - self.floor, 0.0)
+        total = np.bincount(self.numbers, excess, self.count + 1)[1:]
+        squares = np.bincount(self.numbers, excess * excess, self.count + 1)[1:]
+        peaks = np.zeros(self.count + 1)
+        np.maximum.at(peaks, self.numbers, brightness)
+        self.rows.append((total, total**2 / np.maximum(squares, 1e-12), peaks[1:]))
+        self._over.append(np.packbits(brightness > OVER_RANGE))
+
+    def over_range(self, index: int) -> Bool[np.ndarray, " pixels"]:
+        return np.unpackbits(self._over[index], count=len(self.numbers)).view(bool)

@@ -19,7 +19,7 @@ from capture.merging.lights import Extremes, find_lights
 from capture.merging.registered_slices import RegisteredSlices, newer, read_slice, source_path
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
-from capture.merging.second_pass import FIRST_PASS_FOLDER
+from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
 from capture.merging.slice_optics import SliceOptics
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
@@ -45,8 +45,7 @@ def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None 
 
 def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None) -> FocalStack:
     """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
-    if len(stack) < FEWEST_SLICES:
-        raise InputError(f"{stack.folder} has {len(stack)} slices: merging needs at least {FEWEST_SLICES}, focused at different distances")
+    _require_a_sweep(stack)
     name = stack.folder.name
     slices = RegisteredSlices(stack, _registration_of(stack, overwrite, registration))
     extremes = Extremes()
@@ -63,6 +62,16 @@ def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path |
     write_focal_stack(merged)
     write_merge_sheet(merged)
     return merged
+
+
+def _require_a_sweep(stack: FocalStack) -> None:
+    """Neighbours in order must be neighbours in focus."""
+    if len(stack) < FEWEST_SLICES:
+        raise InputError(f"{stack.folder} has {len(stack)} slices: merging needs at least {FEWEST_SLICES}, focused at different distances")
+    dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
+    steps = np.diff(dioptres)
+    if stack.is_metric and (steps > 0).any() and (steps < 0).any():
+        raise InputError(f"the slices of {stack.folder} are not in the order of their focus: ingest the photographs again")
 
 
 def _crossover(stack: FocalStack, width_px: int) -> float:
@@ -100,7 +109,8 @@ def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:
     """The merged stack in the geometry of its reference: lens focused there, camera of that focus."""
     reference = slices.registration.reference
-    changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference)
+    metadata = stack.metadata | {DEPTH_SOURCE: FROM_FOCUS}
+    changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference, metadata=metadata)
     if stack.lens is None or stack.slices[reference].focus_distance_m is None:
         return changed
     lens = changed.lens_of(reference)

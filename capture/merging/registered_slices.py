@@ -12,6 +12,7 @@ from capture.merging.alignment import Registration, warp, warped_validity
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.similarity import Similarity, to_opencv_centres
 from mrbokeh.camera_rgb import SATURATED, write_camera_rgb
+from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FocalStack, Slice
 
@@ -90,6 +91,12 @@ class RegisteredSlices:
 
     def _resampled(self, index: int) -> tuple[Rgb, Plane]:
         rgb, saturated = read_slice(self.stack.folder / source_path(self.stack.slices[index]))
+        size_px = (rgb.shape[1], rgb.shape[0])
+        if self.registration.size_px not in (None, size_px):
+            raise InputError(
+                f"the registration is for pictures of {self.registration.size_px} px, but slice {index} of {self.stack.folder} has "
+                f"{size_px}: leave --registration out, and the slices are registered anew"
+            )
         transform = self.registration.reference_from_slice[index]
         return warp(rgb, transform), _warped_share(saturated, transform)
 

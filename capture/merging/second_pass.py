@@ -16,6 +16,9 @@ from mrbokeh.focal_stack import FocalStack
 from mrbokeh.image_io import read_image
 
 FIRST_PASS_FOLDER = "first_pass"
+DEPTH_SOURCE = "depth_source"
+"""Key in a stack's metadata: where depth.exr and all_in_focus.exr come from; FROM_FOCUS after merging."""
+FROM_FOCUS = "focus"
 
 Rgb = Float32[np.ndarray, "height width 3"]
 

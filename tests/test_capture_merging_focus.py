@@ -1,0 +1,123 @@
+"""Focus energies in noise, confidence beside edges and saturation, and the blend's fast and plain twins."""
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.merging.all_in_focus import all_in_focus, crossover_of, slice_weight
+from capture.merging.depth_from_focus import FocusMap, focus_map
+from capture.merging.focus_volume import FocusVolume, focus_energy, focus_volume
+from capture.merging.lights import no_lights
+from mrbokeh.aperture import Aperture
+from mrbokeh.layer import opaque
+from mrbokeh.renderers.scatter_reference import blur_layer
+
+SIZE = (96, 128)
+SLICES = 7
+STEP_PX = 1.2
+
+
+@pytest.fixture(scope="module")
+def noisy() -> tuple[list[np.ndarray], np.ndarray]:
+    """A slanted texture of low contrast in seven slices with 1 % shot noise, and the index at which each column is sharp."""
+    rng = np.random.default_rng(0)
+    grain = cv2.GaussianBlur(rng.uniform(-1, 1, (128, 160, 3)).astype(np.float32), (0, 0), 0.8)
+    rgb = np.clip(0.4 + 0.25 * grain, 0.02, 1.0)
+    index = np.tile(np.linspace(1.0, 5.0, 160, dtype=np.float32), (128, 1))
+    slices = []
+    for i in range(SLICES):
+        blurred = blur_layer(opaque(rgb, np.ones(index.shape, np.float32)), STEP_PX * (index - i), Aperture.disc(24))
+        clean = (blurred.rgb / blurred.alpha[..., None])[16:-16, 16:-16]
+        slices.append((rng.poisson(clean * 1e4) / 1e4).astype(np.float32))
+    return slices, index[16:-16, 16:-16]
+
+
+def test_averaging_slices_finds_depth_in_noise(noisy: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    import capture.merging.focus_volume as module
+
+    slices, truth = noisy
+    calm = np.abs(focus_map(focus_volume(slices), no_lights(SIZE)).focus_index - truth)
+    monkeypatch.setattr(module, "CALM_NOISE_FLOORS", 1e-9)
+    nervous = np.abs(focus_map(focus_volume(slices), no_lights(SIZE)).focus_index - truth)
+    assert calm.mean() < 0.9 * nervous.mean()
+    # Half a step is 0.6 px of blur, the least that this texture shows.
+    assert np.median(calm) < 0.5
+
+
+def test_energies_far_above_the_noise_are_kept() -> None:
+    """Weights 1, 2, 1 have full effect on noise alone, none on energies a million times as large."""
+    rng = np.random.default_rng(0)
+    energies = rng.uniform(0.5, 1.5, (5, 20, 20)).astype(np.float32)
+    energies[2, :, 10:] *= 1e6
+    volume = FocusVolume(energies, (40, 40))
+    calmed = volume.calmed()
+    np.testing.assert_allclose(calmed[2, :, 10:], energies[2, :, 10:], rtol=1e-3)
+    averaged = 0.25 * energies[0] + 0.5 * energies[1] + 0.25 * energies[2]
+    np.testing.assert_allclose(calmed[1, :, :10], averaged[:, :10], rtol=0.01)
+
+
+def test_a_volume_is_never_larger_than_it_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    import capture.merging.focus_volume as module
+
+    monkeypatch.setattr(module, "LARGEST_VOLUME_BYTES", 4.0 * 3 * 96 * 128 / 9)
+    rgb = np.random.default_rng(0).uniform(0, 1, (*SIZE, 3)).astype(np.float32)
+    volume = focus_volume([rgb] * 3, count=3)
+    assert volume.energies.shape == (3, 32, 43) and volume.energies.nbytes <= 1.02 * module.LARGEST_VOLUME_BYTES
+    np.testing.assert_allclose(volume.energies.mean(), focus_energy(rgb).mean(), rtol=0.02)
+    assert volume.enlarged(volume.energies[0]).shape == SIZE
+
+
+def test_where_a_slice_has_no_data_it_is_never_the_sharpest(noisy: tuple) -> None:
+    slices, truth = noisy
+
+    def valid(index: int) -> np.ndarray:
+        return np.full(SIZE, index != 3)
+
+    focus = focus_map(focus_volume(slices, valid), no_lights(SIZE))
+    assert focus_volume(slices, valid).energies[3].max() == 0.0
+    assert (np.abs(focus.focus_index - 3) < 0.4).mean() < 0.1 < (np.abs(truth - 3) < 0.4).mean()
+
+
+def test_no_confidence_beside_what_is_saturated(noisy: tuple) -> None:
+    slices, _ = noisy
+    saturated = np.zeros(SIZE, bool)
+    saturated[40:44, 60:64] = True
+    volume = focus_volume(slices)
+    with_veto, without = (focus_map(volume, no_lights(SIZE), mask).confidence for mask in (saturated, None))
+    for beside in (np.s_[36:48, 60:64], np.s_[40:44, 56:68]):
+        assert with_veto[beside].max() == 0.0 < without[beside].max()
+    np.testing.assert_array_equal(with_veto[:30], without[:30])
+
+
+def test_confidence_is_low_where_the_window_sees_two_surfaces() -> None:
+    rng = np.random.default_rng(0)
+    rgb = np.clip(0.4 + cv2.GaussianBlur(rng.uniform(-1, 1, (*SIZE, 3)).astype(np.float32), (0, 0), 0.8), 0.02, 1.0)
+    index = np.ones(SIZE, np.float32)
+    index[:, 64:] = 5.0
+    slices = [blur_layer(opaque(rgb, np.ones(SIZE, np.float32)), 2.5 * (index - i), Aperture.disc(24)).rgb for i in range(SLICES)]
+    focus = focus_map(focus_volume(slices), no_lights(SIZE))
+    beside, away = focus.confidence[16:-16, 60:68], focus.confidence[16:-16, 16:50]
+    assert beside.mean() < 0.5 * away.mean()
+
+
+def test_the_index_in_dioptres() -> None:
+    index = np.array([[0.0, 0.5, 1.75]], np.float32)
+    focus = FocusMap(index, index, index)
+    np.testing.assert_allclose(focus.dioptres((2.0, 1.0, 0.6)), [[2.0, 1.5, 0.7]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("crossover", [0.5, 0.8, 1.0])
+def test_the_compiled_blend_is_the_plain_one(crossover: float) -> None:
+    rng = np.random.default_rng(0)
+    slices = [rng.uniform(0, 2, (20, 30, 3)).astype(np.float32) for _ in range(4)]
+    index = rng.uniform(0, 3, (20, 30)).astype(np.float32)
+    plain = sum(slice_weight(index, i, crossover)[..., None] * rgb for i, rgb in enumerate(slices))
+    np.testing.assert_allclose(all_in_focus(slices, index, crossover), plain, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(sum(slice_weight(index, i, crossover) for i in range(4)), 1.0, atol=1e-6)
+
+
+def test_close_slices_cross_over_all_the_way() -> None:
+    """Up to 2 px from slice to slice both neighbours are within 1 px of sharp in the middle."""
+    assert crossover_of(1.2) == crossover_of(2.0) == 1.0
+    assert crossover_of(3.0) == pytest.approx(2 / 3)
+    assert crossover_of(20.0) == 0.5
