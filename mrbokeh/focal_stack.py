@@ -5,7 +5,7 @@ there to Rec.709, and is None where the pictures are Rec.709 already (JPEG, EXR)
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -137,19 +137,27 @@ class FocalStack:
         return self.depth_confidence() >= least_confidence
 
     def lens_of(self, index: int) -> Lens:
-        """The lens as it was focused for one slice."""
-        distance = self.slices[index].focus_distance_m
-        if self.lens is None or distance is None:
+        """The lens as it was focused for one slice; where its blur was calibrated (`mrbokeh capture scale`), with the f-number
+        that gives the blur found."""
+        each = self.slices[index]
+        if self.lens is None or each.focus_distance_m is None:
             raise InputError(
                 f"{self.folder} does not know its lens and focus distances: give focal_length_mm, f_number, sensor_width_mm and "
                 f"focus_distances_m in a lens.toml beside the photographs and ingest again"
             )
-        return self.lens.focused_at(distance)
+        lens = self.lens.focused_at(each.focus_distance_m)
+        if "px_per_dioptre" not in each.metadata:
+            return lens
+        found = each.metadata["px_per_dioptre"] / lens.coc_px_per_dioptre(each.metadata["px_per_dioptre_width_px"])
+        return replace(lens, f_number=lens.f_number / found)
+
+    def coc_px_per_dioptre(self, index: int, width_px: int) -> float:
+        """How fast blur grows in a registered slice, width_px wide: what registration enlarged grew with it."""
+        return self.lens_of(index).coc_px_per_dioptre(width_px) * self.slices[index].scale
 
     def coc_px(self, index: int, depth_m: Float[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
-        """Signed circle of confusion (diameter) of a registered slice: what registration enlarged grew with it."""
-        coc_px = self.lens_of(index).coc_px(depth_m, depth_m.shape[1]) * self.slices[index].scale
-        return coc_px.astype(np.float32)
+        """Signed circle of confusion (diameter) of a registered slice."""
+        return (self.lens_of(index).coc_px(depth_m, depth_m.shape[1]) * self.slices[index].scale).astype(np.float32)
 
     def _depth_channel(self, name: str) -> Float32[np.ndarray, "height width"]:
         self._require_merged()

@@ -169,3 +169,15 @@ def test_stacks_of_the_first_version_are_refused_with_advice(tmp_path: Path) -> 
     (tmp_path / "stack.json").write_text(json.dumps(document | {"version": 1}))
     with pytest.raises(InputError, match=r"version 1: run `mrbokeh capture ingest` on the photographs again"):
         read_focal_stack(tmp_path)
+
+
+def test_a_calibrated_slice_blurs_as_it_was_found_to(tmp_path: Path) -> None:
+    """4 px per dioptre at 100 px width is 2 at 50; registration by 1.1 enlarges it; half a dioptre off gives half of that."""
+    found = {"px_per_dioptre": 4.0, "px_per_dioptre_width_px": 100}
+    lens = Lens(50.0, 2.0, 1.0, 36.0)
+    stack = FocalStack(tmp_path, (Slice("a.exr", 1.0, 1.1, found), Slice("b.exr", 1.0)), lens)
+    assert stack.coc_px_per_dioptre(0, 50) == pytest.approx(2.2, rel=1e-9)
+    depth_m = np.full((3, 50), 2.0)
+    np.testing.assert_allclose(stack.coc_px(0, depth_m), 1.1, rtol=1e-6)
+    assert stack.lens_of(0).focal_length_mm == 50.0
+    assert stack.lens_of(1) == lens

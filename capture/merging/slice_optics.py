@@ -34,9 +34,9 @@ class SliceOptics:
 
     @classmethod
     def of_stack(cls, stack: FocalStack, width_px: int) -> "SliceOptics":
-        """From the lens and the focus distances that the stack states; registration enlarged the blur by each slice's scale."""
+        """The focus distances and the growth of blur that the stack states."""
         lenses = [stack.lens_of(index) for index in range(len(stack))]
-        growth = [lens.coc_px_per_dioptre(width_px) * each.scale for lens, each in zip(lenses, stack.slices, strict=True)]
+        growth = [stack.coc_px_per_dioptre(index, width_px) for index in range(len(stack))]
         return cls.of_slices([1.0 / lens.focus_distance_m for lens in lenses], growth, lenses[0].aperture)
 
     def __len__(self) -> int:
