@@ -9,7 +9,7 @@ import pytest
 
 from capture.views.plane_sweep import UNSEEN, WORST_COST, Matching, PlaneScores, plane_sweep
 from capture.views.plane_sweep_plainly import scores_of_surface
-from capture.views.plane_sweep_planes import dioptre_planes, pixels_per_dioptre
+from capture.views.plane_sweep_planes import by_parallax, dioptre_planes, pixels_per_dioptre
 from capture.views.plane_sweep_refinement import refine
 from capture.views.plane_sweep_view import BRIGHTEST, SweepView, structure_of
 from mrbokeh.camera import Camera
@@ -72,6 +72,19 @@ def test_planes_step_by_so_many_pixels_in_the_widest_neighbour() -> None:
     assert len(dioptre_planes(scene.views[0], scene.views[1:], (0.4, 2.0), 0.5, most=9)) == 9
 
 
+def test_neighbours_of_little_parallax_come_first_but_not_those_of_none() -> None:
+    """Over 1 dioptre a view moved by 0.06 m travels 10.2 px, one by 0.2 m 34 px, one by 0.001 m 0.2 px."""
+    view = tilted_wall().views[0]
+
+    def moved(x_m: float) -> SweepView:
+        pose = np.eye(4)
+        pose[0, 3] = -x_m
+        return replace(view, camera=replace(view.camera, camera_from_world=pose))
+
+    others = [moved(0.2), moved(0.001), moved(0.06)]
+    assert by_parallax(view, others, (0.5, 1.5)) == [others[2], others[0], others[1]]
+
+
 def test_views_from_one_place_are_refused() -> None:
     view = tilted_wall().views[0]
     with pytest.raises(InputError, match="parallax"):
@@ -132,6 +145,17 @@ def _bent(view: SweepView, k1: float) -> np.ndarray:
 
     x, y = np.moveaxis(undistorted_px(view.camera, (k1, 0.0), view.camera.pixel_centres_px()) - 0.5, -1, 0).astype(np.float32)
     return cv2.remap(view.structure, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def test_pixels_beyond_the_fold_of_the_distortion_are_seen_by_nobody() -> None:
+    """r (1 + k1 r^2) with k1 = -2 never exceeds 0.272 (at r = 0.408): what lies farther out has no ray."""
+    view = turned_view(0, (-2.0, 0.0), 0.0)
+    camera = view.camera
+    radius = np.linalg.norm((camera.pixel_centres_px() - camera.principal_px) / np.asarray(camera.focal_px), axis=-1)
+    sweep = PlaneScores(view, [turned_view(1, (0.0, 0.0), 0.0, (60, 80))], Matching(), np.ones((28, 36), np.float32))
+    scores = sweep.of_rows(0, 28, 0.0)
+    assert (scores[radius > 0.28] == UNSEEN).all()
+    assert (scores[radius < 0.15] > UNSEEN).any()
 
 
 def test_structure_evens_out_shot_noise_and_cuts_lights() -> None:
