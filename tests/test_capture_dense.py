@@ -10,8 +10,9 @@ from capture.views._dense_labelling_numba import aggregate
 from capture.views.dense_clues import Clues, SparseDepths
 from capture.views.dense_confidence import sweep_trust, with_consistency
 from capture.views.dense_consistency import Consistency, ViewDepth, consistency
-from capture.views.dense_depth import FILLED, FOCUS, SWEEP, DenseDepth, DenseSettings, dense_depth
+from capture.views.dense_depth import DenseSettings, dense_depth
 from capture.views.dense_edges import near_steps, weighted_medians, weighted_medians_plainly
+from capture.views.dense_finish import FILLED, FOCUS, SWEEP, DenseDepth
 from capture.views.dense_labelling import Penalties, aggregate_plainly, label_planes
 from capture.views.dense_levels import halvings, level_sizes
 from capture.views.dense_smoothing import interpolate, smooth, smooth_plainly

@@ -19,12 +19,16 @@ HELP = "\n\n".join(
 def depth_command(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder that `mrbokeh capture scale` worked on")],
     neighbours: Annotated[int, typer.Option(min=1, help="how many other views each stack is compared with")] = 6,
+    device: Annotated[
+        str | None, typer.Option(metavar="cuda|cpu", help="of torch, for the plane sweep; without it compiled loops run")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
 ) -> None:
+    from capture.views.dense_depth import DenseSettings
     from capture.views.scene_depth import SceneDepthSettings, deepen_scene
     from mrbokeh.stack_pictures import SHEET_NAME
 
-    result = deepen_scene(scene, SceneDepthSettings(neighbours, overwrite))
+    result = deepen_scene(scene, SceneDepthSettings(neighbours, overwrite, DenseSettings(device=device)))
     for stack in result.stacks:
         typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
     if result.left_out:

@@ -11,30 +11,21 @@ from functools import partial
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
-from capture.views.dense_clues import Clues, SparseDepths
-from capture.views.dense_confidence import either, sweep_trust, with_consistency
-from capture.views.dense_consistency import consistency
-from capture.views.dense_edges import near_steps, weighted_medians
+from capture.views.dense_clues import Clues
+from capture.views.dense_finish import DenseDepth, FinishSettings, Surface, finished
 from capture.views.dense_labelling import Penalties, label_planes
 from capture.views.dense_levels import halvings, level_sizes, scaled_size
-from capture.views.dense_smoothing import interpolate
-from capture.views.depth_fusion import add_focus_votes, agreement
+from capture.views.depth_fusion import add_focus_votes
 from capture.views.plane_sweep import Costs, Matching, plane_sweep
 from capture.views.plane_sweep_planes import by_parallax, dioptre_planes, pixels_per_dioptre
 from capture.views.plane_sweep_refinement import Refined, refine
-from capture.views.plane_sweep_view import BRIGHTEST, SweepView
+from capture.views.plane_sweep_view import SweepView
 
 Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]
 
-SWEEP, FOCUS, FILLED = 0, 1, 2
-"""What a pixel's depth came from."""
-# In gaps the labelling is a better guess than far surroundings, the more it prefers one plane.
-_SAY_OF_LABELLING = 0.05
-_MARGIN_OF_HALF_SAY = 5.0
-_LEAST_SAY = 1e-6
 _LEAST_DIOPTRE = np.float32(1e-4)  # 10 km: nothing lies beyond infinity
 
 
@@ -42,8 +33,7 @@ _LEAST_DIOPTRE = np.float32(1e-4)  # 10 km: nothing lies beyond infinity
 class DenseSettings:
     """step_px: between planes, in the widest neighbour; most_planes caps their number (the sweeps around the surface are finer).
 
-    most_cells: pixels times planes of the coarse level, at 3 bytes each. edge_radius_px: how far windows may spill over an edge.
-    step_dioptre: a step of depth between neighbouring pixels that counts as an edge. fill_px: how far gaps are filled evenly.
+    most_cells: pixels times planes of the coarse level, at 3 bytes each.
     device: of torch, for the sweep over all planes ('cuda'); None takes the compiled loops.
     """
 
@@ -55,19 +45,8 @@ class DenseSettings:
     matching: Matching = field(default_factory=lambda: Matching(radius_px=2, noise=0.01))
     fine_matching: Matching = field(default_factory=lambda: Matching(radius_px=3))
     penalties: Penalties = field(default_factory=Penalties)
-    edge_radius_px: int = 6
-    step_dioptre: float = 0.03
-    fill_px: float = 20.0
+    finish: FinishSettings = field(default_factory=FinishSettings)
     device: str | None = None
-
-
-@dataclass(frozen=True)
-class DenseDepth:
-    """depth_m (H, W) along the axis, everywhere; confidence (H, W) in [0, 1]; source (H, W): SWEEP, FOCUS or FILLED."""
-
-    depth_m: Plane
-    confidence: Plane
-    source: UInt8[np.ndarray, "height width"]
 
 
 def dense_depth(
@@ -96,7 +75,7 @@ def dense_depth(
         for finer in halvings(step, finest * width / size[0]):
             fine = _refined(_at(reference, width, size), views, cv2.medianBlur(dioptre, 5), finer, settings)
             dioptre, step = fine.dioptre, finer
-    return _finished(rgb, reference, fine, margin, clues, settings)
+    return finished(rgb, reference, Surface(fine.dioptre, fine.score, margin), clues, settings.finish)
 
 
 def _coarse(
@@ -139,30 +118,3 @@ def _refined(reference: SweepView, neighbours: Sequence[SweepView], dioptre: Pla
     """A finer sweep around the surface; where views agree on nothing it stays as it was."""
     fine = refine(reference, neighbours, dioptre, step, matching=settings.fine_matching)
     return replace(fine, dioptre=np.maximum(np.where(fine.score > 0.0, fine.dioptre, dioptre), _LEAST_DIOPTRE))
-
-
-def _finished(rgb: Rgb, reference: SweepView, fine: Refined, margin: Plane, clues: Clues, settings: DenseSettings) -> DenseDepth:
-    """Edges on those of the picture, trust in each pixel, gaps filled."""
-    guide = cv2.bilateralFilter(np.sqrt(np.clip(rgb, 0.0, BRIGHTEST)), 5, 0.05, 1.5)
-    edges = near_steps(fine.dioptre, settings.edge_radius_px - 1, settings.step_dioptre)
-    dioptre = weighted_medians(fine.dioptre, np.ones_like(margin), guide, edges, settings.edge_radius_px, 0.07)
-    moved = np.abs(dioptre - fine.dioptre) > 0.5 * settings.step_dioptre
-    by_views = np.where(moved, 0.5, 1.0).astype(np.float32) * sweep_trust(fine.score, margin)
-    by_focus = np.zeros_like(margin) if clues.focus is None else agreement(clues.focus, dioptre)
-    trust = either(by_views, by_focus)
-    if clues.views:
-        trust = with_consistency(trust, consistency(reference, dioptre, clues.views, 0.5 * settings.step_dioptre))
-    keep = np.clip((trust - 0.05) / 0.2, 0.0, 1.0)
-    filled = _filled(dioptre, trust, margin, guide, clues.sparse, settings.fill_px)
-    source = np.where(keep < 0.5, FILLED, np.where(by_focus > by_views, FOCUS, SWEEP)).astype(np.uint8)
-    return DenseDepth((1.0 / (keep * dioptre + (1.0 - keep) * filled)).astype(np.float32), trust, source)
-
-
-def _filled(dioptre: Plane, trust: Plane, margin: Plane, guide: Rgb, sparse: SparseDepths | None, fill_px: float) -> Plane:
-    """Trusted pixels spread over the others, up to the edges of the guide; known points count in full."""
-    weights = trust**2 + _SAY_OF_LABELLING * margin / (margin + _MARGIN_OF_HALF_SAY) + _LEAST_SAY
-    known = dioptre.copy()
-    if sparse is not None:
-        row, column, chosen = sparse.pixels(dioptre.shape)
-        known[row, column], weights[row, column] = 1.0 / sparse.depth_m[chosen], 1.0
-    return interpolate(known, weights.astype(np.float32), guide, fill_px**2, 0.03)

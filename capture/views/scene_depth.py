@@ -16,7 +16,9 @@ from jaxtyping import Float, Float32
 from capture.merging.second_pass import DEPTH_SOURCE, first_pass_path, keep_first_pass, second_pass
 from capture.merging.slice_optics import SliceOptics
 from capture.views.colmap import RECONSTRUCTION_FOLDER
-from capture.views.dense_depth import Clues, DenseDepth, DenseSettings, SparseDepths, dense_depth
+from capture.views.dense_clues import Clues, SparseDepths
+from capture.views.dense_depth import DenseSettings, dense_depth
+from capture.views.dense_finish import DenseDepth
 from capture.views.depth_fusion import FocusVote, focus_vote_of_map, near_lights
 from capture.views.neighbours import nearest_views
 from capture.views.plane_sweep_view import SweepView, structure_of
