@@ -11,8 +11,6 @@ Speed: the same tools from photographs on disk to pictures on disk, with registr
 
 import argparse
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -27,18 +25,11 @@ from mrbokeh.focal_stack import FocalStack, read_focal_stack
 from mrbokeh.image_io import read_image, write_image
 from tests.capture_truth import ViewTruth, picture_db, view_truth
 from tests.machine import machine_line
+from tests.process_cost import measured, mrbokeh
 
 LAB = Path("bench_out") / "lab"
 PHOTOGRAPHS = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "stacks" / "button_macro"
 ENFUSE = ("enfuse", "--exposure-weight=0", "--saturation-weight=0", "--contrast-weight=1", "--hard-mask")
-LAUNCHER = """
-import resource, subprocess, sys
-done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL)
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-print(used.ru_utime + used.ru_stime, used.ru_maxrss)
-sys.exit(done.returncode)
-"""
-MEGABYTE = 1024.0  # kilobytes, as Linux states the largest memory of a process
 
 
 def main() -> None:
@@ -109,22 +100,6 @@ def command_of(name: str, program: str, pictures: list[Path], result: Path, *, a
     if aligned:
         return ["sh", "-c", f"{fuse} {names}"]
     return ["sh", "-c", f"align_image_stack -m -a {result.parent}/aligned_ {names} && {fuse} {result.parent}/aligned_*.tif"]
-
-
-def mrbokeh(*arguments: object) -> tuple[float, float]:
-    return measured([sys.executable, "-c", "from mrbokeh.cli import main; main()", *map(str, arguments)])
-
-
-def measured(command: list[str]) -> tuple[float, float]:
-    """(CPU seconds of all cores, largest memory in MB) of a program and those that it starts and waits for.
-
-    A small process starts it, because Linux counts what the starting process holds as memory of the started one.
-    """
-    done = subprocess.run([sys.executable, "-c", LAUNCHER, *command], capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(f"{' '.join(command)} failed: {done.stderr[-500:]}")
-    cpu_s, memory_kb = done.stdout.split()[-2:]
-    return float(cpu_s), float(memory_kb) / MEGABYTE
 
 
 def blur_of(stack: FocalStack, truth: ViewTruth) -> list[np.ndarray]:

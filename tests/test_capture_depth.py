@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from capture.merging.merge import merge_scene
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
 from capture.views.neighbours import nearest_views
-from capture.views.scene_depth import DEPTH_SOURCE, deepen_scene
+from capture.views.patch_match_scene import PatchMatchScene
+from capture.views.scene_depth import DEPTH_SOURCE, SceneDepthSettings, deepen_scene
 from capture.views.sparse_model import SparseModel, SparseView
-from capture.views.sparse_model_file import write_sparse_model
+from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
 from mrbokeh.atomic_files import write_json
 from mrbokeh.camera import Camera
 from mrbokeh.demo.plan import DATA, VIEWS
@@ -158,6 +160,32 @@ def test_what_is_missing_is_said_in_one_sentence(merged: Path, tmp_path: Path) -
     with pytest.raises(InputError, match="capture scale"):
         deepen_scene(scene)
     assert len(find_focal_stacks(scene)) == 3
+
+
+def test_patch_match_says_what_it_needs_before_anything_changes(merged: Path, tmp_path: Path) -> None:
+    """The package pycolmap of the extra is built without CUDA."""
+    scene = tmp_path / "desk"
+    shutil.copytree(merged, scene)
+    with pytest.raises(InputError, match="pycolmap-cuda12"):
+        deepen_scene(scene, SceneDepthSettings(patch_match=True))
+    assert not list(scene.rglob("first_pass"))
+
+
+def test_depths_of_patch_match_come_in_metres(merged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its maps are in COLMAP's unit, here half a metre: a map of 3 units is 1.5 m. COLMAP itself is stood in for."""
+    scene, model = tmp_path / "desk", replace(read_sparse_model(merged / "reconstruction"), metres_per_unit=0.5)
+    picture = {"name": VIEWS[0], "file": f"{VIEWS[0]}.png", "camera": 0}
+    write_json(scene / "reconstruction" / "colmap_job.json", {})
+    job = SimpleNamespace(pictures=[SimpleNamespace(**picture)], pictures_folder="images")
+    ran: list[Path] = []
+    monkeypatch.setattr("capture.views.patch_match_scene.patch_match_obstacle", lambda: None)
+    monkeypatch.setattr("capture.views.patch_match_scene.job_from_json", lambda _: job)
+    monkeypatch.setattr("capture.views.patch_match_scene.run_patch_match", lambda _s, _p, folder: (folder.mkdir(), ran.append(folder)))
+    monkeypatch.setattr("capture.views.patch_match_scene.read_patch_match", lambda *_: np.full((2, 3), 3.0, np.float32))
+    for _ in range(2):
+        found = PatchMatchScene(scene, model).depths_in(VIEWS[0])
+    np.testing.assert_array_equal(found.depth_m, 1.5)
+    assert len(found.xy_px) == 6 and len(ran) == 1, "what is finished is not run again"
 
 
 def test_neighbours_are_those_with_parallax_and_common_points() -> None:

@@ -22,13 +22,16 @@ def depth_command(
     device: Annotated[
         str | None, typer.Option(metavar="cuda|cpu", help="of torch, for the plane sweep; without it compiled loops run")
     ] = None,
+    patch_match: Annotated[
+        bool, typer.Option("--patch-match", help="narrow the sweep by COLMAP's PatchMatch (pycolmap-cuda12 and an NVIDIA GPU)")
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
 ) -> None:
     from capture.views.dense_depth import DenseSettings
     from capture.views.scene_depth import SceneDepthSettings, deepen_scene
     from mrbokeh.stack_pictures import SHEET_NAME
 
-    result = deepen_scene(scene, SceneDepthSettings(neighbours, overwrite, DenseSettings(device=device)))
+    result = deepen_scene(scene, SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device)))
     for stack in result.stacks:
         typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
     if result.left_out:

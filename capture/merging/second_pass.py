@@ -11,9 +11,9 @@ from capture.merging.light_discs import measure_discs
 from capture.merging.lights import find_lights
 from capture.merging.slice_optics import SliceOptics
 from mrbokeh.atomic_files import atomic_path
+from mrbokeh.camera_rgb import read_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import read_image
 
 FIRST_PASS_FOLDER = "first_pass"
 DEPTH_SOURCE = "depth_source"
@@ -30,7 +30,7 @@ def second_pass(stack: FocalStack, depth_m: Float[np.ndarray, "height width"], o
     """
     if not stack.merged:
         raise InputError(f"{stack.folder} is not merged yet: run `mrbokeh capture merge` before its depth is found")
-    first = read_image(first_pass_path(stack, stack.all_in_focus_path))
+    first = read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path))
     optics = SliceOptics.of_stack(stack, first.shape[1]) if optics is None else optics
     lights = find_lights(stack.iter_camera_rgb)
     discs = measure_discs(stack.iter_camera_rgb(), lights)

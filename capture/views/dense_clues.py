@@ -23,6 +23,9 @@ class SparseDepths:
         spare = margin * (nearest - farthest)
         return max(float(farthest - spare), 0.0), float(nearest + spare)
 
+    def joined(self, other: "SparseDepths") -> "SparseDepths":
+        return SparseDepths(np.concatenate([self.xy_px, other.xy_px]), np.concatenate([self.depth_m, other.depth_m]))
+
     def pixels(self, shape: tuple[int, int], scale: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(row, column, number) of the points inside a picture (height, width) at that scale."""
         column, row = np.floor(self.xy_px * scale).astype(int).T

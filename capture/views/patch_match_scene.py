@@ -1,0 +1,38 @@
+"""PatchMatch depths of a whole scene as clues for its dense depth; run once, in SCENE/reconstruction/patch_match."""
+
+from pathlib import Path
+
+import numpy as np
+
+from capture.views.colmap import JOB_NAME, RECONSTRUCTION_FOLDER
+from capture.views.colmap_job import job_from_json
+from capture.views.dense_clues import SparseDepths
+from capture.views.patch_match import patch_match_clue, patch_match_obstacle, read_patch_match, run_patch_match
+from capture.views.sparse_model import SparseModel
+from mrbokeh.atomic_files import read_json
+from mrbokeh.errors import InputError
+
+WORKSPACE = "patch_match"
+_FINISHED = "finished"
+
+
+class PatchMatchScene:
+    """model: in COLMAP's own unit, with its scale. Raises InputError where PatchMatch cannot run."""
+
+    def __init__(self, scene: Path, model: SparseModel) -> None:
+        obstacle = patch_match_obstacle()
+        if obstacle:
+            raise InputError(obstacle)
+        folder = scene / RECONSTRUCTION_FOLDER
+        job = job_from_json(read_json(folder / JOB_NAME, "what COLMAP was asked to do (run `mrbokeh capture poses --overwrite`)"))
+        self._files = {each.name: each.file for each in job.pictures}
+        self._model, self._workspace = model, folder / WORKSPACE
+        if not (self._workspace / _FINISHED).is_file():
+            run_patch_match(folder / "sparse", folder / job.pictures_folder, self._workspace)
+            (self._workspace / _FINISHED).touch()
+
+    def depths_in(self, name: str) -> SparseDepths:
+        """Every pixel of a view that PatchMatch knows, in metres."""
+        view = self._model.view(name)
+        depth = read_patch_match(self._workspace, self._files[name], view.camera, view.distortion)
+        return patch_match_clue((depth * np.float32(self._model.metres_per_unit)).astype(np.float32))
