@@ -19,7 +19,7 @@ class ExrPart:
     """One picture of an EXR file.
 
     channels: name to (H, W) float16 or float32, all of the size of the display window.
-    attributes: further header entries (numbers, strings).
+    attributes: further header entries: numbers, strings, and chromaticities (CIE x, y of red, green, blue and white).
     """
 
     channels: Channels
@@ -76,7 +76,8 @@ def _part_from_openexr(part: Any) -> ExrPart:
     size = tuple((header["displayWindow"][1] - display_min + 1)[::-1].tolist())
     offset_y, offset_x = (data_min - display_min)[::-1].tolist()
     channels = {name: _placed(channel.pixels, size, offset_y, offset_x) for name, channel in part.channels.items()}
-    attributes = {key: value for key, value in header.items() if isinstance(value, (int, float, str)) and key != "name"}
+    told = {key: value for key, value in header.items() if isinstance(value, (int, float, str)) or key == "chromaticities"}
+    attributes = {key: value for key, value in told.items() if key != "name"}
     return ExrPart(channels, str(header.get("name", "")), attributes)
 
 

@@ -1,4 +1,8 @@
-"""Pictures and layers to and from scene-linear float32: EXR and HDR as they are, PNG, TIFF and JPEG through a stated encoding."""
+"""Pictures and layers to and from scene-linear float32: HDR as it is, EXR from the primaries that it states, PNG, TIFF and JPEG
+through a stated encoding.
+
+Files are written without stating primaries: EXR takes Rec.709 where none are stated, and kernels and maps of numbers have none.
+"""
 
 from pathlib import Path
 from typing import Literal
@@ -10,6 +14,7 @@ from mrbokeh.atomic_files import atomic_path
 from mrbokeh.color import linear_to_srgb, srgb_to_linear
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.exr_primaries import in_rec709, stated_primaries
 from mrbokeh.layer import Layer
 
 Encoding = Literal["srgb", "linear"]
@@ -22,9 +27,10 @@ _INTEGER_RANGE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
 
 def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
-    """A picture as scene-linear RGB (H, W, 3); transparent pictures lose their alpha (see `read_layer`).
+    """A picture as scene-linear Rec.709 (H, W, 3); transparent pictures lose their alpha (see `read_layer`).
 
-    encoding: what the numbers of an integer file (PNG, TIFF, JPEG) mean; EXR, HDR and float TIFF are linear already.
+    encoding: what the numbers of an integer file (PNG, TIFF, JPEG) mean; EXR, HDR and float TIFF are linear already. EXR of other
+    primaries (ACES, the camera RGB of focal stacks) is converted; `read_camera_rgb` gives what is stored.
     """
     return _read_rgba(Path(path), encoding)[..., :3]
 
@@ -69,13 +75,14 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     """A layer from an EXR with R, G, B and, where present, A and Z (or depth.Z), in one part or several.
 
     Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf. Of several views (stereo)
-    it is the first that has colour, with its own depth. extra: keep all other channels too, each under its own name.
+    it is the first that has colour, with its own depth. R, G, B become Rec.709 where the file states other primaries.
+    extra: keep all other channels too, each under its own name and as stored.
     """
     parts = read_exr(path)
     colour = next((part for part in parts if set("RGB") <= part.channels.keys()), parts[0])
     of_one_view = [part for part in parts if part.attributes.get("view") == colour.attributes.get("view")]
     channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
-    rgb = ExrPart(channels).stacked("RGB")
+    rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
     depth = next((channels[name] for name in _DEPTH_NAMES if name in channels), np.zeros(rgb.shape[:2])).astype(np.float32)
     others = sorted(channels.keys() - set("RGBA") - set(_DEPTH_NAMES)) if extra else []

@@ -4,7 +4,7 @@ NPZ: `version` (1), `width_px`, `height_px` and the arrays of `LightFieldSamples
 
 EXR: one part per sample of a pixel, `sample00`, `sample01`, ..., each a picture of the size of the frame whose pixel (i, j)
 holds one sample that fell on it, in 32 bit channels (16 bit are read as well):
-    R, G, B                  scene-linear light
+    R, G, B                  scene-linear light, Rec.709 or the primaries that the file states
     Z                        depth along the axis in metres; inf is background, 0 says that the pixel has no such sample
     lens.u, lens.v           place in the unit pupil, x right, y down
     time                     0 (shutter opens) to 1 (it closes)
@@ -20,6 +20,7 @@ import numpy as np
 from mrbokeh.atomic_files import atomic_path
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.exr_primaries import in_rec709, stated_primaries
 from mrbokeh.light_field_samples import LightFieldSamples
 
 VERSION = 1
@@ -113,4 +114,5 @@ def _from_parts(parts: list[ExrPart], path: Path | str) -> LightFieldSamples:
         values = np.stack([part.stacked(letters) for part in parts], axis=2)[held]
         values = values * np.array([-1.0 if letter == _UPWARDS else 1.0 for letter in letters], np.float32)
         arrays[name] = values if len(letters) > 1 else values[:, 0]
+    arrays["rgb"] = in_rec709(arrays["rgb"], stated_primaries(parts[0], parts), path)
     return LightFieldSamples(width_px, height_px, **arrays)

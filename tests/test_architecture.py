@@ -28,6 +28,7 @@ ROWS = (
     ("lens_file", "camera_file"),
     ("lens_file_values",),
     ("image_io", "camera_rgb"),
+    ("exr_primaries",),
     ("exr_io",),
     ("layering",),
     ("other_view",),
