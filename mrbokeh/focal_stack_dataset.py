@@ -6,6 +6,7 @@ slices would test on what was trained on.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -94,6 +95,17 @@ def network_blocks(largest_coc_px: float) -> int:
     circle of confusion of the data.
     """
     return max(1, math.ceil((abs(largest_coc_px) - 1.0) / 2.0))
+
+
+def file_troubles(dataset: FocalStackDataset) -> Iterator[str]:
+    """What is missing or has another size than when it was written, one sentence each; contents are not read."""
+    for record in dataset.stacks:
+        for relative, expected in record.files.items():
+            path = dataset.folder / record.name / relative
+            if not path.is_file():
+                yield f"{record.name}/{relative} is missing"
+            elif path.stat().st_size != expected.bytes:
+                yield f"{record.name}/{relative} has {path.stat().st_size} bytes, expected {expected.bytes}"
 
 
 def write_focal_stack_dataset(dataset: FocalStackDataset) -> None:

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from mrbokeh.errors import InputError
+from mrbokeh.focal_stack_dataset import network_blocks
 from training.gated_network import GatedTiles, bins_px, blocks_for_gates, disc_kernel, hat_lines
-from training.network import BlurNetwork, PublishedTiles, blocks_for
+from training.network import BlurNetwork, PublishedTiles
 from training.settings import NetworkSettings, TrainSettings, demo_settings, settings_from_json, settings_to_json
 from training.tiling import TileGrid
 
@@ -29,7 +30,7 @@ def _count(module: torch.nn.Module) -> int:
 @pytest.mark.parametrize(("coc_px", "blocks"), [(0.5, 1), (3.0, 1), (3.1, 2), (-13.0, 6), (13.5, 7), (50.0, 25), (81.0, 40)])
 def test_the_largest_kernel_covers_the_largest_circle_of_confusion(coc_px: float, blocks: int) -> None:
     """N is the smallest number with 2N + 1 >= |CoC|; 81 px is the largest lens of the paper's Table 2."""
-    assert blocks_for(coc_px) == blocks
+    assert network_blocks(coc_px) == blocks
 
 
 def test_published_default_has_the_parameters_of_the_paper() -> None:

@@ -19,11 +19,14 @@ from training.baselines import gaussian_gather, gaussian_scatter, scatter_refere
 from training.batches import draw_batch
 from training.blur_functions import blur_of
 from training.cli import app
-from training.dataset import PairSet, gather_facts, read_pair, split_stacks, stacks_of
+from training.data_facts import gather_facts
+from training.dataset import PairSet, read_pair
 from training.evaluate import GATHERED, NETWORK, NO_BLUR, REFERENCE, SCATTERED, evaluate, unseen
 from training.objective import learning_rate_factor
 from training.run_folder import load_run
 from training.settings import NetworkSettings, TrainSettings, demo_settings
+from training.training_data import training_data
+from training.weights import Counting
 
 SIZE = (48, 72)
 LENS = Lens(35.0, 2.8, 1.0, 3.5, Aperture.blades(6, 0.2))
@@ -63,13 +66,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "demo_like"
-    train.fit(stacks_of([scene]), folder, DEMO_LIKE, ["view_2"])
+    train.fit(training_data([scene]), folder, DEMO_LIKE, ["view_2"])
     return folder
 
 
 def test_facts_come_from_the_data(scene: Path) -> None:
     """The largest CoC is that of the wall's end farthest (in dioptres) from a focus: 0.5 m seen at a focus of 0.8 m, or 0.8 m at 0.5 m."""
-    facts = gather_facts(PairSet(stacks_of([scene])))
+    facts = gather_facts(PairSet(training_data([scene]).stacks))
     far_px, near_px = abs(LENS.focused_at(0.5).coc_px(0.8, SIZE[1])), abs(LENS.focused_at(0.8).coc_px(0.5, SIZE[1]))
     assert facts.largest_coc_px == pytest.approx(max(far_px, near_px), rel=1e-4)
     assert facts.radiance_scale == pytest.approx(20.0, rel=1e-3)
@@ -79,7 +82,7 @@ def test_facts_come_from_the_data(scene: Path) -> None:
 def test_the_network_learns_the_lens(scene: Path, run: Path, tmp_path: Path) -> None:
     """On a viewpoint it has not seen it beats no blur and both Gaussians by the 3 dB that the product promises."""
     blur, trained_on = blur_of(run)
-    held_out = unseen(stacks_of([scene]), trained_on)
+    held_out = unseen(training_data([scene]).stacks, trained_on)
     assert [stack.folder.name for stack in held_out] == ["view_2"]
     result = evaluate(blur, held_out, tmp_path)
     assert result.gain_over_no_blur_db > 3.0
@@ -93,9 +96,9 @@ def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
     """With tiles, over the reassembled picture, lights out of its range left out: it ends clearly nearer to the truth than the sharp
     picture is. (How far it comes with the published size of data is not for a test to show.)"""
     settings = dataclasses.replace(PUBLISHED, epochs=60, learning_rate=5e-3, radiance_scale=1.2, saturation=1.0)
-    train.fit(stacks_of([scene]), tmp_path / "run", settings, ["view_2"])
+    train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
     blur, trained_on = blur_of(tmp_path / "run")
-    pairs = PairSet(unseen(stacks_of([scene]), trained_on))
+    pairs = PairSet(unseen(training_data([scene]).stacks, trained_on))
     assert load_run(tmp_path / "run")[0].grid is not None
     for pair in (pairs[0], pairs[2]):
         counted = pair.target.max(axis=2) < 1.0
@@ -109,7 +112,7 @@ def test_a_killed_run_goes_on_as_if_never_stopped(
 ) -> None:
     """Killed after a checkpoint and a few more steps, which are lost: the same weights, to the last bit."""
     settings = dataclasses.replace(settings, checkpoint_every_s=0.0)
-    stacks = stacks_of([scene])
+    stacks = training_data([scene])
     train.fit(stacks, tmp_path / "whole", settings, ["view_2"])
     step, steps = train._Run._step, []
 
@@ -164,16 +167,16 @@ def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, 
 
 def test_a_finished_run_is_left_alone_and_another_needs_its_own_folder(scene: Path, run: Path) -> None:
     before = (run / "network.pt").read_bytes()
-    assert train.fit(stacks_of([scene]), run, DEMO_LIKE, ["view_2"]).finished
+    assert train.fit(training_data([scene]), run, DEMO_LIKE, ["view_2"]).finished
     assert (run / "network.pt").read_bytes() == before
     with pytest.raises(InputError, match="other settings \\(seed\\)"):
-        train.fit(stacks_of([scene]), run, dataclasses.replace(DEMO_LIKE, seed=1), ["view_2"])
+        train.fit(training_data([scene]), run, dataclasses.replace(DEMO_LIKE, seed=1), ["view_2"])
 
 
 def test_a_time_budget_is_kept(scene: Path, tmp_path: Path) -> None:
     """0.05 minutes are 3 s; one step of this size takes well under half a second."""
     settings = dataclasses.replace(DEMO_LIKE, epochs=None, minutes=0.05)
-    progress = train.fit(stacks_of([scene]), tmp_path / "run", settings, ["view_2"])
+    progress = train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
     assert 3.0 <= progress.elapsed_s < 4.5
 
 
@@ -185,15 +188,15 @@ def test_learning_rate_rises_then_falls_to_zero() -> None:
 
 
 def test_viewpoints_are_held_out_whole(scene: Path) -> None:
-    stacks = stacks_of([scene])
-    kept, apart = split_stacks(stacks, ["wall/view_1"], 0.2, 0)
+    data = training_data([scene])
+    kept, apart = data.split(["wall/view_1"], 0.2, 0)
     assert [each.folder.name for each in kept] == ["view_0", "view_2"] and [each.folder.name for each in apart] == ["view_1"]
-    kept, apart = split_stacks(stacks, [], 0.34, seed=5)
+    kept, apart = data.split([], 0.34, seed=5)
     assert len(kept) == 2 and len(apart) == 1
     with pytest.raises(InputError, match="names of stacks among"):
-        split_stacks(stacks, ["view_9"], 0.2, 0)
+        data.split(["view_9"], 0.2, 0)
     with pytest.raises(InputError, match="none is left"):
-        split_stacks(stacks, ["view_0", "view_1", "view_2"], 0.2, 0)
+        data.split(["view_0", "view_1", "view_2"], 0.2, 0)
 
 
 def test_untrusted_and_saturated_pixels_do_not_count(tmp_path: Path) -> None:
@@ -201,7 +204,7 @@ def test_untrusted_and_saturated_pixels_do_not_count(tmp_path: Path) -> None:
     depth_m, confidence = stack.depth_m(), np.ones(SIZE, np.float32)
     confidence[:, :10] = 0.0
     write_merged(stack.folder, stack.all_in_focus(), np.zeros(SIZE, np.float32), confidence, depth_m)
-    pair = read_pair(stack, 0, least_confidence=0.1, saturation=0.5)
+    pair = read_pair(stack, 0, Counting(least_confidence=0.1, saturation=0.5))
     bright = pair.target.max(axis=2) >= 0.5
     assert (pair.weight[:, :10] == 0).all() and (pair.weight[bright] == 0).all()
     assert (pair.weight[:, 10:][~bright[:, 10:]] == 1).all()
@@ -209,7 +212,7 @@ def test_untrusted_and_saturated_pixels_do_not_count(tmp_path: Path) -> None:
 
 def test_the_inside_of_a_crop_has_no_weight_where_light_is_missing(scene: Path) -> None:
     """Crops of 20 px with a halo of 4: only sides on the border of the picture count to their edge."""
-    pairs, rng = PairSet(stacks_of([scene])), np.random.default_rng(0)
+    pairs, rng = PairSet(training_data([scene]).stacks), np.random.default_rng(0)
     for _ in range(20):
         weight = draw_batch(pairs, 1, 20, 4, rng).weight[0, 0]
         assert weight.shape == (20, 20)
@@ -219,7 +222,7 @@ def test_the_inside_of_a_crop_has_no_weight_where_light_is_missing(scene: Path) 
 
 def test_memory_is_bounded(scene: Path) -> None:
     """A pair of 48 x 72 px is 8 floats a pixel: 110 592 bytes; a cache smaller than that keeps only the last one."""
-    pairs = PairSet(stacks_of([scene]), cache_mib=0)
+    pairs = PairSet(training_data([scene]).stacks, cache_mib=0)
     for index in range(len(pairs)):
         assert pairs[index].bytes == 48 * 72 * 8 * 4
     assert len(pairs._cache) == 1
@@ -229,7 +232,7 @@ def test_stacks_of_two_lenses_are_refused(scene: Path, tmp_path: Path) -> None:
     other = dataclasses.replace(make_stack(tmp_path / "other", 3), lens=dataclasses.replace(LENS, f_number=4.0))
     write_focal_stack(other)
     with pytest.raises(InputError, match="one network learns one lens"):
-        gather_facts(PairSet([*stacks_of([scene]), read_focal_stack(other.folder)]))
+        gather_facts(PairSet([*training_data([scene]).stacks, read_focal_stack(other.folder)]))
 
 
 def test_right_size_gaussian_has_the_second_moment_of_the_aperture() -> None:
@@ -251,6 +254,6 @@ def test_gaussian_baselines_keep_light_and_sharpness() -> None:
 
 
 def test_the_reference_beats_gaussians_where_it_is_the_truth(scene: Path) -> None:
-    pairs = PairSet(stacks_of([scene]))
+    pairs = PairSet(training_data([scene]).stacks)
     pair = pairs[0]
     assert psnr(scatter_reference(pair.all_in_focus, pair.coc_px, LENS.aperture), pair.target) > 60.0

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="Focal stacks become a network that blurs like this very lens.")
 
-Scenes = Annotated[list[Path], typer.Argument(help="Folders of merged focal stacks, or folders of such folders.")]
+Scenes = Annotated[
+    list[Path],
+    typer.Argument(help="A data set (of `mrbokeh capture dataset`), or folders of merged focal stacks, or folders of such folders."),
+]
 
 
 class Preset(StrEnum):
@@ -33,7 +36,12 @@ def fit(
     ] = Preset.paper,
     minutes: Annotated[float | None, typer.Option(min=0.01, help="Budget in minutes; the learning rate follows it.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Budget in epochs, instead of minutes.")] = None,
-    held_out: Annotated[list[str] | None, typer.Option(help="Stack to keep for testing (repeat for more); else a fifth is drawn.")] = None,
+    held_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Stack to keep for testing (repeat for more), instead of the split of the data set; of scenes else a fifth is drawn."
+        ),
+    ] = None,
     settings_file: Annotated[Path | None, typer.Option("--settings", help="A settings.json to start from instead of a preset.")] = None,
     threads: Annotated[int, typer.Option(help="CPU threads, 0 takes all.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
@@ -42,12 +50,17 @@ def fit(
 ) -> None:
     """Train a network on focal stacks; run again after an interruption and it goes on where it stopped.
 
+    A data set brings its split by viewpoint, its radiance scale and its largest circle of confusion, which decides the network's N.
+    Pixels that moved, have no data, show a calibration board, are saturated or have no trustworthy depth do not count.
+
+    Example: mrbokeh train fit lens_50mm --out runs/50mm
+
     Example: mrbokeh train fit scenes/attic --preset demo --minutes 2.5 --held-out view_3 --out runs/attic
     """
     # Threads that wait for one another in a busy loop make training many times slower as soon as anything else uses a core.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read by OpenMP when torch is loaded, in the next lines
-    from training.dataset import stacks_of
     from training.train import fit as fit_network
+    from training.training_data import training_data
 
     settings = _settings(preset, settings_file)
     if minutes is not None or epochs is not None:
@@ -56,7 +69,7 @@ def fit(
     if overwrite and out.exists():
         _remove_run(out)
     try:
-        progress = fit_network(stacks_of(scenes), out, settings, held_out or ())
+        progress = fit_network(training_data(scenes), out, settings, held_out or ())
     except KeyboardInterrupt:
         typer.echo(f"stopped; the checkpoint in {out} is kept, run the same command again to go on", err=True)
         raise typer.Exit(130) from None
@@ -91,15 +104,19 @@ def evaluate(
 ) -> None:
     """Compare the network with no blur, Gaussians of the right size and the reference on stacks it was not trained on.
 
+    Of a data set these are the viewpoints that the network's run held out, whatever was given as --held-out.
+
+    Example: mrbokeh train evaluate runs/50mm lens_50mm
+
     Example: mrbokeh train evaluate attic.onnx scenes/attic --out results
     """
     from training import evaluate as evaluation
     from training.blur_functions import blur_of
-    from training.dataset import stacks_of
+    from training.training_data import training_data
 
     blur, trained_on = blur_of(network)
     folder = out or (network if network.is_dir() else network.parent)
-    result = evaluation.evaluate(blur, evaluation.unseen(stacks_of(scenes), trained_on), folder, reference=reference)
+    result = evaluation.evaluate(blur, evaluation.unseen(training_data(scenes).stacks, trained_on), folder, reference=reference)
     for name, decibel, similarity in evaluation.table(result):
         typer.echo(f"{name:22s} {decibel:>7s} dB   SSIM {similarity}")
     typer.echo(

@@ -16,7 +16,9 @@ from mrbokeh.focal_stack import FocalStack
 from mrbokeh.image_metrics import psnr, ssim
 from mrbokeh.progress import track
 from training.baselines import gaussian_gather, gaussian_scatter, scatter_reference, sigma_per_coc
-from training.dataset import Pair, PairSet, stack_name
+from training.dataset import Pair, PairSet
+from training.stacks import stack_name
+from training.weights import WHERE_TRUTH_IS_KNOWN
 
 NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE = "network", "no blur", "Gaussian, scattered", "Gaussian, gathered", "scatter reference"
 
@@ -26,7 +28,8 @@ Blur = Callable[[Image, Float32[np.ndarray, "height width"]], Image]
 
 @dataclass(frozen=True)
 class Score:
-    """One method on one slice. psnr_db, ssim: linear radiance clipped to [0, 1], all pixels."""
+    """One method on one slice. psnr_db, ssim: linear radiance clipped to [0, 1], all pixels but those that moved, have no data or show
+    a calibration board."""
 
     stack: str
     slice_index: int
@@ -64,7 +67,7 @@ def evaluate(blur: Blur, stacks: Sequence[FocalStack], out: Path, *, reference: 
 
     reference: also the scatter reference with the lens's aperture (slow, exact).
     """
-    pairs = PairSet(stacks, least_confidence=0.0, cache_mib=0)
+    pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0)
     scores: list[Score] = []
     rows: list[SheetRow] = []
     for index in track(range(len(pairs)), "evaluate"):
@@ -72,7 +75,7 @@ def evaluate(blur: Blur, stacks: Sequence[FocalStack], out: Path, *, reference: 
         pair = pairs[index]
         results = _results(blur, pair, stack, slice_index, reference)
         for method, picture in results.items():
-            scores.append(Score(stack_name(stack), slice_index, method, psnr(picture, pair.target), ssim(picture, pair.target)))
+            scores.append(Score(stack_name(stack), slice_index, method, *_likeness(picture, pair)))
         rows.append(_sheet_row(pairs.label(index), pair, results))
     result = Evaluation(tuple(scores))
     _write_table(out / "evaluation.md", result)
@@ -91,6 +94,12 @@ def unseen(stacks: Sequence[FocalStack], trained_on: Sequence[str]) -> list[Foca
     return left
 
 
+def _likeness(picture: Image, pair: Pair) -> tuple[float, float]:
+    """(PSNR in dB, SSIM) over the pixels that count; for SSIM, whose windows want whole pictures, the others are those of the slice."""
+    counted = pair.weight > 0
+    return psnr(picture, pair.target, mask=counted), ssim(np.where(counted[..., None], picture, pair.target), pair.target)
+
+
 def _results(blur: Blur, pair: Pair, stack: FocalStack, slice_index: int, reference: bool) -> dict[str, Image]:
     sharp, coc_px, lens = pair.all_in_focus, pair.coc_px, stack.lens_of(slice_index)
     ratio = sigma_per_coc(lens.aperture)
@@ -104,13 +113,13 @@ def _results(blur: Blur, pair: Pair, stack: FocalStack, slice_index: int, refere
 
 
 def _sheet_row(label: str, pair: Pair, results: dict[str, Image]) -> SheetRow:
-    gaussian = max((SCATTERED, GATHERED), key=lambda name: psnr(results[name], pair.target))
+    gaussian = max((SCATTERED, GATHERED), key=lambda name: _likeness(results[name], pair)[0])
     shown = {
         "input": pair.all_in_focus,
         "truth": pair.target,
-        f"network {psnr(results[NETWORK], pair.target):.1f} dB": results[NETWORK],
-        f"Gaussian {psnr(results[gaussian], pair.target):.1f} dB": results[gaussian],
-        f"no blur {psnr(results[NO_BLUR], pair.target):.1f} dB": results[NO_BLUR],
+        f"network {_likeness(results[NETWORK], pair)[0]:.1f} dB": results[NETWORK],
+        f"Gaussian {_likeness(results[gaussian], pair)[0]:.1f} dB": results[gaussian],
+        f"no blur {_likeness(results[NO_BLUR], pair)[0]:.1f} dB": results[NO_BLUR],
         "network - truth, x4": 0.5 + 4.0 * (np.clip(results[NETWORK], 0, 1) - np.clip(pair.target, 0, 1)),
     }
     return SheetRow(label, shown)
@@ -125,7 +134,7 @@ def table(result: Evaluation) -> list[tuple[str, str, str]]:
 def _write_table(path: Path, result: Evaluation) -> None:
     slices = len({(each.stack, each.slice_index) for each in result.scores})
     lines = [
-        f"Mean over {slices} slices of stacks not trained on; linear radiance clipped to [0, 1], all pixels.",
+        f"Mean over {slices} slices of stacks not trained on; linear radiance clipped to [0, 1], all pixels with a truth.",
         "",
         "| method | PSNR dB | SSIM |",
         "|---|---|---|",

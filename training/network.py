@@ -9,21 +9,16 @@ Our reading of what the paper leaves open:
 Shapes are in words here, not in annotations: exporting traces with sizes that are symbols, which a shape check would freeze.
 """
 
-import math
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mrbokeh.focal_stack_dataset import network_blocks
 from training.gated_network import GatedTiles, blocks_for_gates, disc_kernel
 from training.settings import NetworkSettings
 from training.tiling import TileGrid, assemble, split
-
-
-def blocks_for(largest_coc_px: float) -> int:
-    """The smallest N, at least 1, whose largest kernel 2N+1 covers this circle of confusion (diameter)."""
-    return max(1, math.ceil((abs(largest_coc_px) - 1.0) / 2.0))
 
 
 class BlurNetwork(nn.Module):
@@ -37,7 +32,7 @@ class BlurNetwork(nn.Module):
     def __init__(self, settings: NetworkSettings, largest_coc_px: float, radiance_scale: float, grid: TileGrid | None = None) -> None:
         super().__init__()
         self.signed_coc, self.largest_coc_px, self.radiance_scale, self.grid = settings.signed_coc, largest_coc_px, radiance_scale, grid
-        blocks = settings.blocks or (blocks_for_gates if settings.form == "gated" else blocks_for)(largest_coc_px)
+        blocks = settings.blocks or (blocks_for_gates if settings.form == "gated" else network_blocks)(largest_coc_px)
         self.linear_in_radiance = settings.form == "gated" and settings.activation == "identity"
         self.reach_px = blocks if settings.form == "gated" else blocks * (blocks + 1)
         tiles = 1 if grid is None else len(grid)

@@ -1,14 +1,10 @@
-"""What training strives for, how fast it steps, and how far it has come."""
+"""What training strives for, and how fast it steps."""
 
 import math
-from collections.abc import Sequence
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from training.batches import Batch
-from training.network import BlurNetwork
 from training.settings import TrainSettings
 
 
@@ -28,14 +24,3 @@ def learning_rate_factor(done: float, warm_up: float) -> float:
     if done < warm_up:
         return max(done / warm_up, 0.02)
     return 0.5 * (1.0 + math.cos(math.pi * min(1.0, (done - warm_up) / (1.0 - warm_up))))
-
-
-@torch.no_grad()
-def held_out_psnr_db(network: BlurNetwork, batches: Sequence[Batch], device: torch.device) -> float:
-    """Mean PSNR over slices, linear radiance clipped to [0, 1]."""
-    values = []
-    for batch in batches:
-        on_device = batch.to(device)
-        error = network(on_device.rgb, on_device.coc_px).clamp(0, 1) - on_device.target.clamp(0, 1)
-        values.append(-10.0 * math.log10(max(float(error.square().mean()), 1e-12)))
-    return float(np.mean(values))

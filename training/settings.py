@@ -69,11 +69,14 @@ class TrainSettings:
         radiance where that is above white (1.0), so that a few lights do not outweigh the picture.
     sensor_white: radiance at which the sensor of the photographs saturates; result and slice are both clipped there before they are
         compared, so that a light may be as bright as it is. None compares them as they are.
-    radiance_scale: the radiance that is mapped to +1 (0 to -1); None takes the largest value of the training pictures.
-    least_confidence: pixels with less trustworthy depth do not count; 0 counts all.
-    saturation: pixels of a slice at or above this radiance do not count (its true value is unknown); None counts all.
+    radiance_scale: the radiance that is mapped to +1 (0 to -1); None takes that of the data set's manifest, or for scene folders the
+        largest value of the training pictures.
+    least_confidence: pixels with less trustworthy depth do not count; 0 counts all. Pixels that moved, have no data, show a calibration
+        board or are marked as saturated in the slice never count (training/weights.py).
+    saturation: pixels of a slice at or above this radiance do not count either, for slices without a saturation mask; None is no limit.
     ema_decay: the result is this exponential moving average over steps of the weights; 0 takes the last weights.
-    test_fraction: of the stacks (viewpoints), held out when no names are given; the paper's split is 80 : 20.
+    test_fraction: of the stacks (viewpoints) of scene folders, held out when no names are given; the paper's split is 80 : 20.
+        A data set has its own split.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)

@@ -11,74 +11,59 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack
 from mrbokeh.progress import progress_bars
-from training.batches import Batch, draw_batch, stack_pairs
+from training.batches import draw_batch
 from training.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.checkpoint import Progress, load_checkpoint, save_checkpoint
-from training.dataset import PairSet, gather_facts, split_stacks, stack_name
-from training.objective import held_out_psnr_db, learning_rate_factor, mean_square_error
+from training.dataset import PairSet
+from training.held_out import HeldOutSlices
+from training.objective import learning_rate_factor, mean_square_error
+from training.resuming import require_same_data, require_same_settings
 from training.run_folder import RunFacts, build_network, save_network, source_commit, write_curve, write_facts
-from training.settings import FILE_NAME as SETTINGS_NAME
-from training.settings import TrainSettings, read_settings, write_settings
+from training.settings import TrainSettings, write_settings
+from training.stacks import stack_name
+from training.training_data import TrainingData
+from training.weights import Counting
 
-VALIDATION_SLICES = 4
 
-
-def fit(stacks: Sequence[FocalStack], run_folder: Path, settings: TrainSettings, held_out: Sequence[str] = ()) -> Progress:
-    """Train, or go on training, into run_folder; a finished run is left as it is.
+def fit(data: TrainingData, run_folder: Path, settings: TrainSettings, held_out: Sequence[str] = ()) -> Progress:
+    """Train, or go on training, into run_folder; a finished run is left as it is. held_out: see `TrainingData.split`.
 
     Interrupting (KeyboardInterrupt) leaves a checkpoint, and the same call goes on from it.
     """
-    _require_same_settings(run_folder, settings)
-    train_stacks, test_stacks = split_stacks(stacks, held_out, settings.test_fraction, settings.seed)
-    pairs = PairSet(train_stacks, settings.least_confidence, settings.saturation, settings.cache_mib)
-    facts = _facts_of(pairs, test_stacks, settings)
+    require_same_settings(run_folder, settings)
+    train_stacks, test_stacks = data.split(held_out, settings.test_fraction, settings.seed)
+    pairs = PairSet(train_stacks, _counting(settings), settings.cache_mib)
+    facts = _facts_of(data, pairs, test_stacks, settings)
+    require_same_data(run_folder, facts)
     write_settings(run_folder, settings)
     write_facts(run_folder, facts)
-    return _Run(run_folder, settings, pairs, _validation_batch(test_stacks, settings), facts).train()
+    return _Run(run_folder, settings, pairs, HeldOutSlices(test_stacks), facts).train()
 
 
-def _require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
-    """A run goes on with the settings it began with; where and how fast it computes may differ."""
-    if not (run_folder / CHECKPOINT_NAME).exists() or not (run_folder / SETTINGS_NAME).exists():
-        return
-    before = vars(read_settings(run_folder))
-    differing = [name for name, value in vars(settings).items() if before[name] != value and name not in ("threads", "device", "cache_mib")]
-    if differing:
-        raise InputError(
-            f"{run_folder} holds a run with other settings ({', '.join(differing)}): give another --out, or --overwrite to start again"
-        )
+def _counting(settings: TrainSettings) -> Counting:
+    return Counting(settings.least_confidence, settings.saturation)
 
 
-def _facts_of(pairs: PairSet, test_stacks: Sequence[FocalStack], settings: TrainSettings) -> RunFacts:
-    data = gather_facts(pairs)
+def _facts_of(data: TrainingData, pairs: PairSet, test_stacks: Sequence[FocalStack], settings: TrainSettings) -> RunFacts:
+    found = data.facts(pairs)
     return RunFacts(
-        lens=data.lens,
-        width_px=data.width_px,
-        height_px=data.height_px,
-        largest_coc_px=data.largest_coc_px,
-        radiance_scale=settings.radiance_scale or data.radiance_scale,
+        lens=found.lens,
+        width_px=found.width_px,
+        height_px=found.height_px,
+        largest_coc_px=found.largest_coc_px,
+        radiance_scale=settings.radiance_scale or found.radiance_scale,
         trained_on=tuple(stack_name(stack) for stack in pairs.stacks),
         held_out=tuple(stack_name(stack) for stack in test_stacks),
         commit=source_commit(),
     )
 
 
-def _validation_batch(test_stacks: Sequence[FocalStack], settings: TrainSettings) -> list[Batch]:
-    """A few held-out slices spread over the focus range; whole pictures."""
-    pairs = PairSet(test_stacks, settings.least_confidence, settings.saturation, cache_mib=0)
-    if not len(pairs):
-        return []
-    chosen = np.unique(np.linspace(0, len(pairs) - 1, VALIDATION_SLICES).round().astype(int))
-    return [stack_pairs([pairs[int(index)]]) for index in chosen]
-
-
 class _Run:
     """One run in memory. The constructor restores a checkpoint where there is one."""
 
-    def __init__(self, folder: Path, settings: TrainSettings, pairs: PairSet, validation: list[Batch], facts: RunFacts) -> None:
+    def __init__(self, folder: Path, settings: TrainSettings, pairs: PairSet, validation: HeldOutSlices, facts: RunFacts) -> None:
         self.folder, self.settings, self.pairs, self.validation, self.facts = folder, settings, pairs, validation, facts
         self.device = _device(settings.device)
         torch.set_num_threads(settings.threads or os.cpu_count() or 1)
@@ -159,7 +144,7 @@ class _Run:
             mean.lerp_(now, 1.0 - decay)
 
     def _note_curve(self) -> None:
-        psnr_db = held_out_psnr_db(self.average, self.validation, self.device) if self.validation else float("nan")
+        psnr_db = self.validation.psnr_db(self.average, self.device)
         self.progress.curve.append((self.progress.step, round(self.progress.elapsed_s, 2), self.progress.smoothed_loss, psnr_db))
 
     def _save(self) -> None:
