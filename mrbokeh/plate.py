@@ -1,6 +1,6 @@
 """Plate: the photograph that virtual objects go into, with what is known of its depth, lens and camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +74,9 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     focused = stack.lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)
     rgb = stack.slice_rgb(slice_index)
-    return Plate(rgb, stack.depth_m(), focused, stack.camera or _pinhole(stack.lens_of(stack.reference), rgb))
+    camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)
+    # A stack of a scene knows where its camera stood; objects are placed in camera axes.
+    return Plate(rgb, stack.depth_m(), focused, replace(camera, camera_from_world=np.eye(4)))
 
 
 def _pinhole(lens: Lens, rgb: Float32[np.ndarray, "height width 3"]) -> Camera:

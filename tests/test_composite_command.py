@@ -15,6 +15,7 @@ from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import write_lens
+from mrbokeh.plate import open_plate
 
 HEIGHT, WIDTH = 96, 144
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
@@ -93,6 +94,19 @@ def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path) -> None:
         spread.append(int((read_layer(layer).alpha > 0).sum()))
     assert spread[1] == 40 * 60, "slice 1 is focused on the card"
     assert spread[0] > spread[1] < spread[2]
+
+
+def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: Path) -> None:
+    """Depth 2 m under the middle of the picture is (0, 0, 2), also for a camera that stands 5 m to the side."""
+    write_image(tmp_path / "0.exr", plate_rgb())
+    pose = np.eye(4)
+    pose[0, 3] = -5.0
+    camera = Camera(WIDTH, HEIGHT, (LENS.focal_px(WIDTH),) * 2, (WIDTH / 2, HEIGHT / 2), pose)
+    plane = np.ones((HEIGHT, WIDTH), np.float32)
+    write_merged(tmp_path, plate_rgb(), plane, plane, 2 * plane)
+    write_focal_stack(FocalStack(tmp_path, (Slice("0.exr", 1.3),), LENS, camera, registered=True, merged=True))
+    plate = open_plate(tmp_path, 0, None, None, None)
+    assert plate.point_under_pixel_m(WIDTH / 2, HEIGHT / 2) == pytest.approx((0.0, 0.0, 2.0), abs=1e-9)
 
 
 @pytest.mark.parametrize(("change", "message"), [

@@ -9,12 +9,22 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
-from mrbokeh.demo.plan import demo_stages
+from mrbokeh.camera import Camera
+from mrbokeh.demo.measurements import camera_measurements, depth_error, merge_measurements, placement_measurement
+from mrbokeh.demo.pictures import write_depth_pictures
+from mrbokeh.demo.plan import VIEWS, demo_stages
+from mrbokeh.demo.records import Record, must_be_anew, read_record, write_record
 from mrbokeh.demo.stages import Stage, run_stages
+from mrbokeh.demo.truth import read_truth
 from mrbokeh.errors import InputError
+from mrbokeh.exr_io import ExrPart, write_exr
+from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.image_io import write_image, write_layer
+from mrbokeh.layer import Layer
 
 
 def lens_stage(path: Path, focus_m: float = 1.0) -> Stage:
@@ -52,12 +62,131 @@ def test_a_failing_stage_names_its_command(tmp_path: Path) -> None:
         run_stages([draw_stage(tmp_path / "none.json", tmp_path / "a.png")], tmp_path, Console(quiet=True))
 
 
+def test_a_result_is_stale_where_its_input_was_made_anew_by_a_run_that_got_no_further(tmp_path: Path) -> None:
+    lens, picture, console = tmp_path / "lens.json", tmp_path / "lens.png", Console(quiet=True)
+    run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console)
+    run_stages([lens_stage(lens, focus_m=2.0)], tmp_path, console)
+    later = run_stages([lens_stage(lens, focus_m=2.0), draw_stage(lens, picture)], tmp_path, console)
+    assert [done.skipped for done in later] == [True, False]
+
+
+def test_what_was_interrupted_goes_on_and_what_replaced_something_starts_over(tmp_path: Path) -> None:
+    arguments, inputs = ("draw",), {"lens": "run 1"}
+    begun = Record("run 2", arguments, inputs)
+    assert not must_be_anew(None, arguments, inputs)
+    assert not must_be_anew(begun, arguments, inputs), "interrupted in its first run: it goes on"
+    assert must_be_anew(begun, arguments, {"lens": "run 3"}), "what it left is of an older input"
+    assert must_be_anew(begun, ("draw", "large"), inputs)
+    assert must_be_anew(Record("run 2", arguments, inputs, anew=True), arguments, inputs), "it may have left parts of both"
+    assert must_be_anew(Record("run 2", arguments, inputs, seconds=1.0), arguments, inputs), "finished, but something was lost"
+    write_record(tmp_path / "draw.json", begun)
+    assert read_record(tmp_path / "draw.json") == begun
+
+
+def test_records_of_earlier_versions_hold_for_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "lens.json"
+    path.write_text(json.dumps({"arguments": ["lens"], "seconds": 2.0}))
+    record = read_record(path)
+    assert record is not None and not record.still_holds(("lens",), {"plan": "run 1"})
+
+
+def test_the_demo_goes_on_without_an_optional_stage_and_finds_it_later(tmp_path: Path) -> None:
+    lens, console = tmp_path / "found" / "lens.json", Console(quiet=True)
+    picture, sheet = tmp_path / "found" / "lens.png", tmp_path / "sheet.png"
+    poses = Stage("poses", "Fails while there is no lens", ("lens", "show", str(lens), "--out", str(picture)), (picture,), optional=True)
+    depth = Stage(
+        "depth", "Needs the poses", ("lens", "show", str(lens), "--out", str(sheet), str(picture.parent)), (sheet,), optional=True
+    )
+    report = lens_stage(tmp_path / "own.json")
+    first = run_stages([poses, depth, report], tmp_path, console)
+    assert [done.failed for done in first] == [True, True, False]
+    again = run_stages([poses, depth, report], tmp_path, console)
+    assert [(done.failed, done.skipped) for done in again] == [(True, False), (True, True), (False, True)], "tried again, report stays"
+    lens.parent.mkdir()
+    run_stages([lens_stage(lens)], tmp_path, console)
+    assert [done.failed for done in run_stages([poses, report], tmp_path, console)] == [False, False]
+
+
 def test_every_stage_of_the_plan_names_its_outputs(tmp_path: Path) -> None:
     stages = demo_stages(tmp_path, 1.0)
     assert len({stage.name for stage in stages}) == len(stages)
     assert all(stage.outputs and str(tmp_path) in stage.command_line for stage in stages)
     commands = {stage.arguments[:2] for stage in stages}
-    assert {("capture", "ingest"), ("capture", "merge"), ("train", "fit"), ("train", "export"), ("train", "evaluate")} <= commands
+    capture = {("capture", name) for name in ("ingest", "merge", "poses", "scale", "depth", "report")}
+    assert capture | {("train", "fit"), ("train", "export"), ("train", "evaluate")} <= commands
+
+
+def test_merging_again_takes_everything_after_it_again(tmp_path: Path) -> None:
+    """`merge` overwrites the pictures that `depth` made, so that no later stage may be skipped."""
+    stages = {stage.name: stage for stage in demo_stages(tmp_path, 1.0)}
+    fed = {name for name, stage in stages.items() if stages["desk_merge"].feeds(stage)}
+    assert {"desk_poses", "desk_scale", "desk_depth", "desk_report", "desk_fit", "desk_evaluate", "desk_cake_sharp_network"} <= fed
+    assert not any(name.startswith("board") for name in fed)
+    replacing = ("desk_merge", "desk_poses", "desk_scale", "desk_depth", "desk_fit")
+    assert all("--overwrite" in stages[name].arguments + stages[name].when_stale for name in replacing)
+
+
+def moved_camera(x_m: float, focal_px: float) -> Camera:
+    pose = np.eye(4)
+    pose[0, 3] = -x_m
+    return Camera(8, 6, (focal_px, focal_px), (4.0, 3.0), pose)
+
+
+def posed_stack(camera: Camera) -> FocalStack:
+    return FocalStack(Path("view"), (), camera=camera)
+
+
+def test_cameras_too_far_apart_are_found_out() -> None:
+    """Placed 1.5 % too far apart, with a focal length 0.4 % too short."""
+    true = [moved_camera(x_m, 100.0) for x_m in (0.0, 0.1, 0.3)]
+    stacks = [posed_stack(moved_camera(0.5 + 1.015 * x_m, 99.6)) for x_m in (0.0, 0.1, 0.3)]
+    scale, focal = camera_measurements(stacks, true)
+    assert (scale.text, scale.met) == ("+1.50%", False)
+    assert (focal.text, focal.met) == ("-0.40%", True)
+    lost = camera_measurements([posed_stack(moved_camera(0.0, 100.0))] * 3, true)
+    assert [(each.text, each.met) for each in lost] == [("not found", False)]
+
+
+def test_an_object_beside_its_pixel_is_found_out(tmp_path: Path) -> None:
+    """Columns 40 to 59 of 100 are solid, so that the object stands at x = 50; its shadow to the right does not count."""
+    alpha = np.zeros((10, 100), np.float32)
+    alpha[:, 40:60], alpha[:, 60:90] = 1.0, 0.5
+    write_layer(tmp_path / "cake.exr", Layer(np.zeros((10, 100, 3), np.float32), alpha, np.ones((10, 100), np.float32)))
+    met, missed = (placement_measurement(tmp_path / "cake.exr", at_pixel) for at_pixel in ("51,5", "53,5"))
+    assert (met.text, met.met, missed.text, missed.met) == ("1.0 px", True, "3.0 px", False)
+
+
+SHAPE = (6, 8)
+
+
+def write_depth_stack(folder: Path, depth_m: float) -> FocalStack:
+    """A grey stack 2 m away whose depth is trusted in its left half and wrong in the other."""
+    depth, confidence = np.full(SHAPE, depth_m, np.float32), np.zeros(SHAPE, np.float32)
+    depth[:, 4:], confidence[:, :4] = 9.0, 1.0
+    grey = np.full((*SHAPE, 3), 0.25, np.float32)
+    stack = FocalStack(folder, (Slice("a.exr", 1.0), Slice("b.exr", 3.0)), registered=True, merged=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    for each in stack.slices:
+        write_image(folder / each.path, 0.5 * grey)
+    write_merged(folder, grey, np.zeros(SHAPE, np.float32), confidence, depth)
+    write_focal_stack(stack)
+    return stack
+
+
+def test_both_passes_are_held_against_the_truth(tmp_path: Path) -> None:
+    """2.02 m instead of 2 m from focus alone, 2.002 m afterwards; only where the depth is trusted."""
+    stack, truth = write_depth_stack(tmp_path / "view", 2.02), tmp_path / "truth"
+    write_image(truth / "all_in_focus.exr", np.full((*SHAPE, 3), 0.375, np.float32))
+    write_exr(truth / "depth.exr", ExrPart({"Z": np.full(SHAPE, 2.0, np.float32)}))
+    assert depth_error(stack, read_truth(truth)).median == pytest.approx(0.01, rel=1e-4)
+    assert "from focus alone" not in merge_measurements(stack.folder, truth)[1].what
+    assert write_depth_pictures(stack, read_truth(truth), tmp_path) == []
+    write_depth_stack(stack.folder / "first_pass", 2.02)
+    write_depth_stack(stack.folder, 2.002)
+    picture, depth = merge_measurements(stack.folder, truth)
+    assert picture.text == "18.06 dB", "20 log10(1 / 0.125)"
+    assert depth.text == "0.10%" and "50% of the picture; from focus alone 1.00% in 50%" in depth.what
+    assert all(path.is_file() for path, _ in write_depth_pictures(stack, read_truth(truth), tmp_path))
 
 
 @pytest.mark.slow
@@ -74,6 +203,7 @@ def test_the_demo_reaches_its_numbers_and_survives_an_interruption(tmp_path: Pat
     assert not (tmp_path / "report.html").exists()
     subprocess.run(command, check=True)
     page = (tmp_path / "report.html").read_text()
-    assert all((tmp_path / source).is_file() for source in re.findall(r'<img src="([^"]+)"', page))
+    assert all((tmp_path / source).is_file() for source in re.findall(r'<(?:img src|a href)="([^"]+)"', page))
+    assert all((tmp_path / "desk" / "scene" / view / "first_pass" / "depth.exr").is_file() for view in VIEWS)
     missed = [number for number in json.loads((tmp_path / "numbers.json").read_text()) if not number["met"]]
     assert not missed

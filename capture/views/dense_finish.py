@@ -26,6 +26,7 @@ _SAY_OF_LABELLING = 0.05
 _MARGIN_OF_HALF_SAY = 5.0
 _LEAST_SAY = 1e-6
 _SAY_OF_FOCUS = 0.01
+_OTHER_SLICE, _SURE_OF_ANOTHER, _BEYOND_DOUBT = 1.5, 0.15, 0.95
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def finished(rgb: Rgb, reference: SweepView, found: Surface, clues: Clues, setti
     if clues.views:
         trust = with_consistency(trust, consistency(reference, dioptre, clues.views, 0.5 * settings.step_dioptre))
     if clues.focus is not None:
-        alone = _where_focus_knows_better(clues.focus, trust)
+        alone = _where_focus_knows_better(clues.focus, trust, dioptre)
         dioptre, trust = np.where(alone, clues.focus.dioptre, dioptre), np.where(alone, np.minimum(clues.focus.trust, DOUBTFUL), trust)
         by_focus[alone] = 1.0
     keep = np.clip((trust - LEAST_TRUST) / 0.2, 0.0, 1.0)
@@ -78,10 +79,14 @@ def finished(rgb: Rgb, reference: SweepView, found: Surface, clues: Clues, setti
     return DenseDepth((1.0 / (keep * dioptre + (1.0 - keep) * filled)).astype(np.float32), trust, source)
 
 
-def _where_focus_knows_better(focus: FocusVote, trust: Plane) -> Bool[np.ndarray, "height width"]:
+def _where_focus_knows_better(focus: FocusVote, trust: Plane, dioptre: Plane) -> Bool[np.ndarray, "height width"]:
     """Places that views do not vouch for, mostly because no neighbour sees them: there one pixel in two is off by 0.05 dioptres on
-    traced scenes, of those that focus trusts one in ten."""
-    return (trust < DOUBTFUL) & (focus.trust > trust)
+    traced scenes, of those that focus trusts one in ten. And places where focus is sure of quite another slice while views are not
+    beyond doubt: patterns that repeat deceive a sweep over few neighbours.
+    """
+    unsure = (trust < DOUBTFUL) & (focus.trust > trust)
+    elsewhere = np.abs(focus.dioptre - dioptre) > _OTHER_SLICE * focus.step_dioptre
+    return unsure | (elsewhere & (focus.trust > _SURE_OF_ANOTHER) & (trust < _BEYOND_DOUBT))
 
 
 def _filled(dioptre: Plane, trust: Plane, margin: Plane, guide: Rgb, clues: Clues, fill_px: float) -> Plane:

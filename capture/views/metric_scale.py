@@ -64,10 +64,10 @@ def scale_scene(scene: Path | str, request: ScaleRequest) -> ScaledScene:
     stacks = merged_stacks(scene, model)
     samples = {view: focus_sample(model, view, stack) for view, stack in stacks.items()}
     result = _answers(model, folder, samples, request)
+    scaled = _calibrated(scene, model, stacks, samples, result) if request.calibrate and stacks else ScaledScene(result)
+    # Last, as the sign that all is done: a run that was interrupted before starts anew.
     write_scale(folder, result)
-    if not request.calibrate or not stacks:
-        return ScaledScene(result)
-    return _calibrated(scene, model, stacks, samples, result)
+    return scaled
 
 
 def reconstruction_folder(scene: Path) -> Path:

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from mrbokeh.demo.capture_stages import deepened_stages, merged_stages, report_stage
 from mrbokeh.demo.stages import Stage
 
 DATA = Path(__file__).resolve().parent.parent / "demo_data"
 VIEWS = ("view_0", "view_1", "view_2")
 HELD_OUT_VIEW = "view_2"
+BOARD_VIEWS = ("pcb_oblique",)
 
 
 @dataclass(frozen=True)
@@ -38,28 +40,15 @@ def demo_stages(out: Path, minutes: float) -> list[Stage]:
     """Both stacks the whole way. minutes: training time of the desk's network; the board's takes a third of it."""
     desk, board = out / "desk", out / "board"
     return [
-        *_capture(desk, "RAW photographs of a desk (simulated camera, known truth)", DATA / "raw_stack", VIEWS, []),
+        *merged_stages(desk, "RAW photographs of a desk (simulated camera, known truth)", DATA / "raw_stack", VIEWS, []),
+        *deepened_stages(desk, VIEWS),
+        report_stage(desk, VIEWS, "--width", "400"),
         *_network(desk, minutes, HELD_OUT_VIEW),
         *_composites(desk, desk / "scene" / HELD_OUT_VIEW, DESK),
-        *_capture(board, "photographs of a circuit board", DATA / "pcb_oblique", ("pcb_oblique",), ["--max-width", "512"]),
+        *merged_stages(board, "photographs of a circuit board", DATA / "pcb_oblique", BOARD_VIEWS, ["--max-width", "512"]),
+        report_stage(board, BOARD_VIEWS),
         *_network(board, minutes / 3.0, None),
         *_composites(board, board / "scene" / "pcb_oblique", BOARD),
-    ]
-
-
-def _capture(folder: Path, what: str, source: Path, names: tuple[str, ...], options: list[str]) -> list[Stage]:
-    scene = folder / "scene"
-    stacks = [scene / name for name in names]
-    ingest = ("capture", "ingest", str(source), "--out", str(scene), *options)
-    return [
-        Stage(f"{folder.name}_ingest", f"Develop {what}", ingest, tuple(stack / "stack.json" for stack in stacks)),
-        Stage(
-            f"{folder.name}_merge",
-            "Register the slices, merge all-in-focus pictures, find depth",
-            ("capture", "merge", str(scene)),
-            tuple(stack / name for stack in stacks for name in ("all_in_focus.exr", "depth.exr")),
-            when_stale=("--overwrite",),
-        ),
     ]
 
 

@@ -12,7 +12,7 @@ from mrbokeh.demo.measurements import Measurement
 from mrbokeh.demo.stages import Done
 from mrbokeh.html_page import cell, section, table, write_page
 
-PACKAGES = ("numpy", "opencv-python-headless", "OpenEXR", "rawpy", "torch", "onnxruntime", "embreex", "numba")
+PACKAGES = ("numpy", "opencv-python-headless", "OpenEXR", "rawpy", "pycolmap", "torch", "onnxruntime", "embreex", "numba")
 
 
 def write_report(path: Path, measurements: Sequence[Measurement], sections: Sequence[str], done: Sequence[Done]) -> None:
@@ -37,6 +37,11 @@ def figure(picture: Path, page: Path, caption: str) -> str:
     return f'<figure><img src="{source}" alt="{html.escape(caption)}"><figcaption>{html.escape(caption)}</figcaption></figure>'
 
 
+def link(target: Path, page: Path, text: str) -> str:
+    """A paragraph that leads to another page, by its relative path."""
+    return f'<p><a href="{html.escape(os.path.relpath(target, page.parent))}">{html.escape(text)}</a></p>'
+
+
 def numbers_table(measurements: Sequence[Measurement]) -> str:
     rows = [(cell(each.what), cell(each.text, "number"), cell(each.wanted, "met" if each.met else "missed")) for each in measurements]
     return table(("what", "measured", "wanted"), rows)
@@ -46,7 +51,7 @@ def _stage_table(done: Sequence[Done]) -> str:
     rows = [
         (
             cell(each.stage.purpose),
-            cell(f"{each.seconds:.1f} s", "number"),
+            cell("failed", "missed") if each.failed else cell(f"{each.seconds:.1f} s", "number"),
             f"<td><code>{html.escape(each.stage.command_line)}</code></td>",
         )
         for each in done

@@ -5,12 +5,14 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from uuid import uuid4
 
 from rich.console import Console
 
-from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.demo.records import Record, must_be_anew, read_record, write_record
 from mrbokeh.errors import InputError
 
 
@@ -20,6 +22,7 @@ class Stage:
 
     when_stale: further arguments for when its input has changed since it last ran, such as --overwrite; without them a
     command goes on where an interrupted run stopped.
+    optional: the demo goes on without it where it fails; optional stages that it feeds are left out then.
     """
 
     name: str
@@ -27,68 +30,78 @@ class Stage:
     arguments: tuple[str, ...]
     outputs: tuple[Path, ...]
     when_stale: tuple[str, ...] = ()
+    optional: bool = False
 
     @property
     def command_line(self) -> str:
         return " ".join(("mrbokeh", *self.arguments))
 
+    def feeds(self, later: "Stage") -> bool:
+        """An output of this stage, or a folder around it, is named by the later one."""
+        named = [Path(argument) for argument in later.arguments]
+        return any(path == output or path in output.parents for output in self.outputs for path in named)
+
+    def missing(self) -> list[str]:
+        return [str(path) for path in self.outputs if not path.exists()]
+
 
 @dataclass(frozen=True)
 class Done:
-    """A finished stage and how long it took when it ran."""
+    """A finished stage and how long it took when it ran; an optional one may have failed."""
 
     stage: Stage
     seconds: float
     skipped: bool
+    failed: bool = False
+    run: str = ""
 
 
 def run_stages(stages: list[Stage], out: Path, console: Console) -> list[Done]:
-    """Run what is not done; a stage whose predecessor ran is run again, so that no result is older than its input."""
+    """Run what is not done; a stage whose predecessor ran is run again, so that no result is older than its input.
+
+    Raises InputError where a stage fails that is not optional.
+    """
     results: list[Done] = []
     for number, stage in enumerate(stages, 1):
         console.print(f"[bold]{number}/{len(stages)} {stage.purpose}[/]")
-        recorded = _recorded_seconds(stage, out)
-        stale = any(not done.skipped and _feeds(done.stage, stage) for done in results)
-        if recorded is not None and not stale:
-            console.print("  done already")
-            results.append(Done(stage, recorded, skipped=True))
-            continue
-        console.print(f"  {stage.command_line}", highlight=False, markup=False, soft_wrap=True)
-        results.append(Done(stage, _run(stage, stale, out), skipped=False))
+        results.append(_done(stage, results, out, console))
     return results
 
 
-def _feeds(earlier: Stage, later: Stage) -> bool:
-    """An output of the earlier stage, or a folder around it, is named by the later one."""
-    named = [Path(argument) for argument in later.arguments]
-    return any(path == output or path in output.parents for output in earlier.outputs for path in named)
+def _done(stage: Stage, before: Sequence[Done], out: Path, console: Console) -> Done:
+    feeding = [done for done in before if done.stage.feeds(stage)]
+    if stage.optional and any(done.failed for done in feeding):
+        console.print("  left out, for it needs what failed")
+        return Done(stage, 0.0, skipped=True, failed=True)
+    inputs = {done.stage.name: done.run for done in feeding if not done.failed}
+    record = read_record(_record_path(stage, out))
+    if record is not None and record.seconds is not None and record.still_holds(stage.arguments, inputs) and not stage.missing():
+        console.print("  done already")
+        return Done(stage, record.seconds, skipped=True, run=record.run)
+    console.print(f"  {stage.command_line}", highlight=False, markup=False, soft_wrap=True)
+    return _run(stage, Record(uuid4().hex, stage.arguments, inputs, must_be_anew(record, stage.arguments, inputs)), out, console)
 
 
-def _record(stage: Stage, out: Path) -> Path:
+def _record_path(stage: Stage, out: Path) -> Path:
     return out / ".stages" / f"{stage.name}.json"
 
 
-def _recorded_seconds(stage: Stage, out: Path) -> float | None:
-    """How long the stage took when it was run with the same arguments and left all its outputs; None where it was not."""
-    if not _record(stage, out).is_file() or not all(path.exists() for path in stage.outputs):
-        return None
-    record = read_json(_record(stage, out), "the record of a finished stage")
-    return float(record["seconds"]) if record["arguments"] == list(stage.arguments) else None
-
-
-def _run(stage: Stage, stale: bool, out: Path) -> float:
-    _record(stage, out).unlink(missing_ok=True)
+def _run(stage: Stage, record: Record, out: Path, console: Console) -> Done:
+    write_record(_record_path(stage, out), record)
     start = time.perf_counter()
-    code = _exit_code([sys.executable, "-m", "mrbokeh.cli", *stage.arguments, *(stage.when_stale if stale else ())])
+    code = _exit_code([sys.executable, "-m", "mrbokeh.cli", *stage.arguments, *(stage.when_stale if record.anew else ())])
     seconds = time.perf_counter() - start
-    missing = [str(path) for path in stage.outputs if not path.exists()]
-    if code != 0 or missing:
+    missing = stage.missing()
+    if code == 0 and not missing:
+        write_record(_record_path(stage, out), replace(record, seconds=seconds))
+        return Done(stage, seconds, skipped=False, run=record.run)
+    if not stage.optional:
         raise InputError(
             f"the stage {stage.name!r} failed (exit code {code}, missing {missing or 'nothing'}); see its message above. "
             f"Its command was: {stage.command_line}"
         )
-    write_json(_record(stage, out), {"arguments": list(stage.arguments), "seconds": seconds})
-    return seconds
+    console.print("  failed; the demo goes on without it")
+    return Done(stage, seconds, skipped=False, failed=True)
 
 
 def _exit_code(command: list[str]) -> int:
