@@ -136,19 +136,22 @@ class FocalStack:
     def depth_valid(self, least_confidence: float = 0.1) -> Bool[np.ndarray, "height width"]:
         return self.depth_confidence() >= least_confidence
 
-    def lens_of(self, index: int) -> Lens:
-        """The lens as it was focused for one slice; where its blur was calibrated (`mrbokeh capture scale`), with the f-number
-        that gives the blur found."""
-        each = self.slices[index]
-        if self.lens is None or each.focus_distance_m is None:
+    def stated_lens_of(self, index: int) -> Lens:
+        """The lens as it was focused for one slice, with the f-number that the camera states."""
+        distance = self.slices[index].focus_distance_m
+        if self.lens is None or distance is None:
             raise InputError(
                 f"{self.folder} does not know its lens and focus distances: give focal_length_mm, f_number, sensor_width_mm and "
                 f"focus_distances_m in a lens.toml beside the photographs and ingest again"
             )
-        lens = self.lens.focused_at(each.focus_distance_m)
-        if "px_per_dioptre" not in each.metadata:
+        return self.lens.focused_at(distance)
+
+    def lens_of(self, index: int) -> Lens:
+        """The lens of one slice; where its blur was calibrated (`mrbokeh capture scale`), with the f-number that gives the blur found."""
+        lens, metadata = self.stated_lens_of(index), self.slices[index].metadata
+        if "px_per_dioptre" not in metadata:
             return lens
-        found = each.metadata["px_per_dioptre"] / lens.coc_px_per_dioptre(each.metadata["px_per_dioptre_width_px"])
+        found = metadata["px_per_dioptre"] / lens.coc_px_per_dioptre(metadata["px_per_dioptre_width_px"])
         return replace(lens, f_number=lens.f_number / found)
 
     def coc_px_per_dioptre(self, index: int, width_px: int) -> float:

@@ -113,7 +113,7 @@ def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStac
     changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference, metadata=metadata)
     if stack.lens is None or stack.slices[reference].focus_distance_m is None:
         return changed
-    lens = changed.lens_of(reference)
+    lens = changed.stated_lens_of(reference)
     return replace(changed, lens=lens, camera=_breathed(stack.camera, lens) if stack.camera else None)
 
 

@@ -104,7 +104,7 @@ def with_calibrated_focus(each: Slice, stated_m: float | None, dioptre: float, p
 def focused_stack(stack: FocalStack, slices: Sequence[Slice]) -> FocalStack:
     """The stack with these slices, its lens focused as its reference."""
     changed = replace(stack, slices=tuple(slices))
-    return changed if changed.lens is None else replace(changed, lens=changed.lens_of(changed.reference))
+    return changed if changed.lens is None else replace(changed, lens=changed.stated_lens_of(changed.reference))
 
 
 def stated_distances_m(stack: FocalStack) -> tuple[float | None, ...]:
