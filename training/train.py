@@ -43,7 +43,7 @@ def fit(data: TrainingData, run_folder: Path, settings: TrainSettings, held_out:
 
 
 def _counting(settings: TrainSettings) -> Counting:
-    return Counting(settings.least_confidence, settings.saturation)
+    return Counting(settings.least_confidence, settings.saturation, saturated=settings.sensor_white is not None)
 
 
 def _facts_of(data: TrainingData, pairs: PairSet, test_stacks: Sequence[FocalStack], settings: TrainSettings) -> RunFacts:

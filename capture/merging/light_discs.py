@@ -26,14 +26,14 @@ RING_PX = 3.0
 
 @dataclass(frozen=True)
 class LightDiscs:
-    """Per slice and light: flux (slices, lights, 3) above the surroundings within the light's disc; zone_flux the same within the
-    largest of its discs, where texture adds the same to every slice; xy_px (slices, lights, 2) centroid, variance_px2
+    """Per slice and light: flux (slices, lights, 3) above the surroundings within the light's disc; zone_light: all light within the
+    largest of its discs, to which texture adds the same in every slice; xy_px (slices, lights, 2) centroid, variance_px2
     (slices, lights) mean of both axes, peak (slices, lights), whole (slices, lights) whether the disc is all within the
     light's zone and the picture.
     """
 
     flux: Float[np.ndarray, "slices lights 3"]
-    zone_flux: Float[np.ndarray, "slices lights 3"]
+    zone_light: Float[np.ndarray, "slices lights 3"]
     xy_px: Float[np.ndarray, "slices lights 2"]
     variance_px2: Float[np.ndarray, "slices lights"]
     peak: Float[np.ndarray, "slices lights"]
@@ -90,7 +90,7 @@ def _core_centres(lights: Lights) -> Float[np.ndarray, "lights 2"]:
 
 
 def _measured(rgb: Rgb, lights: Lights, light: int, index: int, centre: Float[np.ndarray, "2"]) -> tuple[float, ...]:
-    """(flux r, g, b, zone flux r, g, b, x, y, variance, peak, whole) of one light in one slice."""
+    """(flux r, g, b, all light r, g, b, x, y, variance, peak, whole) of one light in one slice."""
     largest_px, radius_px = (_radius_px(area) for area in (lights.areas_px[:, light].max(), lights.areas_px[index, light]))
     reach = int(np.ceil(largest_px + RING_PX))
     left, top = max(int(centre[0]) - reach, 0), max(int(centre[1]) - reach, 0)
@@ -100,14 +100,14 @@ def _measured(rgb: Rgb, lights: Lights, light: int, index: int, centre: Float[np
     distance = np.hypot(x - centre[0], y - centre[1])
     inside, everywhere = distance < radius_px, distance < largest_px
     excess = patch - _level(patch, distance, radius_px)
-    zone_flux = ((patch - _level(patch, distance, largest_px)) * everywhere[..., None]).sum(axis=(0, 1)).tolist()
+    zone_light = (patch * everywhere[..., None]).sum(axis=(0, 1)).tolist()
     whole = bool((zone[inside] == light + 1).all()) and inside.sum() > 0.97 * np.pi * radius_px**2
     weight = np.maximum(excess.sum(axis=2), 0.0) * inside
     total = max(float(weight.sum()), 1e-9)
     mean_x, mean_y = float((weight * x).sum() / total), float((weight * y).sum() / total)
     variance = 0.5 * float((weight * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum() / total)
     flux = (excess * inside[..., None]).sum(axis=(0, 1)).tolist()
-    return (*flux, *zone_flux, mean_x, mean_y, variance, float(patch[inside].max(initial=0.0)), float(whole))
+    return (*flux, *zone_light, mean_x, mean_y, variance, float(patch[inside].max(initial=0.0)), float(whole))
 
 
 def _level(patch: Rgb, distance: Float[np.ndarray, "height width"], radius_px: float) -> Float32[np.ndarray, "3"]:

@@ -20,7 +20,6 @@ CORE_SHARE = 0.7
 RADII_PX = np.arange(0.0, 2.51, 0.125)
 LARGEST_AREA_PX = 30.0
 LARGEST_HELD_SHARE = 0.65
-ALL_HELD_SHARE = 0.8
 # A point light behind a low-pass filter covers about this; demosaicing of full pixels hides smaller differences, which
 # count as much as this squared radiance per squared pixel of the radius.
 USUAL_RADIUS_PX = 1.0
@@ -107,16 +106,15 @@ def _radius_px(seen: Rgb, patch: _Patch, flux: Float[np.ndarray, "3"]) -> float:
 
 
 def _raise(restored: Rgb, lights: Lights, discs: LightDiscs, light: int, box: tuple[slice, slice]) -> None:
-    """Raise the sharp pixels of a light by the flux that its widest disc has and they have not."""
+    """Raise the sharp pixels of a light by what all around it is brighter where its disc is wide: texture there cancels."""
     mine = (lights.zone[box] == light + 1) & lights.core[box]
     if not mine.any():
         return
     brightness = restored[box].max(axis=2)
     brightest = mine & (brightness >= CORE_SHARE * brightness[mine].max())
     believable = discs.believable(light)
-    held = discs.zone_flux[lights.sharpest[light], light]
-    flux = np.median(discs.zone_flux[believable, light], axis=0) if believable.any() else discs.zone_flux[lights.widest[light], light]
-    if held.sum() > ALL_HELD_SHARE * flux.sum():
-        return
-    missing = np.maximum(flux - held, 0.0)
+    held = discs.zone_light[lights.sharpest[light], light]
+    zone = np.median(discs.zone_light[believable, light], axis=0) if believable.any() else discs.zone_light[lights.widest[light], light]
+    # Channels fill one by one: a lamp that has lost a third of its red may hold all of its blue.
+    missing = np.maximum(zone - held, 0.0)
     restored[box][brightest] += (missing / np.count_nonzero(brightest)).astype(np.float32)
