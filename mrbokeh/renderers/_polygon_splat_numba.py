@@ -4,7 +4,7 @@ import numpy as np
 
 from mrbokeh.renderers._polygon_aim_numba import AIM_PX, CHUNK_PX, aim_level, aim_steep
 from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, APART_PX, Corners, Ring, Scratch, compiled
-from mrbokeh.renderers._vectors_numba import add_to_cell, add_to_two_cells, fetch, scaled
+from mrbokeh.renderers._vectors_numba import add_to_cell, add_to_two_cells, fetch, one_by_one, scaled
 
 CELLS_OF_LINE = 4
 """Cells of four numbers in single precision that share a line of the cache."""
@@ -85,17 +85,20 @@ def _fetch_below(corners: Corners, ring: Ring, scratch: Scratch, i: int) -> None
 def _splat_pixel(corners: Corners, ring: Ring, scratch: Scratch, i: int, value: tuple[float, float, float, float]) -> None:
     planes, weights, places = ring.planes, scratch.weight, corners.place
     for corner in range(corners.level):
+        one_by_one()
         at = np.int64(scratch.target[np.uint64(corner * CHUNK_PX + i)])
         weight = 4 * corner * CHUNK_PX + 2 * i
         add_to_two_cells(planes, at + places[corner, 0], weights, weight, value)
         add_to_two_cells(planes, at + places[corner, 2], weights, weight + 2 * CHUNK_PX, value)
     for corner in range(corners.level, corners.steep):
+        one_by_one()
         at = np.int64(scratch.target[np.uint64(corner * CHUNK_PX + i)])
         weight = 4 * corner * CHUNK_PX + 2 * i
         add_to_two_cells(planes, at + places[corner, 0], weights, weight, value)
         add_to_cell(planes, at + places[corner, 2], weights, weight + 2 * CHUNK_PX, value)
         add_to_cell(planes, at + places[corner, 3], weights, weight + 2 * CHUNK_PX + 1, value)
     for corner in range(corners.steep, corners.before.shape[0]):
+        one_by_one()
         at = np.int64(scratch.target[np.uint64(corner * CHUNK_PX + i)])
         weight = 4 * corner * CHUNK_PX + 2 * i
         for k in range(4):
