@@ -18,8 +18,10 @@ from mrbokeh.lens import Lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from tests.machine import machine_line, memory_line
 from training.export_onnx import export_network
+from training.network_settings import NetworkSettings
+from training.presets import demo_settings
 from training.run_folder import RunFacts, build_network
-from training.settings import NetworkSettings, TrainSettings, demo_settings
+from training.settings import TrainSettings
 
 HEIGHT_PX, WIDTH_PX, LARGEST_COC_PX = 384, 576, 13.0
 FACTS = RunFacts(Lens(35.0, 2.8, 1.0, 23.5), WIDTH_PX, HEIGHT_PX, LARGEST_COC_PX, 20.0, (), (), None)

@@ -19,8 +19,10 @@ from training import export_onnx
 from training.cli import app
 from training.export_onnx import LARGEST_DIFFERENCE, export_network, largest_difference
 from training.network import BlurNetwork
+from training.network_settings import NetworkSettings
+from training.presets import demo_settings
 from training.run_folder import RunFacts, build_network, save_network, write_facts
-from training.settings import NetworkSettings, TrainSettings, demo_settings, write_settings
+from training.settings import TrainSettings, write_settings
 
 FACTS = RunFacts(
     lens=Lens(35.0, 2.8, 1.25, 23.5, Aperture.blades(6)),

@@ -10,7 +10,9 @@ from mrbokeh.errors import InputError
 from mrbokeh.focal_stack_dataset import network_blocks
 from training.gated_network import GatedTiles, bins_px, blocks_for_gates, disc_kernel, hat_lines
 from training.network import BlurNetwork, PublishedTiles
-from training.settings import NetworkSettings, TrainSettings, demo_settings, settings_from_json, settings_to_json
+from training.network_settings import NetworkSettings
+from training.presets import demo_settings
+from training.settings import TrainSettings, settings_from_json, settings_to_json
 from training.tiling import TileGrid
 
 ONE_TILE = NetworkSettings(tile_px=0, overlap_px=0)

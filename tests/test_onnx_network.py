@@ -16,8 +16,10 @@ from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from training.export_onnx import export_network
+from training.network_settings import NetworkSettings
+from training.presets import demo_settings
 from training.run_folder import RunFacts, build_network
-from training.settings import NetworkSettings, TrainSettings, demo_settings
+from training.settings import TrainSettings
 
 LENS = Lens(35.0, 2.8, 0.5, 5.0)
 SIZE = (64, 96)

@@ -22,9 +22,11 @@ from training.cli import app
 from training.data_facts import gather_facts
 from training.dataset import PairSet, read_pair
 from training.evaluate import GATHERED, NETWORK, NO_BLUR, REFERENCE, SCATTERED, evaluate, unseen
+from training.network_settings import NetworkSettings
 from training.objective import learning_rate_factor
+from training.presets import demo_settings
 from training.run_folder import load_run
-from training.settings import NetworkSettings, TrainSettings, demo_settings
+from training.settings import TrainSettings
 from training.training_data import training_data
 from training.weights import Counting
 

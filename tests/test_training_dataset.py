@@ -25,8 +25,10 @@ from training.cli import app
 from training.data_facts import common_lens
 from training.dataset import PairSet
 from training.export_onnx import export_run
+from training.network_settings import NetworkSettings
+from training.presets import demo_settings
 from training.run_folder import load_run, read_facts
-from training.settings import NetworkSettings, TrainSettings, demo_settings, settings_to_json
+from training.settings import TrainSettings, settings_to_json
 from training.training_data import training_data
 
 SIZE = (24, 32)

@@ -126,7 +126,8 @@ def evaluate(
 
 
 def _settings(preset: Preset, settings_file: Path | None) -> "TrainSettings":
-    from training.settings import PRESETS, load_settings
+    from training.presets import PRESETS
+    from training.settings import load_settings
 
     return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
 

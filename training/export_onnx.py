@@ -16,8 +16,8 @@ from mrbokeh.atomic_files import atomic_path, write_json
 from mrbokeh.errors import InputError
 from mrbokeh.renderers.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
 from training.network import BlurNetwork
+from training.network_settings import NetworkSettings
 from training.run_folder import RunFacts, load_run
-from training.settings import NetworkSettings
 
 LARGEST_DIFFERENCE = 1e-4
 OPSET = 18

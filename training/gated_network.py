@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from training.settings import NetworkSettings
+from training.network_settings import NetworkSettings
 
 LOGIT_LIMIT = 10.0
 FLAT_SHARE, FLAT_SHARE_IN_FOCUS = 0.05, 0.005  # of a fresh kernel, so that every one of its pixels can learn

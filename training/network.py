@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from mrbokeh.focal_stack_dataset import network_blocks
 from training.gated_network import GatedTiles, blocks_for_gates, disc_kernel
-from training.settings import NetworkSettings
+from training.network_settings import NetworkSettings
 from training.tiling import TileGrid, assemble, split
 
 

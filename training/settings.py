@@ -1,60 +1,16 @@
 """Every choice of a training run in one frozen dataclass, saved as JSON beside the result."""
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.errors import InputError
+from training.network_settings import NetworkSettings
 
 FORMAT = "mrbokeh-training-settings"
 VERSION = 1
 FILE_NAME = "settings.json"
-
-
-@dataclass(frozen=True)
-class NetworkSettings:
-    """The shape of the network. The defaults are Neural Bokeh as published (Mandl et al. 2024, Section 3).
-
-    form: "published" stacks residual blocks one after the other; "gated" is our variant in which every kernel size
-        serves the pixels whose circle of confusion it fits (training/gated_network.py).
-    blocks: N; None takes the smallest N whose largest kernel, 2N+1 px, covers the largest circle of confusion of the data.
-    width: published form: features per colour channel (the paper's three-channel tensor is 1);
-        gated form: kernels per kernel size.
-    mixing: published form: "none" convolves every feature by itself, "colour" lets the features of one colour mix in each
-        convolution, "tile" adds a 1x1 convolution over all features of a tile after every block.
-    activation: of the output; "tanh" as published, "identity" has no upper end.
-    tile_px, overlap_px: t and t_o; neighbouring tiles start t - t_o px apart. tile_px 0 is one tile of any size.
-    signed_coc: tell near from far (the paper's circle of confusion has no sign).
-    padding: what lies beyond the border for the published form; the gated form renormalises what is inside.
-    initialisation: published form: "default" (PyTorch's), "identity" (the network starts by copying the picture) or "disc"
-        (the first convolution of each block a disc of its size, the second adding a little of it);
-        gated form: kernels start as "disc" or, by "default", as flat squares.
-    hidden: gated form: features of the pointwise network that decides who hides whom.
-    kernels_per_colour: gated form: each colour has its own kernels, as a lens with chromatic aberration needs; or all share one.
-    """
-
-    form: Literal["published", "gated"] = "published"
-    blocks: int | None = None
-    width: int = 1
-    mixing: Literal["none", "colour", "tile"] = "none"
-    activation: Literal["tanh", "identity"] = "tanh"
-    tile_px: int = 200
-    overlap_px: int = 60
-    signed_coc: bool = False
-    padding: Literal["replicate", "reflect", "zeros"] = "replicate"
-    initialisation: Literal["default", "identity", "disc"] = "identity"
-    hidden: int = 32
-    kernels_per_colour: bool = True
-
-    def __post_init__(self) -> None:
-        if self.tile_px and not 0 <= self.overlap_px < self.tile_px:
-            raise InputError(
-                f"tiles need 0 <= overlap_px < tile_px, got an overlap of {self.overlap_px} px with tiles of {self.tile_px} px"
-            )
-        if self.width < 1 or self.hidden < 1 or (self.blocks is not None and self.blocks < 1):
-            raise InputError(f"expected width, hidden and blocks of at least 1, got {self.width}, {self.hidden}, {self.blocks}")
 
 
 @dataclass(frozen=True)
@@ -65,8 +21,12 @@ class TrainSettings:
         for minutes, over steps for epochs. An epoch shows as many pictures as there are pairs.
     crop_px: side of the square crops, 0 for whole pictures. Crops are for one tile only: the loss of the published network is
         over the reassembled picture.
+    loss_scope: "picture" takes the error of the reassembled picture as published, "tile" that of every tile by itself (Table 1, last row).
     loss_weighting: the loss is a mean square error; "uniform" as published, "relative" divides each error by the true
         radiance where that is above white (1.0), so that a few lights do not outweigh the picture.
+    energy_weight: of a second term, the squared error of the light in each neighbourhood as large as the largest blur; 0 as published.
+    edge_weight: of a third term, the squared error of the result's gradients; 0 as published.
+    depth_noise: how badly depth is made worse while training (training/augmentation.py): 1 as bad as multi-view stereo, 0 not at all.
     sensor_white: radiance at which the sensor of the photographs saturates; result and slice are both clipped there before they are
         compared, so that a light may be as bright as it is. None compares them as they are.
     radiance_scale: the radiance that is mapped to +1 (0 to -1); None takes that of the data set's manifest, or for scene folders the
@@ -75,6 +35,9 @@ class TrainSettings:
         board or are marked as saturated in the slice never count (training/weights.py).
     saturation: pixels of a slice at or above this radiance do not count either, for slices without a saturation mask; None is no limit.
     ema_decay: the result is this exponential moving average over steps of the weights; 0 takes the last weights.
+    precision: of the network's arithmetic while training; the half types are for GPUs.
+    patience: stop after so many looks at the held-out slices without a better one; 0 never stops early.
+    sheets: write a sheet of predictions on held-out slices at every look, so that one can watch it learn.
     test_fraction: of the stacks (viewpoints) of scene folders, held out when no names are given; the paper's split is 80 : 20.
         A data set has its own split.
     """
@@ -87,13 +50,20 @@ class TrainSettings:
     warm_up: float = 0.05
     batch: int = 1
     crop_px: int = 0
+    loss_scope: Literal["picture", "tile"] = "picture"
     loss_weighting: Literal["uniform", "relative"] = "uniform"
+    energy_weight: float = 0.0
+    edge_weight: float = 0.0
+    depth_noise: float = 0.0
     sensor_white: float | None = None
     radiance_scale: float | None = None
     least_confidence: float = 0.1
     saturation: float | None = None
     ema_decay: float = 0.0
     test_fraction: float = 0.2
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    patience: int = 0
+    sheets: bool = True
     device: str = "auto"
     threads: int = 0
     checkpoint_every_s: float = 30.0
@@ -108,33 +78,6 @@ class TrainSettings:
                 f"crops of {self.crop_px} px cannot train a network of {self.network.tile_px} px tiles, each of which has its own place "
                 f"in the picture: set crop_px to 0, or tile_px to 0"
             )
-
-
-def demo_settings(minutes: float = 2.5) -> TrainSettings:
-    """The preset of the demo: the gated form without tiles, which learns a lens in minutes on two cores."""
-    network = NetworkSettings(
-        form="gated",
-        width=2,
-        tile_px=0,
-        overlap_px=0,
-        signed_coc=True,
-        activation="identity",
-        initialisation="disc",
-        kernels_per_colour=False,
-    )
-    return TrainSettings(
-        network=network,
-        minutes=minutes,
-        epochs=None,
-        learning_rate=0.02,
-        batch=2,
-        crop_px=128,
-        sensor_white=1.0,
-        ema_decay=0.97,
-    )
-
-
-PRESETS: dict[str, Callable[[], TrainSettings]] = {"paper": TrainSettings, "demo": demo_settings}
 
 
 def settings_to_json(settings: TrainSettings) -> dict[str, Any]:

@@ -1,0 +1,33 @@
+"""Settings to start from."""
+
+from collections.abc import Callable
+
+from training.network_settings import NetworkSettings
+from training.settings import TrainSettings
+
+
+def demo_settings(minutes: float = 2.5) -> TrainSettings:
+    """The preset of the demo: the gated form without tiles, which learns a lens in minutes on two cores."""
+    network = NetworkSettings(
+        form="gated",
+        width=2,
+        tile_px=0,
+        overlap_px=0,
+        signed_coc=True,
+        activation="identity",
+        initialisation="disc",
+        kernels_per_colour=False,
+    )
+    return TrainSettings(
+        network=network,
+        minutes=minutes,
+        epochs=None,
+        learning_rate=0.02,
+        batch=2,
+        crop_px=128,
+        sensor_white=1.0,
+        ema_decay=0.97,
+    )
+
+
+PRESETS: dict[str, Callable[[], TrainSettings]] = {"paper": TrainSettings, "demo": demo_settings}
