@@ -19,6 +19,7 @@ ROWS = (
     ("renderers.choose",),
     ("renderers.",),
     ("renderers.base",),
+    ("lens_fitting.", "lens_matching."),
     ("psf_models.", "spreadlets_build"),
     ("psf_bank_export",),
     ("focal_stack_dataset",),
