@@ -6,7 +6,7 @@ slices would test on what was trained on.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -97,15 +97,16 @@ def network_blocks(largest_coc_px: float) -> int:
     return max(1, math.ceil((abs(largest_coc_px) - 1.0) / 2.0))
 
 
-def file_troubles(dataset: FocalStackDataset) -> Iterator[str]:
-    """What is missing or has another size than when it was written, one sentence each; contents are not read."""
-    for record in dataset.stacks:
-        for relative, expected in record.files.items():
-            path = dataset.folder / record.name / relative
-            if not path.is_file():
-                yield f"{record.name}/{relative} is missing"
-            elif path.stat().st_size != expected.bytes:
-                yield f"{record.name}/{relative} has {path.stat().st_size} bytes, expected {expected.bytes}"
+def file_troubles(dataset: FocalStackDataset, record: StackRecord, sha256_of: Callable[[Path], str] | None = None) -> Iterator[str]:
+    """What of a stack is missing or not as it was written, one sentence each; without sha256_of only sizes count, contents are not read."""
+    for relative, expected in record.files.items():
+        path = dataset.folder / record.name / relative
+        if not path.is_file():
+            yield f"{record.name}/{relative} is missing"
+        elif path.stat().st_size != expected.bytes:
+            yield f"{record.name}/{relative} has {path.stat().st_size} bytes, expected {expected.bytes}"
+        elif sha256_of is not None and sha256_of(path) != expected.sha256:
+            yield f"{record.name}/{relative} has another content than when it was written"
 
 
 def write_focal_stack_dataset(dataset: FocalStackDataset) -> None:

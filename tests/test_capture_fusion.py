@@ -1,5 +1,7 @@
 """Where focus votes on depth, and how it is blended with the views."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,43 +10,20 @@ from capture.views.depth_fusion import (
     FocusVote,
     add_focus_votes,
     agreement,
-    focus_vote,
     focus_vote_of_map,
     near_lights,
 )
-from mrbokeh.errors import InputError
 
 SLICE_DIOPTRES = np.linspace(1.6, 0.5, 12)
 PLANES = np.linspace(0.4, 1.7, 53)
 SHAPE = (6, 8)
 
 
-def energies(peak: np.ndarray | float, curvature: float = 2.0, floor: float = 1e-6) -> np.ndarray:
-    """Energies whose logarithm is a parabola with its peak at a fractional index; a few pixels hold noise alone."""
-    index = np.arange(12, dtype=np.float32)[:, None, None]
-    result = np.exp(-0.5 * curvature * (index - np.broadcast_to(np.asarray(peak, np.float32), SHAPE)) ** 2) + np.float32(floor)
-    result[:, 0] = floor
-    return result.astype(np.float32)
-
-
-def test_a_peak_between_slices_is_read_in_dioptres() -> None:
-    """A parabola goes through a parabola: index 4.3 lies at 1.6 - 4.3 * 0.1 dioptres."""
-    vote = focus_vote(energies(4.3), SLICE_DIOPTRES)
-    np.testing.assert_allclose(vote.dioptre[1:], 1.6 - 0.43, atol=1e-3)
-    assert vote.trust[1:].min() > 0.9
-    assert vote.trust[0].max() == 0.0, "noise alone has no say"
-    assert vote.step_dioptre == pytest.approx(0.1)
-
-
-def test_peaks_at_the_ends_flat_peaks_and_lights_have_no_say() -> None:
-    """At an end the true peak may lie beyond; a flat peak is anywhere; near a light the disc's rim is what is sharp."""
-    for end in (0.0, 11.0):
-        assert focus_vote(energies(end), SLICE_DIOPTRES).trust.max() == 0.0
-    assert focus_vote(energies(4.3, curvature=0.03), SLICE_DIOPTRES).trust.max() <= 0.1 + 1e-6
-    veto = np.zeros(SHAPE, bool)
-    veto[3, 3] = True
-    vote = focus_vote(energies(4.3), SLICE_DIOPTRES, veto)
-    assert vote.trust[3, 3] == 0.0 < vote.trust[3, 4]
+def vote_for(index: float) -> FocusVote:
+    """Focus found one depth everywhere and trusts it, except in the first row."""
+    confidence = np.ones(SHAPE, np.float32)
+    confidence[0] = 0.0
+    return focus_vote_of_map(np.full(SHAPE, index, np.float32), confidence, SLICE_DIOPTRES)
 
 
 def test_lights_reach_as_far_as_half_the_largest_blur() -> None:
@@ -56,7 +35,7 @@ def test_lights_reach_as_far_as_half_the_largest_blur() -> None:
 
 
 def test_focus_decides_where_views_do_not_and_yields_where_they_do() -> None:
-    vote = focus_vote(energies(6.0), SLICE_DIOPTRES)  # 1.0 dioptre
+    vote = vote_for(6.0)  # 1.0 dioptre
     costs = np.full((*SHAPE, len(PLANES)), 255, np.uint8)
     sure = np.abs(PLANES - 0.7).argmin()
     costs[2, 2] = np.minimum(255, 40 * np.abs(np.arange(len(PLANES)) - sure))
@@ -77,7 +56,7 @@ def test_blended_costs_keep_their_range() -> None:
 
 
 def test_focus_vouches_only_for_what_it_found() -> None:
-    vote = focus_vote(energies(6.0), SLICE_DIOPTRES)
+    vote = dataclasses.replace(vote_for(6.0), curvature=np.full(SHAPE, 2.0, np.float32))
     here, half_a_step, far = (agreement(vote, np.full(SHAPE, d, np.float32))[3, 3] for d in (1.0, 0.95, 0.7))
     assert here > half_a_step > far
     assert far < 1e-3
@@ -88,11 +67,6 @@ def test_a_finished_focus_map_votes_with_its_confidence() -> None:
     vote = focus_vote_of_map(index, np.full((1, 3), 0.8, np.float32), SLICE_DIOPTRES)
     np.testing.assert_allclose(vote.trust, [[0.0, 0.8, 0.0]])
     assert vote.dioptre[0, 1] == pytest.approx(1.15)
-
-
-def test_slices_without_distances_are_refused() -> None:
-    with pytest.raises(InputError, match="12 slices and 11 distances"):
-        focus_vote(energies(3.0), SLICE_DIOPTRES[:-1])
 
 
 def test_a_smaller_vote_keeps_depths_of_single_pixels() -> None:

@@ -52,7 +52,7 @@ def training_data(folders: Sequence[Path]) -> TrainingData:
 
 
 def _of_dataset(dataset: FocalStackDataset) -> TrainingData:
-    trouble = next(file_troubles(dataset), None)
+    trouble = next((each for record in dataset.stacks for each in file_troubles(dataset, record)), None)
     if trouble is not None:
         raise InputError(
             f"{dataset.folder} is not the data set that its {FILE_NAME} describes: {trouble}; "

@@ -40,6 +40,10 @@ class ColmapJob:
     seed: int = 0
     threads: int = -1
 
+    def file_of(self, name: str) -> str:
+        """Of the picture of that view, relative to the folder of pictures."""
+        return next(each.file for each in self.pictures if each.name == name)
+
     def features_key(self) -> dict[str, Any]:
         """What the features and matches depend on: where it differs, the database is of no use."""
         document = job_to_json(self)

@@ -10,10 +10,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from capture.merging.depth_from_focus import CONFIDENCE_NOISE_FLOORS, peak_parabola
-from capture.merging.focus_volume import noise_floor, share_above
-from mrbokeh.errors import InputError
-
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 
@@ -45,24 +41,6 @@ class FocusVote:
             return cv2.resize(values, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
 
         return FocusVote(at(self.dioptre), at(self.trust), at(self.curvature), self.step_dioptre)
-
-
-def focus_vote(
-    energies: Float32[np.ndarray, "slices height width"], slice_dioptres: Float[np.ndarray, " distances"], near_lights: Mask | None = None
-) -> FocusVote:
-    """The vote of focus energies (see `focus_energy`) of slices in the order of their focus; near_lights: where it has none."""
-    if len(energies) != len(slice_dioptres) or len(energies) < 3:
-        raise InputError(f"expected the focus of each of 3 slices or more, got {len(energies)} slices and {len(slice_dioptres)} distances")
-    floor = noise_floor(energies)
-    log_energies = np.log(energies + np.float32(floor))
-    labels = log_energies.argmax(axis=0)
-    offset, curvature = peak_parabola(log_energies, labels)
-    interior = (labels > 0) & (labels < len(energies) - 1)
-    known = share_above(energies.max(axis=0), CONFIDENCE_NOISE_FLOORS * floor)
-    trust = np.where(interior, known * np.clip(curvature / _SHARP_CURVATURE, 0.0, 1.0), 0.0)
-    if near_lights is not None:
-        trust = np.where(near_lights, 0.0, trust)
-    return FocusVote(_between(labels + offset, slice_dioptres), trust.astype(np.float32), curvature, _step(slice_dioptres))
 
 
 def focus_vote_of_map(focus_index: Plane, confidence: Plane, slice_dioptres: Float[np.ndarray, " slices"]) -> FocusVote:

@@ -109,11 +109,11 @@ def _focus_answer(samples: Mapping[str, FocusSample]) -> ScaleAnswer:
 def view_pictures(model: SparseModel, folder: Path) -> Iterator[Picture]:
     """The 8-bit pictures that the poses were found with, in the order of the views."""
     job = job_from_json(read_json(folder / JOB_NAME, "what COLMAP was asked to do (run `mrbokeh capture poses --overwrite`)"))
-    paths = {each.name: folder / job.pictures_folder / each.file for each in job.pictures}
     for view in model.views:
-        picture = cv2.imread(str(paths[view.name]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        path = folder / job.pictures_folder / job.file_of(view.name)
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if picture is None:
-            raise InputError(f"cannot read {paths[view.name]}: run `mrbokeh capture poses --overwrite`")
+            raise InputError(f"cannot read {path}: run `mrbokeh capture poses --overwrite`")
         yield np.ascontiguousarray(picture[..., ::-1])
 
 

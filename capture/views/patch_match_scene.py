@@ -25,8 +25,7 @@ class PatchMatchScene:
             raise InputError(obstacle)
         folder = scene / RECONSTRUCTION_FOLDER
         job = job_from_json(read_json(folder / JOB_NAME, "what COLMAP was asked to do (run `mrbokeh capture poses --overwrite`)"))
-        self._files = {each.name: each.file for each in job.pictures}
-        self._model, self._workspace = model, folder / WORKSPACE
+        self._job, self._model, self._workspace = job, model, folder / WORKSPACE
         if not (self._workspace / _FINISHED).is_file():
             run_patch_match(folder / "sparse", folder / job.pictures_folder, self._workspace)
             (self._workspace / _FINISHED).touch()
@@ -34,5 +33,5 @@ class PatchMatchScene:
     def depths_in(self, name: str) -> SparseDepths:
         """Every pixel of a view that PatchMatch knows, in metres."""
         view = self._model.view(name)
-        depth = read_patch_match(self._workspace, self._files[name], view.camera, view.distortion)
+        depth = read_patch_match(self._workspace, self._job.file_of(name), view.camera, view.distortion)
         return patch_match_clue((depth * np.float32(self._model.metres_per_unit)).astype(np.float32))
