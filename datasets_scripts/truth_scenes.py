@@ -12,9 +12,9 @@ from mrbokeh.errors import InputError
 
 GROUND_M = 0.62
 FAR_M = 9.0
-_TINTS = ((1.0, 0.7, 0.36), (1.0, 0.86, 0.62), (0.55, 0.75, 1.0), (1.0, 0.42, 0.3), (0.6, 1.0, 0.55))
+TINTS = ((1.0, 0.7, 0.36), (1.0, 0.86, 0.62), (0.55, 0.75, 1.0), (1.0, 0.42, 0.3), (0.6, 1.0, 0.55))
 # Tangents of half the picture's angle of view, for placing things within it.
-_HALF_X, _HALF_Y = 0.36, 0.2025
+HALF_X, HALF_Y = 0.36, 0.2025
 
 
 def make_scene(name: str, seed: int) -> TruthScene:
@@ -26,8 +26,8 @@ def make_scene(name: str, seed: int) -> TruthScene:
 
 def _fence(rng: np.random.Generator) -> TruthScene:
     """A mesh of wires close to the camera; blocks, balls, cards, a wall and lamps behind."""
-    metal = _fine(rng, (0.12, 0.12, 0.13), (0.5, 0.48, 0.44))
-    bodies = [*_stage(rng), *_blocks(rng, 7, (2.2, 6.5))]
+    metal = fine(rng, (0.12, 0.12, 0.13), (0.5, 0.48, 0.44))
+    bodies = [*stage(rng), *blocks(rng, 7, (2.2, 6.5))]
     near_m = float(rng.uniform(0.78, 0.85))
     for slope in (1.0, -1.0):
         for offset in np.arange(-0.75, 0.75, 0.125):
@@ -41,20 +41,20 @@ def _fence(rng: np.random.Generator) -> TruthScene:
 
 def _leaves(rng: np.random.Generator) -> TruthScene:
     """Twigs with small leaves between 0.75 m and 1.6 m before the same kind of room, under an open sky."""
-    greens = [_fine(rng, (0.03, 0.1, 0.02), (0.35, 0.55, 0.12)), _fine(rng, (0.16, 0.12, 0.02), (0.75, 0.5, 0.1))]
-    bark = _fine(rng, (0.05, 0.03, 0.02), (0.35, 0.24, 0.15))
-    bodies = [*_stage(rng, wall_height_m=2.3), *_blocks(rng, 7, (2.5, 6.5))]
+    greens = [fine(rng, (0.03, 0.1, 0.02), (0.35, 0.55, 0.12)), fine(rng, (0.16, 0.12, 0.02), (0.75, 0.5, 0.1))]
+    bark = fine(rng, (0.05, 0.03, 0.02), (0.35, 0.24, 0.15))
+    bodies = [*stage(rng, wall_height_m=2.3), *blocks(rng, 7, (2.5, 6.5))]
     for _ in range(11):
-        bodies += _twig(rng, greens, bark)
+        bodies += twig(rng, greens, bark)
     lamps = _lamps(rng, 20, (1.9, FAR_M - 0.4))
     return TruthScene("thin", tuple(bodies), lamps, sky=_clouds(rng), focus_distances_m=(0.95, 1.6, 7.0))
 
 
 def _checkers(rng: np.random.Generator) -> TruthScene:
     """Slanted checkerboards and blocks with lamps, nothing thin."""
-    bodies = [*_stage(rng, dark=0.13), *_blocks(rng, 3, (3.2, 6.5), dark=0.25)]
+    bodies = [*stage(rng, dark=0.13), *blocks(rng, 3, (3.2, 6.5), dark=0.25)]
     for depth_m in (1.7, 2.7):
-        bodies.append(_slanted_board(rng, depth_m))
+        bodies.append(slanted_board(rng, depth_m))
     lamps = _lamps(rng, 12, (1.3, FAR_M - 0.4))
     return TruthScene("open", tuple(bodies), lamps, focus_distances_m=(1.15, 2.0, 5.0))
 
@@ -62,10 +62,10 @@ def _checkers(rng: np.random.Generator) -> TruthScene:
 SCENES: dict[str, Callable[[np.random.Generator], TruthScene]] = {"fence": _fence, "leaves": _leaves, "checkers": _checkers}
 
 
-def _stage(rng: np.random.Generator, wall_height_m: float = 5.0, dark: float = 0.1) -> list[Body]:
+def stage(rng: np.random.Generator, wall_height_m: float = 5.0, dark: float = 0.1, light: float = 0.85) -> list[Body]:
     """Ground and far wall with fine detail."""
-    ground = checks(1024, rng, _colour(rng, dark), _colour(rng, 0.85), count=16)
-    wall = bricks(1024, rng, rows=24, columns=12, brick=_colour(rng, 1.5 * dark), mortar=_colour(rng, 0.9))
+    ground = checks(1024, rng, colour(rng, dark), colour(rng, light), count=16)
+    wall = bricks(1024, rng, rows=24, columns=12, brick=colour(rng, 1.5 * dark), mortar=colour(rng, light + 0.05))
     top = GROUND_M - wall_height_m
     return [
         quad((-6.0, GROUND_M, FAR_M), (12.0, 0.0, 0.0), (0.0, 0.0, 0.3 - FAR_M), ground, (3.0, 2.2)),
@@ -73,13 +73,13 @@ def _stage(rng: np.random.Generator, wall_height_m: float = 5.0, dark: float = 0
     ]
 
 
-def _blocks(rng: np.random.Generator, count: int, depths_m: tuple[float, float], dark: float = 0.05) -> list[Body]:
+def blocks(rng: np.random.Generator, count: int, depths_m: tuple[float, float], dark: float = 0.05) -> list[Body]:
     """Boxes and balls on the ground and cards in the air, near and far in equal shares of dioptres."""
     bodies: list[Body] = []
     for depth_m in 1.0 / rng.permutation(np.linspace(1 / depths_m[1], 1 / depths_m[0], count)):
-        x_m = float(rng.uniform(-0.9, 0.9) * _HALF_X * depth_m)
+        x_m = float(rng.uniform(-0.9, 0.9) * HALF_X * depth_m)
         size_m = float(rng.uniform(0.14, 0.24) * depth_m)
-        texture = _any_texture(rng, dark)
+        texture = any_texture(rng, dark)
         kind = rng.integers(3)
         if kind == 0:
             bodies += box((x_m, GROUND_M, depth_m), (size_m, size_m * rng.uniform(1.0, 2.2), size_m), rng.uniform(-0.7, 0.7), texture)
@@ -94,24 +94,24 @@ def _card(rng: np.random.Generator, x_m: float, depth_m: float, size_m: float, t
     yaw, lean = rng.uniform(-0.9, 0.9), rng.uniform(-0.3, 0.3)
     right = size_m * np.array([np.cos(yaw), 0.0, np.sin(yaw)])
     down = 0.8 * size_m * np.array([np.sin(lean), np.cos(lean), 0.2 * np.sin(lean)])
-    y_m = float(rng.uniform(-0.8, 0.3) * _HALF_Y * depth_m)
+    y_m = float(rng.uniform(-0.8, 0.3) * HALF_Y * depth_m)
     return quad(np.array([x_m, y_m, depth_m]) - 0.5 * (right + down), right, down, texture)
 
 
-def _slanted_board(rng: np.random.Generator, depth_m: float) -> Body:
+def slanted_board(rng: np.random.Generator, depth_m: float) -> Body:
     """A checkerboard that recedes by about its own width."""
-    texture = checks(512, rng, _colour(rng, 0.14), _colour(rng, 0.65), count=10)
+    texture = checks(512, rng, colour(rng, 0.14), colour(rng, 0.65), count=10)
     side_m = 0.3 * depth_m
     yaw = rng.choice([-1.0, 1.0]) * rng.uniform(0.75, 1.1)
     right = side_m * np.array([np.cos(yaw), 0.1, np.sin(yaw)])
     down = side_m * np.array([0.1, 0.9, 0.0])
-    x_m, y_m = rng.uniform(-0.75, 0.75) * _HALF_X * depth_m, rng.uniform(-0.5, 0.5) * _HALF_Y * depth_m
+    x_m, y_m = rng.uniform(-0.75, 0.75) * HALF_X * depth_m, rng.uniform(-0.5, 0.5) * HALF_Y * depth_m
     return quad(np.array([x_m, y_m, depth_m]) - 0.5 * (right + down), right, down, texture)
 
 
-def _twig(rng: np.random.Generator, greens: list[Texture], bark: Texture) -> list[Body]:
+def twig(rng: np.random.Generator, greens: list[Texture], bark: Texture) -> list[Body]:
     depth_m = 1.0 / rng.uniform(1 / 1.6, 1 / 0.82)
-    start = np.array([rng.uniform(-1.1, 1.1) * _HALF_X, -1.2 * _HALF_Y, 1.0]) * depth_m
+    start = np.array([rng.uniform(-1.1, 1.1) * HALF_X, -1.2 * HALF_Y, 1.0]) * depth_m
     t = np.linspace(0.0, 1.0, 24)[:, None]
     swing = rng.normal(0.0, 0.12, 3) * depth_m * [1.0, 0.3, 0.5]
     points = start + t * np.array([swing[0], rng.uniform(0.2, 0.46) * depth_m, 0.0]) + np.sin(2.5 * t) * swing
@@ -131,20 +131,20 @@ def _lamps(rng: np.random.Generator, count: int, depths_m: tuple[float, float]) 
     """Lamps in the air, evenly in dioptres, about a pixel in size at 640 px, 10 to 1000 in radiance."""
     lamps = []
     for depth_m in 1.0 / np.linspace(1 / depths_m[1], 1 / depths_m[0], count):
-        place = (rng.uniform(-0.95, 0.95) * _HALF_X * depth_m, rng.uniform(-0.9, 0.35) * _HALF_Y * depth_m, depth_m)
+        place = (rng.uniform(-0.95, 0.95) * HALF_X * depth_m, rng.uniform(-0.9, 0.35) * HALF_Y * depth_m, depth_m)
         radius_m = rng.uniform(0.7e-3, 1.4e-3) * depth_m
-        radiance = np.exp(rng.uniform(np.log(10.0), np.log(1000.0))) * np.asarray(_TINTS[rng.integers(len(_TINTS))])
-        lamps.append(Lamp(_triple(np.array(place)), float(radius_m), _triple(radiance)))
+        radiance = np.exp(rng.uniform(np.log(10.0), np.log(1000.0))) * np.asarray(TINTS[rng.integers(len(TINTS))])
+        lamps.append(Lamp(triple(np.array(place)), float(radius_m), triple(radiance)))
     return tuple(lamps)
 
 
-def _any_texture(rng: np.random.Generator, darkness: float) -> Texture:
+def any_texture(rng: np.random.Generator, darkness: float) -> Texture:
     kind = rng.integers(5)
-    dark, light = _colour(rng, darkness), _colour(rng, 0.85)
+    dark, light = colour(rng, darkness), colour(rng, 0.85)
     if kind == 0:
         return checks(384, rng, dark, light, count=int(rng.integers(6, 14)))
     if kind == 1:
-        return spots(384, rng, light, (dark, _colour(rng, 0.3), _colour(rng, 0.6)), 60, (6.0, 20.0))
+        return spots(384, rng, light, (dark, colour(rng, 0.3), colour(rng, 0.6)), 60, (6.0, 20.0))
     if kind == 2:
         return page_of_text(384, 384, rng, dark, light, cell=5)
     if kind == 3:
@@ -152,7 +152,7 @@ def _any_texture(rng: np.random.Generator, darkness: float) -> Texture:
     return mottled(384, rng, dark, light, slope=0.2, contrast=0.4)
 
 
-def _fine(rng: np.random.Generator, dark: Vector, light: Vector) -> Texture:
+def fine(rng: np.random.Generator, dark: Vector, light: Vector) -> Texture:
     return mottled(256, rng, dark, light, slope=0.2, contrast=0.3)
 
 
@@ -161,9 +161,9 @@ def _clouds(rng: np.random.Generator) -> Texture:
     return ((1 - cover) * np.array([0.15, 0.3, 0.6]) + cover * np.array([0.75, 0.75, 0.73])).astype(np.float32)
 
 
-def _colour(rng: np.random.Generator, brightness: float) -> Vector:
-    return _triple(np.clip(brightness * rng.uniform(0.65, 1.35, 3), 0.01, 0.92))
+def colour(rng: np.random.Generator, brightness: float) -> Vector:
+    return triple(np.clip(brightness * rng.uniform(0.65, 1.35, 3), 0.01, 0.92))
 
 
-def _triple(values: np.ndarray) -> Vector:
+def triple(values: np.ndarray) -> Vector:
     return float(values[0]), float(values[1]), float(values[2])

@@ -4,17 +4,19 @@ A camera ray goes from a point of the entrance pupil through the point of the fo
 The film keeps its distance, so that the field of view does not change with the focus. A lens point u of the unit pupil
 (x right, y down) moves a point at depth z by u * coc / 2 with coc = focal_px * pupil diameter * (1 / focus - 1 / z).
 
-Cat-eyes: a front rim clips the pupil by a circle of radius 1 around -cat_eye * field_xy, where field_xy is the place of the
-point that is SEEN, in half diagonals from the middle of the frame. Each ray counts 1 over the share of the pupil that is open for
-its point, so that nothing is vignetted.
+Cat-eyes and stops: a front rim clips the pupil by a circle of radius 1 around -cat_eye * field_xy, where field_xy is the place of
+the point that is SEEN, in half diagonals from the middle of the frame; a stop (`truth_field_stop`) depends on that place too. Each
+ray counts 1 over the share of the pupil that is open for its point, so that nothing is vignetted.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from datasets_scripts.truth_field_stop import FieldStop, OpenShares
 from datasets_scripts.truth_scene import PackedScene
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera import Camera
@@ -34,18 +36,33 @@ LAMP_STREAM = 1000
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The lens of one picture: shape of the unit pupil, its diameter and the distance of the focus plane."""
+    """The lens of one picture: shape of the unit pupil, its diameter and the distance of the focus plane.
+
+    stop: what a round opening loses besides, by the place in the frame of the point seen.
+    """
 
     aperture: Aperture
     diameter_m: float
     focus_distance_m: float
+    stop: FieldStop | None = None
+
+    @property
+    def varies(self) -> bool:
+        """Whether points see another opening from place to place."""
+        return bool(self.aperture.cat_eye) or self.stop is not None
+
+    @cached_property
+    def shares(self) -> OpenShares:
+        """How much rim and stop leave open; only where there is a stop."""
+        assert self.stop is not None
+        return OpenShares(self.stop, self.aperture.cat_eye)
 
     def __post_init__(self) -> None:
         aperture = self.aperture
         if aperture.spherical_aberration or aperture.is_chromatic:
             raise InputError("the ray tracer knows openings and cat-eyes, but no spherical or chromatic aberration")
-        if aperture.cat_eye and (len(aperture.outlines) > 1 or not np.allclose(np.hypot(*aperture.outlines[0].T), 1.0, atol=5e-3)):
-            raise InputError("the ray tracer clips only round openings to cat-eyes: use Aperture.disc() with cat_eye")
+        if self.varies and (len(aperture.outlines) > 1 or not np.allclose(np.hypot(*aperture.outlines[0].T), 1.0, atol=5e-3)):
+            raise InputError("the ray tracer clips only round openings by rims and stops: use Aperture.disc() with cat_eye or a stop")
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,12 +121,18 @@ class ScalarTracer:
         return starts_m, towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
     def _open_weight(self, opening: Opening | None, lens_uv: Pairs, slope: Pairs) -> Numbers:
-        """1 over the open share where the rim lets the ray pass, 0 where not, for points in the direction (x / z, y / z)."""
-        if opening is None or not opening.aperture.cat_eye:
+        """1 over the open share where rim and stop let the ray pass, 0 where not, for points in the direction (x / z, y / z)."""
+        if opening is None or not opening.varies:
             return np.ones(len(lens_uv))
         middle_x, middle_y, half_diagonal = field_scale(self.camera)
-        shift = opening.aperture.cat_eye * (slope * self.camera.focal_px + self.camera.principal_px - (middle_x, middle_y)) / half_diagonal
-        return (np.hypot(*(lens_uv + shift).T) <= 1.0) / two_disc_overlap(np.minimum(np.hypot(*shift.T), 1.998))
+        field = (slope * self.camera.focal_px + self.camera.principal_px - (middle_x, middle_y)) / half_diagonal
+        shift = opening.aperture.cat_eye * field
+        passes = np.hypot(*(lens_uv + shift).T) <= 1.0
+        if opening.stop is None:
+            return passes / two_disc_overlap(np.minimum(np.hypot(*shift.T), 1.998))
+        radius, stop_x = opening.stop.radius_and_shift(field[:, 0])
+        passes &= np.hypot(lens_uv[:, 0] - stop_x, lens_uv[:, 1]) >= radius
+        return passes / opening.shares.at(*field.T)
 
     def _numbers(self, bits: np.ndarray, pixel: np.ndarray, stream: int) -> list[np.ndarray]:
         """Four numbers in [0, 1) of scrambled Sobol points: bits (4, 1 or N)."""

@@ -1,4 +1,6 @@
-"""How alike two pictures are: PSNR, SSIM, PSNR near depth edges, and the light that was lost or made."""
+"""How alike two pictures are: PSNR, SSIM, PSNR near depth edges, light that was lost, made or leaked, and how steadily a film changes."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -64,6 +66,55 @@ def energy_ratio(result: Image, truth: Image) -> float:
     """Light of the result over light of the truth, unclipped: 1 where nothing was lost or made."""
     _require_same_shape(result, truth)
     return float(result.astype(np.float64).sum() / truth.astype(np.float64).sum())
+
+
+def leak(result: Image, truth: Image, band: Bool[np.ndarray, "height width"], peak: float = 1.0) -> float:
+    """Light that the result has too much within `band`, over the light of the truth there; both are clipped to [0, peak].
+
+    0 where nothing leaked; what is missing does not make up for it. With a band on the sharp side of depth edges this is the
+    blur of one side that runs over the other. nan where the band is empty or black.
+    """
+    _require_same_shape(result, truth)
+    shown, expected = np.clip(result[band], 0, peak).astype(np.float64), np.clip(truth[band], 0, peak)
+    light = float(expected.sum(dtype=np.float64))
+    return float(np.maximum(shown - expected, 0.0).sum()) / light if light > 0 else float("nan")
+
+
+def light_error(
+    result: Image, truth: Image, mask: Bool[np.ndarray, "height width"], saturated: Bool[np.ndarray, "height width"] | None = None
+) -> float:
+    """Absolute differences over the light of the truth within `mask`, unclipped: 0 is perfect, 0.5 discs of half the light.
+
+    saturated: where the truth says only "at least that much", so that more is no error. nan where the mask is empty or black.
+    """
+    _require_same_shape(result, truth)
+    shown, expected = result[mask].astype(np.float64), truth[mask].astype(np.float64)
+    if saturated is not None:
+        shown = np.where(saturated[mask][(...,) + (None,) * (shown.ndim - 1)], np.minimum(shown, expected), shown)
+    light = float(expected.sum())
+    return float(np.abs(shown - expected).sum()) / light if light > 0 else float("nan")
+
+
+def flicker(frames: Sequence[Image], truth: Sequence[Image], peak: float = 1.0) -> float:
+    """How much a film jumps that the true one does not: root mean square of the error of second differences in time, over 4.
+
+    An error that stays, or that grows evenly, scores 0; one that alternates by +a and -a from frame to frame scores a. All is
+    clipped to [0, peak]. Raises InputError for fewer than three frames.
+    """
+    if len(frames) != len(truth) or len(frames) < 3:
+        raise InputError(f"flicker needs as many frames as the true film, at least three, got {len(frames)} and {len(truth)}")
+    squared, count = 0.0, 0
+    for middle in range(1, len(frames) - 1):
+        around = slice(middle - 1, middle + 2)
+        jump = _second_difference(frames[around], peak) - _second_difference(truth[around], peak)
+        squared, count = squared + float((jump**2).sum()), count + jump.size
+    return float(np.sqrt(squared / count)) / 4.0
+
+
+def _second_difference(three: Sequence[Image], peak: float) -> Image:
+    before, now, after = (np.clip(each, 0, peak).astype(np.float64) for each in three)
+    _require_same_shape(before, after)
+    return before - 2.0 * now + after
 
 
 def _require_same_shape(result: np.ndarray, truth: np.ndarray) -> None:

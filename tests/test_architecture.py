@@ -21,7 +21,7 @@ ROWS = (
     ("renderers.base",),
     ("lens_fitting.", "lens_matching."),
     ("psf_models.", "spreadlets_build"),
-    ("psf_bank_export",),
+    ("psf_bank_export", "bank_fits_file"),
     ("focal_stack_dataset",),
     ("focal_stack", "video_io", "scene.", "contact_sheet", "psf_bank_file", "light_field_samples_file", "motion_file"),
     ("video_frames", "video_audio"),
@@ -46,14 +46,15 @@ ROWS = (
     ("spreadlet_values", "_spreadlets_numba"),
     ("laplacian_integration", "_laplacian_integration_numba"),
     ("lens",),
-    ("polygon_rectification", "directional_differences", "low_rank"),
+    ("bank_apertures", "bank_low_rank"),
+    ("polygon_rectification", "directional_differences", "low_rank", "polygon_fit", "bank_lattice"),
     ("outline_symmetry", "_polygon_rectification_numba"),
     ("aperture",),
     ("aperture_modifiers",),
     ("aperture_shapes",),
     ("psf", "_polygon_coverage_numba", "psf_bank"),
     ("nested_grid", "proportional_grid", "psf_axis"),
-    ("layer", "camera", "color", "image_metrics"),
+    ("layer", "camera", "color", "image_metrics", "field_position"),
     ("html_page",),
     ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device"),
     ("errors",),
@@ -125,9 +126,11 @@ def _one_room(a: str, b: str) -> bool:
 
 
 def test_renderers_do_not_import_their_siblings() -> None:
-    """Twins on devices (torch_*) are no siblings: each belongs to one renderer."""
+    """Twins on devices (torch_*) are no siblings: each belongs to one renderer. Nor is what opens a session."""
     public = {name for name in MODULES if name.startswith("mrbokeh.renderers.") and not name.split(".")[-1].startswith("_")}
-    siblings = {name for name in public if ".torch_" not in name} - {"mrbokeh.renderers.base", "mrbokeh.renderers.choose"}
+    siblings = {name for name in public if ".torch_" not in name} - {
+        f"mrbokeh.renderers.{name}" for name in ("base", "choose", "onnx_sessions")
+    }
     assert not [f"{a} -> {b}" for a, b in arrows() if a in siblings and b in siblings]
 
 

@@ -11,9 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from capture.report.charts import Axes, chart
-from capture.report.examination import SliceFindings, StackFindings
 from capture.report.exclusion_masks import REASONS, board_mask, exclusion_masks
 from capture.report.exposure_drift import low_frequency_gain
+from capture.report.findings import SliceFindings, StackFindings
 from capture.report.focus_curve import focus_curve
 from capture.report.focus_spacing import focus_spacing
 from capture.report.poses_view import poses_view, scene_of
@@ -192,15 +192,21 @@ def test_a_stack_that_was_not_registered_has_no_drift() -> None:
     assert registration_drift(FocalStack(Path("nowhere"), (Slice("a.exr", 1.0),)), 10, 10) is None
 
 
-def test_a_jump_or_a_pair_that_does_not_match_fails_registration(scene: Path) -> None:
+def test_a_jump_or_a_pair_that_does_not_match_fails_registration(scene: Path, tmp_path: Path) -> None:
     """2 px of 160 are more than 1 %; a drift of 2 px per slice is no jump; a correlation of 0.7 is below 0.8."""
-    stack = read_focal_stack(scene / "view_0")
+    stack = replace(read_focal_stack(scene / "view_0"), folder=tmp_path)
     curve = focus_curve(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32), 6)
 
+    def placed(shifts_px: list[float], correlations: tuple[float, ...]) -> FocalStack:
+        """As registration leaves it."""
+        write_json(tmp_path / "registration.json", {"correlations": correlations})
+        matrices = [[[1.0, 0.0, x], [0.0, 1.0, 0.0]] for x in shifts_px]
+        pairs = zip(stack.slices, matrices, strict=False)
+        return replace(stack, slices=tuple(replace(each, metadata={"reference_from_slice": matrix}) for each, matrix in pairs))
+
     def verdict(shifts_px: list[float], correlations: tuple[float, ...] = ()) -> str:
-        drift = drift_of([np.array([[1.0, 0.0, x], [0.0, 1.0, 0.0]]) for x in shifts_px], 160, 107, correlations)
-        slices = tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(len(shifts_px)))
-        gates = stack_gates(StackFindings(stack, 160, 107, slices, curve, None, drift, None, None))
+        found = tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(len(shifts_px)))
+        gates = stack_gates(StackFindings(placed(shifts_px, correlations), (160, 107), (160, 107), found, curve, None, None))
         return str(next(each for each in gates if each.name == "registration held").verdict)
 
     assert verdict([0.0, 2.0, 4.0, 6.0]) == "passed"

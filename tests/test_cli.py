@@ -16,6 +16,7 @@ COMMANDS = [
     ["capture"], ["capture", "ingest"], ["capture", "merge"], ["capture", "plan"], ["capture", "cameras"],
     ["capture", "shoot"], ["capture", "poses"], ["capture", "scale"], ["capture", "depth"], ["capture", "report"],
     ["capture", "dataset"], ["capture", "process"], ["train"], ["train", "fit"], ["train", "evaluate"], ["train", "export"],
+    ["train", "ablate"],
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"], ["render"], ["composite"], ["video"],
     ["viewfinder"], ["viewfinder", "serve"], ["demo"], ["doctor"],
 ]  # fmt: skip

@@ -12,15 +12,16 @@ from typer.testing import CliRunner
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
+from mrbokeh.field_position import field_positions
 from mrbokeh.lens import Lens
 from mrbokeh.renderers import onnx_network
 from mrbokeh.renderers.onnx_network import METADATA_KEY, OnnxNetwork
 from training import export_onnx
 from training.cli import app
-from training.export_onnx import LARGEST_DIFFERENCE, export_network, largest_difference
+from training.export_onnx import LARGEST_DIFFERENCE, export_network, largest_difference, picture_for_parity
 from training.network import BlurNetwork
 from training.network_settings import NetworkSettings
-from training.presets import demo_settings
+from training.presets import better_settings, demo_settings
 from training.run_folder import RunFacts, build_network, save_network, write_facts
 from training.settings import TrainSettings, write_settings
 
@@ -33,12 +34,18 @@ FACTS = RunFacts(
     trained_on=("attic/view_0", "attic/view_1"),
     held_out=("attic/view_2",),
     commit="0123abc",
+    f_numbers=(1.4, 5.6),
+    focal_lengths_mm=(24.0, 70.0),
 )
 FORMS = {
     "published": NetworkSettings(tile_px=24, overlap_px=8),
     "published, one tile": NetworkSettings(tile_px=0, overlap_px=0, width=2, mixing="tile"),
     "gated": demo_settings().network,
     "gated, tiles, unsigned": replace(demo_settings().network, tile_px=32, overlap_px=6, signed_coc=False),
+    "published, 3x3, place and lens": NetworkSettings(
+        kernels="3x3", tile_px=24, overlap_px=8, field_position=True, lens_inputs=True, headroom=1.5
+    ),
+    "gated, place": better_settings().network,
 }
 
 
@@ -80,6 +87,8 @@ def test_facts_survive_in_the_file(exported: tuple[BlurNetwork, NetworkSettings,
         1.25,
         23.5,
     )
+    assert facts.field_position == settings.field_position and facts.lens_inputs == settings.lens_inputs
+    assert (facts.f_numbers, facts.focal_lengths_mm) == (((1.4, 5.6), (24.0, 70.0)) if settings.lens_inputs else (None, None))
     assert np.allclose(facts.lens.aperture.outlines[0], FACTS.lens.aperture.outlines[0])
 
 
@@ -90,8 +99,31 @@ def test_size_is_free_without_tiles_only(exported: tuple[BlurNetwork, NetworkSet
         with pytest.raises(InputError, match="60x40 px, but came 47x33 px"):
             OnnxNetwork(path).blur(rgb, coc_px)
         return
-    expected = network(torch.from_numpy(rgb).permute(2, 0, 1)[None], torch.from_numpy(coc_px)[None, None])[0].permute(1, 2, 0)
-    assert np.allclose(OnnxNetwork(path).blur(rgb, coc_px), expected.detach().numpy(), atol=1e-4)
+    place = torch.from_numpy(field_positions((33, 47)).transpose(2, 0, 1).copy())[None]
+    planes = torch.from_numpy(rgb).permute(2, 0, 1)[None], torch.from_numpy(coc_px)[None, None]
+    expected = network(*planes, place, torch.tensor([[2.8, 35.0]]))[0].permute(1, 2, 0)
+    assert np.allclose(OnnxNetwork(path).blur(rgb, coc_px), expected.detach().numpy(), atol=1e-4)  # whole frame, lens of the facts
+
+
+def test_graph_has_the_inputs_it_uses_and_no_others(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+    _, settings, path = exported
+    further = ["place"] * settings.field_position + ["lens"] * settings.lens_inputs
+    assert [each.name for each in onnx.load(path).graph.input] == ["rgb", "coc_px", *further]
+
+
+def test_files_from_before_place_and_lens_still_load(exported: tuple[BlurNetwork, NetworkSettings, Path], tmp_path: Path) -> None:
+    """Their facts lack the three newer names; all else is as it was."""
+    _, settings, path = exported
+    if settings.input_channels > 4:
+        return
+    old = onnx.load(path)
+    facts = json.loads(old.metadata_props[0].value)
+    for name in ("field_position", "f_numbers", "focal_lengths_mm"):
+        del facts[name]
+    old.metadata_props[0].value = json.dumps(facts)
+    onnx.save(old, tmp_path / "old.onnx")
+    rgb, coc_px = (each[0].permute(1, 2, 0).numpy().copy() for each in picture_for_parity(OnnxNetwork(path).facts))
+    assert np.array_equal(OnnxNetwork(tmp_path / "old.onnx").blur(rgb, coc_px[..., 0]), OnnxNetwork(path).blur(rgb, coc_px[..., 0]))
 
 
 def test_a_network_that_computes_something_else_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

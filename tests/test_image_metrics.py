@@ -3,7 +3,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import depth_edge_mask, edge_psnr, energy_ratio, psnr, ssim
+from mrbokeh.image_metrics import depth_edge_mask, edge_psnr, energy_ratio, flicker, leak, light_error, psnr, ssim
 
 
 def picture(seed: int) -> np.ndarray:
@@ -47,3 +47,57 @@ def test_energy_ratio_sees_light_beyond_white() -> None:
 def test_shapes_must_agree() -> None:
     with pytest.raises(InputError, match="one shape"):
         psnr(np.zeros((2, 2)), np.zeros((2, 3)))
+
+
+def test_leak_counts_only_what_is_too_much_in_the_band() -> None:
+    """In the band the truth is 0.5; half of it is 0.1 too bright, half 0.3 too dark: 0.05 too much on average, a tenth of 0.5."""
+    truth = np.full((10, 20, 3), 0.5)
+    band = np.zeros((10, 20), bool)
+    band[:, 8:12] = True
+    result = truth.copy()
+    result[:5] += 0.1
+    result[5:] -= 0.3
+    assert leak(result, truth, band) == pytest.approx(0.1)
+    result[:, :8] += 5.0
+    result[:, 12:] += 5.0
+    assert leak(result, truth, band) == pytest.approx(0.1)
+    assert leak(truth - 0.2, truth, band) == 0.0
+    assert np.isnan(leak(result, truth, np.zeros((10, 20), bool)))
+
+
+def test_light_error_sees_highlights_that_were_clipped() -> None:
+    """A disc of radiance 4 shown at white has lost three quarters of its light, which PSNR, clipped at white, does not see."""
+    truth = np.full((6, 6, 3), 0.2)
+    truth[2:4, 2:4] = 4.0
+    disc = truth[..., 0] > 1
+    clipped = np.minimum(truth, 1.0)
+    assert psnr(clipped, truth) == float("inf")
+    assert light_error(clipped, truth, disc) == pytest.approx(0.75)
+    assert light_error(truth * 1.5, truth, disc) == pytest.approx(0.5)
+
+
+def test_more_light_than_a_full_photosite_is_no_error() -> None:
+    truth = np.ones((4, 4, 3))
+    everywhere, saturated = np.ones((4, 4), bool), np.zeros((4, 4), bool)
+    saturated[:2] = True
+    assert light_error(truth * 3.0, truth, everywhere, saturated) == pytest.approx(1.0)  # 2 too much in the other half
+    assert light_error(truth * 0.5, truth, everywhere, saturated) == pytest.approx(0.5)
+
+
+def test_flicker_of_a_known_error() -> None:
+    """Second difference of +a, -a, +a is 4 a, and over 4 it is a; an offset and an error that grows evenly have none."""
+    truth = [np.full((5, 7, 3), 0.4 + 0.02 * t) for t in range(6)]
+    assert flicker([frame + 0.03 * (-1) ** t for t, frame in enumerate(truth)], truth) == pytest.approx(0.03)
+    assert flicker([frame + 0.1 + 0.01 * t for t, frame in enumerate(truth)], truth) == pytest.approx(0.0, abs=1e-12)
+    assert flicker(truth, truth) == 0.0
+
+
+def test_flicker_compares_with_the_true_film() -> None:
+    """A film that bends as the true one does not flicker; one that stays still where the truth bends misses its second difference.
+
+    t^2 / 50 has the second difference 0.04, over 4 that is 0.01."""
+    truth = [np.full((3, 3), t * t / 50.0) for t in range(5)]
+    assert flicker(truth, truth) == 0.0
+    assert flicker([np.full((3, 3), 0.1)] * 5, truth) == pytest.approx(0.01)
+    with pytest.raises(InputError, match="at least three"):
+        flicker(truth[:2], truth[:2])

@@ -8,10 +8,13 @@ import torch
 
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack_dataset import network_blocks
-from training.gated_network import GatedTiles, bins_px, blocks_for_gates, disc_kernel, hat_lines
-from training.network import BlurNetwork, PublishedTiles
+from training.gated_bins import bins_px, blocks_for_gates, hat_lines
+from training.gated_kernels import disc_kernel
+from training.gated_network import GatedTiles
+from training.network import BlurNetwork
 from training.network_settings import NetworkSettings
 from training.presets import demo_settings
+from training.published_tiles import PublishedTiles
 from training.settings import TrainSettings, settings_from_json, settings_to_json
 from training.tiling import TileGrid
 
@@ -40,7 +43,7 @@ def test_published_default_has_the_parameters_of_the_paper() -> None:
 
     N = 4: 2 * 3 * (9 + 25 + 49 + 81) + 4 * 2 * 3 = 1008, and 36 more; a picture of 40 x 24 px has 2 * 1 tiles of 24 px with overlap 8.
     """
-    assert _count(PublishedTiles(NetworkSettings(), blocks=4, tiles=1)) == 1008 + 36
+    assert _count(PublishedTiles(NetworkSettings(), blocks=4, largest_coc_px=9.0, tiles=1)) == 1008 + 36
     grid = TileGrid(24, 40, 24, 8)
     assert len(grid) == 2
     assert _count(BlurNetwork(NetworkSettings(), 9.0, 1.0, grid)) == 2 * (1008 + 36)
@@ -53,7 +56,7 @@ def test_published_default_has_the_parameters_of_the_paper() -> None:
 def test_width_and_mixing(mixing: str, expected: int) -> None:
     """Width 2 makes 6 features; N = 2 has kernels of 9 + 25 = 34. Depthwise: 6 of them per convolution; per colour: 6 * 2 (two inputs
     each); 2 convolutions and 2 * 2 * 6 = 24 biases. "tile" adds a 6 x 6 mixture with 6 biases per block."""
-    tiles = PublishedTiles(replace(ONE_TILE, width=2, mixing=mixing), blocks=2, tiles=1)
+    tiles = PublishedTiles(replace(ONE_TILE, width=2, mixing=mixing), blocks=2, largest_coc_px=5.0, tiles=1)
     assert _count(tiles.blocks) == expected
 
 

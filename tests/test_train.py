@@ -1,6 +1,7 @@
 """Training on a tiny stack made here: it learns, it stops and goes on, it keeps viewpoints apart."""
 
 import dataclasses
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +16,18 @@ from mrbokeh.image_io import write_image
 from mrbokeh.image_metrics import psnr
 from mrbokeh.lens import Lens
 from training import train
-from training.baselines import gaussian_gather, gaussian_scatter, scatter_reference, sigma_per_coc
 from training.batches import draw_batch
 from training.blur_functions import blur_of
+from training.classical_blur import gaussian_gather, gaussian_scatter, scatter_reference, sigma_per_coc
 from training.cli import app
 from training.data_facts import gather_facts
 from training.dataset import PairSet, read_pair
-from training.evaluate import GATHERED, NETWORK, NO_BLUR, REFERENCE, SCATTERED, evaluate, unseen
+from training.evaluation.comparison import Extras, compare, unseen
+from training.evaluation.methods import NETWORK, NO_BLUR, network_method, plain_methods
 from training.network_settings import NetworkSettings
 from training.objective import learning_rate_factor
 from training.presets import demo_settings
+from training.run import Run
 from training.run_folder import load_run
 from training.settings import TrainSettings
 from training.training_data import training_data
@@ -86,12 +89,9 @@ def test_the_network_learns_the_lens(scene: Path, run: Path, tmp_path: Path) -> 
     blur, trained_on = blur_of(run)
     held_out = unseen(training_data([scene]).stacks, trained_on)
     assert [stack.folder.name for stack in held_out] == ["view_2"]
-    result = evaluate(blur, held_out, tmp_path)
-    assert result.gain_over_no_blur_db > 3.0
-    assert result.gain_over_gaussian_db > 3.0
-    assert set(result.methods) == {NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE}
-    assert len(result.scores) == len(FOCUS_M) * 5
-    assert {each.name for each in tmp_path.iterdir()} == {"evaluation.md", "evaluation.csv", "evaluation.png"}
+    result = compare([network_method(NETWORK, blur), *plain_methods()], held_out, tmp_path, Extras(pull_frames=0, memory=False))
+    assert result.gain_db(NETWORK, NO_BLUR) > 3.0
+    assert result.gain_db(NETWORK, result.better_gaussian) > 3.0
 
 
 def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
@@ -105,7 +105,10 @@ def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
     for pair in (pairs[0], pairs[2]):
         counted = pair.target.max(axis=2) < 1.0
         sharp = np.minimum(pair.all_in_focus, 1.0)
-        assert psnr(blur(sharp, pair.coc_px), pair.target, mask=counted) > psnr(sharp, pair.target, mask=counted) + 1.0
+        assert (
+            psnr(blur(dataclasses.replace(pair, all_in_focus=sharp)), pair.target, mask=counted)
+            > psnr(sharp, pair.target, mask=counted) + 1.0
+        )
 
 
 @pytest.mark.parametrize("settings", [dataclasses.replace(DEMO_LIKE, epochs=4), PUBLISHED], ids=["gated", "published"])
@@ -116,9 +119,9 @@ def test_a_killed_run_goes_on_as_if_never_stopped(
     settings = dataclasses.replace(settings, checkpoint_every_s=0.0)
     stacks = training_data([scene])
     train.fit(stacks, tmp_path / "whole", settings, ["view_2"])
-    step, steps = train._Run._step, []
+    step, steps = Run._step, []
 
-    def dying_step(run: "train._Run", rate_factor: float) -> None:
+    def dying_step(run: Run, rate_factor: float) -> None:
         steps.append(1)
         if len(steps) == 4:
             run._save = lambda: None  # a kill leaves no time to save
@@ -126,22 +129,23 @@ def test_a_killed_run_goes_on_as_if_never_stopped(
             raise RuntimeError("killed")
         step(run, rate_factor)
 
-    monkeypatch.setattr(train._Run, "_step", dying_step)
+    monkeypatch.setattr(Run, "_step", dying_step)
     with pytest.raises(RuntimeError, match="killed"):
         train.fit(stacks, tmp_path / "killed", settings, ["view_2"])
     assert not (tmp_path / "killed" / "network.pt").exists()
-    monkeypatch.setattr(train._Run, "_step", step)
+    monkeypatch.setattr(Run, "_step", step)
     train.fit(stacks, tmp_path / "killed", settings, ["view_2"])
     whole, resumed = (load_run(tmp_path / name)[0].state_dict() for name in ("whole", "killed"))
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
 
 
 def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    step = train._Run._step
+    step = Run._step
 
-    def interrupted(run: "train._Run", rate_factor: float) -> None:
-        if run.progress.step == 3:
-            raise KeyboardInterrupt
+    def interrupted(run: Run, rate_factor: float) -> None:
+        """Ctrl-C in the third step, which is still done."""
+        if run.progress.step == 2:
+            signal.raise_signal(signal.SIGINT)
         step(run, rate_factor)
 
     arguments = [
@@ -158,11 +162,11 @@ def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, 
         "--out",
         str(tmp_path / "run"),
     ]
-    monkeypatch.setattr(train._Run, "_step", interrupted)
+    monkeypatch.setattr(Run, "_step", interrupted)
     stopped = CliRunner().invoke(app, arguments)
     assert stopped.exit_code == 130 and "go on" in stopped.output
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["progress"]["step"] == 3
-    monkeypatch.setattr(train._Run, "_step", step)
+    monkeypatch.setattr(Run, "_step", step)
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert (tmp_path / "run" / "network.pt").exists()
 

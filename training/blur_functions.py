@@ -1,4 +1,4 @@
-"""A trained network, as a run or as ONNX, as a plain function of picture and circles of confusion."""
+"""A trained network, as a run or as ONNX, as a plain function of a pair."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,23 +8,29 @@ import torch
 from jaxtyping import Float32
 
 from mrbokeh.renderers.onnx_network import OnnxNetwork
+from training.batches import network_inputs
+from training.dataset import Pair
 from training.run_folder import load_run
 
-Blur = Callable[[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]], Float32[np.ndarray, "height width 3"]]
+Image = Float32[np.ndarray, "height width 3"]
+Blur = Callable[[Pair], Image]
 
 
-def blur_of(network: Path) -> tuple[Blur, tuple[str, ...]]:
-    """(the function, names of the stacks it was trained on) of a run folder or an .onnx file."""
+def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, tuple[str, ...]]:
+    """(the function, names of the stacks it was trained on) of a run folder or an .onnx file. device: of a run, cpu or cuda."""
     if network.suffix.lower() == ".onnx":
         exported = OnnxNetwork(network)
-        return exported.blur, exported.facts.trained_on
+
+        def exported_blur(pair: Pair) -> Image:
+            return exported.blur(pair.all_in_focus, pair.coc_px, pair.place, (pair.f_number, pair.focal_length_mm))
+
+        return exported_blur, exported.facts.trained_on
     model, _, facts = load_run(network)
+    model.to(device)
 
     @torch.no_grad()
-    def blur(
-        rgb: Float32[np.ndarray, "height width 3"], coc_px: Float32[np.ndarray, "height width"]
-    ) -> Float32[np.ndarray, "height width 3"]:
-        result = model(torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))[None], torch.from_numpy(coc_px)[None, None])
-        return result[0].permute(1, 2, 0).contiguous().numpy()
+    def blur(pair: Pair) -> Image:
+        result = model(*(each.to(device) for each in network_inputs(pair)))
+        return result[0].permute(1, 2, 0).contiguous().cpu().numpy()
 
     return blur, facts.trained_on

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mrbokeh.atomic_files import atomic_path, write_json
 from mrbokeh.errors import InputError
+from mrbokeh.field_position import field_positions
 from mrbokeh.renderers.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
 from training.network import BlurNetwork
 from training.network_settings import NetworkSettings
@@ -72,20 +73,23 @@ def network_facts_of(network: BlurNetwork, settings: NetworkSettings, facts: Run
         reach_px=network.reach_px,
         trained_on=facts.trained_on,
         commit=facts.commit,
+        field_position=settings.field_position,
+        f_numbers=facts.lens_ranges[0] if settings.lens_inputs else None,
+        focal_lengths_mm=facts.lens_ranges[1] if settings.lens_inputs else None,
     )
 
 
 def _write(network: BlurNetwork, facts: NetworkFacts, path: Path) -> None:
-    rgb, coc_px = picture_for_parity(facts)
-    free = torch.export.Dim.DYNAMIC
-    sizes = {} if facts.tiled else {2: free, 3: free}
+    inputs = inputs_for_parity(facts)
+    free = {} if facts.tiled else {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             network.eval(),
-            (rgb, coc_px),
-            input_names=["rgb", "coc_px"],
+            (),
+            kwargs=inputs,
+            input_names=list(inputs),
             output_names=["blurred"],
-            dynamic_shapes={"rgb": sizes, "coc_px": sizes},
+            dynamic_shapes={name: {} if name == "lens" else free for name in inputs},
             opset_version=OPSET,
             dynamo=True,
             verbose=False,
@@ -119,13 +123,27 @@ def picture_for_parity(facts: NetworkFacts, seed: int = 0) -> tuple[Tensor, Tens
     return torch.from_numpy(rgb), torch.from_numpy(np.ascontiguousarray(np.broadcast_to(coc_px, (1, 1, height, width))))
 
 
+def inputs_for_parity(facts: NetworkFacts, seed: int = 0) -> dict[str, Tensor]:
+    """All inputs of the graph by name: that picture as a whole frame, seen by a lens drawn from those trained on."""
+    rgb, coc_px = picture_for_parity(facts, seed)
+    inputs = {"rgb": rgb, "coc_px": coc_px}
+    if facts.field_position:
+        inputs["place"] = torch.from_numpy(field_positions((rgb.shape[2], rgb.shape[3])).transpose(2, 0, 1).copy())[None]
+    if facts.f_numbers is not None and facts.focal_lengths_mm is not None:
+        rng = np.random.default_rng(seed)
+        inputs["lens"] = torch.tensor([[rng.uniform(*facts.f_numbers), rng.uniform(*facts.focal_lengths_mm)]], dtype=torch.float32)
+    return inputs
+
+
 @torch.no_grad()
 def largest_difference(network: BlurNetwork, exported: OnnxNetwork) -> float:
     """The largest difference between PyTorch and ONNX Runtime over two pictures: absolute up to white (1.0), relative above."""
     differences = []
     for seed in (0, 1):
-        rgb, coc_px = picture_for_parity(exported.facts, seed)
-        expected = network(rgb, coc_px)[0].permute(1, 2, 0).numpy()
-        got = exported.blur(np.ascontiguousarray(rgb[0].permute(1, 2, 0).numpy()), coc_px[0, 0].numpy())
+        inputs = inputs_for_parity(exported.facts, seed)
+        expected = network(**inputs)[0].permute(1, 2, 0).numpy()
+        planes = {name: np.ascontiguousarray(each[0].permute(1, 2, 0).numpy()) for name, each in inputs.items() if name != "lens"}
+        lens = inputs["lens"][0].numpy() if "lens" in inputs else None
+        got = exported.blur(planes["rgb"], planes["coc_px"][..., 0], planes.get("place"), lens)
         differences.append(float((np.abs(got - expected) / np.maximum(1.0, np.abs(expected))).max()))
     return max(differences)

@@ -12,77 +12,37 @@ n = 1 serves what is in focus; it starts as a copy, the paper's skip connection,
 circles of confusion a lens has kernels of its own in front of the focus and behind it. The weights depend on the circles of
 confusion alone, so the result is linear in radiance, as light is: a highlight beyond anything seen in training is blurred like any
 other, and alpha like colour.
+
+Blur that varies over the frame, or with the lens's settings, needs no tiles: a bin has several kernels k_nb (`field_bases`), and
+colour_n = sum over b of k_nb * (share_nb gate_n rgb). The shares sum to 1 and depend on place and lens at the source q, where the
+light comes from, so light is conserved; see training/field_mixing.py.
 """
 
-import math
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from training.field_mixing import FieldMixing
+from training.gated_bins import bins_px, hat_lines
+from training.gated_kernels import fresh_kernels
 from training.network_settings import NetworkSettings
 
 LOGIT_LIMIT = 10.0
-FLAT_SHARE, FLAT_SHARE_IN_FOCUS = 0.05, 0.005  # of a fresh kernel, so that every one of its pixels can learn
-
-
-def bins_px(blocks: int, per_size: int, signed: bool) -> tuple[list[float], list[int]]:
-    """(circles of confusion at which the gates peak, n of each one's kernel), by n, near before far.
-
-    Kernel size 2n+1 serves diameters up to 2n-1: the pixel left on each side is for what the sensor itself blurs (its colour
-    filters, the resampling of registration). n = 1 serves 1 px and below (signed: its gate peaks at 0), every other n per_size diameters.
-    """
-    knots, radii = [0.0 if signed else 1.0], [1]
-    for n in range(2, blocks + 1):
-        diameters = [2.0 * n - 3.0 + 2.0 * (j + 1) / per_size for j in range(per_size)]
-        knots += [-each for each in diameters] + diameters if signed else diameters
-        radii += [n] * (len(knots) - len(radii))
-    return knots, radii
-
-
-def blocks_for_gates(largest_coc_px: float) -> int:
-    """The smallest N whose largest kernel, 2N+1 px, serves this circle of confusion (diameter)."""
-    return max(1, math.ceil((abs(largest_coc_px) + 1.0) / 2.0))
-
-
-def hat_lines(knots: list[float]) -> Tensor:
-    """(4, bins): slope and offset of each hat's rising line, then of its falling line; the outermost hats stay at 1."""
-    ascending = sorted(knots)
-    lines = []
-    for knot in knots:
-        i = ascending.index(knot)
-        rise = (0.0, 1.0) if i == 0 else _line_to_one(ascending[i - 1], knot)
-        fall = (0.0, 1.0) if i == len(knots) - 1 else _line_to_one(ascending[i + 1], knot)
-        lines.append((*rise, *fall))
-    return torch.tensor(lines).T.contiguous()
-
-
-def _line_to_one(zero_at: float, one_at: float) -> tuple[float, float]:
-    slope = 1.0 / (one_at - zero_at)
-    return slope, -zero_at * slope
-
-
-def disc_kernel(size: int, diameter_px: float) -> Tensor:
-    """(size, size): a disc with exact pixel coverage, sum 1."""
-    from mrbokeh.aperture import Aperture
-
-    kernel = np.zeros((size, size), np.float32)
-    psf = Aperture.disc(sides=64).rasterize(min(diameter_px, 0.98 * size)).kernel
-    margin = (size - psf.shape[0]) // 2
-    kernel[margin : size - margin, margin : size - margin] = psf
-    return torch.from_numpy(kernel)
 
 
 class GatedTiles(nn.Module):
-    """The gated network for all tiles at once: input (B, 4 tiles, t, t) in [-1, 1], output (B, 3 tiles, t, t)."""
+    """The gated network for all tiles at once: input (B, C tiles, t, t) in [-1, 1], output (B, 3 tiles, t, t).
+
+    kernels[n - 1]: (tiles, bins of this size * bases, colours, 2n+1, 2n+1), bases fastest.
+    """
 
     hats: Tensor
 
     def __init__(self, settings: NetworkSettings, blocks: int, largest_coc_px: float, tiles: int) -> None:
         super().__init__()
         self.tile_count, self.signed, self.largest_coc_px = tiles, settings.signed_coc, largest_coc_px
-        self.activation, self.colours = settings.activation, 3 if settings.kernels_per_colour else 1
+        self.activation, self.colours, self.bases = settings.activation, 3 if settings.kernels_per_colour else 1, settings.field_bases
+        self.linear_in_radiance, self.reach_px = settings.activation == "identity", blocks
         self.knots, self.radii = bins_px(blocks, settings.width, settings.signed_coc)
         self.register_buffer("hats", hat_lines(self.knots), persistent=False)
         bins = len(self.knots)
@@ -91,23 +51,19 @@ class GatedTiles(nn.Module):
         self.hide_out = nn.Conv2d(settings.hidden * tiles, bins * tiles, 1, groups=tiles)
         for parameter in self.hide_out.parameters():
             nn.init.zeros_(parameter)
+        self.mixing = FieldMixing(settings.input_channels - 4, settings.hidden, bins, self.bases, tiles) if self.bases > 1 else None
 
     def _fresh_kernels(self, n: int, initialisation: str) -> nn.Parameter:
-        """(tiles, bins of this size, colours, 2n+1, 2n+1): a kernel is their magnitude over its sum; a typical one is 1."""
-        size = 2 * n + 1
-        flat = torch.full((size, size), 1.0 / size**2)
-        peaks = [max(1.0, abs(knot)) for knot, radius in zip(self.knots, self.radii, strict=True) if radius == n]
-        share = 1.0 if initialisation != "disc" else FLAT_SHARE_IN_FOCUS if n == 1 else FLAT_SHARE
-        starts = [(1.0 - share) * disc_kernel(size, peak) + share * flat for peak in peaks]
-        kernels = torch.stack(starts) * size**2
+        knots = [knot for knot, radius in zip(self.knots, self.radii, strict=True) if radius == n]
+        kernels = fresh_kernels(n, knots, self.bases, initialisation)
         return nn.Parameter(kernels[None, :, None].repeat(self.tile_count, 1, self.colours, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         batch, _, height, width = x.shape
-        inputs = x.reshape(batch, self.tile_count, 4, height, width)
-        rgb, gates = 0.5 * (inputs[:, :, :3] + 1.0), self.gates(inputs[:, :, 3:])  # black is 0, so that it stays black
+        inputs = x.reshape(batch, self.tile_count, -1, height, width)
+        rgb, gates = 0.5 * (inputs[:, :, :3] + 1.0), self.gates(inputs[:, :, 3:4])  # black is 0, so that it stays black
         used = self._used_bins(gates)
-        spread = self._spread(rgb, gates, used)
+        spread = self._spread(rgb, gates, inputs[:, :, 4:], used)
         weights = self._weights(gates, spread[:, :, :, 3:].mean(dim=3), used)[:, :, :, None]
         total = (weights * spread).sum(dim=2)
         y = (2.0 * total[:, :, :3] / total[:, :, 3:] - 1.0).reshape(batch, -1, height, width)
@@ -125,29 +81,36 @@ class GatedTiles(nn.Module):
         rise, rise_0, fall, fall_0 = self.hats[:, None, None, :, None, None]
         return torch.minimum(position * rise + rise_0, position * fall + fall_0).clamp(0.0, 1.0)
 
-    def _spread(self, rgb: Tensor, gates: Tensor, used: list[int]) -> Tensor:
+    def _spread(self, rgb: Tensor, gates: Tensor, where: Tensor, used: list[int]) -> Tensor:
         """What the used bins spread: (B, tiles, used, 3 + colours, h, w), colour and then the coverage of each kernel."""
         light = torch.cat([rgb, torch.ones_like(rgb[:, :, : self.colours])], dim=2)[:, :, None]
+        features = None if self.mixing is None else self.mixing.features(where)
         by_size = []
         for n in range(1, len(self.kernels) + 1):
             bins = [each for each in used if self.radii[each] == n]
-            if bins:
-                gated = gates[:, :, bins][:, :, :, None] * light
-                by_size.append(self._convolved(gated, n, [each - self.radii.index(n) for each in bins]))
+            if not bins:
+                continue
+            gated = gates[:, :, bins][:, :, :, None] * light
+            if self.mixing is not None and features is not None:
+                gated = self.mixing.shares(features, bins)[:, :, :, :, None] * gated[:, :, :, None]
+            by_size.append(self._convolved(gated, n, [each - self.radii.index(n) for each in bins]))
         return torch.cat(by_size, dim=2)
 
     def _convolved(self, gated: Tensor, n: int, members: list[int]) -> Tensor:
-        """Bins of one size through their kernels; the coverage of a kernel goes the same way as its light."""
+        """Bins of one size through their kernels; the coverage of a kernel goes the same way as its light.
+
+        gated: (B, tiles, members, 3 + colours, h, w), with several bases (B, tiles, members, bases, 3 + colours, h, w).
+        """
         size = 2 * n + 1
-        magnitude = self.kernels[n - 1][:, members].abs()
+        own = [self.bases * member + base for member in members for base in range(self.bases)]
+        magnitude = self.kernels[n - 1][:, own].abs()
         kernels = magnitude / magnitude.sum(dim=(-2, -1), keepdim=True)
         kernels = kernels.repeat(1, 1, 2 if self.colours == 3 else 4, 1, 1).reshape(-1, 1, size, size)
-        batch, _, _, _, height, width = gated.shape
-        maps = gated.reshape(batch, -1, height, width)
+        maps = gated.flatten(1, -3)
         if not torch.compiler.is_exporting():
             maps = maps.contiguous(memory_format=torch.channels_last)
-        blurred = functional.conv2d(maps, kernels, padding=n, groups=kernels.shape[0])
-        return blurred.reshape(gated.shape)
+        blurred = functional.conv2d(maps, kernels, padding=n, groups=kernels.shape[0]).reshape(gated.shape)
+        return blurred if self.mixing is None else blurred.sum(dim=3)
 
     def _weights(self, gates: Tensor, coverage: Tensor, used: list[int]) -> Tensor:
         """(B, tiles, used, h, w): how much each used bin counts at a pixel, from the circles of confusion alone."""

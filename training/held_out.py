@@ -2,17 +2,30 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from mrbokeh.contact_sheet import SheetRow
 from mrbokeh.focal_stack import FocalStack
-from training.batches import stack_pairs
+from training.batches import Batch, stack_pairs
 from training.dataset import PairSet
-from training.network import BlurNetwork
+from training.sheets import small_picture
 from training.weights import WHERE_TRUTH_IS_KNOWN
 
 SLICES = 4
+
+
+@dataclass(frozen=True)
+class Look:
+    """psnr_db: mean over slices, of linear radiance clipped to [0, 1] where the truth is known; nan where nothing is held out.
+
+    rows: for a sheet: the sharp picture, what the network makes of it, and the photograph.
+    """
+
+    psnr_db: float
+    rows: tuple[SheetRow, ...] = ()
 
 
 class HeldOutSlices:
@@ -23,14 +36,26 @@ class HeldOutSlices:
         spread = np.linspace(0, len(self._pairs) - 1, SLICES if len(self._pairs) else 0)
         self._chosen = [int(index) for index in np.unique(spread.round())]
 
+    def __len__(self) -> int:
+        return len(self._chosen)
+
     @torch.no_grad()
-    def psnr_db(self, network: BlurNetwork, device: torch.device) -> float:
-        """Mean over slices, linear radiance clipped to [0, 1], of the pixels whose truth is known; nan where nothing is held out."""
-        values = []
-        for index in self._chosen:
-            batch = stack_pairs([self._pairs[index]]).to(device)
-            error = network(batch.rgb, batch.coc_px).clamp(0, 1) - batch.target.clamp(0, 1)
-            weight = batch.weight.expand_as(error)
-            mean = float((weight * error.square()).sum() / weight.sum().clamp(min=1e-6))
-            values.append(-10.0 * math.log10(max(mean, 1e-12)))
-        return float(np.mean(values)) if values else float("nan")
+    def look(self, network: torch.nn.Module, device: torch.device) -> Look:
+        """In full precision, whatever the training's."""
+        scored = [self._scored(index, network, device) for index in self._chosen]
+        return Look(float(np.mean([value for value, _ in scored])) if scored else math.nan, tuple(row for _, row in scored))
+
+    def _scored(self, index: int, network: torch.nn.Module, device: torch.device) -> tuple[float, SheetRow]:
+        batch = stack_pairs([self._pairs[index]]).to(device)
+        result = network(batch.rgb, batch.coc_px, batch.place, batch.lens)
+        psnr_db = _psnr_db(result, batch)
+        pictures = {"sharp": batch.rgb, f"network {psnr_db:.2f} dB": result, "photograph": batch.target}
+        small = {caption: small_picture(picture[0].permute(1, 2, 0).cpu().numpy()) for caption, picture in pictures.items()}
+        return psnr_db, SheetRow(self._pairs.label(index), small)
+
+
+def _psnr_db(result: torch.Tensor, batch: Batch) -> float:
+    error = result.clamp(0, 1) - batch.target.clamp(0, 1)
+    weight = batch.weight.expand_as(error)
+    mean = float((weight * error.square()).sum() / weight.sum().clamp(min=1e-6))
+    return -10.0 * math.log10(max(mean, 1e-12))

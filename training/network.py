@@ -1,22 +1,19 @@
-"""The Neural Bokeh network (Mandl et al. 2024, Section 3): a sharp picture and its circles of confusion in, a blurred picture out.
+"""What all networks share: a sharp picture and its circles of confusion in, a blurred picture out (Mandl et al. 2024, Section 3).
 
-Our reading of what the paper leaves open:
-- "Per-channel convolutions" are depthwise: C1 makes a three-channel tensor per tile, and each of its channels has its own kernels.
-- A block is the basic block of He et al. 2016, which the paper cites: R(x) = ReLU(x + conv(ReLU(conv(x)))).
-- Every convolution pads its input, so that a block keeps the size of a tile (replicated border unless set otherwise).
-- The circle of confusion enters as a fraction of the largest one, mapped to [-1, 1] as the colours are.
+Here are the ranges, the tiles and the inputs; the four forms are in published_tiles.py, gated_network.py, deepfocus_network.py and
+neural_camera_network.py. The circle of confusion enters as a fraction of the largest one, mapped to [-1, 1] as the colours are.
 
 Shapes are in words here, not in annotations: exporting traces with sizes that are symbols, which a shape check would freeze.
 """
 
-from typing import Literal
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
+from mrbokeh.errors import InputError
 from mrbokeh.focal_stack_dataset import network_blocks
-from training.gated_network import GatedTiles, blocks_for_gates, disc_kernel
+from training.lens_scale import LensRanges, LensScale
 from training.network_settings import NetworkSettings
 from training.tiling import TileGrid, assemble, split
 
@@ -24,117 +21,102 @@ from training.tiling import TileGrid, assemble, split
 class BlurNetwork(nn.Module):
     """Linear radiance and circles of confusion in, linear radiance out; tiling and the mapping to [-1, 1] are inside.
 
-    radiance_scale: the radiance that becomes +1 inside; 0 becomes -1.
+    radiance_scale: the largest radiance of the data; `headroom` times it becomes +1 inside, 0 becomes -1.
     grid: the tiles, for one size of picture; None takes the whole picture as one tile of any size.
+    lens_ranges: trained on, for a network that takes the lens as input.
     linear_in_radiance: doubled light gives a doubled result. reach_px: how far from a pixel the network looks.
     """
 
-    def __init__(self, settings: NetworkSettings, largest_coc_px: float, radiance_scale: float, grid: TileGrid | None = None) -> None:
+    def __init__(
+        self,
+        settings: NetworkSettings,
+        largest_coc_px: float,
+        radiance_scale: float,
+        grid: TileGrid | None = None,
+        lens_ranges: LensRanges | None = None,
+    ) -> None:
         super().__init__()
-        self.signed_coc, self.largest_coc_px, self.radiance_scale, self.grid = settings.signed_coc, largest_coc_px, radiance_scale, grid
-        blocks = settings.blocks or (blocks_for_gates if settings.form == "gated" else network_blocks)(largest_coc_px)
-        self.linear_in_radiance = settings.form == "gated" and settings.activation == "identity"
-        self.reach_px = blocks if settings.form == "gated" else blocks * (blocks + 1)
-        tiles = 1 if grid is None else len(grid)
-        if settings.form == "gated":
-            self.tiles: nn.Module = GatedTiles(settings, blocks, largest_coc_px, tiles)
-        else:
-            self.tiles = PublishedTiles(settings, blocks, tiles)
+        self.signed_coc, self.field_position = settings.signed_coc, settings.field_position
+        self.largest_coc_px, self.radiance_scale, self.grid = largest_coc_px, radiance_scale, grid
+        self.top = settings.headroom * radiance_scale
+        self.lens_scale = _lens_scale(lens_ranges) if settings.lens_inputs else None
+        form = form_of(settings, largest_coc_px, 1 if grid is None else len(grid))
+        self.linear_in_radiance, self.reach_px = form.linear_in_radiance, form.reach_px
+        assert isinstance(form, nn.Module)
+        self.tiles: nn.Module = form
 
-    def forward(self, rgb: Tensor, coc_px: Tensor) -> Tensor:
-        """rgb (B, 3, H, W) linear; coc_px (B, 1, H, W) signed diameters; the result is (B, 3, H, W) linear."""
-        x = self.encode(rgb, coc_px)
-        y = self.tiles(x) if self.grid is None else assemble(self.tiles(split(x, self.grid)), self.grid)
-        return (y + 1.0) * (0.5 * self.radiance_scale)
+    def forward(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor:
+        """rgb (B, 3, H, W) linear; coc_px (B, 1, H, W) signed diameters; the result is (B, 3, H, W) linear.
 
-    def encode(self, rgb: Tensor, coc_px: Tensor) -> Tensor:
-        """The network's input (B, 4, H, W): R, G, B and circle of confusion in [-1, 1]."""
+        place (B, 2, H, W), field positions, and lens (B, 2), f-number and focal length in mm, are needed where the settings say so.
+        """
+        y = self._tiles(rgb, coc_px, place, lens)
+        return self._radiance(y if self.grid is None else assemble(y, self.grid))
+
+    def tile_outputs(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor:
+        """(B, 3 tiles, t, t) linear: what every tile makes of its part, before overlaps are averaged."""
+        return self._radiance(self._tiles(rgb, coc_px, place, lens))
+
+    def encode(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor:
+        """The network's input (B, C, H, W), all in [-1, 1]: R, G, B, circle of confusion, then place and lens where they are used."""
         fraction = coc_px / self.largest_coc_px
         coc = fraction.clamp(-1.0, 1.0) if self.signed_coc else 2.0 * fraction.abs().clamp(max=1.0) - 1.0
-        return torch.cat([rgb * (2.0 / self.radiance_scale) - 1.0, coc], dim=1)
+        planes = [rgb * (2.0 / self.top) - 1.0, coc]
+        if self.field_position:
+            planes.append(_given(place, "place (B, 2, H, W)", "field_position"))
+        if self.lens_scale is not None:
+            scaled = self.lens_scale(_given(lens, "lens (B, 2)", "lens_inputs"))
+            planes.append(scaled[:, :, None, None].expand(-1, -1, *coc.shape[2:]))
+        return torch.cat(planes, dim=1)
+
+    def _tiles(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None, lens: Tensor | None) -> Tensor:
+        x = self.encode(rgb, coc_px, place, lens)
+        y: Tensor = self.tiles(x if self.grid is None else split(x, self.grid))
+        return y
+
+    def _radiance(self, y: Tensor) -> Tensor:
+        return (y + 1.0) * (0.5 * self.top)
 
 
-class PublishedTiles(nn.Module):
-    """F(x) = tanh(C2(R_N(... R_1(C1(x)) ...) + x_RGB)) of Eq. 2, "+" being concatenation, for all tiles at once.
+@runtime_checkable
+class Form(Protocol):
+    """What computes: x (B, C tiles, t, t) to y (B, 3 tiles, t, t), colours in [-1, 1] (an nn.Module)."""
 
-    Input (B, 4 tiles, t, t), output (B, 3 tiles, t, t). All convolutions are grouped, so no tile sees another.
-    """
-
-    def __init__(self, settings: NetworkSettings, blocks: int, tiles: int) -> None:
-        super().__init__()
-        features = 3 * settings.width
-        self.tile_count, self.activation = tiles, settings.activation
-        self.c1 = nn.Conv2d(4 * tiles, features * tiles, 1, groups=tiles)
-        self.blocks = nn.ModuleList(ResidualBlock(n, tiles, settings) for n in range(1, blocks + 1))
-        self.c2 = nn.Conv2d((features + 3) * tiles, 3 * tiles, 1, groups=tiles)
-        if settings.initialisation != "default":
-            self._start_as_identity(features)
-
-    def forward(self, x: Tensor) -> Tensor:
-        batch, _, height, width = x.shape
-        # Depthwise convolutions on the CPU are many times faster with the channels of a pixel side by side.
-        state = self.c1(x if torch.compiler.is_exporting() else x.contiguous(memory_format=torch.channels_last))
-        for block in self.blocks:
-            state = block(state)
-        per_tile = (batch, self.tile_count, -1, height, width)
-        joined = torch.cat([state.reshape(per_tile), x.reshape(per_tile)[:, :, :3]], dim=2)
-        y = self.c2(joined.reshape(batch, -1, height, width))
-        return torch.tanh(y) if self.activation == "tanh" else y
-
-    @torch.no_grad()
-    def _start_as_identity(self, features: int) -> None:
-        """C1 copies the colours, lifted above the ReLU; C2 takes half of its answer from the blocks and half from the skip."""
-        colour = torch.arange(features) % 3
-        c1 = self.c1.weight.view(self.tile_count, features, 4)
-        c1.mul_(0.1)
-        c1[:, torch.arange(features), colour] = 1.0
-        _bias(self.c1).fill_(1.0)
-        c2 = self.c2.weight.view(self.tile_count, 3, features + 3)
-        c2.zero_()
-        copies = features // 3
-        for channel in range(3):
-            c2[:, channel, :features][:, colour == channel] = 0.5 / copies
-            c2[:, channel, features + channel] = 0.5
-        _bias(self.c2).fill_(-0.5)
+    linear_in_radiance: bool
+    reach_px: int
 
 
-class ResidualBlock(nn.Module):
-    """R_n: two per-channel convolutions of size 2n+1, each followed by a ReLU, the second after the residual sum."""
+def form_of(settings: NetworkSettings, largest_coc_px: float, tiles: int) -> Form:
+    """A fresh network of that form; N follows from the largest circle of confusion unless the settings give it."""
+    if settings.form == "gated":
+        from training.gated_bins import blocks_for_gates
+        from training.gated_network import GatedTiles
 
-    def __init__(self, n: int, tiles: int, settings: NetworkSettings) -> None:
-        super().__init__()
-        features, size = 3 * settings.width, 2 * n + 1
-        groups = tiles * (3 if settings.mixing == "colour" else features)
-        self.radius, self.padding = n, settings.padding
-        self.first = nn.Conv2d(features * tiles, features * tiles, size, groups=groups)
-        self.second = nn.Conv2d(features * tiles, features * tiles, size, groups=groups)
-        self.mix = nn.Conv2d(features * tiles, features * tiles, 1, groups=tiles) if settings.mixing == "tile" else nn.Identity()
-        self._initialise(settings.initialisation, features, tiles)
+        return GatedTiles(settings, settings.blocks or blocks_for_gates(largest_coc_px), largest_coc_px, tiles)
+    blocks = settings.blocks or network_blocks(largest_coc_px)
+    if settings.form == "deepfocus":
+        from training.deepfocus_network import DeepFocusTiles
 
-    def forward(self, x: Tensor) -> Tensor:
-        change = self.second(self._padded(torch.relu(self.first(self._padded(x)))))
-        return self.mix(torch.relu(x + change))
+        return DeepFocusTiles(settings, blocks, largest_coc_px, tiles)
+    if settings.form == "neural_camera":
+        from training.neural_camera_network import NeuralCameraTiles
 
-    def _padded(self, x: Tensor) -> Tensor:
-        mode: Literal["constant", "replicate", "reflect"] = "constant" if self.padding == "zeros" else self.padding  # type: ignore[assignment]
-        return functional.pad(x, (self.radius,) * 4, mode=mode)
+        return NeuralCameraTiles(settings, blocks, largest_coc_px, tiles)
+    from training.published_tiles import PublishedTiles
 
-    @torch.no_grad()
-    def _initialise(self, initialisation: str, features: int, tiles: int) -> None:
-        if initialisation == "default":
-            return
-        if initialisation == "disc":
-            self.first.weight.zero_()
-            self.first.weight[:, 0] = disc_kernel(2 * self.radius + 1, 2.0 * self.radius + 1.0)
-            _bias(self.first).zero_()
-        self.second.weight.mul_(0.1)
-        _bias(self.second).zero_()
-        if isinstance(self.mix, nn.Conv2d):
-            self.mix.weight.zero_()
-            self.mix.weight.view(tiles, features, features).diagonal(dim1=1, dim2=2).fill_(1.0)
-            _bias(self.mix).zero_()
+    return PublishedTiles(settings, blocks, largest_coc_px, tiles)
 
 
-def _bias(convolution: nn.Conv2d) -> Tensor:
-    assert convolution.bias is not None
-    return convolution.bias
+def _lens_scale(ranges: LensRanges | None) -> LensScale:
+    if ranges is None:
+        raise InputError(
+            "a network with lens_inputs needs the ranges of f-number and focal length that it is trained on: give lens_ranges, "
+            "or set lens_inputs to false"
+        )
+    return LensScale(ranges)
+
+
+def _given(values: Tensor | None, what: str, setting: str) -> Tensor:
+    if values is None:
+        raise InputError(f"this network was made with {setting}, so it needs {what} beside the picture, got none: give it")
+    return values

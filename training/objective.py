@@ -1,22 +1,86 @@
 """What training strives for, and how fast it steps."""
 
 import math
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from training.batches import Batch
+from training.loss_terms import gradient_error, local_light_error, weighted_mean_square
 from training.settings import TrainSettings
+from training.tiling import TileGrid, split
+
+
+@runtime_checkable
+class Network(Protocol):
+    """What the objective asks of a network (`training.network.BlurNetwork`)."""
+
+    grid: TileGrid | None
+
+    def __call__(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor: ...
+
+    def tile_outputs(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor: ...
+
+
+def loss(network: Network, batch: Batch, radiance_scale: float, largest_coc_px: float, settings: TrainSettings) -> Tensor:
+    """Everything that one batch is judged by: a scalar.
+
+    loss_scope "picture" judges the reassembled picture (Mandl et al. 2024, Section 3.3), "tile" the mean over tiles of what each one
+    makes of its own part, before overlaps are averaged; a tile counts where any of its pixels does.
+    """
+    inputs = (batch.rgb, batch.coc_px, batch.place, batch.lens)
+    if settings.loss_scope == "picture" or network.grid is None:
+        return judged(network(*inputs), batch, radiance_scale, largest_coc_px, settings)
+    outputs = network.tile_outputs(*inputs).chunk(len(network.grid), dim=1)
+    tiles = _tiles(batch, network.grid)
+    losses = [judged(output, tile, radiance_scale, largest_coc_px, settings) for output, tile in zip(outputs, tiles, strict=True)]
+    counted = torch.stack([tile.weight.any() for tile in tiles])
+    return torch.stack(losses).sum() / counted.sum().clamp(min=1)
+
+
+def judged(result: Tensor, batch: Batch, radiance_scale: float, largest_coc_px: float, settings: TrainSettings) -> Tensor:
+    """The mean square error, and as much as the settings say of the light of neighbourhoods and of edges; for equal pictures 0."""
+    total = mean_square_error(result, batch, radiance_scale, settings)
+    if settings.energy_weight == 0.0 and settings.edge_weight == 0.0:
+        return total
+    error = _error(result, batch, radiance_scale, settings)
+    weight = _weight(batch, settings)
+    if settings.energy_weight:
+        light = local_light_error(error, batch.weight, largest_coc_px)
+        total = total + settings.energy_weight * weighted_mean_square(light, weight)
+    if settings.edge_weight:
+        total = total + settings.edge_weight * gradient_error(error, weight)
+    return total
 
 
 def mean_square_error(result: Tensor, batch: Batch, radiance_scale: float, settings: TrainSettings) -> Tensor:
     """Eq. 3 over the reassembled pictures, in the units of the network, [-1, 1]; pixels without weight do not count."""
-    weight, target = batch.weight.expand_as(batch.target), batch.target
+    return weighted_mean_square(_error(result, batch, radiance_scale, settings), _weight(batch, settings))
+
+
+def _weight(batch: Batch, settings: TrainSettings) -> Tensor:
+    """(B, 3, H, W); "relative" turns the error of bright pixels into that of their ratio."""
+    weight = batch.weight.expand_as(batch.target)
     if settings.loss_weighting == "relative":
-        weight = weight / target.amax(dim=1, keepdim=True).clamp(min=1.0).square()
+        weight = weight / batch.target.amax(dim=1, keepdim=True).clamp(min=1.0).square()
+    return weight
+
+
+def _error(result: Tensor, batch: Batch, radiance_scale: float, settings: TrainSettings) -> Tensor:
+    """Result less slice, in the units of the network. A full photosite says "at least so bright": more than that is no error."""
+    result, target = result.float(), batch.target
     if settings.sensor_white is not None:
         result, target = result.clamp(max=settings.sensor_white), target.clamp(max=settings.sensor_white)
     error = (result - target) * (2.0 / radiance_scale)
-    return (weight * error.square()).sum() / weight.sum().clamp(min=1e-6)
+    return error if batch.saturated is None else torch.where(batch.saturated, error.clamp(max=0.0), error)
+
+
+def _tiles(batch: Batch, grid: TileGrid) -> list[Batch]:
+    """The part of a batch that each tile is judged by."""
+    planes = {name: split(part, grid).chunk(len(grid), dim=1) for name, part in batch.parts().items() if part.dim() == 4}
+    return [replace(batch, **{name: parts[tile] for name, parts in planes.items()}) for tile in range(len(grid))]
 
 
 def learning_rate_factor(done: float, warm_up: float) -> float:

@@ -9,11 +9,13 @@ from training.run_folder import RunFacts, read_facts
 from training.settings import FILE_NAME as SETTINGS_NAME
 from training.settings import TrainSettings, read_settings
 
+_MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
+
 
 def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
-    """Where and how fast it computes may differ."""
+    """Where and how fast it computes, and how often it writes, may differ."""
     if _begun(run_folder, SETTINGS_NAME):
-        _require_same(run_folder, "settings", read_settings(run_folder), settings, ("threads", "device", "cache_mib"))
+        _require_same(run_folder, "settings", read_settings(run_folder), settings, _MAY_DIFFER)
 
 
 def require_same_data(run_folder: Path, facts: RunFacts) -> None:
@@ -32,3 +34,9 @@ def _require_same(run_folder: Path, what: str, before: object, now: object, may_
         raise InputError(
             f"{run_folder} holds a run with other {what} ({', '.join(differing)}): give another --out, or --overwrite to start again"
         )
+
+
+def remove_unfinished(run_folder: Path) -> None:
+    """Remove what a killed run was writing: files get their name when they are whole."""
+    for path in run_folder.rglob(".*.part.*"):
+        path.unlink()

@@ -1,8 +1,6 @@
 """The folder of a training run: settings, what it was trained on, checkpoint, curve and the finished network."""
 
-import csv
 import subprocess
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from mrbokeh.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import lens_from_json, lens_to_json
+from training.lens_scale import LensRanges
 from training.network import BlurNetwork
 from training.settings import TrainSettings, read_settings
 from training.tiling import TileGrid
@@ -21,7 +20,6 @@ FORMAT = "mrbokeh-training-run"
 VERSION = 1
 FILE_NAME = "run.json"
 NETWORK_NAME = "network.pt"
-CURVE_NAME = "curve.csv"
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,7 @@ class RunFacts:
 
     largest_coc_px: diameter; radiance_scale: the radiance at the upper end of the network's range;
     trained_on, held_out: names of stacks; commit: of the source, or None where git is absent.
+    f_numbers, focal_lengths_mm: (lowest, highest) of the data; None: those of `lens` alone.
     """
 
     lens: Lens
@@ -40,6 +39,13 @@ class RunFacts:
     trained_on: tuple[str, ...]
     held_out: tuple[str, ...]
     commit: str | None
+    f_numbers: tuple[float, float] | None = None
+    focal_lengths_mm: tuple[float, float] | None = None
+
+    @property
+    def lens_ranges(self) -> LensRanges:
+        one_f_number, one_focal_length_mm = (self.lens.f_number,) * 2, (self.lens.focal_length_mm,) * 2
+        return self.f_numbers or one_f_number, self.focal_lengths_mm or one_focal_length_mm
 
     def to_json(self) -> dict[str, Any]:
         return {"format": FORMAT, "version": VERSION, **vars(self), "lens": lens_to_json(self.lens)}
@@ -48,9 +54,10 @@ class RunFacts:
 def facts_from_json(document: dict[str, Any], where: str) -> RunFacts:
     if document.get("format") != FORMAT or document.get("version") != VERSION:
         raise InputError(f"{where}: expected format {FORMAT!r} version {VERSION}, got {document.get('format')!r}: train again")
-    values = {name: value for name, value in document.items() if name not in ("format", "version")}
-    lens = lens_from_json(values.pop("lens"), where)
-    return RunFacts(lens=lens, trained_on=tuple(values.pop("trained_on")), held_out=tuple(values.pop("held_out")), **values)
+    lens = lens_from_json(document["lens"], where)
+    others = {name: value for name, value in document.items() if name not in ("format", "version", "lens")}
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in others.items()}
+    return RunFacts(lens=lens, **values)
 
 
 def write_facts(folder: Path, facts: RunFacts) -> None:
@@ -67,7 +74,7 @@ def build_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
     grid = TileGrid(facts.height_px, facts.width_px, tile.tile_px, tile.overlap_px) if tile.tile_px else None
     with torch.random.fork_rng():
         torch.manual_seed(settings.seed)
-        return BlurNetwork(tile, facts.largest_coc_px, facts.radiance_scale, grid)
+        return BlurNetwork(tile, facts.largest_coc_px, facts.radiance_scale, grid, facts.lens_ranges)
 
 
 def save_network(folder: Path, network: BlurNetwork) -> None:
@@ -85,13 +92,6 @@ def load_run(folder: Path) -> tuple[BlurNetwork, TrainSettings, RunFacts]:
     network = build_network(settings, facts)
     network.load_state_dict(torch.load(folder / NETWORK_NAME, map_location="cpu", weights_only=True))
     return network.eval(), settings, facts
-
-
-def write_curve(folder: Path, curve: Iterable[tuple[int, float, float, float]]) -> None:
-    with atomic_path(folder / CURVE_NAME) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(["step", "elapsed_s", "loss", "held_out_psnr_db"])
-        rows.writerows(curve)
 
 
 def source_commit() -> str | None:

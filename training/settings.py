@@ -32,8 +32,12 @@ class TrainSettings:
     radiance_scale: the radiance that is mapped to +1 (0 to -1); None takes that of the data set's manifest, or for scene folders the
         largest value of the training pictures.
     least_confidence: pixels with less trustworthy depth do not count; 0 counts all. Pixels that moved, have no data, show a calibration
-        board or are marked as saturated in the slice never count (training/weights.py).
+        board never count (training/weights.py).
+    saturated: pixels whose slice was saturated are "left_out" (with sensor_white they count), or count "one_sided": only a result
+        darker than the slice is an error.
     saturation: pixels of a slice at or above this radiance do not count either, for slices without a saturation mask; None is no limit.
+    clip_norm: gradients longer than this are shortened to it; 0 leaves them as they are.
+    crops_per_picture: so many crops in a row are cut from one picture, which is read once for them all.
     ema_decay: the result is this exponential moving average over steps of the weights; 0 takes the last weights.
     precision: of the network's arithmetic while training; the half types are for GPUs.
     patience: stop after so many looks at the held-out slices without a better one; 0 never stops early.
@@ -50,6 +54,7 @@ class TrainSettings:
     warm_up: float = 0.05
     batch: int = 1
     crop_px: int = 0
+    crops_per_picture: int = 1
     loss_scope: Literal["picture", "tile"] = "picture"
     loss_weighting: Literal["uniform", "relative"] = "uniform"
     energy_weight: float = 0.0
@@ -59,6 +64,8 @@ class TrainSettings:
     radiance_scale: float | None = None
     least_confidence: float = 0.1
     saturation: float | None = None
+    saturated: Literal["left_out", "one_sided"] = "left_out"
+    clip_norm: float = 0.0
     ema_decay: float = 0.0
     test_fraction: float = 0.2
     precision: Literal["float32", "bfloat16", "float16"] = "float32"

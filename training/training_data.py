@@ -29,9 +29,11 @@ class TrainingData:
             apart = drawn(self.stacks, test_fraction, seed)
         return split_stacks(self.stacks, apart)
 
-    def facts(self, pairs: PairSet) -> DataFacts:
-        """Of the manifest, or from a look at every pair to train on."""
-        return gather_facts(pairs) if self.dataset is None else manifest_facts(self.dataset, pairs.stacks)
+    def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
+        """Of the manifest, or from a look at every pair to train on. several_lenses: f-number and focal length may differ."""
+        if self.dataset is None:
+            return gather_facts(pairs, several_lenses)
+        return manifest_facts(self.dataset, pairs.stacks, several_lenses)
 
 
 def training_data(folders: Sequence[Path]) -> TrainingData:

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.focal_stack import FocalStack
+from training.settings import TrainSettings
+from training.slice_rows import REASONS, SliceRows
 
 # Nobody knows what the network should give there, so neither loss nor score counts them.
 # "saturated" of the exclusion masks means saturated in any slice; a light that is full where it is sharp is well measured in the discs
 # of other slices, so each slice has its own mask. Saturated targets pull: counted as recorded they cost 7 to 8 dB on a traced still life
 # with lights (gated form, held-out view against its unclipped truth), or with a modelled white of the sensor 2 dB or nothing. Leaving
 # them out of all slices instead of their own is 0.1 to 0.5 dB worse where nothing is saturated, 0.7 to 0.9 dB better over all pixels.
-_NO_TRUTH = ("moving", "border", "board")
 _LOW_CONFIDENCE = "low_confidence"
 
 
@@ -21,27 +21,36 @@ class Counting:
     """least_confidence: pixels with less trustworthy depth do not count, nor those of the mask low_confidence; 0 counts all.
     saturation: pixels of a slice at or above this radiance do not count; None sets no such limit.
     saturated: whether pixels count in whose slice the sensor was full.
+    one_sided: they count, but only where the result is darker than the slice, which is what a full photosite tells.
     """
 
     least_confidence: float = 0.1
     saturation: float | None = None
     saturated: bool = False
+    one_sided: bool = False
 
 
 WHERE_TRUTH_IS_KNOWN = Counting(least_confidence=0.0, saturated=True)
 
 
-def pixel_weight(
-    stack: FocalStack, index: int, target: Float32[np.ndarray, "height width 3"], counting: Counting
-) -> Float32[np.ndarray, "height width"]:
+def counting_of(settings: TrainSettings) -> Counting:
+    """What counts in a training run."""
+    return Counting(
+        settings.least_confidence,
+        settings.saturation,
+        saturated=settings.sensor_white is not None,
+        one_sided=settings.saturated == "one_sided",
+    )
+
+
+def pixel_weight(read: SliceRows, counting: Counting) -> Float32[np.ndarray, "height width"]:
     """(H, W): 1 where the pixel counts, else 0."""
-    counted = stack.depth_confidence() >= counting.least_confidence
-    masks, exclusions = stack.slice_masks(index), stack.exclusions()
-    counted &= masks.valid
-    for reason in (*_NO_TRUTH, *([_LOW_CONFIDENCE] if counting.least_confidence > 0 else [])):
-        counted &= ~exclusions.get(reason, np.zeros_like(counted))
-    if not counting.saturated:
-        counted &= ~masks.saturated
+    counted = (read.confidence >= counting.least_confidence) & read.valid
+    for reason in REASONS:
+        if reason in read.exclusions and (reason != _LOW_CONFIDENCE or counting.least_confidence > 0):
+            counted &= ~read.exclusions[reason]
+    if not (counting.saturated or counting.one_sided):
+        counted &= ~read.saturated
     if counting.saturation is not None:
-        counted &= target.max(axis=2) < counting.saturation
+        counted &= read.target.max(axis=2) < counting.saturation
     return counted.astype(np.float32)

@@ -10,6 +10,7 @@ DATA = Path(__file__).resolve().parent.parent / "demo_data"
 VIEWS = ("view_0", "view_1", "view_2")
 HELD_OUT_VIEW = "view_2"
 BOARD_VIEWS = ("pcb_oblique",)
+QUICK_EVALUATION = ("--renderer", "scatter", "--pull", "0")
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def _network(folder: Path, minutes: float, held_out: str | None) -> list[Stage]:
         ),
     ]
     if held_out:
-        evaluate = ("train", "evaluate", str(network), str(scene), "--out", str(folder / "evaluation"))
+        evaluate = ("train", "evaluate", str(network), str(scene), "--out", str(folder / "evaluation"), *QUICK_EVALUATION)
         outputs = (folder / "evaluation" / "evaluation.csv", folder / "evaluation" / "evaluation.png")
         stages.append(
             Stage(f"{folder.name}_evaluate", f"Compare the network with photographs it has not seen ({held_out})", evaluate, outputs)

@@ -1,4 +1,4 @@
-"""What a network must beat: no blur, and a Gaussian of the right size; and the reference renderer to see it beside."""
+"""What a network must beat: a Gaussian of the right size; and light that is thrown without asking what hides it."""
 
 import numpy as np
 from jaxtyping import Float32

@@ -1,0 +1,152 @@
+"""Focal stacks blurred by a bank of kernels, to train a network on a measured lens.
+
+    mrbokeh lens fit STACK... --out BANK
+    python -m datasets_scripts.bank_pairs BANK --out DATASET [--scenes 10 --focuses 5 --lens lens.json]
+    mrbokeh train fit DATASET --out RUN
+
+Random layered scenes are rendered with the exact kernels of the bank (`ScatterReference`), each focused at several distances. What is
+hard in photographs is exact here: all-in-focus picture and depth. Finished files are kept; an interrupted run goes on where it stopped.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from datasets_scripts.bank_pairs_scenes import FARTHEST_M, NEAREST_M, random_layers
+from datasets_scripts.bokeh_stacks_manifest import LICENCE, stack_record
+from datasets_scripts.bokeh_stacks_view import slice_name
+from mrbokeh.aperture import Aperture
+from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.camera import Camera
+from mrbokeh.camera_rgb import write_camera_rgb
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.focal_stack_dataset import FILE_NAME as MANIFEST
+from mrbokeh.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
+from mrbokeh.layer import flatten
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import read_lens, write_lens
+from mrbokeh.progress import track
+from mrbokeh.psf_bank import PsfBank
+from mrbokeh.psf_bank_file import read_bank
+from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.spreadlets_file import fingerprint
+
+PLAN_NAME = "plan.json"
+_TEST_SHARE = 0.2
+_MOST_BLUR = 0.98  # of what the bank holds
+_SOME_LENS = Lens(focal_length_mm=50.0, f_number=1.0, focus_distance_m=NEAREST_M, sensor_width_mm=36.0, aperture=Aperture.disc())
+
+
+@dataclass(frozen=True)
+class PairsPlan:
+    """Equal plans and banks give equal pictures. Scenes are numbered; the last fifth of them, at least one of several, is for testing."""
+
+    scenes: int = 10
+    focuses: int = 5
+    width_px: int = 192
+    height_px: int = 112
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        if self.scenes < 1 or self.focuses < 1 or min(self.width_px, self.height_px) < 16:
+            raise InputError(
+                f"a set needs at least one scene, one focus and pictures of 16x16 px, got {self.scenes} scenes, {self.focuses} "
+                f"focuses and {self.width_px}x{self.height_px} px"
+            )
+
+    @property
+    def names(self) -> list[str]:
+        return [f"layers_{number:03d}/view_00" for number in range(self.scenes)]
+
+    @property
+    def tested(self) -> set[str]:
+        return set(self.names[self.scenes - max(round(_TEST_SHARE * self.scenes), int(self.scenes > 1)) :]) if self.scenes > 1 else set()
+
+    @property
+    def focus_distances_m(self) -> tuple[float, ...]:
+        """Evenly in dioptres, near to far."""
+        return tuple(float(each) for each in 1.0 / np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, self.focuses))
+
+
+def make_bank_pairs(bank: PsfBank, out: Path, plan: PairsPlan, lens: Lens | None = None, *, overwrite: bool = False) -> FocalStackDataset:
+    """Write what is missing of a set, the manifest last. lens: None takes one whose largest blur is what the bank holds.
+
+    Raises InputError where `out` holds something else, unless `overwrite` says to replace its files.
+    """
+    used = lens or _fitting_lens(bank, plan)
+    _claim(out, {"plan": asdict(plan), "bank": fingerprint(bank.kernels), "f_number": used.f_number}, overwrite)
+    write_lens(out / "lens.json", used)
+    renderer = ScatterReference(bank=bank)
+    for number, name in enumerate(track(plan.names, "blurring scenes")):
+        if overwrite or not (out / name / FILE_NAME).is_file():
+            _make_stack(out / name, plan, number, used, renderer)
+    records = tuple(stack_record(out, name, "test" if name in plan.tested else "train") for name in plan.names)
+    metadata = {"made_by": "datasets_scripts.bank_pairs", "plan": asdict(plan), "bank": fingerprint(bank.kernels), "model": bank.model}
+    dataset = FocalStackDataset(out, LICENCE, max(each.radiance.largest for each in records), records, metadata)
+    write_focal_stack_dataset(dataset)
+    return dataset
+
+
+def _make_stack(folder: Path, plan: PairsPlan, number: int, lens: Lens, renderer: ScatterReference) -> None:
+    layers = random_layers((plan.height_px, plan.width_px), np.random.default_rng([plan.seed, number]))
+    sharp, distances_m = flatten(layers), plan.focus_distances_m
+    for index, distance_m in enumerate(distances_m):
+        blurred = renderer.render(layers, lens.focused_at(distance_m))
+        write_camera_rgb(folder / slice_name(index), blurred.rgb, None)
+    dioptres = 1.0 / np.asarray(distances_m)
+    focus_index = np.interp(1.0 / sharp.depth_m, dioptres[::-1], np.arange(len(dioptres))[::-1].astype(np.float64)).astype(np.float32)
+    write_merged(folder, sharp.rgb, focus_index, np.ones_like(sharp.depth_m), sharp.depth_m)
+    focal_px = lens.focal_length_mm * plan.width_px / lens.sensor_width_mm
+    camera = Camera(plan.width_px, plan.height_px, (focal_px, focal_px), (0.5 * plan.width_px, 0.5 * plan.height_px))
+    slices = tuple(Slice(slice_name(index), distance_m) for index, distance_m in enumerate(distances_m))
+    write_focal_stack(FocalStack(folder, slices, lens.focused_at(distances_m[0]), camera, registered=True, merged=True))
+
+
+def _fitting_lens(bank: PsfBank, plan: PairsPlan) -> Lens:
+    """The f-number at which the largest circle of confusion of any scene is nearly the bank's."""
+    high_px = next((axis.high for axis in bank.axes if axis.name == "diameter_px"), None)
+    if high_px is None:
+        raise InputError("expected a bank over diameter, as `mrbokeh lens fit` writes it")
+    ends_m = np.array([NEAREST_M, FARTHEST_M])
+    largest = max(float(np.abs(_SOME_LENS.focused_at(each).coc_px(ends_m, plan.width_px)).max()) for each in plan.focus_distances_m)
+    return replace(_SOME_LENS, f_number=_SOME_LENS.f_number * largest / (_MOST_BLUR * high_px))
+
+
+def _claim(out: Path, document: dict[str, object], overwrite: bool) -> None:
+    """Go on only in a folder that is empty or was begun with the same plan: plan.json, written first, says which."""
+    path = out / PLAN_NAME
+    if path.exists() and not overwrite and read_json(path, "the plan of a set") != document:
+        raise InputError(f"{out} was begun with other settings: choose another folder, or --overwrite to replace its files")
+    if not path.exists() and out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} holds something else than a set of pairs: give the name of a new folder")
+    (out / MANIFEST).unlink(missing_ok=True)
+    write_json(path, document)
+
+
+def main(
+    bank: Annotated[Path, typer.Argument(help="Bank of PSFs, as `mrbokeh lens fit` or `mrbokeh lens psf` writes it.")],
+    out: Annotated[Path, typer.Option(help="Folder for the set.")],
+    scenes: Annotated[int, typer.Option(help="How many.", min=1)] = 10,
+    focuses: Annotated[int, typer.Option(help="Slices of each.", min=1)] = 5,
+    width: Annotated[int, typer.Option(help="Of the pictures, px.", min=16)] = 192,
+    height: Annotated[int, typer.Option(help="Of the pictures, px.", min=16)] = 112,
+    lens: Annotated[Path | None, typer.Option(help="Lens file whose blur the bank describes; without it one that fits it.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the scenes.")] = 1,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a set made with other settings.")] = False,
+) -> None:
+    """Render the missing stacks of a set by a bank of kernels."""
+    try:
+        plan = PairsPlan(scenes, focuses, width, height, seed)
+        dataset = make_bank_pairs(read_bank(bank), out, plan, None if lens is None else read_lens(lens), overwrite=overwrite)
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from None
+    typer.echo(f"{out}: {len(dataset.stacks)} stacks, largest circle of confusion {dataset.largest_coc_px:.1f} px")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,110 @@
+"""One viewpoint of a set as a FocalStack folder: slices through the lens, the same view through a pinhole, depth; each made once."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from datasets_scripts.bokeh_stacks_plan import StacksPlan
+from datasets_scripts.bokeh_stacks_scenes import bokeh_scene
+from datasets_scripts.truth_scene import pack
+from datasets_scripts.truth_sharp import sharp_layer
+from datasets_scripts.truth_tracer import Opening, Picture, TruthTracer
+from datasets_scripts.truth_tracer_choice import make_tracer
+from mrbokeh.camera_rgb import write_camera_rgb
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.image_metrics import psnr
+
+NOISE_FLOOR = "noiseFloorDb"
+# Two halves differ by twice the variance of one, their mean has half of it: a quarter, 6.02 dB.
+_MEAN_OVER_DIFFERENCE_DB = 20.0 * np.log10(2.0)
+
+
+@dataclass(frozen=True)
+class Job:
+    """Files that are made together."""
+
+    paths: tuple[Path, ...]
+    make: Callable[[], None]
+
+    @property
+    def done(self) -> bool:
+        return all(path.is_file() for path in self.paths)
+
+
+class StackView:
+    """OUT/SCENE/VIEW. focus_distances_m: those of the plan, or others for a focus pull. variant: of Mitsuba, None for the best here."""
+
+    def __init__(
+        self,
+        folder: Path,
+        plan: StacksPlan,
+        scene: str,
+        view: int,
+        focus_distances_m: tuple[float, ...] | None = None,
+        variant: str | None = None,
+    ) -> None:
+        self.folder, self._plan, self._scene, self._view, self._variant = folder, plan, scene, view, variant
+        self.focus_distances_m = focus_distances_m or plan.focus_distances_m
+
+    def jobs(self) -> Iterator[Job]:
+        """stack.json comes last, when the pictures are there."""
+        yield Job((self.folder / "all_in_focus.exr", self.folder / "depth.exr"), self._make_sharp)
+        for index in range(len(self.focus_distances_m)):
+            yield Job((self.folder / slice_name(index),), partial(self._make_slice, index))
+        yield Job((self.folder / FILE_NAME,), self._make_stack)
+
+    @cached_property
+    def _tracers(self) -> tuple[TruthTracer, TruthTracer]:
+        """Equal but for their random numbers, so that their difference shows the noise."""
+        camera = self._plan.camera(self._scene, self._view)
+        packed = pack(bokeh_scene(self._scene), camera)
+        first, second = (make_tracer(packed, camera, "all", 2 * self._plan.seed + half, self._variant) for half in (0, 1))
+        return first, second
+
+    def defocused(self, opening: Opening) -> tuple[Picture, float]:
+        """(picture, its noise floor in dB: the PSNR that a perfect method would reach)."""
+        size = self._plan.size
+        first, second = (
+            tracer.traced(opening, self._plan.samples // 2).rgb + tracer.lamp_light(opening, size.lamp_rays // 2)
+            for tracer in self._tracers
+        )
+        return 0.5 * (first + second), float(psnr(first, second) + _MEAN_OVER_DIFFERENCE_DB)
+
+    def _make_slice(self, index: int) -> None:
+        rgb, noise_floor_db = self.defocused(self._plan.traced_opening(self.focus_distances_m[index]))
+        write_camera_rgb(self.folder / slice_name(index), rgb, None, attributes={NOISE_FLOOR: noise_floor_db})
+
+    def _make_sharp(self) -> None:
+        size = self._plan.size
+        first, second = (sharp_layer(tracer, self._plan.size.samples // 2, size.lamp_rays // 2) for tracer in self._tracers)
+        depth_m = first.depth_m
+        if not np.isfinite(depth_m).all():
+            raise InputError(f"{self._scene} is open somewhere: expected a scene in which every pixel has a depth")
+        confidence = np.ones_like(depth_m)
+        write_merged(self.folder, 0.5 * (first.rgb + second.rgb), self._focus_index(depth_m), confidence, depth_m)
+
+    def _focus_index(self, depth_m: np.ndarray) -> np.ndarray:
+        """The fractional index of the sharpest slice."""
+        dioptres = 1.0 / np.asarray(self.focus_distances_m)
+        order = np.argsort(dioptres)
+        return np.interp(1.0 / depth_m, dioptres[order], order.astype(np.float64)).astype(np.float32)
+
+    def _make_stack(self) -> None:
+        stack = FocalStack(
+            self.folder,
+            tuple(Slice(slice_name(index), distance_m) for index, distance_m in enumerate(self.focus_distances_m)),
+            lens=self._plan.lens(self.focus_distances_m[0]),
+            camera=self._plan.camera(self._scene, self._view),
+            registered=True,
+            merged=True,
+            metadata={"traced": True, "scene": self._scene, "shape": self._plan.shape, "opening": self._plan.opening.document()},
+        )
+        write_focal_stack(stack)
+
+
+def slice_name(index: int) -> str:
+    return f"slice_{index:02d}.exr"

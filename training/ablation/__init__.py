@@ -1,0 +1,1 @@
+"""Tables of trained variants: which choice of the network brings how much."""

@@ -1,0 +1,84 @@
+"""`mrbokeh train evaluate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mrbokeh.errors import InputError
+
+
+def evaluate_command(
+    networks: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="NETWORK... | NETWORK SCENE...",
+            help="Folders of runs and exported .onnx files. Without --data only the first is a network, the others are the data.",
+        ),
+    ],
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="A data set, or a folder of merged focal stacks or of such folders (repeat for more folders)."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for tables and pictures; of one network else the run, or beside the .onnx.")
+    ] = None,
+    renderer: Annotated[
+        list[str] | None,
+        typer.Option(help="Renderer to compare with (repeat for more), else polygon, low-rank, laplacian and scatter; `none` for none."),
+    ] = None,
+    reference: Annotated[bool, typer.Option(help="Also the scatter reference with the aperture of the lens (slow).")] = True,
+    pull: Annotated[int, typer.Option(min=0, help="Frames of the focus pull that shows flicker; 0 leaves it out.")] = 8,
+    lpips: Annotated[
+        Path | None, typer.Option(help="Weights of LPIPS as .onnx, which are not shipped; without them it is left out.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="Where runs compute: cpu, cuda.")] = "cpu",
+) -> None:
+    """Compare networks with no blur, Gaussians of the right size and our renderers on stacks that none of them was trained on.
+
+    Of a data set these are the viewpoints that the networks' runs held out, whatever was given as --held-out.
+
+    Example: mrbokeh train evaluate runs/paper runs/gated fast.onnx --data lens_50mm --out comparison
+
+    Example: mrbokeh train evaluate attic.onnx scenes/attic --out results
+    """
+    from training.evaluation.comparison import Extras, compare, unseen
+    from training.evaluation.methods import network_methods, plain_methods, renderer_methods
+    from training.evaluation.perceptual import OnnxPerceptualDistance
+    from training.evaluation.tables import gain_lines, table_rows
+    from training.training_data import training_data
+
+    networks, scenes = _networks_and_data(networks, data or [])
+    folder = _folder(networks, out)
+    of_networks, trained_on = network_methods(networks, device)
+    methods = [*of_networks, *plain_methods(), *renderer_methods(_renderers(renderer, reference))]
+    extras = Extras(None if lpips is None else OnnxPerceptualDistance(lpips), pull)
+    result = compare(methods, unseen(training_data(scenes).stacks, trained_on), folder, extras)
+    for name, decibel, similarity, *_ in table_rows(result):
+        typer.echo(f"{name:22s} {decibel:>7s} dB   SSIM {similarity}")
+    for line in gain_lines(result):
+        typer.echo(line)
+    typer.echo(f"written to {folder}: evaluation.md, evaluation.csv, evaluation.png, evaluation_crops.png")
+
+
+def _networks_and_data(paths: list[Path], data: list[Path]) -> tuple[list[Path], list[Path]]:
+    if data:
+        return paths, data
+    if len(paths) < 2:
+        raise InputError(f"expected the data to evaluate {paths[0]} on, got none: give --data")
+    return paths[:1], paths[1:]
+
+
+def _folder(networks: list[Path], out: Path | None) -> Path:
+    if out is not None:
+        return out
+    if len(networks) > 1:
+        raise InputError(f"expected a folder for the comparison of {len(networks)} networks, got none: give --out")
+    return networks[0] if networks[0].is_dir() else networks[0].parent
+
+
+def _renderers(names: list[str] | None, reference: bool) -> list[str]:
+    from training.evaluation.methods import RENDERERS
+
+    chosen = [] if names == ["none"] else names or list(RENDERERS)
+    return [name for name in chosen if reference or name != "scatter"]

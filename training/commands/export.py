@@ -1,0 +1,58 @@
+"""`mrbokeh train export`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from mrbokeh.renderers.onnx_network import NetworkFacts
+
+
+def export_command(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
+    out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
+    fast: Annotated[bool, typer.Option("--fast", help="Make it fast on a CPU, at the price of a few tenths of a decibel.")] = False,
+    max_psnr_loss: Annotated[float, typer.Option(min=0.0, help="With --fast: decibel that may be lost.")] = 0.2,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="With --fast: focal stacks to measure the loss against the truth (repeat for more); else a made-up picture."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+) -> None:
+    """Write the network as ONNX, with its lens inside, after checking that ONNX Runtime agrees with PyTorch.
+
+    With --fast large kernels run at a fraction of the resolution, or as sums of separable ones, as boldly as the budget allows; nothing
+    is written where it is not met.
+
+    Example: mrbokeh train export runs/attic --out attic.onnx
+
+    Example: mrbokeh train export runs/attic --out attic_fast.onnx --fast --max-psnr-loss 0.1 --data scenes/attic
+    """
+    from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.errors import InputError
+
+    if data and not fast:
+        raise InputError("--data measures what --fast loses: add --fast, or leave --data out")
+    refuse_existing(out, overwrite)
+    if fast:
+        _export_fast(run, out, max_psnr_loss, data or [])
+        return
+    from training.export_onnx import export_run
+
+    exported = export_run(run, out)
+    typer.echo(f"{out}: ONNX Runtime differs from PyTorch by {exported.difference:.1e}; takes {_sizes(exported.facts)}")
+
+
+def _export_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]) -> None:
+    from training.fast_export.export import export_fast_run
+
+    done = export_fast_run(run, out, max_psnr_loss_db, data)
+    against = "the truth" if data else "the trained network, on a made-up picture"
+    typer.echo(f"{out}: {done.naive_ms:.0f} ms plain, {done.fast_ms:.0f} ms fast, {done.naive_ms / done.fast_ms:.1f} times faster")
+    typer.echo(f"loses {done.loss_db:.3f} dB of at most {max_psnr_loss_db:g} dB, measured against {against}; takes {_sizes(done.facts)}")
+    typer.echo(done.plan.words())
+
+
+def _sizes(facts: "NetworkFacts") -> str:
+    return f"only {facts.width_px}x{facts.height_px} px" if facts.tiled else "any size"

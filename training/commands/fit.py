@@ -1,0 +1,136 @@
+"""`mrbokeh train fit`."""
+
+import math
+import os
+import shutil
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mrbokeh.errors import InputError
+from training.commands.arguments import Scenes
+from training.settings_overrides import with_overrides
+
+if TYPE_CHECKING:
+    from training.checkpoint import Progress
+    from training.settings import TrainSettings
+
+
+class Preset(StrEnum):
+    paper = "paper"
+    demo = "demo"
+    better = "better"
+
+
+def fit_command(
+    scenes: Scenes,
+    out: Annotated[Path, typer.Option(help="Folder of the run: settings, checkpoint, curve, network.")],
+    preset: Annotated[
+        Preset,
+        typer.Option(
+            help="paper: as published; demo: our gated form, learns in minutes on two cores; better: with kernels by place and colour."
+        ),
+    ] = Preset.paper,
+    minutes: Annotated[float | None, typer.Option(min=0.01, help="Budget in minutes; the learning rate follows it.")] = None,
+    epochs: Annotated[int | None, typer.Option(min=1, help="Budget in epochs, instead of minutes.")] = None,
+    held_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Stack to keep for testing (repeat for more), instead of the split of the data set; of scenes else a fifth is drawn."
+        ),
+    ] = None,
+    settings_file: Annotated[Path | None, typer.Option("--settings", help="A settings.json to start from instead of a preset.")] = None,
+    choices: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Any setting of settings.json (repeat for more), as in batch=4 or network.tile_px=96; none for no value.",
+        ),
+    ] = None,
+    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0 takes all.")] = None,
+    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of weights and batches.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Start again where a run exists.")] = False,
+) -> None:
+    """Train a network on focal stacks; run again after an interruption and it goes on where it stopped.
+
+    A data set brings its split by viewpoint, its radiance scale and its largest circle of confusion, which decides the network's N.
+    Pixels that moved, have no data, show a calibration board, are saturated or have no trustworthy depth do not count.
+
+    On several GPUs or machines torchrun starts it: every process takes its own pictures, `batch` of them a step. After an interruption it
+    may go on with another number of processes: through the same pictures in the same order, but so many fewer or more a step.
+
+    Example: mrbokeh train fit lens_50mm --out runs/50mm
+
+    Example: mrbokeh train fit scenes/attic --preset demo --minutes 2.5 --held-out view_3 --out runs/attic
+
+    Example: mrbokeh train fit lens_50mm --set network.tile_px=96 --set network.overlap_px=24 --set loss_scope=tile --out runs/tiles
+
+    Example: torchrun --nproc-per-node 4 -m training fit lens_50mm --set precision=bfloat16 --out runs/50mm
+    """
+    # Threads that wait for one another in a busy loop make training many times slower as soon as anything else uses a core.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read by OpenMP when torch is loaded, in the next lines
+    budget: dict[str, Any] = {"minutes": minutes, "epochs": epochs} if minutes is not None or epochs is not None else {}
+    given = {"threads": threads, "device": device, "seed": seed}
+    try:
+        settings = with_overrides(_begun_with(preset, settings_file), choices or ())
+        settings = replace(settings, **budget | {name: value for name, value in given.items() if value is not None})
+        if overwrite and out.exists() and _number("RANK") == 0:
+            _remove_run(out)
+        _fit(scenes, out, settings, held_out or [])
+    except InputError:
+        if _number("LOCAL_RANK"):  # one sentence for each machine
+            raise typer.Exit(2) from None
+        raise
+
+
+def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str]) -> None:
+    from training.interruption import StoppedError
+    from training.train import fit
+    from training.training_data import training_data
+
+    code, said = 0, ""
+    try:
+        said = f"{out}: {_summary(fit(training_data(scenes), out, settings, held_out))}"
+    except StoppedError as stop:
+        code, said = stop.exit_code, f"stopped; the checkpoint in {out} is kept, run the same command again to go on"
+    except KeyboardInterrupt:
+        code, said = 130, "stopped at once; the same command goes on from the last checkpoint, if there is one"
+    if _number("RANK") == 0:
+        typer.echo(said, err=code != 0)
+    raise typer.Exit(code)
+
+
+def _summary(progress: "Progress") -> str:
+    looks = [point.held_out_psnr_db for point in progress.curve if not math.isnan(point.held_out_psnr_db)]
+    said = f"{progress.step} steps in {progress.elapsed_s:.0f} s, loss {progress.smoothed_loss:.2e}"
+    if looks:
+        said += f", held-out slices {looks[-1]:.2f} dB"
+    if progress.stopped_early:
+        said += f"; stopped early, for nothing was better in {progress.looks_since_best} looks"
+    if looks and progress.kept_step != progress.step:
+        said += f"; kept the weights of step {progress.kept_step}, {progress.best_psnr_db:.2f} dB"
+    return said
+
+
+def _number(name: str) -> int:
+    """Of this process, as torchrun tells it: RANK among all, LOCAL_RANK on its machine."""
+    return int(os.environ.get(name, "0"))
+
+
+def _begun_with(preset: Preset, settings_file: Path | None) -> "TrainSettings":
+    from training.presets import PRESETS
+    from training.settings import load_settings
+
+    return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
+
+
+def _remove_run(out: Path) -> None:
+    """Remove an earlier run, and nothing that is not one."""
+    if not (out / "settings.json").exists() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty and holds no training run: give another --out")
+    shutil.rmtree(out)

@@ -1,0 +1,1 @@
+"""Networks and classical renderers against photographs that none of them has seen."""

@@ -1,0 +1,46 @@
+"""Being asked to stop: Ctrl-C, or the SIGTERM with which batch systems announce that time is up."""
+
+import signal
+import threading
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StoppedError(KeyboardInterrupt):
+    """The run was asked to stop and its checkpoint is written; number: of the signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.number = number
+
+    @property
+    def exit_code(self) -> int:
+        """As shells give it: 130 after Ctrl-C, 143 after SIGTERM."""
+        return 128 + self.number
+
+
+class Interruption:
+    """A block in which the signals only leave a note, so that a step is never torn; `asked` holds the last one.
+
+    Of a process on its own a second Ctrl-C stops at once, without a checkpoint (torchrun passes on what its children have got already).
+    """
+
+    def __init__(self, alone: bool = True) -> None:
+        self.asked: int | None = None
+        self._alone = alone
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> "Interruption":
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self._alone and self.asked == number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.asked = number

@@ -1,0 +1,128 @@
+"""One run in memory: steps until the budget is used, with looks at held-out slices and checkpoints between them."""
+
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+
+import numpy as np
+import torch
+from rich.progress import Progress as Bars
+
+from mrbokeh.progress import progress_bars
+from training.batches import Batch, draw_share
+from training.checkpoint import FILE_NAME as CHECKPOINT_NAME
+from training.checkpoint import Progress, read_checkpoint, restore_checkpoint
+from training.crops import Drawing
+from training.distributed import Ranks
+from training.interruption import Interruption, StoppedError
+from training.learner import Learner
+from training.objective import learning_rate_factor, loss
+from training.record import Record, Task
+from training.run_folder import build_network
+
+
+class Run:
+    """The constructor restores a checkpoint where there is one. Every process has a run; that of the first one writes and looks."""
+
+    def __init__(self, task: Task, ranks: Ranks) -> None:
+        self.task, self.settings, self.ranks = task, task.settings, ranks
+        torch.set_num_threads(self.settings.threads or max(1, (os.cpu_count() or 1) // ranks.local_count))
+        self.learner = Learner(build_network(self.settings, task.facts), self.settings, ranks.device)
+        self._rng = np.random.default_rng(self.settings.seed)
+        self.progress = self._restored()
+        self._record = Record(task, self.learner, self.progress, self._rng)
+        self._halo_px = math.ceil(task.facts.largest_coc_px / 2.0)
+        self._interruption = Interruption(alone=ranks.count == 1)
+        self._stopped_by: int | None = None
+        self._started_s = time.monotonic() - self.progress.elapsed_s
+        self._saved_s = self._looked_s = self.progress.elapsed_s
+
+    def train(self) -> Progress:
+        """Use the rest of the budget; raises StoppedError, with a checkpoint, where any process is asked to stop."""
+        if self.progress.finished:
+            return self.progress
+        with self._interruption:
+            self._loop()
+            if self._stopped_by is not None:
+                self._save()
+                raise StoppedError(self._stopped_by)
+            self.ranks.from_first(self._record.finish)
+        return self.progress
+
+    def _restored(self) -> Progress:
+        path = self.task.folder / CHECKPOINT_NAME
+        state = self.ranks.from_first(lambda: read_checkpoint(path))
+        return Progress() if state is None else restore_checkpoint(path, state, self.learner, self._rng)
+
+    def _done(self) -> float:
+        """How much of the budget is used, in [0, 1]."""
+        if self.settings.epochs is not None:
+            return min(1.0, self.progress.pictures / (self.settings.epochs * len(self.task.pairs)))
+        return min(1.0, self.progress.elapsed_s / (60.0 * (self.settings.minutes or 0.0) + 1e-9))
+
+    def _loop(self) -> None:
+        with self._bars() as bars:
+            bar = bars.add_task("train", total=1000)
+            while (done := self._done()) < 1.0 and self._stopped_by is None and not self.progress.stopped_early:
+                self._step(learning_rate_factor(done, self.settings.warm_up))
+                bars.update(bar, completed=1000 * self._done(), description=f"train, loss {self.progress.smoothed_loss:.2e}")
+                self._keep()
+
+    def _step(self, rate_factor: float) -> None:
+        """One update from `batch` pictures of each process, one after the other: a picture uses few of the network's bins, all
+        together most of them."""
+        self.learner.begin(rate_factor)
+        mean_loss = self._agree(sum(self._learn_from(batch) for batch in self._draw()))
+        self.learner.apply(self.progress.step)
+        self.progress.took_step(mean_loss, self.settings.batch * self.ranks.count)
+
+    def _draw(self) -> Iterator[Batch]:
+        """The pictures of this process, one by one. All draw from one sequence and pass over the pictures of the others, so that it
+        does not matter who draws what: two processes see what one with twice the batch sees."""
+        settings, noise = self.settings, self.settings.depth_noise
+        drawing = Drawing(self.task.pairs, settings.batch, settings.crop_px, self._halo_px, settings.crops_per_picture, noise > 0.0)
+        place, most_px = (self.ranks.number, self.ranks.count), self.task.facts.largest_coc_px
+        for batch in draw_share(drawing, self._rng, *place, depth_noise=noise, largest_coc_px=most_px):
+            yield batch.to(self.ranks.device)
+
+    def _learn_from(self, batch: Batch) -> float:
+        """Add the gradients of one picture."""
+        facts, settings = self.task.facts, self.settings
+        with self.learner.autocast():
+            error = loss(self.learner.network, batch, facts.radiance_scale, facts.largest_coc_px, settings) / settings.batch
+        self.learner.backward(error)
+        return error.item()
+
+    def _agree(self, own_loss: float) -> float:
+        """Average gradients and loss over all processes; all take the clock of the first, and stop when one is asked to."""
+        asked, elapsed_s = self._interruption.asked, self._now_s() if self.ranks.first else 0.0
+        own = (own_loss, elapsed_s, float(asked == signal.SIGINT), float(asked == signal.SIGTERM))
+        losses, self.progress.elapsed_s, by_key, by_system = self.ranks.average_gradients(self.learner.network, own)
+        if by_key or by_system:
+            self._stopped_by = signal.SIGTERM if by_system else signal.SIGINT
+        return losses / self.ranks.count
+
+    def _now_s(self) -> float:
+        return time.monotonic() - self._started_s
+
+    def _keep(self) -> None:
+        """Looks and checkpoints, where they are due."""
+        now_s = self.progress.elapsed_s
+        if self.ranks.first:
+            self._record.note_if_due(self._done())
+        if self.settings.validate_every_s and now_s - self._looked_s >= self.settings.validate_every_s:
+            # The next look is due an interval after this one ended, or long looks would leave no time to learn.
+            self.progress.stopped_early, self._looked_s = self.ranks.from_first(lambda: (self._record.look(), self._now_s()))
+        if now_s - self._saved_s >= self.settings.checkpoint_every_s:
+            self._save()
+            self._saved_s = now_s
+
+    def _save(self) -> None:
+        if self.ranks.first:
+            self._record.save()
+
+    def _bars(self) -> AbstractContextManager[Bars]:
+        return progress_bars() if self.ranks.first else nullcontext(Bars(disable=True))
