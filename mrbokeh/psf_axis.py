@@ -8,7 +8,8 @@ from jaxtyping import Float, Float64
 
 from mrbokeh.errors import InputError
 
-AxisName = Literal["diameter_px", "motion_px", "depth_m", "eccentricity"]
+AxisName = Literal["diameter_px", "motion_px", "depth_m", "eccentricity", "field_x", "field_y"]
+_SIGNED = ("diameter_px", "field_x", "field_y")
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Axis:
     paper's Table 1).
 
     name: diameter_px, the circle of confusion (diameter); motion_px, path per shutter; depth_m, along the optical axis;
-    eccentricity, distance from the middle of the frame in half diagonals.
+    eccentricity, distance from the middle of the frame in half diagonals; field_x and field_y, how far right and down of it.
     A diameter axis that begins at 0 or above serves both sides of the focus: its coordinates are taken without their sign.
     One from -high to high keeps the sides apart; its unit coordinate is 1/2 in focus and fine on both sides of it.
     in_dioptres: the share is one of 1 / depth, in which the circle of confusion is linear; `high` may then be inf.
@@ -41,13 +42,16 @@ class Axis:
             raise InputError(f"the axis {self.name} needs a positive exponent, got {self.exponent}")
         if self.in_dioptres and not self.low > 0.0:
             raise InputError(f"a depth in dioptres needs a range that begins above 0 m, got {self.low}")
-        if self.low < 0.0 and (self.name != "diameter_px" or self.low != -self.high):
-            raise InputError(f"only diameter_px may be negative, and then from -high to high, got {self.name} {self.low} to {self.high}")
+        if self.low < 0.0 and (self.name not in _SIGNED or self.low != -self.high):
+            raise InputError(
+                f"only diameter_px may be negative, and field_x and field_y, and then from -high to high, got {self.name} {self.low} to "
+                f"{self.high}"
+            )
 
     @property
     def is_signed(self) -> bool:
-        """Whether the two sides of the focus lie apart."""
-        return self.low < 0.0
+        """Whether the two sides of the focus, or of the frame, lie apart."""
+        return bool(self.low < 0.0)
 
     def to_unit(self, coordinate: Float[np.ndarray, "*batch"] | float) -> Float64[np.ndarray, "*batch"]:
         """Physical to unit coordinate; what lies beyond the range goes to its nearer end."""

@@ -113,7 +113,7 @@ def check_space(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, t
     if not axes or len(axes) != len(counts) or len(set(names)) != len(names):
         raise InputError(f"a bank needs different axes and a count for each, got {names} and {counts}")
     if nested and any(axis.is_signed for axis in axes):
-        raise InputError("a bank over signed diameters needs a regular grid (nested=False): a nested one is fine at one end only")
+        raise InputError("a bank over signed coordinates needs a regular grid (nested=False): a nested one is fine at one end only")
     if turns not in get_args(Turns):
         raise InputError(f"a bank turns by one of {', '.join(get_args(Turns))}, got {turns!r}")
 

@@ -15,7 +15,14 @@ if TYPE_CHECKING:
 KERNELS_IN_ROW = 6
 _TICKS = np.linspace(0.0, 1.0, 5)
 _COLOURS = {1: ("black",), 3: ("tab:red", "tab:green", "tab:blue")}
-_SHORT = {"diameter_px": "circle of confusion, px", "motion_px": "motion, px", "depth_m": "depth, m", "eccentricity": "eccentricity"}
+_SHORT = {
+    "diameter_px": "circle of confusion, px",
+    "motion_px": "motion, px",
+    "depth_m": "depth, m",
+    "eccentricity": "eccentricity",
+    "field_x": "right of the middle, half diagonals",
+    "field_y": "below the middle, half diagonals",
+}
 
 
 def draw_bank(bank: PsfBank) -> "Figure":
@@ -59,7 +66,7 @@ def _draw_kernels(figure: "Figure", place: "SubplotSpec", bank: PsfBank) -> None
     for index, cell in enumerate(cells):
         axes = figure.add_subplot(grid[index // KERNELS_IN_ROW, index % KERNELS_IN_ROW])
         axes.imshow(_shown(bank.kernels[cell]), interpolation="nearest")
-        axes.set_title(", ".join(f"{value:.3g}" for value in bank.centres[cell]), fontsize=7)
+        axes.set_title(", ".join(f"{value:.3g}" for value in bank.centres[cell].round(9) + 0.0), fontsize=7)
         axes.axis("off")
 
 

@@ -21,6 +21,7 @@ FORMAT = "mrbokeh-psf-bank"
 VERSION = 1
 HEAD = "bank.json"
 SPREADLETS, SPREADLETS_PART = "spreadlets.npz", "spreadlets.part"
+POLYGONS, LOW_RANK = "polygons.npz", "low_rank.npz"
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def clear_bank(folder: Path | str) -> None:
     """Remove the files of a bank and their caches, and nothing else; the description goes last."""
     folder = Path(folder)
     cells, parts = (folder / "cells").glob("[0-9]*.npy"), (folder / SPREADLETS_PART).glob("[0-9]*.npz")
-    for path in [*sorted(cells), *sorted(parts), folder / SPREADLETS, folder / HEAD]:
+    for path in [*sorted(cells), *sorted(parts), *(folder / name for name in (SPREADLETS, POLYGONS, LOW_RANK, HEAD))]:
         path.unlink(missing_ok=True)
 
 

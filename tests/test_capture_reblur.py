@@ -1,7 +1,7 @@
 """The re-blur residual: a traced stack with its truth passes every gate, and each fault fails the gate that names it."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,27 +15,13 @@ from capture.report.moving_objects import noise_deviation
 from capture.report.reblur import Reblur
 from capture.report.slice_fit import NAMES, Prediction, fit_slice, normal_equations
 from capture.report.stack_gates import stack_gates
-from capture.report.stack_rules import (
-    BLUR,
-    DEPTH,
-    EXPOSURE,
-    FOCUS,
-    LARGEST_BLUR_GAIN,
-    LARGEST_FOCUS_PX,
-    LARGEST_SHIFT_PX,
-    MOTION,
-    PLACE,
-    RESIDUAL,
-    SPACING,
-)
+from capture.report.stack_rules import BLUR, DEPTH, EXPOSURE, FOCUS, MOTION, PLACE, RESIDUAL, SPACING
 from capture.report.stack_view import StackView
 from mrbokeh.aperture import Aperture
 from mrbokeh.focal_stack import FocalStack
 from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
+from mrbokeh.layer import opaque
 from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from tests.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
@@ -102,16 +88,6 @@ def test_the_exact_renderer_says_the_same(right: FocalStack) -> None:
     coc_px = view.coc_px(5)
     fast, exact = (each(view.all_in_focus, coc_px, view.aperture) for each in (REBLUR, Reblur(ScatterReference(threads=1))))
     assert psnr(fast, exact) > 52.0
-
-
-@dataclass(frozen=True)
-class Whole:
-    """A renderer whose slices of depth nobody can make fewer."""
-
-    renderer: Renderer
-
-    def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        return self.renderer.render(layers, lens)
 
 
 def f_number_wrong(stack: FocalStack, _: TracedStack, __: Path) -> FocalStack:
@@ -197,9 +173,10 @@ def test_every_fault_fails_the_gate_that_names_it(
 def test_slices_beside_the_wrong_one_are_not_blamed(
     fault: Callable[[FocalStack, TracedStack, Path], FocalStack], right: FocalStack, truth: TracedStack, tmp_path: Path
 ) -> None:
-    fits = [each.fit for each in findings_of(fault(right, truth, tmp_path)).slices]
-    assert all(fits[i] is not None and not fits[i].focus_px.exceeds(0.6) for i in (0, 1, 4, 5))
-    assert fits[2] is not None and fits[2].focus_px.exceeds(0.6)
+    fits = [each.fit for each in findings_of(fault(right, truth, tmp_path)).slices if each.fit is not None]
+    assert len(fits) == SLICES
+    assert not any(fits[i].focus_px.exceeds(0.6) for i in (0, 1, 4, 5))
+    assert fits[2].focus_px.exceeds(0.6)
 
 
 def test_what_moved_is_found_where_it_moved(truth: TracedStack, tmp_path: Path) -> None:
@@ -262,21 +239,6 @@ def test_sums_of_cells_are_those_of_their_pixels() -> None:
             product = (columns[i].astype(float) * columns[j] * weight[..., None]).sum(axis=2)
             expected = np.bincount(cell.ravel(), product.ravel(), minlength=48)
             np.testing.assert_allclose(sides[:, i] if j == 3 else matrices[:, i, j], expected, atol=1e-5)
-
-
-def test_coarse_predictions_have_the_same_differences(right: FocalStack) -> None:
-    """The exact way is to render the two neighbours as the slice itself; the fit moves by less than a tenth of what the gates allow."""
-    usual = Reblur(PolygonDifferences(threads=1))
-    view = StackView(right)
-    for index in (0, 3):
-        exact = predict(view, index, replace(usual, renderer=Whole(usual.renderer)))
-        coarse = predict(view, index, usual)
-        np.testing.assert_array_equal(coarse.rgb, exact.rgb)
-        assert not np.array_equal(coarse.more, exact.more)
-        fits = [fit_slice(view.slice_rgb(index), each, inside(exact.rgb.shape))[0] for each in (exact, coarse)]
-        assert fits[1].focus_px.value == pytest.approx(fits[0].focus_px.value, abs=0.1 * LARGEST_FOCUS_PX)
-        assert fits[1].blur_gain.value == pytest.approx(fits[0].blur_gain.value, abs=0.1 * LARGEST_BLUR_GAIN)
-        assert fits[1].shift_x_px.value == pytest.approx(fits[0].shift_x_px.value, abs=0.1 * LARGEST_SHIFT_PX)
 
 
 def test_the_fit_reads_back_the_changes_that_were_made() -> None:

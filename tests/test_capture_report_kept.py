@@ -14,14 +14,14 @@ from capture.report.findings import SliceFindings, StackFindings
 from capture.report.findings_json import findings_document, findings_from
 from capture.report.focus_curve import FocusCurve
 from capture.report.reblur import Reblur
-from capture.report.scene_report import report_scene
+from capture.report.scene_report import examine_stack, report_scene
 from capture.report.slice_fit import Change, SliceFit
 from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
-from tests.traced_focal_stack import SLICES, traced, write_stack
+from tests.traced_focal_stack import HEIGHT_PX, SLICES, WIDTH_PX, traced, write_stack
 
 NAMES = ("view_0", "view_1")
 
@@ -175,6 +175,23 @@ def test_findings_are_read_back_exactly(scene: Path) -> None:
     back = findings_from(read_json(scene / "there.json", "findings"), stack)
     np.testing.assert_array_equal(back.curve.shares, findings.curve.shares)
     assert replace(back, curve=findings.curve) == findings
+
+
+def test_finished_stacks_hold_neither_pictures_nor_maps(reported: Path) -> None:
+    """What a finished stack holds is far less than a single map of its pixels, 4 bytes each."""
+    import tracemalloc
+
+    stack = write_stack(reported / "view_2", traced())
+    tracemalloc.start()
+    try:
+        examine_stack(stack, Reblur(Counting(), "none"), 160)
+        before = tracemalloc.get_traced_memory()[0]
+        examined = [examine_stack(read_focal_stack(reported / name), Reblur(Counting(), "none"), 160, overwrite=True) for name in NAMES]
+        held = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert all(len(each.pictures) > 5 for each in examined)
+    assert held / len(examined) < 4 * WIDTH_PX * HEIGHT_PX, held
 
 
 def test_the_command_tells_what_was_kept(tmp_path: Path) -> None:

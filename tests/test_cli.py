@@ -17,7 +17,8 @@ COMMANDS = [
     ["capture", "shoot"], ["capture", "poses"], ["capture", "scale"], ["capture", "depth"], ["capture", "report"],
     ["capture", "dataset"], ["capture", "process"], ["train"], ["train", "fit"], ["train", "evaluate"], ["train", "export"],
     ["train", "ablate"],
-    ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"], ["render"], ["composite"], ["video"],
+    ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
+    ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"],
     ["viewfinder"], ["viewfinder", "serve"], ["demo"], ["doctor"],
 ]  # fmt: skip
 

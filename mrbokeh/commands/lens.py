@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from mrbokeh.commands.lens_fit import fit
+from mrbokeh.commands.lens_match import match
 from mrbokeh.commands.lens_pictures import export, show
 from mrbokeh.commands.lens_psf import psf, spreadlets
 from mrbokeh.errors import InputError
@@ -112,5 +114,5 @@ def coc(
         typer.echo(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px")
 
 
-for command in (psf, spreadlets, show, export):
+for command in (psf, spreadlets, show, export, fit, match):
     app.command()(command)

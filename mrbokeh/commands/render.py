@@ -34,7 +34,9 @@ def render(
     method: Annotated[
         str, typer.Option("--method", "--renderer", help="polygon, low-rank, laplacian, lrdm, scatter (exact, slow), or a network (.onnx).")
     ] = DEFAULT,
-    psf: Annotated[Path | None, typer.Option(help="Bank of PSFs in place of the lens's opening, for --method laplacian.")] = None,
+    psf: Annotated[
+        Path | None, typer.Option(help="Bank of PSFs in place of the opening, for polygon, low-rank, laplacian, scatter.")
+    ] = None,
     focus_distance_m: Annotated[float | None, typer.Option(help="Focus distance in place of the lens file's; inf is allowed.")] = None,
     focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None,
     srgb: Annotated[bool, typer.Option("--srgb", help="--rgb holds integers encoded as sRGB (highlights are lost).")] = False,

@@ -56,7 +56,7 @@ class BankTables:
     @cached_property
     def needed(self) -> frozenset[str]:
         """What a `Place` must hold: "motion", "field", "depth"."""
-        of_axes = {"motion_px": "motion", "eccentricity": "field", "depth_m": "depth"}
+        of_axes = {"motion_px": "motion", "eccentricity": "field", "field_x": "field", "field_y": "field", "depth_m": "depth"}
         names = {self.bank.turns, *(of_axes.get(axis.name, "none") for axis in self.bank.axes)}
         return frozenset(names - {"none"})
 
@@ -130,7 +130,8 @@ class BankTables:
             return self._needed(place.depth_m, "depth")
         if name == "motion_px":
             return np.hypot(*np.moveaxis(self._needed(place.motion_px, "motion"), -1, 0))
-        return np.hypot(*np.moveaxis(self._needed(place.field_xy, "the place in the frame"), -1, 0))
+        right, down = np.moveaxis(self._needed(place.field_xy, "the place in the frame"), -1, 0)
+        return {"field_x": right, "field_y": down}.get(name, np.hypot(right, down))
 
     def _needed(self, plane: np.ndarray | None, what: str) -> np.ndarray:
         if plane is None:

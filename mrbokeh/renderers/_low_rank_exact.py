@@ -9,6 +9,7 @@ from jaxtyping import Float32, Int
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.psf import kernel_radius_px
+from mrbokeh.renderers._bank_opening import KernelOpening
 
 _BEGINS_PX = np.array([0.0, 32.0, 64.0, 128.0, 256.0])
 _KERNELS_PER_PX = np.array([16.0, 8.0, 4.0, 2.0, 1.0])
@@ -38,7 +39,7 @@ def scatter_exactly(
     values: Float32[np.ndarray, "height width channels"],
     shares: Float32[np.ndarray, "height width"],
     diameters_px: Float32[np.ndarray, "height width"],
-    aperture: Aperture,
+    aperture: Aperture | KernelOpening,
     sign: int,
     each: Callable[[Callable, Iterable], Iterable] = map,
 ) -> None:
@@ -53,7 +54,7 @@ def scatter_exactly(
         _add_inside(out, band, top, left)
 
 
-def _tables(diameters_px: Float32[np.ndarray, " pixels"], aperture: Aperture, sign: int) -> _Tables:
+def _tables(diameters_px: Float32[np.ndarray, " pixels"], aperture: Aperture | KernelOpening, sign: int) -> _Tables:
     """The kernel of every diameter in use if they are few, as lights are; else kernels at fixed steps."""
     own_px, lowers = np.unique(diameters_px, return_inverse=True)
     taps_each = (2 * kernel_radius_px(float(own_px[-1]), aperture.unit_radius) + 1) ** 2

@@ -1,5 +1,6 @@
 """A renderer by its name on the command line; the only module that knows them all."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,18 +47,22 @@ def _lrdm(**settings: Any) -> Renderer:
 BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "lrdm": _lrdm, "scatter": _scatter}
 
 ON_DEVICES = ("laplacian", "lrdm")
+WITH_BANKS = ("polygon", "low-rank", "laplacian", "scatter")
 
 
-def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:
+def make_renderer(
+    name: str, *, threads: int = 0, layering: Layering | None = None, device: str = "", kernels: Mapping[str, Any] | None = None
+) -> Renderer:
     """The renderer of that name, or the network in that .onnx file (which takes every layer as it is, without slices).
 
+    kernels: `bank`, and what is known of it already, as the renderer's constructor takes them (those of WITH_BANKS).
     device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there, where the renderer has such a twin.
     """
     if device and name not in ON_DEVICES:
         raise InputError(f"--device is for --method {' or '.join(ON_DEVICES)}, got {name!r}: the others run on the CPU, leave --device out")
     if name in BY_NAME:
         on = {"device": device} if device else {}
-        return BY_NAME[name](threads=threads, layering=layering or Layering(), **on)
+        return BY_NAME[name](threads=threads, layering=layering or Layering(), **on, **kernels or {})
     if name.lower().endswith(".onnx"):
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 

@@ -15,17 +15,21 @@ see _low_rank_highlights. Beside a bright area that just fails to count as one, 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 
 from mrbokeh.aperture import Aperture
+from mrbokeh.bank_low_rank import BankTerms
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
 from mrbokeh.low_rank import LowRankKernel, decompose
+from mrbokeh.psf_bank import PsfBank
+from mrbokeh.renderers._bank_opening import KernelOpening
+from mrbokeh.renderers._bank_renderers import BankRenderer, by_low_rank
 from mrbokeh.renderers._low_rank_exact import scatter_exactly
 from mrbokeh.renderers._low_rank_highlights import LEAST_RADIUS_PX, exact_share
 from mrbokeh.renderers._low_rank_levels import Levels, Taps, levels_of, taps_of
@@ -45,6 +49,8 @@ class LowRankFilter:
     relative_error: the rank of every kernel is the least from 4 on with this error (McGraw, Eq. 4), at most max_rank.
     per_pixel: McGraw's two passes of varying width with a mask near edges of depth, in place of levels (slower, less exact).
     threads: 0 takes all cores.
+    bank: kernels to use instead of the lens's aperture (what is blurred by up to 1 px stays sharp, other kernels are blended between
+      those of the bank around a pixel); terms: its own, if they have been computed before.
 
     It is linear but for two steps. Which pixels count as highlights depends on ratios to their surroundings: light scaled as
     a whole gives the scaled result, but two pictures spread apart may not add up to their sum to better than relative_error
@@ -57,6 +63,8 @@ class LowRankFilter:
     layering: Layering = field(default_factory=Layering)
     per_pixel: bool = False
     threads: int = 0
+    bank: PsfBank | None = None
+    terms: BankTerms | None = field(default=None, repr=False)
     _kernels: dict[tuple[bytes, float], LowRankKernel] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -67,10 +75,19 @@ class LowRankFilter:
             )
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        return render_layers(layers, lens, self.spread, self.layering)
+        if self._of_bank is None or not layers:
+            return render_layers(layers, lens, self.spread, self.layering)
+        return self._of_bank.render(layers, lens, self.layering)
+
+    @cached_property
+    def _of_bank(self) -> BankRenderer | None:
+        return None if self.bank is None else by_low_rank(self.bank, self.terms, self.spread)
 
     def spread(
-        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+        self,
+        values: Float32[np.ndarray, "height width channels"],
+        coc_px: Float32[np.ndarray, "height width"],
+        aperture: Aperture | KernelOpening,
     ) -> Float32[np.ndarray, "height width channels"]:
         """See mrbokeh.spreading.Spread."""
         if values.shape[2] > _MOST_CHANNELS:
@@ -92,7 +109,7 @@ class LowRankFilter:
         values: Float32[np.ndarray, "height width channels"],
         diameters_px: Float32[np.ndarray, "height width"],
         coc_px: Float32[np.ndarray, "height width"],
-        aperture: Aperture,
+        aperture: Aperture | KernelOpening,
         sign: int,
         each: Callable[[Callable, Iterable], Iterable],
     ) -> None:
@@ -108,19 +125,24 @@ class LowRankFilter:
         if self.per_pixel:
             scatter_per_pixel(out, values, shares, diameters_px, kernel_at, sign < 0, each)
             return
-        levels = levels_of(diameters_px, exact)
+        levels = aperture.levels(diameters_px, exact) if isinstance(aperture, KernelOpening) else levels_of(diameters_px, exact)
         _scatter_levels(out, values, shares, levels, taps_of(levels, kernel_at, sign < 0), each)
 
-    def _kernel(self, aperture: Aperture, diameter_px: float) -> LowRankKernel:
-        """The decomposed PSF, kept for the next call; small ones at full rank."""
+    def decomposed(self, kernel: Float64[np.ndarray, "size size"]) -> LowRankKernel:
+        """As few terms of a kernel as the settings allow; small ones at full rank."""
+        small = len(kernel) // 2 < LEAST_RADIUS_PX
+        return decompose(kernel) if small else decompose(kernel, self.relative_error, self.max_rank, _LEAST_RANK)
+
+    def _kernel(self, aperture: Aperture | KernelOpening, diameter_px: float) -> LowRankKernel:
+        """The decomposed PSF, kept for the next call."""
+        if isinstance(aperture, KernelOpening):
+            return aperture.low_rank(diameter_px, self.decomposed)
         vertices, starts, weights = aperture.packed()
         key = vertices.tobytes() + starts.tobytes() + weights.tobytes(), diameter_px
         if key not in self._kernels:
-            psf = aperture.rasterize(diameter_px)
-            small = psf.radius_px < LEAST_RADIUS_PX
             if len(self._kernels) >= _MOST_KERNELS:
                 self._kernels.clear()
-            self._kernels[key] = decompose(psf.kernel) if small else decompose(psf.kernel, self.relative_error, self.max_rank, _LEAST_RANK)
+            self._kernels[key] = self.decomposed(aperture.rasterize(diameter_px).kernel)
         return self._kernels[key]
 
 

@@ -30,6 +30,7 @@ then the sums. Larger kernels cost no more: what they need at the halved resolut
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 from weakref import WeakKeyDictionary
 
@@ -37,12 +38,16 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.aperture import Aperture
+from mrbokeh.bank_apertures import BankApertures, fit_apertures
+from mrbokeh.bank_lattice import BankLattice
 from mrbokeh.directional_differences import Direction
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
 from mrbokeh.polygon_rectification import PAPER_DIRECTIONS
+from mrbokeh.psf_bank import PsfBank
+from mrbokeh.renderers._bank_renderers import BankRenderer, by_polygons
 from mrbokeh.workers import cores, workers
 from mrbokeh.zeroed_memory import ZeroedMemory
 
@@ -68,6 +73,8 @@ class PolygonDifferences:
       a quarter is so blurred.
     precision: of the impulses, "auto" for the choice above; "single" and "double" force it.
     threads: 0 takes all cores. The result does not depend on it, bit for bit.
+    bank: kernels to use instead of the lens's aperture, as polygons fitted to them (what is blurred by up to 1 px stays sharp);
+      apertures: those, if they have been fitted before.
     Memory for the rows is kept between calls.
     """
 
@@ -79,6 +86,8 @@ class PolygonDifferences:
     precision: Literal["auto", "single", "double"] = "auto"
     layering: Layering = field(default_factory=Layering)
     threads: int = 0
+    bank: PsfBank | None = None
+    apertures: BankApertures | None = field(default=None, repr=False)
     _memory: ZeroedMemory = field(default_factory=ZeroedMemory, repr=False, compare=False)
     _tables: "WeakKeyDictionary[Aperture, ApertureTables]" = field(default_factory=WeakKeyDictionary, repr=False, compare=False)
 
@@ -91,7 +100,15 @@ class PolygonDifferences:
             raise InputError(f"precision must be auto, single or double, got {self.precision!r}")
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        return render_layers(layers, lens, self.spread, self.layering)
+        if self._of_bank is None or not layers:
+            return render_layers(layers, lens, self.spread, self.layering)
+        return self._of_bank.render(layers, lens, self.layering)
+
+    @cached_property
+    def _of_bank(self) -> BankRenderer | None:
+        if self.bank is None:
+            return None
+        return by_polygons(self.bank, self.apertures or fit_apertures(BankLattice(self.bank)), self.spread, self.tables_of)
 
     def spread(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture

@@ -6,6 +6,7 @@ Slow and obvious: no kernel is rounded, cached or shared; everything is summed i
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from os import cpu_count
 
 import numpy as np
@@ -17,6 +18,8 @@ from mrbokeh.layer import Layer
 from mrbokeh.layering import Layering, render_layers
 from mrbokeh.lens import Lens
 from mrbokeh.psf import kernel_radius_px
+from mrbokeh.psf_bank import PsfBank
+from mrbokeh.renderers._bank_renderers import BankRenderer, by_scatter
 
 _BAND_PX = 64  # rows that are summed by themselves; fixed, so that the sum does not depend on the number of threads
 
@@ -25,14 +28,22 @@ _BAND_PX = 64  # rows that are summed by themselves; fixed, so that the sum does
 class ScatterReference:
     """A Renderer that spreads by exact kernels; layers, slices and hidden background as in mrbokeh.layering.
 
-    threads: 0 takes all cores.
+    threads: 0 takes all cores. bank: kernels to use instead of the lens's aperture, each pixel's blended from those of the bank
+    around it (bilinearly over the frame, linearly over the diameter).
     """
 
     layering: Layering = field(default_factory=Layering)
     threads: int = 0
+    bank: PsfBank | None = None
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        return render_layers(layers, lens, self.spread, self.layering)
+        if self._of_bank is None or not layers:
+            return render_layers(layers, lens, self.spread, self.layering)
+        return self._of_bank.render(layers, lens, self.layering)
+
+    @cached_property
+    def _of_bank(self) -> BankRenderer | None:
+        return None if self.bank is None else by_scatter(self.bank)
 
     def spread(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture

@@ -1,0 +1,119 @@
+"""`mrbokeh lens fit`: a bank of PSFs measured from focal stacks and from pictures of points of light."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mrbokeh.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.lens_fitting.lens_fit import LensFit
+    from mrbokeh.lens_fitting.point_lights import PointLight
+    from mrbokeh.psf_bank import PsfBank
+
+RINGS = 4
+
+
+def fit(
+    out: Annotated[Path, typer.Option(help="The folder to write: a bank of PSFs, kernels.png and evidence.png.")],
+    stacks: Annotated[list[Path] | None, typer.Argument(help="Merged focal stacks, or scenes of them.")] = None,
+    lights: Annotated[
+        list[Path] | None, typer.Option(help="Linear picture of points of light behind the focus, isolated, not full.")
+    ] = None,
+    near_lights: Annotated[list[Path] | None, typer.Option(help="The same in front of the focus.")] = None,
+    symmetric: Annotated[bool, typer.Option(help="Kernels depend on eccentricity and turn with the place.")] = False,
+    regions: Annotated[
+        str, typer.Option(help="Columns and rows of the frame that have kernels of their own, e.g. 3x3; 1x1 is one for all.")
+    ] = "3x3",
+    diameters: Annotated[
+        str, typer.Option(help="Diameters in px around which shapes are solved for, e.g. 8,20 (two that suit where not given).")
+    ] = "",
+    smoothness: Annotated[float, typer.Option(help="More trusts noisy pictures less, and rounds off shapes.")] = 1.0,
+    pixels: Annotated[int, typer.Option(help="How many pixels of the stacks to use, at most.")] = 120_000,
+    seed: Annotated[int, typer.Option(help="Seed of the choice of pixels.")] = 0,
+    overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False,
+) -> None:
+    """Measure the kernels of a lens over signed blur, field and colour.
+
+    From merged, metric focal stacks (every blurred pixel tells a little), from pictures of isolated points of light out of focus (each
+    is its kernel), or from both. Use the bank with `mrbokeh render --psf LENS`.
+
+    Example: mrbokeh lens fit scene --out my_lens --regions 3x3
+    """
+    from mrbokeh.lens_fitting.lens_fit import FitSettings, fit_lens
+    from mrbokeh.lens_fitting.measured_bank import bank_of
+    from mrbokeh.psf_bank_file import refuse_existing_bank, write_bank
+
+    refuse_existing_bank(out, overwrite)
+    _check(smoothness, pixels)
+    settings = FitSettings(_diameters(diameters), _regions(regions), RINGS if symmetric else 0, smoothness, pixels, seed=seed)
+    found, frame = _lights(lights or [], near_lights or [])
+    fitted = fit_lens(_stacks(stacks or []), found, settings, frame)
+    bank = bank_of(fitted)
+    write_bank(out, bank, overwrite)
+    _draw(out, fitted, bank)
+    typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px, {_proof(fitted)}")
+
+
+def _stacks(folders: list[Path]) -> list:  # type: ignore[type-arg]
+    from mrbokeh.focal_stack import find_focal_stacks
+
+    return [stack for folder in folders for stack in find_focal_stacks(folder)]
+
+
+def _lights(behind: list[Path], in_front: list[Path]) -> "tuple[list[PointLight], tuple[int, int] | None]":
+    """All lights of all frames, and the size of the frames."""
+    from mrbokeh.image_io import read_linear
+    from mrbokeh.lens_fitting.point_lights import find_lights
+
+    found, size = [], None
+    for path, near in [*((path, False) for path in behind), *((path, True) for path in in_front)]:
+        frame = read_linear(path)
+        size = (frame.shape[1], frame.shape[0])
+        mine = find_lights(frame, near)
+        if not mine:
+            raise InputError(
+                f"expected isolated points of light out of focus, below 1 and clear of the border, in {path}, found none: expose less"
+            )
+        found += mine
+    return found, size
+
+
+def _check(smoothness: float, pixels: int) -> None:
+    if not smoothness > 0.0 or pixels < 1:
+        raise InputError(f"expected --smoothness above 0 and --pixels from 1 up, got {smoothness} and {pixels}")
+
+
+def _diameters(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        raise InputError(f"expected --diameters as numbers with commas between them, such as 8,20, got {text!r}") from None
+
+
+def _regions(text: str) -> tuple[int, int]:
+    columns, _, rows = text.partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise InputError(f"expected --regions as columns x rows, such as 3x3, got {text!r}")
+    return int(columns), int(rows)
+
+
+def _draw(out: Path, fitted: "LensFit", bank: "PsfBank") -> None:
+    from mrbokeh.atomic_files import atomic_path
+    from mrbokeh.lens_fitting.evidence_picture import draw_evidence
+    from mrbokeh.psf_bank_drawing import draw_bank
+
+    for name, figure in (("kernels.png", draw_bank(bank)), ("evidence.png", draw_evidence(fitted))):
+        with atomic_path(out / name) as temporary:
+            figure.savefig(temporary, dpi=110)
+
+
+def _proof(fitted: "LensFit") -> str:
+    import numpy as np
+
+    if not fitted.scores:
+        return f"from {int(fitted.lights.sum())} lights"
+    disc, stated, ours = (float(np.mean([getattr(score, name) for score in fitted.scores])) for name in ("disc", "stated", "fitted"))
+    kind = "held-out slices" if fitted.scores[0].held_out else "slices"
+    return f"error on {kind} {ours:.4f} (a disc {disc:.4f}, the stated aperture {stated:.4f})"

@@ -1,0 +1,79 @@
+"""A side of the focus of a bank through any Spread: shares of light by place and diameter, each with an opening of its own."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.bank_apertures import BankApertures
+from mrbokeh.bank_lattice import SIDES, BankLattice
+from mrbokeh.optics import Channels, Plane
+from mrbokeh.psf import kernel_radius_px
+from mrbokeh.renderers._bank_spread import Around
+
+SHARP_PX = 1.0
+
+Shares = Iterator[tuple[Plane, Any]]
+"""How much of each pixel's light an opening takes, and the opening."""
+
+
+def spread_shares(values: Channels, coc_px: Plane, shares: Shares, spread: Callable[..., Channels]) -> Channels:
+    """What is sharp, and every share spread within the window that its light reaches."""
+    blurred = np.any(values != 0, axis=-1) & (np.abs(coc_px) > SHARP_PX)
+    total = np.where(blurred[..., None], np.float32(0.0), values)
+    for share, opening in shares:
+        mine = blurred & (share > 0)
+        rows, columns = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
+        if not rows.size:
+            continue
+        reach = kernel_radius_px(float(np.abs(coc_px[mine]).max()), opening.unit_radius)
+        ends = ((each[0], each[-1] + 1, length) for each, length in zip((rows, columns), mine.shape, strict=True))
+        window = tuple(slice(max(0, first - reach), min(length, stop + reach)) for first, stop, length in ends)
+        part = values[window] * np.where(mine[window], share[window], np.float32(0.0))[..., None]
+        total[window] += spread(np.ascontiguousarray(part), np.ascontiguousarray(coc_px[window]), opening)
+    return total
+
+
+def by_place(around: Around) -> Iterator[tuple[int, Plane]]:
+    """The anchors in use, and each pixel's share of them."""
+    used = np.unique(around.anchors[around.shares > 0])
+    for anchor in used.tolist():
+        yield anchor, np.where(around.anchors == anchor, around.shares, np.float32(0.0)).sum(axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class TurnedApertures:
+    """The apertures of a bank turned to where they are used, kept: renderers keep tables for each as long as it lives.
+
+    prepare: makes those tables, once for each although slices are spread at the same time.
+    """
+
+    lattice: BankLattice
+    apertures: BankApertures
+    prepare: Callable[[Aperture], object]
+    _kept: dict[tuple[int, int, int, int], Aperture] = field(default_factory=dict, repr=False)
+    _preparing: Lock = field(default_factory=Lock, repr=False)
+
+    def shares(self, coc_px: Plane, side: int, channel: int, around: Around) -> Shares:
+        """One opening for each place and fitted diameter."""
+        lower, upper = self.apertures.shares(side, np.abs(coc_px))
+        live = np.abs(coc_px) > SHARP_PX
+        for anchor, share in by_place(around):
+            for node in range(len(self.apertures.diameters_px[SIDES.index(side)])):
+                of_node = np.where(lower == node, 1.0 - upper, np.where(lower + 1 == node, upper, 0.0)).astype(np.float32)
+                mine = share * of_node
+                if (mine[live] > 0).any():
+                    yield mine, self._aperture(side, node, anchor, channel)
+
+    def _aperture(self, side: int, node: int, anchor: int, channel: int) -> Aperture:
+        key = side, node, anchor, channel
+        with self._preparing:
+            if key not in self._kept:
+                place, angle_rad = self.lattice.place_and_angle(anchor)
+                aperture = self.apertures.apertures[SIDES.index(side)][node][place][channel].rotated(angle_rad)
+                self.prepare(aperture)
+                self._kept[key] = aperture
+            return self._kept[key]
