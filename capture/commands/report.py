@@ -13,6 +13,8 @@ HELP = "\n\n".join(
         "slices, drift of exposure and registration, movement, wrong focus distances, depth or scale.",
         "Writes SCENE/report.html (one file, pictures and 3D view inside), SCENE/report.json with the same numbers, and each stack's "
         "exclusion.exr. What is not there yet (poses, scale, depth in metres) is named as absent.",
+        "What was found of a stack is kept in STACK/report and used again while the stack, --width and --renderer stay the same: an "
+        "interrupted report goes on where it stopped.",
         "Example:  mrbokeh capture report scene/",
         "Example:  mrbokeh capture report scene/ --strict && mrbokeh train fit scene/",
     )
@@ -24,6 +26,7 @@ def report_command(
     strict: Annotated[bool, typer.Option("--strict", help="exit with 1 when a gate fails")] = False,
     renderer: Annotated[str, typer.Option(help="that re-blurs: polygon, scatter (exact, slow) or another of mrbokeh's")] = "polygon",
     width: Annotated[int, typer.Option(min=64, help="wider pictures are judged at this width, in pixels; blur is then smaller too")] = 960,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
     from capture.report.reblur import Reblur
     from capture.report.scene_page import HTML_NAME
@@ -32,9 +35,17 @@ def report_command(
 
     if not scene.is_dir():
         raise InputError(f"expected a folder with focal stacks, but {scene} is none")
-    report = report_scene(scene, Reblur(make_renderer(renderer)), width)
+    report = report_scene(scene, Reblur(make_renderer(renderer), _named(renderer)), width, overwrite=overwrite)
     for each in report.failures:
         typer.echo(f"failed: {each.where}: {each.name}: {each.measured} (wanted: {each.limit})")
-    typer.echo(f"{scene / HTML_NAME}: {len(report.gates)} gates, {len(report.failures)} failed")
+    reused = sum(each.reused for each in report.stacks)
+    before = f" ({reused} of {len(report.stacks)} stacks were examined before)" if reused else ""
+    typer.echo(f"{scene / HTML_NAME}: {len(report.gates)} gates, {len(report.failures)} failed{before}")
     if strict and report.failures:
         raise typer.Exit(1)
+
+
+def _named(renderer: str) -> str:
+    """The renderer's name; a network that was trained further is another one."""
+    path = Path(renderer)
+    return f"{path.resolve()}, {path.stat().st_mtime_ns}" if path.suffix.lower() == ".onnx" else renderer

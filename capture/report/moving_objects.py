@@ -51,7 +51,7 @@ def moving(slices: Sequence[Disagreement], depth_off_px: Plane) -> Mask:
     if len(slices) < FEWEST_SLICES:
         return np.zeros(depth_off_px.shape, bool)
     blur_px = _BLUR_PX + np.abs(depth_off_px)
-    jumps, allowed = zip(*(_jump(first, second, blur_px) for first, second in pairwise(slices)), strict=True)
+    jumps, allowed = zip(*(_jump(*pair, blur_px) for pair in pairwise(map(_Graded.of, slices))), strict=True)
     sizes = np.stack(jumps)
     # A third and not the median: something that comes and goes again jumps twice.
     usual = np.quantile(sizes, 1.0 / 3.0, axis=0).astype(np.float32)
@@ -61,17 +61,31 @@ def moving(slices: Sequence[Disagreement], depth_off_px: Plane) -> Mask:
     return _areas(jumped)
 
 
-def _jump(first: Disagreement, second: Disagreement, blur_px: Plane) -> tuple[Plane, Plane]:
+@dataclass(frozen=True)
+class _Graded:
+    """A slice in single precision, with the deviation of its noise."""
+
+    residual: Plane
+    level: Plane
+    per_px: Plane
+    noise: Plane
+    counted: Mask
+
+    @classmethod
+    def of(cls, found: Disagreement) -> "_Graded":
+        residual, level, per_px = (each.astype(np.float32) for each in (found.residual, found.level, found.per_px))
+        return cls(residual, level, per_px, noise_deviation(residual, level), found.counted)
+
+
+def _jump(first: _Graded, second: _Graded, blur_px: Plane) -> tuple[Plane, Plane]:
     """How far the residual jumps between a slice and the next, and what noise, a diameter off by blur_px and radiance allow."""
     both = (first.counted & second.counted).astype(np.float32)
-    residuals = [each.residual.astype(np.float32) for each in (first, second)]
-    levels = [each.level.astype(np.float32) for each in (first, second)]
     weight = np.maximum(_softened(both), 1e-3)
-    size = np.abs(_softened((residuals[1] - residuals[0]) * both)) / weight * (weight > 0.5)
-    noise = np.hypot(*(noise_deviation(residual, level) for residual, level in zip(residuals, levels, strict=True)))
+    size = np.abs(_softened((second.residual - first.residual) * both)) / weight * (weight > 0.5)
+    noise = np.hypot(first.noise, second.noise)
     left = 1.0 / (2.0 * np.sqrt(np.pi) * _SOFTENED_PX)
-    blur = _softened(np.maximum(*(np.abs(each.per_px.astype(np.float32)) for each in (first, second)))) * blur_px
-    radiance = _SHARE * (np.maximum(np.minimum(*levels), 0.0) + _DARK)
+    blur = _softened(np.maximum(np.abs(first.per_px), np.abs(second.per_px))) * blur_px
+    radiance = _SHARE * (np.maximum(np.minimum(first.level, second.level), 0.0) + _DARK)
     return size.astype(np.float32), (_NOISES * left * noise + blur + radiance).astype(np.float32)
 
 

@@ -19,9 +19,17 @@ _LEAST_PX = 1e-3
 
 @dataclass(frozen=True)
 class Reblur:
-    """Predicts slices by a renderer of mrbokeh, occlusion and hidden background as it does them."""
+    """Predicts slices by a renderer of mrbokeh, occlusion and hidden background as it does them.
+
+    name: what the user calls the renderer, which tells whether predictions that are kept would come out the same; "" for its repr.
+    """
 
     renderer: Renderer = field(default_factory=PolygonDifferences)
+    name: str = ""
+
+    @property
+    def identity(self) -> str:
+        return self.name or repr(self.renderer)
 
     def __call__(self, all_in_focus: Rgb, coc_px: Plane, aperture: Aperture) -> Rgb:
         """coc_px: signed diameters, in pixels of the picture."""

@@ -4,9 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from capture.report.examination import StackFindings, examine
-from capture.report.exclusion_masks import exclusion_masks, write_exclusions
+from capture.report.examination import Examination, examine
+from capture.report.exclusion_masks import exclusion_masks, has_fresh_exclusions, write_exclusions
+from capture.report.findings import StackFindings
+from capture.report.findings_json import finite, slice_document
 from capture.report.gates import Gate, Rule
+from capture.report.kept_examination import keep, kept, signature_of
 from capture.report.pictures import Shown, slice_triple, stack_maps
 from capture.report.reblur import Reblur
 from capture.report.scene_gates import WHERE, read_reconstruction, scene_gates
@@ -29,11 +32,14 @@ MERGED = Rule(
 )
 
 
-def report_scene(scene: Path, reblur: Reblur | None = None, widest_px: int = DEFAULT_WIDTH_PX) -> SceneReport:
-    """Examine every merged stack; writes report.html, report.json and each stack's exclusion.exr. Stacks not merged fail a gate."""
+def report_scene(scene: Path, reblur: Reblur | None = None, widest_px: int = DEFAULT_WIDTH_PX, *, overwrite: bool = False) -> SceneReport:
+    """Examine every merged stack; writes report.html, report.json and each stack's exclusion.exr. Stacks not merged fail a gate.
+
+    What was found of a stack is kept in its folder and used again while nothing changed that it depends on, unless overwrite is set.
+    """
     stacks = find_focal_stacks(scene)
     reconstruction = read_reconstruction(scene)
-    examined = [examine_stack(stack, reblur or Reblur(), widest_px) for stack in stacks if stack.merged]
+    examined = [examine_stack(stack, reblur or Reblur(), widest_px, overwrite=overwrite) for stack in stacks if stack.merged]
     gates = (merged_gate(stacks), *scene_gates(reconstruction), *(gate for each in examined for gate in each.gates))
     report = SceneReport(scene, gates, tuple(examined), reconstruction)
     write_json(scene / JSON_NAME, report_document(report))
@@ -47,19 +53,31 @@ def merged_gate(stacks: Sequence[FocalStack]) -> Gate:
     return MERGED.judge(WHERE, float(len(waiting)), f"{len(stacks) - len(waiting)} of {len(stacks)}{named}", not waiting)
 
 
-def examine_stack(stack: FocalStack, reblur: Reblur, widest_px: int) -> ExaminedStack:
-    """Findings, gates and pictures of a merged stack; writes its exclusion.exr."""
-    view = StackView(stack, widest_px)
+def examine_stack(stack: FocalStack, reblur: Reblur, widest_px: int, *, overwrite: bool = False) -> ExaminedStack:
+    """Findings, gates and pictures of a merged stack, found now or before; sees to it that its exclusion.exr is fresh."""
+    signature = signature_of(stack, reblur, widest_px)
+    found = None if overwrite else kept(stack, signature)
+    reused = found is not None
+    if found is None:
+        examination, pictures = _examine(StackView(stack, widest_px), reblur)
+        write_exclusions(stack, exclusion_masks(stack, examination.moving))
+        found = keep(stack, signature, examination, pictures)
+    elif not has_fresh_exclusions(stack):
+        write_exclusions(stack, exclusion_masks(stack, found.moving()))
+    return ExaminedStack(found.findings, stack_gates(found.findings), found.pictures, reused)
+
+
+def _examine(view: StackView, reblur: Reblur) -> tuple[Examination, list[Shown]]:
+    """And the pictures of the whole stack, then three each of some slices."""
     triples: dict[int, list[Shown]] = {}
 
-    def keep(index: int, rgb: Any, prediction: Any) -> None:
+    def watch(index: int, rgb: Any, prediction: Any) -> None:
         triples[index] = slice_triple(index, rgb, prediction)
 
-    findings = examine(view, reblur, keep)
-    write_exclusions(stack, exclusion_masks(stack, findings.moving))
-    depth_off_px = None if findings.depth is None else findings.depth.off_px
-    pictures = [picture for index in shown_slices(findings) for picture in triples.get(index, [])]
-    return ExaminedStack(findings, stack_gates(findings), stack_maps(view, findings.moving, depth_off_px), pictures)
+    examination = examine(view, reblur, watch)
+    depth_off_px = None if examination.depth is None else examination.depth.off_px
+    of_slices = [picture for index in shown_slices(examination.findings) for picture in triples.get(index, [])]
+    return examination, [*stack_maps(view, examination.moving, depth_off_px), *of_slices]
 
 
 def shown_slices(findings: StackFindings) -> list[int]:
@@ -84,31 +102,12 @@ def report_document(report: SceneReport) -> dict[str, Any]:
 
 
 def _stack_document(findings: StackFindings) -> dict[str, Any]:
-    drift, curve = findings.drift, findings.curve
+    drift = findings.drift
     return {
-        "examined_width_px": findings.width_px,
-        "moving_share": None if findings.moving is None else float(findings.moving.mean()),
-        "sharp_shares": None if curve is None else curve.shares.tolist(),
+        "examined_width_px": findings.size_px[0],
+        "moving_share": findings.moving_share,
+        "sharp_shares": findings.curve.shares.tolist(),
         "registration_shift_px": None if drift is None else drift.shift_px.tolist(),
         "registration_magnification": None if drift is None else drift.magnification.tolist(),
-        "slices": [
-            {
-                "index": each.index,
-                "gain": _finite(each.gain),
-                "saturated_share": each.saturated,
-                "counted_share": each.counted,
-                "largest_coc_px": each.largest_coc_px,
-                "psnr_db": _finite(each.psnr_db),
-                "unblurred_psnr_db": _finite(each.unblurred_db),
-                "changes": None
-                if each.fit is None
-                else {name: {"value": _finite(change.value), "error": _finite(change.error)} for name, change in each.fit.changes.items()},
-            }
-            for each in findings.slices
-        ],
+        "slices": [slice_document(each, finite) for each in findings.slices],
     }
-
-
-def _finite(value: float | None) -> float | None:
-    """JSON has neither nan nor infinity."""
-    return value if value is not None and abs(value) < float("inf") else None

@@ -6,8 +6,8 @@ lose weight (Huber 1964). Residuals are alike within a neighbourhood, so that st
 disagree (the sandwich of Liang and Zeger 1986, with cells as clusters), not from the number of pixels.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float32
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
+Columns = Float32[np.ndarray, "columns height width 3"]
 
 NAMES = ("exposure", "focus_px", "blur_gain", "shift_x_px", "shift_y_px", "magnification", "softness_px2")
 _CELLS = (6, 8)
@@ -79,16 +80,15 @@ def fit_slice(rgb: Rgb, prediction: Prediction, counted: Mask) -> tuple[SliceFit
 
     counted: (H, W) pixels to fit; where there are none, nothing is known (infinite errors).
     """
-    columns = _derivatives(prediction)
     residual = rgb - prediction.rgb
-    weight = counted / (_DARK + np.maximum(prediction.rgb.mean(axis=2), 0.0))
+    columns = np.stack([*_derivatives(prediction), residual])
+    weight = (counted / (_DARK + np.maximum(prediction.rgb.mean(axis=2), 0.0))).astype(np.float32)
     change, errors = np.zeros(len(NAMES)), np.full(len(NAMES), np.inf)
     remaining = residual
     if counted.any():
         for _ in range(_ROUNDS):
-            cells = _normal_equations(columns, residual, weight * _huber(remaining, weight, counted))
-            change, errors = _solved(*cells)
-            remaining = residual - _combined(columns, change)
+            change, errors = _solved(*normal_equations(columns, weight * _huber(remaining, weight, counted)))
+            remaining = np.tensordot(np.array([*-change, 1.0], np.float32), columns, axes=1)
     return SliceFit(*(Change(float(value), float(error)) for value, error in zip(change, errors, strict=True))), remaining
 
 
@@ -104,30 +104,29 @@ def _derivatives(prediction: Prediction) -> list[Rgb]:
 
 def _huber(remaining: Rgb, weight: Plane, counted: Mask) -> Plane:
     """Weights in (0, 1] by the size of a pixel's residual against the median one."""
-    size = np.sqrt(weight * (remaining**2).sum(axis=2))
+    size = np.sqrt(weight * np.einsum("hwc,hwc->hw", remaining, remaining))
     typical = 1.4826 * float(np.median(size[counted])) + 1e-12
     return np.minimum(1.0, _HUBER * typical / np.maximum(size, 1e-12)).astype(np.float32)
 
 
-def _normal_equations(
-    columns: Sequence[Rgb], residual: Rgb, weight: Plane
+def normal_equations(
+    columns: Columns, weight: Plane
 ) -> tuple[Float[np.ndarray, "cells unknowns unknowns"], Float[np.ndarray, "cells unknowns"]]:
-    """A'WA and A'Wr of every cell of the picture, and r'Wr on the way."""
+    """A'WA and A'Wr of every cell of the picture. columns: (unknowns + 1, H, W, 3), A and then r."""
+    edges = [np.linspace(0, size, cells + 1).astype(int) for size, cells in zip(weight.shape, _CELLS, strict=True)]
+    sums = np.stack([_products(columns[:, rows, across], weight[rows, across]) for rows in _spans(edges[0]) for across in _spans(edges[1])])
+    return sums[:, :-1, :-1], sums[:, :-1, -1]
+
+
+def _spans(edges: np.ndarray) -> list[slice]:
+    return [slice(low, high) for low, high in pairwise(edges)]
+
+
+def _products(columns: Columns, weight: Plane) -> Float[np.ndarray, "columns columns"]:
+    """Every weighted product of two columns, summed over a cell in double precision: one matrix product."""
     count = len(columns)
-    every = [*columns, residual]
-    sums = np.zeros((_CELLS[0] * _CELLS[1], count, count + 1))
-    for i in range(count):
-        weighted = every[i] * weight[..., None]
-        for j in range(i, count + 1):
-            sums[:, i, j] = _cell_sums((weighted * every[j]).sum(axis=2))
-            if j < count:
-                sums[:, j, i] = sums[:, i, j]
-    return sums[..., :count], sums[..., count]
-
-
-def _cell_sums(plane: Plane) -> Float[np.ndarray, " cells"]:
-    rows, columns = (np.linspace(0, size, cells, endpoint=False).astype(int) for size, cells in zip(plane.shape, _CELLS, strict=True))
-    return np.add.reduceat(np.add.reduceat(plane.astype(np.float64), rows, axis=0), columns, axis=1).ravel()
+    every = columns.reshape(count, -1).astype(np.float64)
+    return (every * np.repeat(weight.ravel(), 3)) @ every.T
 
 
 def _solved(
@@ -142,10 +141,3 @@ def _solved(
     gradients = sides - matrices @ change
     covariance = inverse @ (gradients.T @ gradients) @ inverse
     return change, np.where(seen, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.inf)
-
-
-def _combined(columns: Sequence[Rgb], change: Float[np.ndarray, " unknowns"]) -> Rgb:
-    total = np.zeros_like(columns[0])
-    for column, factor in zip(columns, change, strict=True):
-        total += np.float32(factor) * column
-    return total

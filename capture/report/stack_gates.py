@@ -4,13 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from capture.report.examination import SliceFindings, StackFindings
+from capture.report.findings import SliceFindings, StackFindings
 from capture.report.gates import Gate, Rule
 from capture.report.slice_fit import Change
 from capture.report.stack_rules import (
     BLUR,
     DEPTH,
-    DEPTH_OFF_PX,
     EXPOSURE,
     FOCUS,
     LARGEST_BEYOND,
@@ -71,7 +70,7 @@ def _spacing(findings: StackFindings) -> Gate:
 
 def _range(findings: StackFindings) -> Gate:
     curve = findings.curve
-    if curve is None or curve.trusted == 0.0:
+    if curve.trusted == 0.0:
         return RANGE.absent(findings.name, "no focus can be trusted anywhere")
     beyond = max(curve.beyond_near, curve.beyond_far)
     measured = f"{curve.beyond_near:.0%} at the first slice, {curve.beyond_far:.0%} at the last"
@@ -79,7 +78,7 @@ def _range(findings: StackFindings) -> Gate:
 
 
 def _texture(findings: StackFindings) -> Gate:
-    trusted = 0.0 if findings.curve is None else findings.curve.trusted
+    trusted = findings.curve.trusted
     return TEXTURE.judge(findings.name, trusted, f"{trusted:.0%} of the picture", trusted >= LEAST_TRUSTED)
 
 
@@ -146,7 +145,7 @@ def mean_change(changes: list[Change], floor: float = 0.02) -> Change:
 
 
 def _place(findings: StackFindings) -> Gate:
-    half_diagonal_px = 0.5 * float(np.hypot(findings.width_px, findings.height_px))
+    half_diagonal_px = 0.5 * float(np.hypot(*findings.size_px))
 
     def farthest_px(each: SliceFindings) -> Change:
         fit = each.fit
@@ -164,16 +163,16 @@ def _place(findings: StackFindings) -> Gate:
 
 
 def _depth(findings: StackFindings) -> Gate:
-    if findings.depth is None:
+    share = findings.depth_off_share
+    if share is None:
         return DEPTH.absent(findings.name, NO_PREDICTION)
-    share = findings.depth.share_beyond(DEPTH_OFF_PX)
     return DEPTH.judge(findings.name, share, f"{share:.1%} of the picture", share <= LARGEST_DEPTH_SHARE)
 
 
 def _motion(findings: StackFindings) -> Gate:
-    if findings.moving is None:
+    share = findings.moving_share
+    if share is None:
         return MOTION.absent(findings.name, NO_PREDICTION)
-    share = float(findings.moving.mean())
     return MOTION.judge(findings.name, share, f"{share:.2%} of the picture", share <= LARGEST_MOVING)
 
 

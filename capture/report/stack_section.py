@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.report.charts import Axes, chart
-from capture.report.examination import StackFindings
+from capture.report.findings import StackFindings
 from capture.report.gates import Gate
-from capture.report.pictures import Shown
+from capture.report.kept_examination import KeptPicture
 from capture.report.stack_rules import LARGEST_BLUR_GAIN, LARGEST_EXPOSURE, LARGEST_FOCUS_PX, LEAST_DB
 from mrbokeh.html_page import cell, table
 
@@ -18,12 +18,12 @@ _MARKS = {"passed": ("met", "✓"), "failed": ("missed", "✗"), "absent": ("mut
 
 @dataclass(frozen=True)
 class ExaminedStack:
-    """Findings, verdicts and pictures. maps: of the whole stack; slices: of some slices, three each."""
+    """Findings, verdicts and pictures, which stay on disk. reused: whether they were there already."""
 
     findings: StackFindings
     gates: Sequence[Gate]
-    maps: Sequence[Shown] = ()
-    slices: Sequence[Shown] = ()
+    pictures: Sequence[KeptPicture] = ()
+    reused: bool = False
 
     @property
     def failures(self) -> int:
@@ -46,7 +46,7 @@ def stack_section(examined: ExaminedStack, *, with_pictures: bool) -> str:
     findings = examined.findings
     failures = f"{examined.failures} failed" if examined.failures else "all passed"
     summary = f"{html.escape(findings.name)}: {len(findings.slices)} slices, {failures}"
-    pictures = "".join(each.html() for each in (*examined.maps, *examined.slices)) if with_pictures else ""
+    pictures = "".join(each.html() for each in examined.pictures) if with_pictures else ""
     body = gate_table(examined.gates) + f'<div class="charts">{"".join(charts(findings))}</div>' + pictures
     opened = " open" if with_pictures else ""
     return f'<details{opened} id="{html.escape(findings.name)}"><summary><b>{summary}</b></summary>{body}</details>'
@@ -64,10 +64,8 @@ def _focus_charts(findings: StackFindings, x: Sequence[float], label: str) -> li
     gains = np.array([each.gain for each in findings.slices])
     typical = np.nanmedian(gains) if np.isfinite(gains).any() else 1.0
     drawn = [chart(Axes("Brightness against the median", label, "%", (-2.0, 2.0)), x, {"gain": (100 * (gains / typical - 1)).tolist()})]
-    if findings.curve is not None:
-        shares = {"share": (100.0 * findings.curve.shares).tolist()}
-        drawn.insert(0, chart(Axes("Where things are sharp", label, "% of trusted pixels"), x, shares, bars=True))
-    return drawn
+    shares = {"share": (100.0 * findings.curve.shares).tolist()}
+    return [chart(Axes("Where things are sharp", label, "% of trusted pixels"), x, shares, bars=True), *drawn]
 
 
 def _prediction_charts(findings: StackFindings, x: Sequence[float], label: str) -> list[str]:

@@ -17,7 +17,7 @@ from mrbokeh.lens_matching.rim_light import rim_light
 from mrbokeh.lens_matching.sizes import Sizes, size_facts
 
 MOST_DISCS = 60
-_UNKNOWN = {"cat_eye": 0.25, "squeeze": 0.1}  # standard errors from which a value is not known
+_UNKNOWN = {"cat_eye": 0.15, "squeeze": 0.1}  # standard errors from which a value is not known
 _NEUTRAL = {"cat_eye": 0.0, "squeeze": 1.0}
 _HELP = (
     "take a photograph with small bright lights on dark surroundings well out of focus (night, lights at least 10 px wide and apart from "

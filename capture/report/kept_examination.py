@@ -1,0 +1,128 @@
+"""What was found of a stack, kept in its folder: an interrupted report goes on, and pictures wait on disk until a page is written.
+
+STACK/report holds found.json, the pictures of the page as JPEG, and moving.png. found.json comes last and names what it was found from.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from capture.report.examination import Examination
+from capture.report.findings import StackFindings
+from capture.report.findings_json import findings_document, findings_from
+from capture.report.pictures import Shown
+from capture.report.reblur import Reblur
+from capture.report.registration_drift import FILE_NAME as REGISTRATION_FILE
+from mrbokeh.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FILE_NAME as STACK_FILE
+from mrbokeh.focal_stack import FocalStack
+from mrbokeh.html_page import inline_figure
+
+Mask = Bool[np.ndarray, "height width"]
+Signature = dict[str, Any]
+
+FOLDER, JSON_NAME, MOVING_NAME = "report", "found.json", "moving.png"
+VERSION = 1
+"""To be raised whenever other numbers or pictures would be found in the same stack."""
+
+
+@dataclass(frozen=True)
+class KeptPicture:
+    """A JPEG file and what it shows."""
+
+    path: Path
+    caption: str
+
+    def html(self) -> str:
+        return inline_figure(self.path.read_bytes(), "jpeg", self.caption)
+
+
+@dataclass(frozen=True)
+class KeptExamination:
+    """Findings in memory; pictures, and moving_path where anybody knows what moved, on disk."""
+
+    findings: StackFindings
+    pictures: tuple[KeptPicture, ...]
+    moving_path: Path | None
+
+    def moving(self) -> Mask | None:
+        """(H, W) at the width of the report."""
+        if self.moving_path is None:
+            return None
+        levels = cv2.imread(str(self.moving_path), cv2.IMREAD_GRAYSCALE)
+        if levels is None:
+            raise InputError(f"{self.moving_path}: expected a PNG, but it is none: run `mrbokeh capture report --overwrite`")
+        return np.asarray(levels > 0)
+
+
+def signature_of(stack: FocalStack, reblur: Reblur, widest_px: int) -> Signature:
+    """Changes when something does that findings depend on."""
+    names = [STACK_FILE, REGISTRATION_FILE, stack.all_in_focus_path.name, stack.depth_path.name, *(each.path for each in stack.slices)]
+    files = {name: _state(stack.folder / name) for name in names}
+    return {"version": VERSION, "width_px": widest_px, "renderer": reblur.identity, "files": files}
+
+
+def keep(stack: FocalStack, signature: Signature, examination: Examination, pictures: Sequence[Shown]) -> KeptExamination:
+    """signature: taken before the stack was examined. Replaces what was kept before."""
+    folder = stack.folder / FOLDER
+    _forget(folder)
+    names = [f"picture_{number:02d}.jpg" for number in range(len(pictures))]
+    for name, picture in zip(names, pictures, strict=True):
+        _write(folder / name, picture.jpeg)
+    if examination.moving is not None:
+        _write(folder / MOVING_NAME, cv2.imencode(".png", np.where(examination.moving, np.uint8(255), np.uint8(0)))[1].tobytes())
+    document = {
+        "signature": signature,
+        "findings": findings_document(examination.findings),
+        "pictures": [{"file": name, "caption": picture.caption} for name, picture in zip(names, pictures, strict=True)],
+        "moving": None if examination.moving is None else MOVING_NAME,
+    }
+    write_json(folder / JSON_NAME, document)
+    return _from_document(document, stack)
+
+
+def kept(stack: FocalStack, signature: Signature) -> KeptExamination | None:
+    """None where nothing is kept that was found in just this way; what cannot be read, or misses a picture, is found again."""
+    path = stack.folder / FOLDER / JSON_NAME
+    try:
+        document = read_json(path, "the findings of a stack")
+        if document["signature"] != signature:
+            return None
+        found = _from_document(document, stack)
+    except (InputError, KeyError, TypeError, ValueError):
+        return None
+    files = [*(each.path for each in found.pictures), *([found.moving_path] if found.moving_path else [])]
+    return found if all(each.is_file() for each in files) else None
+
+
+def _from_document(document: dict[str, Any], stack: FocalStack) -> KeptExamination:
+    folder = stack.folder / FOLDER
+    pictures = tuple(KeptPicture(folder / each["file"], each["caption"]) for each in document["pictures"])
+    return KeptExamination(
+        findings_from(document["findings"], stack), pictures, None if document["moving"] is None else folder / document["moving"]
+    )
+
+
+def _forget(folder: Path) -> None:
+    """found.json first, so that it never stands beside pictures that are not its own."""
+    for path in (folder / JSON_NAME, folder / MOVING_NAME, *folder.glob("picture_*.jpg")):
+        path.unlink(missing_ok=True)
+
+
+def _state(path: Path) -> list[int] | None:
+    """Size and time of a file; None where there is none."""
+    if not path.is_file():
+        return None
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _write(path: Path, data: bytes) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
