@@ -163,9 +163,7 @@ def test_a_bank_of_kernels_takes_the_place_of_the_opening(folder: Path, method: 
     made = CliRunner().invoke(everything, ["lens", "psf", "simple", "--diameter", "24", "--counts", "48", "--out", str(bank)])
     assert made.exit_code == 0, made.output
     spoil_lens(folder, aperture={"shape": "disc"})
-    by_bank, by_lens = (
-        read_image(run(folder, *PICTURE[:-1], method, *psf, out=f"{len(psf)}.exr")) for psf in (("--psf", str(bank)), ())
-    )
+    by_bank, by_lens = (read_image(run(folder, *PICTURE[:-1], method, *psf, out=f"{len(psf)}.exr")) for psf in (("--psf", str(bank)), ()))
     assert psnr(by_bank, by_lens) > 40.0
     with pytest.raises(InputError, match="laplacian"):
         run(folder, *PICTURE[:-1], "lrdm", "--psf", str(bank), out="other.exr")

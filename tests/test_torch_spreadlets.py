@@ -139,10 +139,12 @@ def bank_named(name: str) -> PsfBank:
     signed = PsfBank("signed", (Axis("diameter_px", -30.0, 30.0, 2.0),), (7,), (dot,) * 7, nested=False)
     depth = (Axis("depth_m", 0.5, np.inf, 1.0, in_dioptres=True), Axis("eccentricity", 0.0, 1.0, 1.0))
     field = PsfBank("field", depth, (3, 2), (dot,) * 6, turns="field", near_side_turned=True, nested=False)
-    return {"proportional": combined(), "nested": combined((9, 9)), "signed": signed, "field": field}[name]
+    measured = (Axis("diameter_px", -30.0, 30.0, 1.0), Axis("field_x", -0.8, 0.8, 1.0), Axis("field_y", -0.6, 0.6, 1.0))
+    frame = PsfBank("frame", measured, (5, 3, 2), (dot,) * 30, nested=False)
+    return {"proportional": combined(), "nested": combined((9, 9)), "signed": signed, "field": field, "frame": frame}[name]
 
 
-@pytest.mark.parametrize("name", ["proportional", "nested", "signed", "field"])
+@pytest.mark.parametrize("name", ["proportional", "nested", "signed", "field", "frame"])
 def test_each_pixel_takes_the_kernel_that_it_takes_on_the_cpu(name: str) -> None:
     bank, rng, size = bank_named(name), np.random.default_rng(3), (80, 90)
     coc_px, depth_m = rng.uniform(-33, 33, size).astype(np.float32), rng.uniform(0.3, 9.0, size).astype(np.float32)

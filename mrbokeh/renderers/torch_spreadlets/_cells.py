@@ -47,7 +47,9 @@ class BankCells:
     ) -> Int64[Tensor, "height width"]:
         """See `BankTables.codes`."""
         bank, angles = self.tables.bank, self.tables.angles
-        planes = {"diameter_px": coc_px, "motion_px": _length(motion_px), "depth_m": depth_m, "eccentricity": _length(field_xy)}
+        right, down = (None, None) if field_xy is None else (field_xy[..., 0], field_xy[..., 1])
+        planes = {"diameter_px": coc_px, "motion_px": _length(motion_px), "depth_m": depth_m}
+        planes |= {"eccentricity": _length(field_xy), "field_x": right, "field_y": down}
         place = torch.zeros_like(coc_px, dtype=torch.int64)
         for axis, borders in zip(bank.axes, self._borders, strict=True):
             plane = self._needed(planes[axis.name], axis.name).double()
