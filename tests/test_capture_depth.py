@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from capture.cli import app
 from capture.merging.merge import merge_scene
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
+from capture.views.colmap_job import ColmapJob, ColmapPicture, job_to_json
 from capture.views.neighbours import nearest_views
 from capture.views.patch_match_scene import PatchMatchScene
 from capture.views.scene_depth import DEPTH_SOURCE, SceneDepthSettings, deepen_scene
@@ -174,12 +174,10 @@ def test_patch_match_says_what_it_needs_before_anything_changes(merged: Path, tm
 def test_depths_of_patch_match_come_in_metres(merged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its maps are in COLMAP's unit, here half a metre: a map of 3 units is 1.5 m. COLMAP itself is stood in for."""
     scene, model = tmp_path / "desk", replace(read_sparse_model(merged / "reconstruction"), metres_per_unit=0.5)
-    picture = {"name": VIEWS[0], "file": f"{VIEWS[0]}.png", "camera": 0}
-    write_json(scene / "reconstruction" / "colmap_job.json", {})
-    job = SimpleNamespace(pictures=[SimpleNamespace(**picture)], pictures_folder="images")
+    job = ColmapJob((ColmapPicture(VIEWS[0], f"{VIEWS[0]}.png", "", 0),), (None,))
+    write_json(scene / "reconstruction" / "colmap_job.json", job_to_json(job))
     ran: list[Path] = []
     monkeypatch.setattr("capture.views.patch_match_scene.patch_match_obstacle", lambda: None)
-    monkeypatch.setattr("capture.views.patch_match_scene.job_from_json", lambda _: job)
     monkeypatch.setattr("capture.views.patch_match_scene.run_patch_match", lambda _s, _p, folder: (folder.mkdir(), ran.append(folder)))
     monkeypatch.setattr("capture.views.patch_match_scene.read_patch_match", lambda *_: np.full((2, 3), 3.0, np.float32))
     for _ in range(2):

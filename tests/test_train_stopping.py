@@ -134,6 +134,7 @@ def test_sigterm_of_a_batch_system_leaves_a_checkpoint_of_that_very_step(scene: 
 
 
 def test_a_second_ctrl_c_does_not_wait_but_one_that_torchrun_repeats_does() -> None:
+    before = signal.getsignal(signal.SIGINT)
     with Interruption() as alone:
         signal.raise_signal(signal.SIGINT)
         assert alone.asked == signal.SIGINT
@@ -143,7 +144,7 @@ def test_a_second_ctrl_c_does_not_wait_but_one_that_torchrun_repeats_does() -> N
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         assert one_of_many.asked == signal.SIGINT
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def looks_of(values: list[float], monkeypatch: pytest.MonkeyPatch) -> list[dict[str, torch.Tensor]]:
