@@ -15,7 +15,7 @@ from tests.card_stack import SIZE, make_card_stack
 from training import train
 from training.ablation.plan import Ablation, planned_runs, read_data_sets, settings_of
 from training.ablation.results import RunResult, read_result, summary
-from training.ablation.rows import PAPER_TABLE_3, PUBLISHED, TABLES, Row, rows_of
+from training.ablation.rows import PAPER_TABLE_3, PUBLISHED, TABLES, Row, paper_numbers, rows_of
 from training.ablation.tables import lines_of, markdown_of, table_cells
 from training.blur_functions import blur_of
 from training.cli import app
@@ -74,6 +74,8 @@ def test_rows_are_those_of_the_paper() -> None:
         "published": 42.1, "neural_camera": 26.7, "deepfocus": 29.4,
     }  # fmt: skip
     assert PAPER_TABLE_3["28mm"]["published"].lpips == 0.133
+    assert paper_numbers(PUBLISHED, "3", ("ring",)) == PAPER_TABLE_3["circle"]["published"], "our name for it"
+    assert paper_numbers(PUBLISHED, "3", ("heart", "ring")) is None is paper_numbers(PUBLISHED, "3", ("attic",))
     assert all(table[0] is PUBLISHED for table in TABLES.values())
     assert len({row.name for row in ALL}) == len(ALL)
 

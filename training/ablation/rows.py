@@ -96,6 +96,9 @@ PAPER_TABLE_3: dict[str, dict[str, PaperNumbers]] = {
 }
 """By bokeh and row. The paper calls its two lenses Nikkor 35mm (Nikon Z6) and Nikkor 28mm (Nikon D3300)."""
 
+_OUR_NAMES = {"ring": "circle"}
+"""Shapes of datasets_scripts.bokeh_stacks that are called otherwise in the paper."""
+
 
 def rows_of(tables: tuple[TableName, ...]) -> list[Row]:
     """Every row once, in the order of the tables."""
@@ -105,6 +108,7 @@ def rows_of(tables: tuple[TableName, ...]) -> list[Row]:
 def paper_numbers(row: Row, table: TableName, set_names: tuple[str, ...]) -> PaperNumbers | None:
     """What the paper has for a row: of Table 3 where the data set is called after one of its bokeh."""
     if table == "3":
-        bokeh = next((name for name in PAPER_TABLE_3 if len(set_names) == 1 and name in set_names[0].lower()), None)
+        names = {name: name for name in PAPER_TABLE_3} | _OUR_NAMES
+        bokeh = next((names[name] for name in names if len(set_names) == 1 and name in set_names[0].lower()), None)
         return None if bokeh is None else PAPER_TABLE_3[bokeh].get(row.name)
     return row.paper
