@@ -1,7 +1,6 @@
 """One viewpoint of a set as a FocalStack folder: slices through the lens, the same view through a pinhole, depth; each made once."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from datasets_scripts.bokeh_stacks_plan import StacksPlan
 from datasets_scripts.bokeh_stacks_scenes import bokeh_scene
+from datasets_scripts.file_job import Job
 from datasets_scripts.truth_scene import pack
 from datasets_scripts.truth_sharp import sharp_layer
 from datasets_scripts.truth_tracer import Opening, Picture, TruthTracer
@@ -21,18 +21,6 @@ from mrbokeh.image_metrics import psnr
 NOISE_FLOOR = "noiseFloorDb"
 # Two halves differ by twice the variance of one, their mean has half of it: a quarter, 6.02 dB.
 _MEAN_OVER_DIFFERENCE_DB = 20.0 * np.log10(2.0)
-
-
-@dataclass(frozen=True)
-class Job:
-    """Files that are made together."""
-
-    paths: tuple[Path, ...]
-    make: Callable[[], None]
-
-    @property
-    def done(self) -> bool:
-        return all(path.is_file() for path in self.paths)
 
 
 class StackView:

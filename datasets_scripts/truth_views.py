@@ -1,12 +1,12 @@
 """The files of one view: sharp picture with depth, layers, defocused truth and a sheet, each made only where it is missing."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
+from datasets_scripts.file_job import Job
 from datasets_scripts.truth_plan import TruthPlan, truth_name, view_document
 from datasets_scripts.truth_scene import PackedScene, TruthScene, pack
 from datasets_scripts.truth_scenes import make_scene
@@ -17,18 +17,6 @@ from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, write_exr
 from mrbokeh.image_io import write_image, write_layer
-
-
-@dataclass(frozen=True)
-class Job:
-    """Files that are made together."""
-
-    paths: tuple[Path, ...]
-    make: Callable[[], None]
-
-    @property
-    def done(self) -> bool:
-        return all(path.is_file() for path in self.paths)
 
 
 class View:

@@ -60,12 +60,16 @@ def make_stack(folder: Path, seed: int, size: tuple[int, int] = SIZE) -> FocalSt
     return stack
 
 
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("training") / "wall"
+def make_wall(folder: Path) -> Path:
+    """Three viewpoints of the wall."""
     for seed in range(3):
         make_stack(folder / f"view_{seed}", seed)
     return folder
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_wall(tmp_path_factory.mktemp("training") / "wall")
 
 
 @pytest.fixture(scope="session")

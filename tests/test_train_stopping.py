@@ -17,7 +17,7 @@ import torch
 from typer.testing import CliRunner
 
 from mrbokeh.errors import InputError
-from tests.test_train import DEMO_LIKE, make_stack
+from tests.test_train import DEMO_LIKE, make_wall
 from training import train
 from training.checkpoint import Progress
 from training.cli import app
@@ -54,10 +54,7 @@ train.fit(training_data([Path(scene)]), Path(out), load_settings(Path(out) / "se
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("stopping") / "wall"
-    for seed in range(3):
-        make_stack(folder / f"view_{seed}", seed)
-    return folder
+    return make_wall(tmp_path_factory.mktemp("stopping") / "wall")
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
