@@ -45,8 +45,20 @@ _VARIANTS = (
 )
 _OTHERS = (
     PUBLISHED,
-    Row("neural_camera", "Neural Cameras' form", network={"form": "neural_camera", **_NO_TILES}, note="our reading of Mandl et al. 2021"),
-    Row("deepfocus", "DeepFocus' form", network={"form": "deepfocus", **_NO_TILES}, note="our reading of Xiao et al. 2018"),
+    Row(
+        "neural_camera",
+        "Neural Cameras' form",
+        network={"form": "neural_camera", "blocks": 3, "initialisation": "identity", **_NO_TILES},
+        training={"learning_rate": 0.01},
+        note="our reading of Mandl et al. 2021, with a learning rate of its own",
+    ),
+    Row(
+        "deepfocus",
+        "DeepFocus' form",
+        network={"form": "deepfocus", "initialisation": "identity", **_NO_TILES},
+        training={"learning_rate": 0.002},
+        note="our reading of Xiao et al. 2018, with a learning rate of its own",
+    ),
     GATED,
 )
 _IMPROVEMENTS = (
@@ -57,6 +69,12 @@ _IMPROVEMENTS = (
         "field position instead of tiles",
         network={"field_position": True, **_NO_TILES},
         note="to be read beside no tiling of Table 1",
+    ),
+    Row(
+        "wide",
+        "8 features a colour, mixed by 1x1 convolutions",
+        network={"width": 8, "mixing": "tile", "initialisation": "disc", "activation": "identity"},
+        note="a wider reading of per-channel convolutions, which can hold a colour and know its blur",
     ),
     Row("energy_edge", "energy and edge loss", training={"energy_weight": 1.0, "edge_weight": 1.0}),
     Row("depth_noise", "depth noise", training={"depth_noise": 1.0}, note="gains where the depth of the data is worse than its truth"),
