@@ -33,10 +33,11 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video_color import code_from_linear, linear_from_code
 from mrbokeh.video_io import VideoWriter
 from viewfinder.focused_layer import FocusedLayer
-from viewfinder.frame_source import CameraFrame, PatternSource, VideoFileSource, open_source
+from viewfinder.frames import CameraFrame
 from viewfinder.newest import Newest
 from viewfinder.pipeline import Pipeline
-from viewfinder.server import serving
+from viewfinder.server.app import serving
+from viewfinder.sources.frame_source import PatternSource, VideoFileSource, open_source
 
 WIDTH, HEIGHT = 160, 90
 # Half a dioptre out of focus blurs over 13.7 px here: 160 / 6 px per mm, 20 mm aperture, 51.3 mm to the sensor.

@@ -13,9 +13,9 @@ from mrbokeh.image_io import read_layer
 from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.choose import DEFAULT, make_renderer
 from viewfinder.focused_layer import FocusedLayer
-from viewfinder.frame_source import open_source
 from viewfinder.pipeline import Pipeline
-from viewfinder.server import serving
+from viewfinder.server.app import serving
+from viewfinder.sources.frame_source import open_source
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 

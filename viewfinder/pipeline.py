@@ -9,8 +9,9 @@ from threading import Event, Thread
 from mrbokeh.errors import InputError
 from mrbokeh.overlay import code_tables
 from viewfinder.focused_layer import FocusedLayer
-from viewfinder.frame_source import CameraFrame, FrameSource
+from viewfinder.frames import CameraFrame
 from viewfinder.newest import Newest
+from viewfinder.sources.frame_source import FrameSource
 
 _POLL_S = 0.1
 _LEAVE_S = 3.0

@@ -3,7 +3,6 @@
 import itertools
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from typing import Protocol, runtime_checkable
@@ -13,19 +12,11 @@ from jaxtyping import UInt8
 
 from mrbokeh.errors import InputError
 from mrbokeh.video_io import probe, read_display_frames
+from viewfinder.frames import CameraFrame
 
 # A camera may differ this much from the layer's aspect ratio before the picture would look stretched.
 _ASPECT_TOLERANCE = 0.01
 DEFAULT_FPS = 30.0
-
-
-@dataclass(frozen=True)
-class CameraFrame:
-    """bgr: (H, W, 3) 8-bit display codes, blue first. captured_s: `time.monotonic` when the camera gave it. sequence: counts captures."""
-
-    bgr: UInt8[np.ndarray, "height width 3"]
-    captured_s: float
-    sequence: int
 
 
 @runtime_checkable

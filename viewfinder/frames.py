@@ -1,0 +1,71 @@
+"""What travels through the viewfinder: a frame of the camera with what is known of it, and the finished picture."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+Bgr = UInt8[np.ndarray, "height width 3"]
+Pose = Float64[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class LensState:
+    """What somebody knows of the lens at one moment; None is not known. focus_distance_m: from the entrance pupil, inf is allowed."""
+
+    focus_distance_m: float | None = None
+    f_number: float | None = None
+    focal_length_mm: float | None = None
+
+    def completed_by(self, other: "LensState") -> "LensState":
+        """What is not known here, from there."""
+        return LensState(*(theirs if mine is None else mine for mine, theirs in zip(self._values(), other._values(), strict=True)))
+
+    def _values(self) -> tuple[float | None, ...]:
+        return self.focus_distance_m, self.f_number, self.focal_length_mm
+
+
+UNKNOWN_LENS = LensState()
+
+
+@dataclass(frozen=True)
+class CameraFrame:
+    """bgr: (H, W, 3) 8-bit display codes, blue first. captured_s: `time.monotonic` when the camera gave it. sequence: counts captures.
+
+    lens, camera_from_world: what the source itself knows (a tracked camera, the Exif of a tethered one); most know nothing.
+    """
+
+    bgr: Bgr
+    captured_s: float
+    sequence: int
+    lens: LensState = UNKNOWN_LENS
+    camera_from_world: Pose | None = None
+
+
+@dataclass(frozen=True)
+class FrameStatus:
+    """What the page tells about a picture.
+
+    focus_distance_m, f_number: of the lens that blurred the virtual layer; focus_pending: another one was asked for and is not shown yet.
+    tracking: quality of the pose from 0 (lost) to 1, None without a tracker. layer_age_ms: since the virtual layer was drawn.
+    stages_ms: how long each stage took, by name, in the order in which they ran. dropped: captures so far that were never composited.
+    """
+
+    focus_distance_m: float
+    f_number: float
+    focus_pending: bool = False
+    tracking: float | None = None
+    layer_age_ms: float = 0.0
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
+    dropped: int = 0
+
+
+@dataclass(frozen=True)
+class OutputFrame:
+    """One finished picture (H, W, 3), 8-bit display codes, blue first; captured_s, sequence: of the capture it shows."""
+
+    bgr: Bgr
+    captured_s: float
+    sequence: int
+    status: FrameStatus

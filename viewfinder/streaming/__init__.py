@@ -1,0 +1,1 @@
+"""Encoded once, sent to many: WebRTC and recordings."""

@@ -1,0 +1,1 @@
+"""Where the camera is, frame by frame."""
