@@ -20,6 +20,7 @@ ROWS = (
     ("renderers.",),
     ("renderers.base",),
     ("lens_fitting.", "lens_matching."),
+    ("film_plane",),
     ("psf_models.", "spreadlets_build"),
     ("psf_bank_export", "bank_fits_file"),
     ("focal_stack_dataset",),

@@ -4,8 +4,9 @@ import math
 
 import pytest
 
-from capture.photos.focus_metadata import FocusReading, lens_distance_m
+from capture.photos.focus_metadata import FocusReading
 from capture.photos.focus_tags import read_focus
+from mrbokeh.film_plane import lens_distance_m
 from mrbokeh.lens import Lens
 
 

@@ -12,10 +12,10 @@ import typer
 from typer.testing import CliRunner
 
 from capture.commands.plan import plan_command
-from capture.photos.focus_metadata import lens_distance_m
-from capture.tether.focus_plan import MOST_SLICES, FocusPlan, FocusRange, film_plane_m, on_scale, plan_focus, plan_for_motor
+from capture.tether.focus_plan import MOST_SLICES, FocusPlan, FocusRange, on_scale, plan_focus, plan_for_motor
 from capture.tether.plan_file import plan_from_json, plan_to_json, read_plan, write_plan
 from mrbokeh.errors import InputError
+from mrbokeh.film_plane import film_plane_m, lens_distance_m
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import write_lens
 

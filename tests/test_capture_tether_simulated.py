@@ -10,11 +10,12 @@ from jaxtyping import Float32
 
 from capture.photos.metadata import read_metadata
 from capture.tether.camera_driver import Ability, CameraSettings
-from capture.tether.focus_plan import FocusRange, film_plane_m, plan_focus
+from capture.tether.focus_plan import FocusRange, plan_focus
 from capture.tether.focus_steps import Stop
 from capture.tether.simulated import SimulatedCamera
 from capture.tether.simulated_picture import nikon_code, to_centimetre, unstated
 from capture.tether.simulated_scene import Card, SimulatedScene
+from mrbokeh.film_plane import film_plane_m
 from mrbokeh.image_io import read_image
 from mrbokeh.lens import Lens
 

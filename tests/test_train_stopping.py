@@ -81,6 +81,20 @@ def steps_logged(log: Path) -> int:
     return len(log.read_text().splitlines()) if log.exists() else 0
 
 
+def test_a_signal_that_was_ignored_stays_so() -> None:
+    """Shells start background jobs with SIGINT ignored: Ctrl-C in the terminal is for the job in front."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interruption() as interruption:
+            signal.raise_signal(signal.SIGINT)
+            assert interruption.asked is None
+            signal.raise_signal(signal.SIGTERM)
+            assert interruption.asked == signal.SIGTERM
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_sigkill_costs_at_most_one_interval_and_the_run_goes_on_to_the_same_weights(scene: Path, tmp_path: Path) -> None:
     """The last checkpoint is at most one interval and two steps (the one that made it due, and the one under way) older than the end."""
     interval_s = 0.05

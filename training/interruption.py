@@ -23,6 +23,7 @@ class StoppedError(KeyboardInterrupt):
 class Interruption:
     """A block in which the signals only leave a note, so that a step is never torn; `asked` holds the last one.
 
+    A signal that was ignored before stays so: shells start background jobs deaf to Ctrl-C.
     Of a process on its own a second Ctrl-C stops at once, without a checkpoint (torchrun passes on what its children have got already).
     """
 
@@ -33,7 +34,8 @@ class Interruption:
 
     def __enter__(self) -> "Interruption":
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+            heard = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._note) for number in heard}
         return self
 
     def __exit__(self, *_: object) -> None:

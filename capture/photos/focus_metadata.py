@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from mrbokeh.film_plane import lens_distance_m
 from mrbokeh.lens import MM_PER_M
 
 Tags = Mapping[str, str]
@@ -42,19 +43,6 @@ class FocusReading:
         if self.origin == "lens" or math.isinf(stated_m):
             return stated_m
         return None if focal_length_mm is None else lens_distance_m(stated_m, focal_length_mm, hiatus_mm)
-
-
-def lens_distance_m(film_plane_m: float, focal_length_mm: float, hiatus_mm: float = 0.0) -> float | None:
-    """The distance d_f from the front principal plane for a distance D = d_f + h + d_s from the film plane, d_s = f d_f / (d_f - f).
-
-    h is the hiatus, the distance between the principal planes (0 for a thin lens). d_f is the far root of
-    d_f^2 - (D - h) d_f + (D - h) f = 0. None below D = 4 f + h, which no lens of that focal length reaches.
-    """
-    if math.isinf(film_plane_m):
-        return film_plane_m
-    focal_m, conjugates_m = focal_length_mm / MM_PER_M, film_plane_m - hiatus_mm / MM_PER_M
-    discriminant = conjugates_m * (conjugates_m - 4.0 * focal_m)
-    return 0.5 * (conjugates_m + math.sqrt(discriminant)) if conjugates_m > 0.0 and discriminant >= 0.0 else None
 
 
 def rational(text: str | None) -> tuple[int, int] | None:

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from capture.photos.focus_metadata import lens_distance_m
 from mrbokeh.errors import InputError
+from mrbokeh.film_plane import lens_distance_m
 from mrbokeh.lens import MM_PER_M, Lens
 
 MOST_SLICES = 999
@@ -140,11 +140,6 @@ def on_scale(plan: FocusPlan, marks_m: Sequence[float]) -> FocusPlan:
     marks = [1.0 / each for each in marks_m]
     chosen = {min(marks, key=lambda mark: abs(mark - wanted)) for wanted in plan.dioptres}
     return FocusPlan(plan.lens, plan.image_width_px, plan.range, tuple(sorted(chosen, reverse=True)), plan.wanted_residual_px)
-
-
-def film_plane_m(lens: Lens) -> float:
-    """Focus distance as a camera's scale and metadata count it: d_f + d_s, the principal planes of a thin lens being one."""
-    return lens.focus_distance_m + lens.image_distance_mm / MM_PER_M
 
 
 def _step_dioptres(lens: Lens, focus_range: FocusRange, image_width_px: int, residual_px: float) -> float:

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from capture.tether.focus_axis import FocusAxis
-from capture.tether.focus_plan import FocusPlan, film_plane_m
+from capture.tether.focus_plan import FocusPlan
 from capture.tether.focus_steps import FocusSteps
+from mrbokeh.film_plane import film_plane_m
 
 
 @runtime_checkable

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.tether.camera_driver import CameraError
-from capture.tether.focus_plan import film_plane_m
 from mrbokeh.color import linear_to_srgb
 from mrbokeh.errors import MissingExtraError
+from mrbokeh.film_plane import film_plane_m
 from mrbokeh.lens import Lens
 
 Rgb = Float32[np.ndarray, "height width 3"]

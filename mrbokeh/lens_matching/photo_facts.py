@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mrbokeh.errors import InputError
-from mrbokeh.lens import MM_PER_M
+from mrbokeh.film_plane import lens_distance_m
 
 _EXIF_IFD = 0x8769
 _F_NUMBER, _SUBJECT_DISTANCE, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x829D, 0x9206, 0x920A, 0xA405
@@ -54,7 +54,7 @@ def read_facts(path: Path | str, size_px: tuple[int, int]) -> PhotoFacts:
     focal_length_mm = _positive(tags.get(_FOCAL_LENGTH))
     distance_m = _positive(tags.get(_SUBJECT_DISTANCE))
     if distance_m is not None and focal_length_mm is not None:
-        distance_m = _from_the_lens(distance_m, focal_length_mm)
+        distance_m = lens_distance_m(distance_m, focal_length_mm)
     return PhotoFacts(focal_length_mm, _positive(tags.get(_F_NUMBER)), _sensor_width_mm(tags, focal_length_mm, size_px), distance_m)
 
 
@@ -88,11 +88,3 @@ def _sensor_width_mm(tags: dict[int, Any], focal_length_mm: float | None, size_p
     if film_mm is None or focal_length_mm is None:
         return None
     return _FULL_FRAME_DIAGONAL_MM * focal_length_mm / film_mm * size_px[0] / float(np.hypot(*size_px))
-
-
-def _from_the_lens(distance_m: float, focal_length_mm: float) -> float | None:
-    if np.isinf(distance_m):
-        return distance_m
-    focal_m = focal_length_mm / MM_PER_M
-    root = distance_m**2 - 4.0 * distance_m * focal_m
-    return None if root <= 0.0 else 0.5 * (distance_m + float(np.sqrt(root)))
