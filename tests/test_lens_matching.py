@@ -206,6 +206,19 @@ def test_focus_and_effective_f_number_of_a_photograph() -> None:
     assert "--depth-m" in unknown.sizes.note
 
 
+@pytest.mark.parametrize("times_white", [1.0, 3.0, 100.0])
+def test_the_stated_error_of_a_diameter_holds_for_lights_of_any_brightness(times_white: float) -> None:
+    """Discs of 22.4 px by their pixels' covered shares; a hundred times white they look 1 px larger."""
+    rows, columns = np.mgrid[:240, :320] + 0.5
+    picture = np.zeros((240, 320), np.float32)
+    for x, y in ((60.3, 50.2), (160.7, 60.6), (250.1, 80.9), (80.5, 170.4), (200.8, 180.1)):
+        picture += times_white * np.clip(11.2 + 0.5 - np.hypot(columns - x, rows - y), 0.0, 1.0).astype(np.float32)
+    clipped = np.repeat(np.minimum(picture, 1.0)[..., None], 3, axis=2)
+    sizes = match_lens(clipped, FACTS, largest_value=1.0).sizes
+    assert abs(sizes.diameter_px - 22.4) < 2.0 * sizes.diameter_error_px
+    assert sizes.diameter_error_px > 0.45
+
+
 def test_discs_larger_than_the_stated_f_number_allows() -> None:
     found = match_lens(linear(photograph(DISC)), replace(FACTS, f_number=4.0), largest_value=1.0)
     bound = float(replace(LENS, f_number=4.0).coc_px(np.inf, WIDTH)) * 4.0 / COC_PX

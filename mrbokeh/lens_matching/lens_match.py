@@ -70,7 +70,8 @@ def match_lens(
     own = choice.fit.own if mean is None else np.array([[*d.centroid_px, r] for d, r in zip(mean.discs, mean.radius_px, strict=True)])
     rim = rim_light(grey, discs, own, side)
     unknown = frozenset(name for name, error in _UNKNOWN.items() if choice.fit.errors[name] > error)
-    sizes = size_facts(facts, 2.0 * own[:, 2], side, depth_m, grey.shape[1])
+    mostly_full = 2 * sum(disc.full for disc in discs) > len(discs)
+    sizes = size_facts(facts, 2.0 * own[:, 2], side, depth_m, grey.shape[1], mostly_full)
     lens = Lens(
         float(facts.focal_length_mm or 0.0),
         sizes.f_number,

@@ -11,8 +11,9 @@ from mrbokeh.lens import Lens
 from mrbokeh.lens_matching.focus_from_size import depth_from_size, effective_f_number, focus_from_size
 from mrbokeh.lens_matching.photo_facts import PhotoFacts
 
-EDGE_PX = 0.15
-"""By how much a diameter is off where the light of a disc is beyond what the file can hold: its edge then shows too far out."""
+EDGE_PX, FULL_EDGE_PX = 0.15, 0.6
+"""By how much diameters are off all alike. Where light L is clipped at 1, the contour at one half lies where a pixel is covered by
+0.5 / L: up to half a pixel too far out on each side, on average over all L a quarter."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,22 @@ class Sizes:
 
 
 def size_facts(
-    facts: PhotoFacts, diameters_px: Float64[np.ndarray, " discs"], side: int, depth_m: float | None, image_width_px: int
+    facts: PhotoFacts,
+    diameters_px: Float64[np.ndarray, " discs"],
+    side: int,
+    depth_m: float | None,
+    image_width_px: int,
+    full: bool = False,
 ) -> Sizes:
-    """diameters_px: of the unit pupil. depth_m: of the lights. facts: all but the focus distance must be there."""
+    """diameters_px: of the unit pupil. depth_m: of the lights. facts: all but the focus distance must be there.
+
+    full: whether the light of most discs is beyond what the file can hold.
+    """
     if depth_m is not None and not depth_m > 0.0:
         raise InputError(f"expected --depth-m above 0 (inf is allowed), got {depth_m:g}")
     facts.require("the photograph")
     diameter = float(np.median(diameters_px))
-    error = float(np.hypot(1.2533 * diameters_px.std() / np.sqrt(len(diameters_px)), EDGE_PX))
+    error = float(np.hypot(1.2533 * diameters_px.std() / np.sqrt(len(diameters_px)), FULL_EDGE_PX if full else EDGE_PX))
     stated = Lens(
         float(facts.focal_length_mm or 0.0),
         float(facts.f_number or 0.0),
