@@ -16,6 +16,7 @@ ROWS = (
     ("demo.",),
     ("plate", "object_layers", "lens_drawing", "psf_bank_drawing", "stack_pictures"),
     ("compositing", "overlay", "_overlay_numba", "tilt_shift"),
+    ("renderers.choose_bank",),
     ("renderers.choose",),
     ("renderers.",),
     ("renderers.base",),
@@ -130,7 +131,7 @@ def test_renderers_do_not_import_their_siblings() -> None:
     """Twins on devices (torch_*) are no siblings: each belongs to one renderer. Nor is what opens a session."""
     public = {name for name in MODULES if name.startswith("mrbokeh.renderers.") and not name.split(".")[-1].startswith("_")}
     siblings = {name for name in public if ".torch_" not in name} - {
-        f"mrbokeh.renderers.{name}" for name in ("base", "choose", "onnx_sessions")
+        f"mrbokeh.renderers.{name}" for name in ("base", "choose", "choose_bank", "onnx_sessions")
     }
     assert not [f"{a} -> {b}" for a, b in arrows() if a in siblings and b in siblings]
 

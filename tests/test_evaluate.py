@@ -15,6 +15,9 @@ from mrbokeh.color import linear_to_srgb
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import write_focal_stack
 from mrbokeh.image_metrics import psnr
+from mrbokeh.nested_grid import NestedGrid
+from mrbokeh.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.psf_bank_file import write_bank
 from tests.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_stack
 from training import train
 from training.blur_functions import blur_of
@@ -30,6 +33,7 @@ from training.evaluation.methods import (
     REFERENCE,
     SCATTERED,
     Method,
+    bank_methods,
     network_names,
     plain_methods,
     renderer_method,
@@ -209,6 +213,21 @@ def test_names_of_networks() -> None:
     assert network_names([Path("x/lens.onnx"), Path("y/lens.onnx")]) == ["x/lens.onnx", "y/lens.onnx"]
     with pytest.raises(InputError, match="expected renderers among"):
         renderer_methods(["gauss"])
+
+
+def test_renderers_with_a_measured_bank(scene: Path, tmp_path: Path) -> None:
+    """A bank of the true opening, sampled per pixel of blur, is as good as the opening itself; networks and LRDM take none."""
+    pairs = PairSet(training_data([scene]).stacks[:1], WHERE_TRUTH_IS_KNOWN, cache_mib=0)
+    seen = unseen_slice(pairs, 0)
+    reach = float(np.abs(seen.pair.coc_px).max()) + 1.0
+    axes, counts = (Axis("diameter_px", -reach, reach),), (2 * int(reach) + 1,)
+    cells = physical_boxes(axes, NestedGrid(counts, nested=False)).mean(axis=2)[:, 0]
+    kernels = tuple(seen.lens.aperture.rasterize(abs(float(size))).kernel[..., None].astype(np.float32) for size in cells)
+    write_bank(tmp_path / "bank", PsfBank("measured", axes, counts, kernels, nested=False))
+    (measured,) = bank_methods(["scatter", "lrdm"], tmp_path / "bank")
+    assert (measured.name, measured.kind) == ("scatter, measured", "renderer")
+    exact = renderer_method("scatter").blur(seen)
+    assert psnr(measured.blur(seen), exact) > 45.0 > psnr(seen.pair.all_in_focus, exact)
 
 
 def test_means_leave_out_what_was_not_measured() -> None:

@@ -53,11 +53,12 @@ def render(
     Example: mrbokeh render --rgb aif.exr --depth z.exr --lens lens.json --focus-at 640,360 --out blurred.exr
     """
     from mrbokeh.atomic_files import refuse_existing
-    from mrbokeh.commands._render_method import chosen_renderer, focused, reconstructed
+    from mrbokeh.commands._render_method import focused, reconstructed
     from mrbokeh.commands._render_sharp import Sources, read_sharp
     from mrbokeh.layering import Layering
     from mrbokeh.lens_file import read_lens
     from mrbokeh.progress import working
+    from mrbokeh.renderers.choose_bank import chosen_renderer
 
     refuse_existing(out, overwrite)
     if alpha_out and out.suffix.lower() != ".exr":

@@ -28,6 +28,9 @@ def evaluate_command(
         typer.Option(help="Renderer to compare with (repeat for more), else polygon, low-rank, laplacian and scatter; `none` for none."),
     ] = None,
     reference: Annotated[bool, typer.Option(help="Also the scatter reference with the aperture of the lens (slow).")] = True,
+    psf: Annotated[
+        Path | None, typer.Option(help="A measured bank of kernels (of `mrbokeh lens fit`): the renderers once more with it.")
+    ] = None,
     pull: Annotated[int, typer.Option(min=0, help="Frames of the focus pull that shows flicker; 0 leaves it out.")] = 8,
     lpips: Annotated[
         Path | None, typer.Option(help="Weights of LPIPS as .onnx, which are not shipped; without them it is left out.")
@@ -41,9 +44,11 @@ def evaluate_command(
     Example: mrbokeh train evaluate runs/paper runs/gated fast.onnx --data lens_50mm --out comparison
 
     Example: mrbokeh train evaluate attic.onnx scenes/attic --out results
+
+    Example: mrbokeh train evaluate runs/50mm --data lens_50mm --psf lens_50mm.bank --renderer polygon --out measured
     """
     from training.evaluation.comparison import Extras, compare, unseen
-    from training.evaluation.methods import network_methods, plain_methods, renderer_methods
+    from training.evaluation.methods import bank_methods, network_methods, plain_methods, renderer_methods
     from training.evaluation.perceptual import OnnxPerceptualDistance
     from training.evaluation.tables import gain_lines, table_rows
     from training.training_data import training_data
@@ -51,7 +56,9 @@ def evaluate_command(
     networks, scenes = _networks_and_data(networks, data or [])
     folder = _folder(networks, out)
     of_networks, trained_on = network_methods(networks, device)
-    methods = [*of_networks, *plain_methods(), *renderer_methods(_renderers(renderer, reference))]
+    chosen = _renderers(renderer, reference)
+    measured = [] if psf is None else bank_methods(chosen, psf)
+    methods = [*of_networks, *plain_methods(), *renderer_methods(chosen), *measured]
     extras = Extras(None if lpips is None else OnnxPerceptualDistance(lpips), pull)
     result = compare(methods, unseen(training_data(scenes).stacks, trained_on), folder, extras)
     for name, decibel, similarity, *_ in table_rows(result):

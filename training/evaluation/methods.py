@@ -10,7 +10,9 @@ from jaxtyping import Float32
 
 from mrbokeh.errors import InputError
 from mrbokeh.layer import opaque
-from mrbokeh.renderers.choose import BY_NAME, make_renderer
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.renderers.choose import BY_NAME, WITH_BANKS, make_renderer
+from mrbokeh.renderers.choose_bank import chosen_renderer
 from training.blur_functions import Blur, blur_of
 from training.classical_blur import gaussian_gather, gaussian_scatter, sigma_per_coc
 from training.evaluation.unseen_slice import UnseenSlice
@@ -70,12 +72,19 @@ def renderer_methods(names: Sequence[str]) -> list[Method]:
 
 
 def renderer_method(name: str) -> Method:
-    renderer = make_renderer(name)
+    return _renderer_method(REFERENCE if name == "scatter" else name, make_renderer(name))
 
+
+def bank_methods(names: Sequence[str], bank: Path) -> list[Method]:
+    """Those of the renderers that can take a bank of kernels, with it; "polygon, measured" and so on."""
+    return [_renderer_method(f"{name}, measured", chosen_renderer(name, bank)) for name in names if name in WITH_BANKS]
+
+
+def _renderer_method(title: str, renderer: Renderer) -> Method:
     def blur(seen: UnseenSlice) -> Image:
         return renderer.render([opaque(seen.pair.all_in_focus, seen.depth_m)], seen.lens).rgb
 
-    return Method(REFERENCE if name == "scatter" else name, blur, "renderer")
+    return Method(title, blur, "renderer")
 
 
 def _gaussian(seen: UnseenSlice) -> tuple[Image, Float32[np.ndarray, "height width"], float]:
