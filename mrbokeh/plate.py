@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.camera import Camera
+from mrbokeh.capture_bundle import CaptureBundle
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
@@ -53,6 +54,14 @@ def open_plate(photo: Path, slice_index: int | None, depth: Path | None, lens: L
     rgb = read_image(photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     return Plate(rgb, None if depth is None else read_depth_m(depth), focused, _pinhole(focused, rgb))
+
+
+def bundle_plate(bundle: CaptureBundle, depth: Path | None, lens: Lens | None, focus_m: float | None) -> Plate:
+    """What the viewfinder captured; lens: overrides the optics but keeps the focus. Objects are placed in camera axes."""
+    focused = bundle.lens if lens is None else lens.focused_at(bundle.lens.focus_distance_m)
+    focused = focused if focus_m is None else focused.focused_at(focus_m)
+    camera = replace(bundle.camera, camera_from_world=np.eye(4))
+    return Plate(bundle.plate_rgb, None if depth is None else read_depth_m(depth), focused, camera)
 
 
 def read_depth_m(path: Path) -> Float32[np.ndarray, "height width"]:

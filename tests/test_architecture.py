@@ -28,6 +28,7 @@ ROWS = (
     ("focal_stack", "video_io", "scene.", "contact_sheet", "psf_bank_file", "light_field_samples_file", "motion_file"),
     ("video_frames", "video_audio"),
     ("video_color", "_video_frames_numba"),
+    ("capture_bundle",),
     ("lens_file", "camera_file"),
     ("lens_file_values",),
     ("image_io", "camera_rgb"),

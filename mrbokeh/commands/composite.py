@@ -12,7 +12,10 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def composite(
-    photo: Annotated[Path, typer.Argument(help="A photograph, or the folder of a merged focal stack (then give --slice).")],
+    photo: Annotated[
+        Path,
+        typer.Argument(help="A photograph, the folder of a merged focal stack (then give --slice), or a capture bundle of the viewfinder."),
+    ],
     out: Annotated[Path, typer.Option(help="Where the picture goes: .exr stays linear, .png and .tif are 16-bit sRGB, .jpg is 8-bit.")],
     layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with R, G, B, A, Z; may be given several times, front first.")] = None,
     object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None,
@@ -44,22 +47,26 @@ def composite(
     """Put virtual objects into a photograph, blurred by its lens.
 
     Example: mrbokeh composite SCENE/view_2 --slice 1 --object cake.glb --at-pixel 300,250 --height 0.1 --lens lens.onnx --out out.png
+
+    Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
     import math
 
     from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.capture_bundle import is_bundle, read_bundle
     from mrbokeh.compositing import composite as put_in
     from mrbokeh.image_io import read_layer, write_image, write_layer
     from mrbokeh.object_layers import Staging, object_layers
-    from mrbokeh.plate import open_plate
+    from mrbokeh.plate import bundle_plate, open_plate
     from mrbokeh.renderers.choose import lens_and_renderer
 
     for path in (out, save_layer):
         if path is not None:
             refuse_existing(path, overwrite)
-    used_lens, used_renderer = lens_and_renderer(lens, renderer)
-    plate = open_plate(photo, slice_, depth, used_lens, focus)
-    layers = [read_layer(path) for path in layer or ()]
+    bundle = read_bundle(photo) if is_bundle(photo) else None
+    used_lens, used_renderer = lens_and_renderer(lens, renderer or (bundle.renderer if bundle and lens is None else None))
+    plate = open_plate(photo, slice_, depth, used_lens, focus) if bundle is None else bundle_plate(bundle, depth, used_lens, focus)
+    layers = [read_layer(path) for path in layer or ()] + list(bundle.layers if bundle else ())
     if object_ is not None:
         foot_m = _triple(at) if at else plate.point_under_pixel_m(*_pair(at_pixel))
         staging = Staging(foot_m, height, math.radians(turn), math.radians(tilt), environment, exposure, shadow)
