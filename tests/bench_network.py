@@ -90,7 +90,7 @@ def _on_devices(path: Path) -> str:
     return ", ".join(times) or "no GPU"
 
 
-def _fast_table(run: Path | None, data: list[Path]) -> None:
+def _fast_table(run: Path | None, data: list[Path], part_of_name: str) -> None:
     picture = np.random.default_rng(0).random((360, 640, 3), dtype=np.float32)
     yardstick_ms = _milliseconds(lambda: cv2.GaussianBlur(picture, (0, 0), 49.0 / 4), repeats=30)
     print(f"640x360 px, yardstick (OpenCV Gaussian of 49 px): {yardstick_ms:.2f} ms, budget 0.2 dB")
@@ -101,7 +101,8 @@ def _fast_table(run: Path | None, data: list[Path]) -> None:
         path = Path(folder) / "fast.onnx"
         if run is not None:
             print(_fast_row(run.name, export_fast_run(run, path, scenes=data), yardstick_ms, _on_devices(path)))
-        for name, (settings, facts) in FAST_FORMS.items() if run is None else ():
+        chosen = {name: form for name, form in FAST_FORMS.items() if run is None and part_of_name in name}
+        for name, (settings, facts) in chosen.items():
             network = build_network(TrainSettings(network=settings), facts)
             print(_fast_row(name, export_fast_network(network.eval(), settings, facts, path), yardstick_ms, _on_devices(path)), flush=True)
 
@@ -123,10 +124,11 @@ def main() -> None:
     parser.add_argument("--only", choices=["fast"], help="leave the training steps out")
     parser.add_argument("--run", type=Path, help="a trained run instead of fresh networks")
     parser.add_argument("--data", type=Path, nargs="*", default=[], help="focal stacks with the truth")
+    parser.add_argument("--form", default="", help="of the fast ones those with this in their name")
     asked = parser.parse_args()
     if asked.only is None and asked.run is None:
         _training_table()
-    _fast_table(asked.run, asked.data)
+    _fast_table(asked.run, asked.data, asked.form)
     print(memory_line())
     print(machine_line())
 

@@ -19,7 +19,7 @@ COMMANDS = [
     ["train", "ablate"],
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
     ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"],
-    ["viewfinder"], ["viewfinder", "serve"], ["demo"], ["doctor"],
+    ["viewfinder"], ["viewfinder", "board"], ["demo"], ["doctor"],
 ]  # fmt: skip
 
 

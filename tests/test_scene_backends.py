@@ -7,11 +7,24 @@ import numpy as np
 import pytest
 
 from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
 from mrbokeh.scene import Environment, Light, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions, neutral_environment, solid_angles_sr
 
-BACKENDS: list[Callable[[], SceneRenderer]] = [EmbreeRaycaster]
+
+def wgpu_rasterizer() -> SceneRenderer:
+    """The rasteriser, where there is a graphics device (Mesa's in software counts)."""
+    pytest.importorskip("wgpu", reason="wgpu is not installed: pip install 'mrbokeh[viewfinder]'")
+    from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
+
+    try:
+        return WgpuRasterizer()
+    except InputError as no_device:
+        pytest.skip(str(no_device))
+
+
+BACKENDS: list[Callable[[], SceneRenderer]] = [EmbreeRaycaster, wgpu_rasterizer]
 DARK = Environment(np.zeros((8, 16, 3), np.float32))
 ODD_CAMERA = Camera(640, 360, (520.0, 515.0), (300.3, 190.7))
 """Unequal focal lengths and a principal point off the middle, as a calibrated camera has."""

@@ -1,10 +1,8 @@
-"""The viewfinder with a real server and real WebSocket clients; where Chromium is installed, with the page in a real browser."""
+"""The viewfinder with a finished layer: a real server and real WebSocket clients; where Chromium is installed, a real browser."""
 
 import asyncio
 import json
-import math
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -15,6 +13,7 @@ from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Event
 from typing import Any
 
@@ -32,17 +31,22 @@ from mrbokeh.overlay import Overlay, code_tables
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video_color import code_from_linear, linear_from_code
 from mrbokeh.video_io import VideoWriter
-from viewfinder.focused_layer import FocusedLayer
+from tests.chromium import CHROMIUM, chromium_page
 from viewfinder.frames import CameraFrame
+from viewfinder.lens_book import LensBook
 from viewfinder.newest import Newest
-from viewfinder.pipeline import Pipeline
-from viewfinder.server.app import serving
-from viewfinder.sources.frame_source import PatternSource, VideoFileSource, open_source
+from viewfinder.running import Parts, Viewfinder
+from viewfinder.running import running as parts_running
+from viewfinder.server.app import serving_site
+from viewfinder.sources.choose import open_source
+from viewfinder.sources.exact_size import ExactSize
+from viewfinder.sources.pattern import PatternSource
+from viewfinder.sources.video_file import VideoFileSource
+from viewfinder.still_layer import StillLayer
 
 WIDTH, HEIGHT = 160, 90
 # Half a dioptre out of focus blurs over 13.7 px here: 160 / 6 px per mm, 20 mm aperture, 51.3 mm to the sensor.
 LENS = Lens(focal_length_mm=50.0, f_number=2.5, focus_distance_m=2.0, sensor_width_mm=6.0)
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 def bright_square(depth_m: float = 2.0) -> Layer:
@@ -65,10 +69,17 @@ def plate(tmp_path: Path) -> tuple[Path, np.ndarray]:
     return path, bgr
 
 
+@contextmanager
+def viewfinder(source: Any, captures: Path, layer: Layer | None = None) -> Iterator[Viewfinder]:
+    still = StillLayer(layer or bright_square(), LENS, ScatterReference(), "scatter")
+    with parts_running(Parts(source, still, LensBook({"test": LENS}), {"scatter": ScatterReference}, captures)) as running_one:
+        yield running_one
+
+
 @asynccontextmanager
 async def running(source: Any, layer: Layer | None = None) -> AsyncIterator[str]:
-    with Pipeline(source, FocusedLayer(layer or bright_square(), LENS, ScatterReference())) as pipeline:
-        async with serving(pipeline, "127.0.0.1", 0) as url:
+    with TemporaryDirectory() as captures, viewfinder(source, Path(captures), layer) as running_one:
+        async with serving_site(running_one.site, "127.0.0.1", 0) as url:
             yield url
 
 
@@ -109,9 +120,13 @@ async def watching(url: str) -> AsyncIterator[Viewer]:
         yield Viewer(stream)
 
 
-async def set_focus(url: str, focus_distance_m: Any) -> tuple[int, dict[str, Any]]:
-    async with aiohttp.ClientSession() as session, session.post(url + "focus", json={"focus_distance_m": focus_distance_m}) as answer:
+async def control(url: str, message: Any) -> tuple[int, dict[str, Any]]:
+    async with aiohttp.ClientSession() as session, session.post(url + "control", json=message) as answer:
         return answer.status, await answer.json()
+
+
+async def set_focus(url: str, distance_m: Any) -> tuple[int, dict[str, Any]]:
+    return await control(url, {"focus": {"distance_m": distance_m}})
 
 
 def in_time(work: Callable[[], Coroutine[Any, Any, None]], limit_s: float = 30.0) -> None:
@@ -155,11 +170,11 @@ def test_the_focus_changes_the_object_and_nothing_else(plate: tuple[Path, np.nda
         async with running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url, watching(url) as viewer:
             sharp = await viewer.frame()
             assert sharp.header["focus_distance_m"] == 2.0
-            assert (await set_focus(url, 1.0))[0] == 202
+            assert (await set_focus(url, 1.0))[0] == 200
             soft = await until(viewer, lambda shown: shown.header["focus_distance_m"] == 1.0)
-            assert (await set_focus(url, None))[0] == 202
+            assert (await set_focus(url, None))[0] == 200
             await until(viewer, lambda shown: shown.header["focus_distance_m"] is None)
-            assert (await set_focus(url, 2.0))[0] == 202
+            assert (await set_focus(url, 2.0))[0] == 200
             again = await until(viewer, lambda shown: shown.header["focus_distance_m"] == 2.0)
         np.testing.assert_array_equal(again.bgr, sharp.bgr)
         change = np.abs(soft.bgr.astype(float) - sharp.bgr).max(axis=2)
@@ -249,7 +264,7 @@ def test_other_web_pages_are_refused() -> None:
         ):
             with pytest.raises(aiohttp.WSServerHandshakeError):
                 await session.ws_connect(url + "stream")
-            async with session.post(url + "focus", json={"focus_distance_m": 1.0}) as answer:
+            async with session.post(url + "control", json={"focus": {"distance_m": 1.0}}) as answer:
                 assert answer.status == 403
 
     in_time(work)
@@ -262,9 +277,9 @@ def test_the_port_is_free_again_and_a_taken_one_is_named(plate: tuple[Path, np.n
         async with running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url, watching(url) as viewer:
             await viewer.frame()
             ports.append(int(url.rsplit(":", 1)[1].strip("/")))
-            pipeline = Pipeline(PatternSource(WIDTH, HEIGHT), FocusedLayer(bright_square(), LENS, ScatterReference()))
-            with pytest.raises(InputError, match=f"port {ports[0]}.*--port"), pipeline:
-                async with serving(pipeline, "127.0.0.1", ports[0]):
+            other = viewfinder(PatternSource(WIDTH, HEIGHT), plate[0].parent)
+            with pytest.raises(InputError, match=f"port {ports[0]}.*--port"), other as second:
+                async with serving_site(second.site, "127.0.0.1", ports[0]):
                     pass
 
     in_time(work)
@@ -274,7 +289,7 @@ def test_the_port_is_free_again_and_a_taken_one_is_named(plate: tuple[Path, np.n
 
 def test_a_failing_camera_says_so() -> None:
     class Unplugged:
-        name, transfer = "camera 7", "srgb"
+        name, transfer, status = "camera 7", "srgb", None
 
         def frames(self, stopping: Event) -> Iterator[CameraFrame]:
             yield CameraFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic(), 0)
@@ -326,7 +341,8 @@ def test_sources_are_named_or_refused(plate: tuple[Path, np.ndarray], tmp_path: 
     assert open_source("test", WIDTH, HEIGHT, None).name == "test pattern"
     assert open_source(str(plate[0]), 2 * WIDTH, 2 * HEIGHT, None).name == "plate.mkv"
     with pytest.raises(InputError, match="aspect ratio"):
-        open_source(str(plate[0]), 100, 100, None)
+        next(ExactSize(open_source(str(plate[0])), 100, 100).frames(Event()))
+    assert next(ExactSize(open_source(str(plate[0])), 320, 180).frames(Event())).bgr.shape == (180, 320, 3)
     with pytest.raises(InputError, match="none of them"):
         open_source(str(tmp_path / "absent.mp4"), WIDTH, HEIGHT, None)
     with pytest.raises(InputError, match="--fps"):
@@ -335,24 +351,25 @@ def test_sources_are_named_or_refused(plate: tuple[Path, np.ndarray], tmp_path: 
         open_source("987", WIDTH, HEIGHT, None)
 
 
-def test_infinity_and_the_nearest_thing_bound_the_slider() -> None:
-    layer = FocusedLayer(bright_square(2.0), LENS, ScatterReference())
-    try:
-        assert layer.dioptre_range == (0.0, 1.0)
-        with pytest.raises(InputError, match="cannot focus"):
-            layer.focus(0.02)
-        layer.focus(math.inf)
-    finally:
-        layer.close()
+def test_what_a_finished_layer_cannot_do_is_said(tmp_path: Path) -> None:
+    with viewfinder(PatternSource(WIDTH, HEIGHT), tmp_path) as running_one:
+        controls = running_one.site.controls
+        with pytest.raises(InputError, match="has not given a picture"):
+            controls.focus_at_point(0.5, 0.5)
+        with pytest.raises(InputError, match="focuses from"):
+            controls.focus_at_distance(0.02)
+        with pytest.raises(InputError, match="--scene"):
+            controls.move_object("lantern", (0.1, 0.0))
+        assert controls.state()["dioptre_range"] == (0.0, pytest.approx(1 / 0.075)), "1.5 focal lengths of 50 mm"
 
 
 @contextmanager
 def command(tmp_path: Path, *extra: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`mrbokeh viewfinder serve` as a process, and the address that it prints."""
+    """`mrbokeh viewfinder` as a process, and the address that it prints."""
     write_layer(tmp_path / "layer.exr", bright_square())
     write_lens(tmp_path / "lens.json", LENS)
     files = ["--layer", str(tmp_path / "layer.exr"), "--lens", str(tmp_path / "lens.json")]
-    arguments = [sys.executable, "-u", "-m", "mrbokeh.cli", "viewfinder", "serve", "--source", "test", *files, *extra]
+    arguments = [sys.executable, "-u", "-m", "mrbokeh.cli", "viewfinder", "--source", "test", *files, *extra]
     root = Path(__file__).parent.parent
     with subprocess.Popen(arguments, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -394,71 +411,31 @@ def test_a_taken_port_ends_the_command_with_a_sentence(tmp_path: Path) -> None:
     assert "Traceback" not in errors
 
 
-@asynccontextmanager
-async def browser_page(url: str, profile: Path, size: str) -> AsyncIterator[Callable[..., Coroutine[Any, Any, Any]]]:
-    """A headless Chromium on a page; gives a function that sends one command of the DevTools protocol."""
-    flags = [
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--remote-debugging-port=0",
-        f"--user-data-dir={profile}",
-        f"--window-size={size}",
-    ]
-    process = subprocess.Popen([str(CHROMIUM), *flags, url], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        port_file = profile / "DevToolsActivePort"
-        while not (port_file.exists() and port_file.read_text().strip()):
-            await asyncio.sleep(0.05)
-        port = port_file.read_text().split()[0]
-        async with aiohttp.ClientSession() as session:
-            async with session.get(f"http://127.0.0.1:{port}/json/list") as answer:
-                page = next(each for each in await answer.json() if each["type"] == "page")
-            async with session.ws_connect(page["webSocketDebuggerUrl"], max_msg_size=0) as devtools:
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed; the page is tested by clients in Python only")
+@pytest.mark.parametrize("transport", ["whep", "jpeg"])
+def test_the_page_shows_the_stream_in_a_browser(tmp_path: Path, plate: tuple[Path, np.ndarray], transport: str) -> None:
+    """The plate on the screen, red in the square, and beside the square more red when a finger has moved the focus."""
 
-                async def send(method: str, **parameters: Any) -> Any:
-                    await devtools.send_json({"id": 1, "method": method, "params": parameters})
-                    while "id" not in (message := await devtools.receive_json(timeout=10)):
-                        pass
-                    return message["result"]
-
-                yield send
-    finally:
-        process.terminate()
-        process.wait(timeout=10)
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed; the page is tested by the WebSocket clients only")
-def test_the_page_shows_the_stream_in_a_browser(tmp_path: Path, plate: tuple[Path, np.ndarray]) -> None:
     async def work() -> None:
         async with (
             running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url,
-            browser_page(url, tmp_path / "profile", "390,844") as send,
+            chromium_page(f"{url}?transport={transport}", tmp_path / "profile") as page,
         ):
 
-            async def value(expression: str) -> Any:
-                return (await send("Runtime.evaluate", expression=expression, returnByValue=True))["result"].get("value")
+            async def color_at(x_px: float, y_px: float) -> np.ndarray:
+                left, top, width, height = await page.box("#stage")
+                column, row = int(left + (x_px + 0.5) / WIDTH * width), int(top + (y_px + 0.5) / HEIGHT * height)
+                return (await page.screenshot())[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).mean(axis=0)
 
-            async def comes_true(expression: str) -> None:
-                for _ in range(200):
-                    if await value(expression):
-                        return
-                    await asyncio.sleep(0.05)
-                raise AssertionError(f"never true: {expression}")
-
-            pixel = "[...document.getElementById('picture').getContext('2d').getImageData({x}, {y}, 1, 1).data]"
-            await comes_true("window.viewfinder && viewfinder.counts.shown > 20 && document.getElementById('age').textContent !== '-'")
-            age_ms = float(await value("viewfinder.age"))
-            assert 0 < age_ms < 1000
-            assert float(await value("document.getElementById('fps').textContent")) > 5
-            assert await value("document.getElementById('picture').clientWidth === document.documentElement.clientWidth")
-            # The canvas shows the plate, red in the square, and beside the square more red when the focus goes away.
-            np.testing.assert_allclose((await value(pixel.format(x=20, y=20)))[:3], plate[1][20, 20, ::-1], atol=6)
-            beside = (await value(pixel.format(x=64, y=45)))[0]
-            await value("{ const s = document.getElementById('focus'); s.value = 1; s.dispatchEvent(new Event('input')); }")
-            await comes_true("viewfinder.focus === 1")
-            assert (await value(pixel.format(x=64, y=45)))[0] > beside + 30
-            assert await value("document.getElementById('metres').textContent") == "1.00 m"
-            assert await value("document.getElementById('message').textContent") == ""
+            await page.comes_true("window.viewfinder && viewfinder.counts.shown > 20 && viewfinder.age > 0")
+            assert 0 < float(await page.value("viewfinder.age")) < 1000
+            np.testing.assert_allclose(await color_at(20, 20), plate[1][20, 20, ::-1], atol=10)
+            beside = (await color_at(64, 45))[0]
+            await page.value("(s => { s.value = 1; s.dispatchEvent(new Event('input')); })(document.getElementById('focus'))")
+            await page.comes_true("viewfinder.focus === 1")
+            assert (await color_at(64, 45))[0] > beside + 25
+            assert await page.value("document.getElementById('message').textContent") == ""
+            assert page.errors == []
 
     in_time(work, 60.0)

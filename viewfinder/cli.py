@@ -1,68 +1,83 @@
-"""`mrbokeh viewfinder`: a camera with a virtual object in it, blurred by the lens, in a browser."""
+"""`mrbokeh viewfinder`: a camera with virtual objects in it, blurred by the lens, in a browser."""
 
-import asyncio
-import contextlib
 import logging
-import signal
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mrbokeh.image_io import read_layer
-from mrbokeh.lens_file import read_lens
-from mrbokeh.renderers.choose import DEFAULT, make_renderer
-from viewfinder.focused_layer import FocusedLayer
-from viewfinder.pipeline import Pipeline
-from viewfinder.server.app import serving
-from viewfinder.sources.frame_source import open_source
+from viewfinder.commands.board import board_command
 
-app = typer.Typer(add_completion=False, no_args_is_help=True)
-
-_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+app = typer.Typer(add_completion=False)
+app.command("board")(board_command)
 
 
-@app.callback()
-def viewfinder() -> None:
-    """Stream a camera with virtual objects in it to a browser.
-
-    Example: mrbokeh viewfinder serve --source clip.mp4 --layer lantern.exr --lens lens.json
-    """
-
-
-@app.command()
-def serve(
+@app.callback(invoke_without_command=True)
+def viewfinder(
+    context: typer.Context,
     source: Annotated[
-        str, typer.Option(metavar="CLIP|CAMERA|test", help="A video played in a loop, the number of a webcam, or a test pattern.")
-    ],
-    layer: Annotated[Path, typer.Option(metavar="RGBAZ.exr", help="All-in-focus virtual layer; the stream has its size.")],
-    lens: Annotated[Path, typer.Option(metavar="LENS.json", help="The lens; its focus is where the slider begins.")],
-    renderer: Annotated[str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).")] = DEFAULT,
-    port: Annotated[int, typer.Option(help="Port of the page; 0 takes a free one.")] = 8080,
-    host: Annotated[str, typer.Option(help="Address to listen on; other machines reach only what is not loopback.")] = "127.0.0.1",
+        str | None,
+        typer.Option(
+            help="Video played in a loop, number of a webcam, rtsp/http/udp URL, folder:PATH, gphoto2, whip (a browser), or test."
+        ),
+    ] = None,
+    scene: Annotated[Path | None, typer.Option(help="SCENE.toml: objects, light, shadow, lens; read again when it changes.")] = None,
+    layer: Annotated[
+        Path | None, typer.Option(metavar="RGBAZ.exr", help="Instead of a scene: an all-in-focus layer before a camera that stands still.")
+    ] = None,
+    lens: Annotated[
+        list[Path] | None, typer.Option(help="LENS.json, or NETWORK.onnx (repeat: the page switches between them); else the scene's.")
+    ] = None,
+    renderer: Annotated[
+        list[str] | None,
+        typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, laplacian (repeat to switch on the page)."),
+    ] = None,
+    backend: Annotated[str, typer.Option(help="What draws the scene: wgpu (a graphics card), embree (the processor), or auto.")] = "auto",
+    psf: Annotated[
+        Path | None, typer.Option(help="A measured bank of kernels (of `mrbokeh lens fit`) in place of the lens's opening.")
+    ] = None,
+    board: Annotated[Path | None, typer.Option(help="BOARD.json of `mrbokeh viewfinder board`: the camera is tracked by it.")] = None,
+    pose: Annotated[Path | None, typer.Option(help="CAMERA.json: the camera stands still, with this pose and these intrinsics.")] = None,
+    map_: Annotated[
+        Path | None, typer.Option("--map", help="Folder of a COLMAP map with its pictures: the camera is localised in it.")
+    ] = None,
+    metres_per_unit: Annotated[float | None, typer.Option(help="Scale of --map, where it does not tell.")] = None,
+    opentrackio: Annotated[int | None, typer.Option(metavar="PORT", help="UDP port where OpenTrackIO comes in.")] = None,
+    freed: Annotated[int | None, typer.Option(metavar="PORT", help="UDP port where FreeD comes in.")] = None,
+    lens_table: Annotated[Path | None, typer.Option(help="CSV that turns FreeD's encoder counts into focus and zoom.")] = None,
+    camera: Annotated[Path | None, typer.Option(help="CAMERA.json with the source's intrinsics; else those of the lens.")] = None,
+    smoothing: Annotated[bool, typer.Option(help="Smooth the track (One-Euro); the page can switch it.")] = False,
+    width: Annotated[int | None, typer.Option(min=16, metavar="PX", help="Wider pictures are made smaller.")] = 640,
     fps: Annotated[float | None, typer.Option(help="At most so many frames per second.")] = None,
+    captures: Annotated[Path, typer.Option(help="Folder for captured bundles and recordings.")] = Path("captures"),
+    port: Annotated[int, typer.Option(help="Port of the page; 0 takes a free one.")] = 8080,
+    lan: Annotated[bool, typer.Option(help="Let this network in, with a one-time token; else only this machine.")] = False,
+    interface: Annotated[str | None, typer.Option(help="With --lan: name or address of the one interface to listen on.")] = None,
+    tls: Annotated[
+        Path | None, typer.Option(metavar="CERTIFICATE", help="PEM certificate: phones lend their camera over https only.")
+    ] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="PEM key, where it is not in the certificate's file.")] = None,
 ) -> None:
-    """Serve a page that shows the camera, which does not move, with the virtual layer in it; Ctrl-C ends it.
+    """Show a camera with virtual objects in it, blurred by the lens, on a page for phones; Ctrl-C ends it.
 
-    Example: mrbokeh viewfinder serve --source 0 --layer lantern.exr --lens lens.json --port 8080
+    Example: mrbokeh viewfinder --source 0 --scene table.toml --board board.json --lens lens.json --lan
+
+    Example: mrbokeh viewfinder --source clip.mp4 --layer lantern.exr --lens lens.json
     """
+    if context.invoked_subcommand is not None:
+        return
+    if source is None:
+        typer.echo(context.get_help())
+        raise typer.Exit(2)
+    from viewfinder.assembly import TrackingChoice
+    from viewfinder.commands.serve import ServeOptions, listening_address, serve
+
     logging.basicConfig(level=logging.WARNING)
-    sharp = read_layer(layer)
-    camera = open_source(source, sharp.width_px, sharp.height_px, fps)
-    virtual = FocusedLayer(sharp, read_lens(lens), make_renderer(renderer))
-    with Pipeline(camera, virtual) as pipeline, contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(pipeline, host, port))
-    typer.echo("viewfinder stopped")
-
-
-async def _serve(pipeline: Pipeline, host: str, port: int) -> None:
-    stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # Where signal handlers cannot be set (Windows), Ctrl-C arrives as KeyboardInterrupt.
-        with contextlib.suppress(NotImplementedError):
-            asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    async with serving(pipeline, host, port) as url:
-        typer.echo(f"viewfinder of {pipeline.source.name}: {url} (Ctrl-C stops it)")
-        if host not in _LOOPBACK:
-            typer.echo("everybody on this network can watch and set the focus: there is no password yet")
-        await stopped.wait()
+    at = (interface or "") if lan else None
+    tracking = TrackingChoice(board, pose, map_, metres_per_unit, opentrackio, freed, lens_table, listening_address(at))
+    lenses, renderers = tuple(lens or ()), tuple(renderer or ())
+    serve(
+        ServeOptions(
+            source, scene, layer, lenses, renderers, psf, tracking, camera, smoothing, width, fps, captures, port, at, tls, tls_key, backend
+        )
+    )

@@ -1,55 +1,56 @@
-"""Pipeline: camera -> virtual layer over it -> JPEG, in two threads with one slot between; a frame nobody waits for is never made."""
+"""Pipeline: camera -> compositor -> sinks, in two threads with one slot between; a frame that nobody wants is never made."""
 
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from threading import Event, Thread
+from typing import Protocol, runtime_checkable
 
 from mrbokeh.errors import InputError
-from mrbokeh.overlay import code_tables
-from viewfinder.focused_layer import FocusedLayer
-from viewfinder.frames import CameraFrame
+from viewfinder.frames import CameraFrame, OutputFrame
 from viewfinder.newest import Newest
-from viewfinder.sources.frame_source import FrameSource
+from viewfinder.sources.base import FrameSource
 
-_POLL_S = 0.1
+_POLL_S = 0.01
+_REPEAT_S = 0.1  # a camera that stands still is shown again so often, for what lies over it may have changed
 _LEAVE_S = 3.0
+_IDLE_S = 1.0  # frames are not counted as dropped while nobody watched for so long
 
 log = logging.getLogger(__name__)
 
+Compositor = Callable[[CameraFrame, int], OutputFrame]
+"""The finished picture of a frame, and how many frames were dropped so far."""
 
-def _ignore(_news: object) -> None:
-    """Where nobody listens."""
 
+@runtime_checkable
+class FrameSink(Protocol):
+    """Where finished pictures go. Called in the compositing thread; must return at once (hand over through `Newest`)."""
 
-@dataclass(frozen=True)
-class StreamFrame:
-    """One finished picture. captured_s: `time.monotonic` of the capture; sequence: the number of the capture."""
+    @property
+    def wants_frame(self) -> bool:
+        """Whether a viewer waits, or a recording runs."""
+        ...
 
-    jpeg: bytes
-    sequence: int
-    captured_s: float
-    focus_distance_m: float
-    focus_pending: bool
-    composite_ms: float
-    encode_ms: float
+    def show(self, frame: OutputFrame) -> None: ...
+
+    def fail(self, sentence: str) -> None:
+        """The source died."""
+        ...
 
 
 class Pipeline:
-    """Runs while open (`with`). `want` asks for one more frame; it comes to `on_frame`, in the compositing thread.
+    """Runs while open (`with`). If the camera fails for good, sinks get a sentence, and the pipeline stands still.
 
-    on_failure gets a sentence if the camera fails, which stays in `failure`; the pipeline then stands still.
+    failure: that sentence. problem: a sentence while frames come that cannot be composited.
     """
 
-    def __init__(self, source: FrameSource, layer: FocusedLayer, jpeg_quality: int = 85) -> None:
-        self.source, self.layer, self._jpeg_quality = source, layer, jpeg_quality
-        self.on_frame: Callable[[StreamFrame], None] = _ignore
-        self.on_failure: Callable[[str], None] = _ignore
+    def __init__(self, source: FrameSource, compositor: Compositor, sinks: Sequence[FrameSink]) -> None:
+        self.source, self._compositor, self._sinks = source, compositor, list(sinks)
         self.failure: str | None = None
-        self._tables = code_tables(source.transfer)
+        self.problem: str | None = None
+        self.dropped = 0
         self._newest: Newest[CameraFrame] = Newest()
-        self._wanted, self._stopping = Event(), Event()
+        self._stopping = Event()
         self._threads = [
             Thread(target=work, name=name, daemon=True) for name, work in (("capture", self._capture), ("composite", self._composite))
         ]
@@ -64,10 +65,6 @@ class Pipeline:
         for thread in self._threads:
             # A camera that hangs in the driver must not keep the program from ending.
             thread.join(_LEAVE_S)
-        self.layer.close()
-
-    def want(self) -> None:
-        self._wanted.set()
 
     def _capture(self) -> None:
         try:
@@ -79,33 +76,42 @@ class Pipeline:
         except Exception:
             log.exception("the source failed")
             self.failure = f"{self.source.name} failed; see the terminal"
-        self.on_failure(self.failure)
+        for sink in self._sinks:
+            sink.fail(self.failure)
 
     def _composite(self) -> None:
+        last: CameraFrame | None = None
+        shown_s = 0.0
         while not self._stopping.is_set():
-            if not self._wanted.wait(_POLL_S):
+            wanting = [sink for sink in self._sinks if sink.wants_frame]
+            if not wanting:
+                self._stopping.wait(_POLL_S)
                 continue
-            frame = self._newest.take(_POLL_S)
-            if frame is not None:
-                # Cleared before the work: who asks during it is served by this frame or asks again on receiving it.
-                self._wanted.clear()
-                self.on_frame(self._finished(frame))
+            frame = self._newest.take(max(0.0, shown_s + _REPEAT_S - time.monotonic()))
+            if frame is not None and last is not None and time.monotonic() - shown_s < _IDLE_S:
+                self.dropped += max(0, frame.sequence - last.sequence - 1)
+            last = last if frame is None else frame
+            if last is None:
+                self._stopping.wait(_POLL_S)
+                continue
+            self._finish(last, wanting)
+            shown_s = time.monotonic()
 
-    def _finished(self, frame: CameraFrame) -> StreamFrame:
-        import cv2
-
-        started_s = time.perf_counter()
-        shown = self.layer.shown
-        bgr = shown.overlay.over_codes(frame.bgr, self._tables)
-        composited_s = time.perf_counter()
-        jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])[1].tobytes()
-        encoded_s = time.perf_counter()
-        return StreamFrame(
-            jpeg,
-            frame.sequence,
-            frame.captured_s,
-            shown.focus_distance_m,
-            self.layer.pending,
-            composite_ms=1000 * (composited_s - started_s),
-            encode_ms=1000 * (encoded_s - composited_s),
-        )
+    def _finish(self, frame: CameraFrame, wanting: Sequence[FrameSink]) -> None:
+        try:
+            finished = self._compositor(frame, self.dropped)
+        except InputError as error:
+            if self.problem != str(error):
+                self.problem = str(error)
+                for sink in self._sinks:
+                    sink.fail(self.problem)
+            self._stopping.wait(_REPEAT_S)
+            return
+        except Exception:
+            # One bad frame, or a scene that was just being changed, must not end the stream.
+            log.exception("a frame could not be composited")
+            self._stopping.wait(_REPEAT_S)
+            return
+        self.problem = None
+        for sink in wanting:
+            sink.show(finished)

@@ -37,6 +37,7 @@ PACKAGES = (
     ("embreex", "rendering 3D objects", "pip install mrbokeh"),
     ("av", "reading and writing videos", "pip install mrbokeh"),
     ("aiohttp", "the viewfinder in a browser", "pip install 'mrbokeh[viewfinder]'"),
+    ("aiortc", "the viewfinder's video stream", "pip install 'mrbokeh[viewfinder]'"),
 )
 PROGRAMS = (
     ("exiftool", "metadata of more cameras (49 of 54 files are read without it)", "install exiftool with your system's package manager"),
@@ -62,7 +63,7 @@ def findings() -> list[Finding]:
     """Every optional thing with its version or path, None where it is missing."""
     packages = [Finding(name, _version(name), enables, remedy) for name, enables, remedy in PACKAGES]
     programs = [Finding(name, shutil.which(name), enables, remedy) for name, enables, remedy in PROGRAMS]
-    return [*packages, _cuda(), *programs]
+    return [*packages, _cuda(), _graphics_device(), *programs]
 
 
 def _version(package: str) -> str | None:
@@ -75,6 +76,21 @@ def _version(package: str) -> str | None:
 def _cuda() -> Finding:
     remedy = "needs an NVIDIA driver and a CUDA build of torch; training works without, slower"
     return Finding("CUDA in torch", _quietly(_cuda_device), "training on the GPU", remedy)
+
+
+def _graphics_device() -> Finding:
+    remedy = "pip install 'mrbokeh[viewfinder]' and a Vulkan, Metal or Direct3D 12 driver; the ray caster draws without one"
+    return Finding("graphics device", _quietly(_described_device), "rendering 3D objects on a graphics card", remedy)
+
+
+def _described_device() -> str | None:
+    from mrbokeh.errors import InputError
+    from mrbokeh.scene.choose import described_device
+
+    try:
+        return described_device()
+    except InputError:
+        return None
 
 
 def _cuda_device() -> str | None:

@@ -17,6 +17,8 @@ What lies where:
     gltf_loader        load_glb(path, time_s, animation) -> Scene; GltfAsset for many moments of one file (needs pygltflib)
     base               SceneRenderer: render(scene, camera) -> Layer, render_shadow_mask(scene, camera, catcher)
     embree_raycaster   EmbreeRaycaster, the backend for any CPU (needs embreex and numba)
+    wgpu_rasterizer    WgpuRasterizer, the backend for graphics cards (needs wgpu)
+    choose             scene_renderer("auto"): the card where there is one, else the ray caster
 
 Only light modules are imported here; the loader and the backends are imported by their own names.
 """

@@ -61,14 +61,14 @@ class PackedTextures(NamedTuple):
 def packed(meshes: Sequence[Mesh], centre_m: Float[np.ndarray, "3"]) -> tuple[PackedTriangles, PackedMaterials, PackedTextures]:
     """Meshes, materials and textures as arrays; shared materials and textures are stored once."""
     materials = list({id(mesh.material): mesh.material for mesh in meshes}.values())
-    textures = list({id(texture): texture for material in materials for texture in _textures_of(material) if texture is not None}.values())
+    textures = list({id(texture): texture for material in materials for texture in textures_of(material) if texture is not None}.values())
     number = {id(material): index for index, material in enumerate(materials)}
-    parts = [_triangles(mesh, centre_m, number[id(mesh.material)], index) for index, mesh in enumerate(meshes)]
+    parts = [packed_triangles(mesh, centre_m, number[id(mesh.material)], index) for index, mesh in enumerate(meshes)]
     triangles = PackedTriangles(*(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts, strict=True)))
-    return triangles, _materials(materials, textures), _textures(textures)
+    return triangles, packed_materials(materials, textures), packed_textures(textures)
 
 
-def _textures_of(material: Material) -> tuple[Texture | None, ...]:
+def textures_of(material: Material) -> tuple[Texture | None, ...]:
     return (
         material.base_color_texture,
         material.metallic_roughness_texture,
@@ -78,7 +78,7 @@ def _textures_of(material: Material) -> tuple[Texture | None, ...]:
     )
 
 
-def _triangles(mesh: Mesh, centre_m: Float[np.ndarray, "3"], material: int, index: int) -> PackedTriangles:
+def packed_triangles(mesh: Mesh, centre_m: Float[np.ndarray, "3"], material: int, index: int) -> PackedTriangles:
     if mesh.material.normal_texture is not None:
         mesh = with_tangents(mesh)
     corner, count = mesh.triangles, len(mesh.triangles)
@@ -102,7 +102,7 @@ def _triangles(mesh: Mesh, centre_m: Float[np.ndarray, "3"], material: int, inde
     )
 
 
-def _materials(materials: list[Material], textures: list[Texture]) -> PackedMaterials:
+def packed_materials(materials: list[Material], textures: list[Texture]) -> PackedMaterials:
     number = {id(texture): index for index, texture in enumerate(textures)}
     number[id(None)] = -1
 
@@ -121,11 +121,11 @@ def _materials(materials: list[Material], textures: list[Texture]) -> PackedMate
         alpha_cutoff=column([m.alpha_cutoff for m in materials], np.float32),
         double_sided=column([m.double_sided for m in materials], np.bool_),
         unlit=column([m.unlit for m in materials], np.bool_),
-        textures=column([[number[id(texture)] for texture in _textures_of(m)] for m in materials], np.int32),
+        textures=column([[number[id(texture)] for texture in textures_of(m)] for m in materials], np.int32),
     )
 
 
-def _textures(textures: list[Texture]) -> PackedTextures:
+def packed_textures(textures: list[Texture]) -> PackedTextures:
     texels, sizes, first_level = [np.zeros((0, 4), np.float32)], [], [0]
     for texture in textures:
         for level in _levels(texture.texels):

@@ -13,6 +13,7 @@ import onnxruntime
 
 from mrbokeh.atomic_files import atomic_path, write_json
 from mrbokeh.errors import InputError
+from mrbokeh.progress import track
 from mrbokeh.renderers.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
 from mrbokeh.renderers.onnx_sessions import open_session
 from training.export_onnx import export_network, largest_difference, network_facts_of, record_path
@@ -28,8 +29,8 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class FastExported:
-    """loss_db: measured (see `training.fast_export.measured_loss`); naive_ms, fast_ms: of one picture with every circle of confusion, the
-    lowest of some rounds in turns; difference: largest one to PyTorch."""
+    """loss_db: measured (see `training.fast_export.measured_loss`); naive_ms, fast_ms: of a picture with every circle of confusion
+    everywhere, the lowest of some rounds in turns; difference: largest one to PyTorch."""
 
     facts: NetworkFacts
     plan: Plan
@@ -58,7 +59,7 @@ def export_fast_network(
     scenes: Sequence[Path] = (),
 ) -> FastExported:
     network_facts = network_facts_of(network, settings, facts)
-    candidates = list(plans(network))
+    candidates = plans(network)
     looks = looks_at(scenes, network, network_facts) if scenes else [made_up_look(network, network_facts)]
     with atomic_path(path) as temporary, tempfile.TemporaryDirectory() as folder:
         plan, loss = _boldest(network, candidates, network_facts, temporary, lambda session: loss_db(session, looks), max_psnr_loss_db)
@@ -80,7 +81,7 @@ def _boldest(
 ) -> tuple[Plan, float]:
     """The first plan within the budget, written to `path`, and what it loses."""
     losses = []
-    for plan in candidates:
+    for plan in track(candidates, "plans tried"):
         write_model(network, plan, facts, path)
         losses.append(loss(open_session(path)))
         if losses[-1] <= max_loss_db:
@@ -98,7 +99,10 @@ def write_model(network: BlurNetwork, plan: Plan, facts: NetworkFacts, path: Pat
 
 
 def made_up_inputs(facts: NetworkFacts, look: Look) -> dict[str, np.ndarray]:
-    """What is timed: the look's picture, repeated to the size at which networks are timed where the size is free."""
+    """What is timed: the look's picture, repeated to the size at which networks are timed where the size is free.
+
+    Every circle of confusion is everywhere, in no order, so that nothing can be left out: the slowest picture there is.
+    """
     height, width = look.inputs["rgb"].shape[2:] if facts.tiled else TIMED_SIZE_PX
     inputs = {}
     for name, values in look.inputs.items():
@@ -107,8 +111,8 @@ def made_up_inputs(facts: NetworkFacts, look: Look) -> dict[str, np.ndarray]:
             repeats = (1, 1, -(-height // array.shape[2]), -(-width // array.shape[3]))
             array = np.ascontiguousarray(np.tile(array, repeats)[:, :, :height, :width])
         inputs[name] = array
-    ramp = np.linspace(-facts.largest_coc_px, facts.largest_coc_px, width, dtype=np.float32)
-    return inputs | {"coc_px": np.ascontiguousarray(np.broadcast_to(ramp, (1, 1, height, width)))}
+    fraction = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 1, height, width)).astype(np.float32)
+    return inputs | {"coc_px": facts.largest_coc_px * fraction}
 
 
 def _timed(paths: Sequence[Path], inputs: dict[str, np.ndarray]) -> list[float]:

@@ -1,57 +1,74 @@
 """The bins of the gated form in groups that are computed together, each at a resolution of its own."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from training.fast_export.coarse_kernels import coarse_kernel
-from training.gated_network import GatedTiles
+from training.fast_export.coarse_kernels import coarse_kernel, taps_radius
+from training.fast_export.gated_weights import GatedWeights, widened
+from training.gated_bins import blocks_for_gates
 
-CHANNELS = 16  # ONNX Runtime convolves channel by channel in blocks of so many
+_PASSES, _COARSE_PASSES = 250.0, 100.0  # measured on Zen 5, in multiplications of a convolution channel by channel
 
 
 @dataclass(frozen=True)
 class Group:
-    """bins: of the network; factor: 1, 2 or 4, by which their resolution is lowered; weights: (bins * bases * maps, 1, k, k) for Conv.
+    """Bins first to end, in order. factor: 1, 2 or 4, by which their resolution is lowered.
 
-    lowest_px, highest_px: pairs of signed diameters between which a pixel belongs to one of these bins.
+    kernels: (bins * bases * maps, 1, k, k), for Conv. span_px: the signed diameters between which a pixel belongs to one of these bins.
     """
 
-    bins: tuple[int, ...]
+    first: int
+    end: int
     factor: int
-    weights: np.ndarray
-    spans_px: tuple[tuple[float, float], ...]
+    kernels: np.ndarray
+    span_px: tuple[float, float]
+
+    @property
+    def count(self) -> int:
+        return self.end - self.first
 
 
-def kernels_of(tiles: GatedTiles, n: int) -> np.ndarray:
-    """(bins of this size, bases, colours, 2n+1, 2n+1), each with sum 1."""
-    magnitude = tiles.kernels[n - 1].detach().abs()[0].double()
-    kernels = magnitude / magnitude.sum(dim=(-2, -1), keepdim=True)
-    return kernels.reshape(-1, tiles.bases, *kernels.shape[1:]).numpy()
+def groups_of(weights: GatedWeights, factors: Sequence[int]) -> list[Group]:
+    """factors: for n = 1, 2, ... A group is as fine as its smallest kernel asks."""
+    return [_group(weights, bins, factor) for bins, factor in shared(weights, factors)]
 
 
-def groups_of(tiles: GatedTiles, factors: Mapping[int, int]) -> list[Group]:
-    """factors: for every n. Sizes of one factor share a group until it fills a block of channels."""
-    together: list[list[int]] = []
-    maps = (3 + tiles.colours) * tiles.bases
-    for n in range(1, len(tiles.kernels) + 1):
-        last = together[-1] if together else []
-        if last and factors[last[0]] == factors[n] and maps * sum(tiles.radii.count(each) for each in last) < CHANNELS:
-            last.append(n)
-        else:
-            together.append([n])
-    return [_group(tiles, sizes, factors[sizes[0]]) for sizes in together]
+def cost(weights: GatedWeights, factors: Sequence[int]) -> float:
+    """Multiplications per pixel, with passes over a map counted as what takes as long."""
+    total = 0.0
+    for bins, factor in shared(weights, factors):
+        radius = max(weights.radii_px[each] for each in bins)
+        taps = radius if factor == 1 else taps_radius(radius, factor)
+        total += len(bins) * (_PASSES + (_COARSE_PASSES if factor > 1 else 0.0) + ((2 * taps + 1) / factor) ** 2)
+    return total * weights.maps * weights.bases
 
 
-def _group(tiles: GatedTiles, sizes: Sequence[int], factor: int) -> Group:
-    kernels = [_at_resolution(kernel, factor) for n in sizes for kernel in kernels_of(tiles, n)]
+def reach_px(weights: GatedWeights, factors: Sequence[int]) -> int:
+    """How far from a pixel the graph looks."""
+    radii = [(max(weights.radii_px[each] for each in bins), factor) for bins, factor in shared(weights, factors)]
+    return max(radius if factor == 1 else factor * (taps_radius(radius, factor) + 1) for radius, factor in radii)
+
+
+def shared(weights: GatedWeights, factors: Sequence[int]) -> list[tuple[range, int]]:
+    """Which bins share a group, and its factor. What does not fill a group is left around the focus."""
+    at_once, count = weights.bins_at_once, len(weights.knots_px)
+    centre = int(np.argmin(np.abs(weights.knots_px)))
+    near, far = centre // at_once * at_once, count - (count - 1 - centre) // at_once * at_once
+    starts = [*range(0, near, at_once), near, *range(far, count, at_once)]
+    together = [range(*ends) for ends in zip(starts, [*starts[1:], count], strict=True)]
+    return [(bins, min(factors[min(blocks_for_gates(weights.knots_px[each]), len(factors)) - 1] for each in bins)) for bins in together]
+
+
+def _group(weights: GatedWeights, bins: range, factor: int) -> Group:
+    kernels = [_at_resolution(weights.kernels[each], factor) for each in bins]
     largest = max(each.shape[-1] for each in kernels)
-    stacked = np.stack([_widened(each, largest) for each in kernels])  # (bins, bases, colours, k, k)
-    repeats = 2 if tiles.colours == 3 else 4
-    weights = np.tile(stacked, (1, 1, repeats, 1, 1)).reshape(-1, 1, largest, largest).astype(np.float32)
-    bins = tuple(index for index, radius in enumerate(tiles.radii) if radius in sizes)
-    return Group(bins, factor, weights, tuple(_span_px(tiles.knots, index) for index in bins))
+    stacked = np.stack([widened(each, largest) for each in kernels])  # (bins, bases, colours, k, k)
+    repeats = 2 if weights.colours == 3 else 4
+    maps = np.tile(stacked, (1, 1, repeats, 1, 1)).reshape(-1, 1, largest, largest).astype(np.float32)
+    return Group(bins.start, bins.stop, factor, maps, _span_px(weights.knots_px, bins))
 
 
 def _at_resolution(kernels: np.ndarray, factor: int) -> np.ndarray:
@@ -60,13 +77,7 @@ def _at_resolution(kernels: np.ndarray, factor: int) -> np.ndarray:
     return np.stack([np.stack([coarse_kernel(kernel, factor) for kernel in base]) for base in kernels])
 
 
-def _widened(kernels: np.ndarray, size: int) -> np.ndarray:
-    margin = (size - kernels.shape[-1]) // 2
-    return np.pad(kernels, [(0, 0)] * (kernels.ndim - 2) + [(margin, margin)] * 2)
-
-
-def _span_px(knots: Sequence[float], index: int) -> tuple[float, float]:
-    """The knots beside this one, outermost ones open."""
-    ascending = sorted(knots)
-    i = ascending.index(knots[index])
-    return (ascending[i - 1] if i else -np.inf), (ascending[i + 1] if i + 1 < len(ascending) else np.inf)
+def _span_px(knots_px: Sequence[float] | np.ndarray, bins: range) -> tuple[float, float]:
+    """The knots beside these bins, outermost ones open."""
+    low = float(knots_px[bins.start - 1]) if bins.start else -math.inf
+    return low, float(knots_px[bins.stop]) if bins.stop < len(knots_px) else math.inf

@@ -1,6 +1,6 @@
 """What may be made faster in a network, from the boldest plan to one that changes nothing."""
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,8 +8,10 @@ import numpy as np
 from onnx import ModelProto
 
 from mrbokeh.errors import InputError
-from training.fast_export.coarse_kernels import taps_radius
-from training.fast_export.gated_graph import GatedGraph
+from training.fast_export.fewer_bins import thinned
+from training.fast_export.gated_graph import gated_model
+from training.fast_export.gated_groups import cost, reach_px, shared
+from training.fast_export.gated_weights import weights_of
 from training.fast_export.published_graph import BlockPlan, PublishedGraph, blocks_of, kernels_of
 from training.fast_export.separable import piece_px, separable_kernels
 from training.gated_network import GatedTiles
@@ -18,6 +20,7 @@ from training.published_tiles import PublishedTiles, ResidualBlock
 
 FACTORS = (4, 2, 1)
 LEAST_PIXELS = (3.0, 4.0, 5.0, 6.5, 8.5, 11.0, 15.0, 20.0, 27.0, float("inf"))
+SPACINGS = (0.4, 0.3, 0.2, 0.16, 0.14, 0.12, 0.1, 0.05, 0.0)  # of bins, over their diameter
 SMALL_ERROR = 0.02  # of a separable kernel, norm over norm
 _MATRIX_OVER_CONVOLUTION = 0.5  # measured on Zen 5: multiplications a second of MatMul with its copies, over those of a blocked Conv
 
@@ -26,6 +29,7 @@ _MATRIX_OVER_CONVOLUTION = 0.5  # measured on Zen 5: multiplications a second of
 class Plan:
     """least_pixels: so many coarse pixels a kernel is wide, at least. factors: for n = 1, 2, ...; ranks: likewise, None is not separable.
 
+    spacing: of the bins of the gated form, see `fewer_bins.thinned`; bins: how many that leaves, 0 in the published form.
     reach_px: how far from a pixel the graph looks.
     """
 
@@ -33,47 +37,59 @@ class Plan:
     factors: tuple[int, ...]
     ranks: tuple[int | None, ...]
     reach_px: int
+    spacing: float = 0.0
+    bins: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        return {"factors": list(self.factors), "ranks": list(self.ranks)}
+        return {"factors": list(self.factors), "ranks": list(self.ranks), "spacing": self.spacing, "bins": self.bins}
 
     def words(self) -> str:
         """One line for people."""
         shares = [f"{self.factors.count(factor)} at 1/{factor}" for factor in sorted(set(self.factors))]
         ranks = sorted(rank for rank in self.ranks if rank is not None)
         low_rank = f"{len(ranks)} separable of rank {ranks[0]} to {ranks[-1]}" if ranks else "none separable"
-        return f"kernel sizes by resolution: {', '.join(shares)}; {low_rank}"
+        return f"kernel sizes by resolution: {', '.join(shares)}; {f'{self.bins} bins' if self.bins else low_rank}"
 
 
-def plans(network: BlurNetwork) -> Iterator[Plan]:
+def plans(network: BlurNetwork) -> Sequence[Plan]:
     """Boldest first. Large kernels go to coarse pixels as long as they are still `least_pixels` of them wide."""
-    tiles = network.tiles
-    if isinstance(tiles, GatedTiles) and network.grid is not None:
+    if isinstance(network.tiles, GatedTiles) and network.grid is not None:
         raise InputError(
             "a fast export of the gated form needs a network without tiles: train with tile_px 0 (field_bases learn the field)"
         )
-    if not isinstance(tiles, GatedTiles | PublishedTiles):
-        raise InputError("a fast export is there for the published and the gated form only: export without --fast")
-    if isinstance(tiles, GatedTiles):
-        radii = list(range(1, len(tiles.kernels) + 1))
-        whole_ranks: list[int | None] = [None] * len(radii)
-    else:
-        radii = [block.radius for block in blocks_of(tiles)]
-        whole_ranks = [_rank(block) for block in blocks_of(tiles)]
-    for least in LEAST_PIXELS:
-        factors = tuple(next((factor for factor in FACTORS if (2 * n + 1) / factor >= least), 1) for n in radii)
-        if isinstance(tiles, GatedTiles):
-            reach = max(n if factor == 1 else factor * (taps_radius(n, factor) + 1) for n, factor in zip(radii, factors, strict=True))
-            yield Plan(least, factors, (None,) * len(factors), reach)
-        else:
-            ranks = tuple(rank if factor == 1 else None for rank, factor in zip(whole_ranks, factors, strict=True))
-            coarse_margin = sum(4 * factor for factor in factors if factor > 1)
-            yield Plan(least, factors, ranks if least < np.inf else (None,) * len(factors), network.reach_px + coarse_margin)
+    if isinstance(network.tiles, GatedTiles):
+        return _gated_plans(network.tiles)
+    if isinstance(network.tiles, PublishedTiles):
+        return [_published_plan(network, network.tiles, least) for least in LEAST_PIXELS]
+    raise InputError("a fast export is there for the published and the gated form only: export without --fast")
+
+
+def _gated_plans(tiles: GatedTiles) -> list[Plan]:
+    """Every resolution with every number of bins, in the order of what they cost; of those that come to the same the first."""
+    found: dict[Hashable, tuple[float, Plan]] = {}
+    sizes, whole = range(1, len(tiles.kernels) + 1), weights_of(tiles)
+    for spacing in SPACINGS:
+        weights = thinned(whole, spacing)
+        for least in LEAST_PIXELS:
+            factors = _factors(sizes, least)
+            plan = Plan(least, factors, (None,) * len(factors), reach_px(weights, factors), spacing, len(weights.knots_px))
+            found.setdefault((tuple(weights.knots_px), *shared(weights, factors)), (cost(weights, factors), plan))
+    return [plan for _, plan in sorted(found.values(), key=lambda each: each[0])]
+
+
+def _published_plan(network: BlurNetwork, tiles: PublishedTiles, least: float) -> Plan:
+    factors = _factors([block.radius for block in blocks_of(tiles)], least)
+    ranks = tuple(_rank(block) if factor == 1 and least < np.inf else None for block, factor in zip(blocks_of(tiles), factors, strict=True))
+    return Plan(least, factors, ranks, network.reach_px + sum(4 * factor for factor in factors if factor > 1))
+
+
+def _factors(radii: Sequence[int], least_pixels: float) -> tuple[int, ...]:
+    return tuple(next((factor for factor in FACTORS if (2 * n + 1) / factor >= least_pixels), 1) for n in radii)
 
 
 def model_of(network: BlurNetwork, plan: Plan) -> ModelProto:
     if isinstance(network.tiles, GatedTiles):
-        return GatedGraph(network, dict(enumerate(plan.factors, start=1))).model()
+        return gated_model(network, thinned(weights_of(network.tiles), plan.spacing), plan.factors)
     return PublishedGraph(network, [BlockPlan(*each) for each in zip(plan.factors, plan.ranks, strict=True)]).model()
 
 

@@ -1,7 +1,7 @@
 """The protocol of everything that knows where the camera is."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from mrbokeh.camera import Camera
 from viewfinder.frames import CameraFrame, Pose
@@ -21,6 +21,7 @@ class TrackedPose:
     points: int = 0
 
 
+@runtime_checkable
 class Tracker(Protocol):
     """Called with every frame that is composited, in order; frames between may be missing.
 

@@ -1,5 +1,10 @@
 // What every shader knows of a scene: triangles, materials, textures. Mirrors packed_scene.py and _surface_numba.py.
 
+// What a scene does not have is left out when a pipeline is made: processors that stand in for a graphics device (llvmpipe)
+// run both sides of every branch.
+override TEXTURED = true;
+override SEE_THROUGH = true;  // something is cut out or blended
+
 const OPAQUE = 0u;
 const MASK = 1u;
 const CLAMP = 1u;
@@ -13,7 +18,7 @@ struct Material {
     f0: vec3f, f90: f32,
     metallic: f32, roughness: f32, occlusion_strength: f32, alpha_cutoff: f32,
     alpha_mode: u32, double_sided: u32, unlit: u32, base_texture: i32,
-    metallic_roughness_texture: i32, emissive_texture: i32, normal_texture: i32, occlusion_texture: i32,
+    textures: vec4i,  // metallic and roughness, emissive, normal, occlusion; -1: none
 }
 
 struct Texture {
@@ -23,7 +28,7 @@ struct Texture {
 }
 
 // Where a ray meets a triangle: weights of its corners, depth in lengths of the ray.
-struct Hit { weights: vec3f, depth: f32, inside: bool }
+struct Hit { weights: vec3f, depth: f32 }
 
 @group(0) @binding(0) var<storage, read> triangles: array<vec4f>;
 @group(0) @binding(1) var<storage, read> materials: array<Material>;
@@ -48,12 +53,11 @@ fn meet(a: vec3f, b: vec3f, c: vec3f, origin: vec3f, ray: vec3f) -> Hit {
     let q = cross(to_origin, side_1);
     let determinant = dot(p, side_1);
     if determinant == 0.0 {
-        return Hit(vec3f(1.0, 0.0, 0.0), 0.0, false);
+        return Hit(vec3f(1.0, 0.0, 0.0), 0.0);
     }
     let w1 = dot(p, to_origin) / determinant;
     let w2 = dot(q, ray) / determinant;
-    let inside = w1 >= 0.0 && w2 >= 0.0 && w1 + w2 <= 1.0;
-    return Hit(vec3f(1.0 - w1 - w2, w1, w2), dot(q, side_2) / determinant, inside);
+    return Hit(vec3f(1.0 - w1 - w2, w1, w2), dot(q, side_2) / determinant);
 }
 
 fn clamped(w: vec3f) -> vec3f {
@@ -79,17 +83,6 @@ fn texel(index: u32) -> vec4f {
     return textureLoad(texels, vec2u(index % TEXEL_ROW, line % layer_rows), line / layer_rows, 0);
 }
 
-fn bilinear(texture: Texture, start: u32, size: vec2u, st: vec2f) -> vec4f {
-    let at = st * vec2f(size) - 0.5;
-    let low = floor(at);
-    let f = at - low;
-    let x0 = u32(wrapped(i32(low.x), i32(size.x), texture.wrap_s));
-    let x1 = u32(wrapped(i32(low.x) + 1, i32(size.x), texture.wrap_s));
-    let y0 = start + size.x * u32(wrapped(i32(low.y), i32(size.y), texture.wrap_t));
-    let y1 = start + size.x * u32(wrapped(i32(low.y) + 1, i32(size.y), texture.wrap_t));
-    return mix(mix(texel(y0 + x0), texel(y0 + x1), f.x), mix(texel(y1 + x0), texel(y1 + x1), f.x), f.y);
-}
-
 // A texture at uv (two sets) where it has about one texel per ray; footprint: width in each set's coordinates.
 fn read_texture(number: i32, uv: vec4f, footprint: vec2f) -> vec4f {
     let texture = textures[number];
@@ -98,30 +91,40 @@ fn read_texture(number: i32, uv: vec4f, footprint: vec2f) -> vec4f {
     let stretch = abs(texture.s_from_uv.x * texture.t_from_uv.y - texture.s_from_uv.y * texture.t_from_uv.x);
     let width = select(footprint.x, footprint.y, texture.uv_set == 1u);
     let detail = width * sqrt(f32(texture.width) * f32(texture.height) * stretch);
+    let level = clamp(log2(max(detail, 1.0)), 0.0, f32(texture.levels - 1u));
     var start = texture.start;
     var size = vec2u(texture.width, texture.height);
-    if detail <= 1.0 {
-        return bilinear(texture, start, size, st);
-    }
-    let level = min(log2(detail), f32(texture.levels - 1u));
     for (var k = 0u; k < u32(level); k++) {
         start += size.x * size.y;
         size = max(size / 2u, vec2u(1u));
     }
-    let fine = bilinear(texture, start, size, st);
-    if u32(level) + 1u >= texture.levels {
-        return fine;
+    // Four texels of the finer level and, between two levels, four of the coarser; a loop, for it is compiled many times over.
+    var sum = vec4f(0.0);
+    let count = select(4u, 8u, fract(level) > 0.0);
+    for (var k = 0u; k < count; k++) {
+        if k == 4u {
+            start += size.x * size.y;
+            size = max(size / 2u, vec2u(1u));
+        }
+        let at = st * vec2f(size) - 0.5;
+        let corner = vec2u(k & 1u, (k >> 1u) & 1u);
+        let f = fract(at);
+        let weight = select(1.0 - f, f, corner == vec2u(1u));
+        let x = wrapped(i32(floor(at.x)) + i32(corner.x), i32(size.x), texture.wrap_s);
+        let y = wrapped(i32(floor(at.y)) + i32(corner.y), i32(size.y), texture.wrap_t);
+        let share = weight.x * weight.y * select(1.0 - fract(level), fract(level), k >= 4u);
+        sum += share * texel(start + u32(y) * size.x + u32(x));
     }
-    return mix(fine, bilinear(texture, start + size.x * size.y, max(size / 2u, vec2u(1u)), st), fract(level));
+    return sum;
 }
 
 // Factor times texture times vertex colour; alpha is how much it covers under the material's alpha mode.
 fn base_color(material: Material, tint: vec4f, uv: vec4f, footprint: vec2f) -> vec4f {
     var base = material.base_color * tint;
-    if material.base_texture >= 0 {
+    if TEXTURED && material.base_texture >= 0 {
         base *= read_texture(material.base_texture, uv, footprint);
     }
-    if material.alpha_mode == OPAQUE {
+    if !SEE_THROUGH || material.alpha_mode == OPAQUE {
         base.a = 1.0;
     } else if material.alpha_mode == MASK {
         base.a = select(0.0, 1.0, base.a >= material.alpha_cutoff);

@@ -20,14 +20,18 @@ struct Surface {
     emissive: vec3f,
 }
 
+// The maps of one cluster of casters; texel: width of a texel, in metres of a sun, at unit distance of a lamp.
+struct Maps {
+    first: i32, faces: u32, texel: f32, unused: u32,
+    clip_from_point: array<mat4x4f, 6>,
+}
+
 struct Light {
     rgb: vec3f, luminance: f32,
     position: vec3f, kind: u32,
     direction: vec3f, one_over_range: f32,
-    cos_outer: f32, cone_width: f32, first_map: i32, faces: u32,
-    texel: f32,  // width of a texel of the map: in metres of a sun, at unit distance of a lamp
-    unused_1: f32, unused_2: f32, unused_3: f32,
-    clip_from_point: array<mat4x4f, 6>,
+    cos_outer: f32, cone_width: f32, clusters: u32, unused: u32,  // clusters: 0 where it casts no shadow
+    maps: array<Maps, 2>,
 }
 
 // Light that arrives at a point, facing it and without shadows: as a share of the light's rgb.
@@ -35,12 +39,14 @@ struct Arriving { towards: vec3f, distance: f32, share: f32 }
 
 struct Level { start: u32, height: u32, width: u32, unused: u32 }
 
+const MOST_PEAKS = 16u;
+
 struct Panorama {
     environment_from_world: mat3x3f,
-    peak_count: u32, table_size: u32, level_count: u32, unused: u32,
+    unused: u32, table_size: u32, level_count: u32, table_start: u32,
     irradiance: Level,
-    table_start: u32, peaks_start: u32, unused_1: u32, unused_2: u32,
     levels: array<Level, 16>,
+    peaks: array<mat3x3f, 16>,  // a column per colour
 }
 
 @group(1) @binding(1) var<uniform> panorama: Panorama;
@@ -99,25 +105,27 @@ fn panorama_texel(level: Level, column: i32, row: i32) -> vec3f {
     return vec3f(panorama_values[i], panorama_values[i + 1u], panorama_values[i + 2u]);
 }
 
-fn look_up(level: Level, towards: vec3f) -> vec3f {
-    let column = (atan2(towards.x, towards.z) / (2.0 * PI) + 0.5) * f32(level.width) - 0.5;
-    let row = acos(clamp(-towards.y, -1.0, 1.0)) / PI * f32(level.height) - 0.5;
-    let x = i32(floor(column));
-    let y = i32(floor(row));
-    let right = column - floor(column);
-    let upper = mix(panorama_texel(level, x, y), panorama_texel(level, x + 1, y), right);
-    let lower = mix(panorama_texel(level, x, y + 1), panorama_texel(level, x + 1, y + 1), right);
-    return mix(upper, lower, row - floor(row));
+// Longitude and polar angle of a direction, as shares of a panorama's width and height.
+fn place_in_panorama(towards: vec3f) -> vec2f {
+    return vec2f(atan2(towards.x, towards.z) / (2.0 * PI) + 0.5, acos(clamp(-towards.y, -1.0, 1.0)) / PI);
 }
 
-fn look_up_between(level: f32, towards: vec3f) -> vec3f {
+fn look_up(level: Level, place: vec2f) -> vec3f {
+    let at = place * vec2f(f32(level.width), f32(level.height)) - 0.5;
+    let low = floor(at);
+    let x = i32(low.x);
+    let y = i32(low.y);
+    let f = at - low;
+    let upper = mix(panorama_texel(level, x, y), panorama_texel(level, x + 1, y), f.x);
+    let lower = mix(panorama_texel(level, x, y + 1), panorama_texel(level, x + 1, y + 1), f.x);
+    return mix(upper, lower, f.y);
+}
+
+fn look_up_between(level: f32, place: vec2f) -> vec3f {
     let low = u32(clamp(level, 0.0, f32(panorama.level_count - 1u)));
-    let fine = look_up(panorama.levels[low], towards);
-    let fraction = level - f32(low);
-    if fraction <= 0.0 {
-        return fine;
-    }
-    return mix(fine, look_up(panorama.levels[min(low + 1u, panorama.level_count - 1u)], towards), fraction);
+    let fine = look_up(panorama.levels[low], place);
+    let coarse = look_up(panorama.levels[min(low + 1u, panorama.level_count - 1u)], place);
+    return mix(fine, coarse, clamp(level - f32(low), 0.0, 1.0));
 }
 
 fn table_entry(row: u32, column: u32) -> vec2f {
@@ -139,16 +147,12 @@ fn from_environment(s: Surface) -> vec3f {
     let n_v = max(dot(s.normal, s.to_viewer), 0.0);
     let around = panorama.environment_from_world * s.normal;
     let mirrored = panorama.environment_from_world * unit(2.0 * n_v * s.normal - s.to_viewer);
-    var matte_light = look_up(panorama.irradiance, around);
-    for (var p = 0u; p < panorama.peak_count; p++) {
-        let i = panorama.peaks_start + 9u * p;
-        for (var k = 0u; k < 3u; k++) {
-            let j = i + 3u * k;
-            matte_light[k] += max(dot(around, vec3f(panorama_values[j], panorama_values[j + 1u], panorama_values[j + 2u])), 0.0);
-        }
+    var matte_light = look_up(panorama.irradiance, place_in_panorama(around));
+    for (var p = 0u; p < MOST_PEAKS; p++) {
+        matte_light += max(around * panorama.peaks[p], vec3f(0.0));
     }
     let level = select(pow(s.roughness, 2.0 / 3.0), 0.0, s.roughness <= 0.0) * f32(panorama.level_count - 1u);
-    let mirror_light = look_up_between(level, mirrored);
+    let mirror_light = look_up_between(level, place_in_panorama(mirrored));
     let share = reflected_share(s.roughness, n_v);
     let missing = 1.0 - share.x - share.y;
     let single = s.f0 * share.x + s.f90 * share.y;

@@ -4,6 +4,8 @@
 // triangle's does, at any resolution, and no distance has to be fudged for a surface not to shadow itself.
 // Only where triangles are smaller than a texel does the map decide alone, and then it is as fine as its texels.
 
+const EDGE_SLACK = 1e-5;
+
 @group(1) @binding(3) var<storage, read> lights: array<Light>;
 @group(1) @binding(4) var<storage, read> casters: array<vec4f>;
 @group(1) @binding(5) var shadow_maps: texture_2d_array<u32>;
@@ -14,8 +16,13 @@ struct Obstacle { distance: f32, covers: f32 }
 fn obstacle(id: u32, origin: vec3f, towards: vec3f, distance: f32) -> Obstacle {
     let first = (id - 1u) * PER_TRIANGLE;
     let hit = meet(casters[first].xyz, casters[first + 1u].xyz, casters[first + 2u].xyz, origin, towards);
-    if !hit.inside || hit.depth <= 0.0 || hit.depth >= distance {
+    // A ray along the edge that two triangles share must not slip through.
+    let is_inside = all(hit.weights >= vec3f(-EDGE_SLACK));
+    if !is_inside || hit.depth <= 0.0 || hit.depth >= distance {
         return Obstacle(hit.depth, -1.0);
+    }
+    if !SEE_THROUGH {
+        return Obstacle(hit.depth, 1.0);
     }
     let material = materials[u32(casters[first].w)];
     if material.alpha_mode == OPAQUE {
@@ -40,46 +47,45 @@ fn face_towards(way: vec3f) -> u32 {
 
 // How much of a light's rays reach a point; grazing: tangent of the angle between the surface's normal and the light.
 fn reaching(number: u32, origin: vec3f, towards: vec3f, distance: f32, grazing: f32) -> f32 {
-    var face = 0u;
-    if lights[number].faces == 6u {
-        face = face_towards(-towards);
-    }
-    let clip = lights[number].clip_from_point[face] * vec4f(origin, 1.0);
-    if clip.w <= 0.0 || any(abs(clip.xy) >= vec2f(clip.w)) {
-        return 1.0;
-    }
     let size = f32(textureDimensions(shadow_maps).x);
-    let at = (vec2f(clip.x, -clip.y) / clip.w * 0.5 + 0.5) * size;
-    let low = vec2i(floor(at - 0.5));
-    let layer = lights[number].first_map + i32(face * (1u + frame.veils));
-    let margin = 3.0 * lights[number].texel * select(distance, 1.0, lights[number].kind == DIRECTIONAL) * (1.0 + grazing);
-    var all_behind = true;
-    var last = 0u;
-    for (var k = 0; k < 4; k++) {
-        let place = clamp(low + vec2i(k & 1, k >> 1), vec2i(0), vec2i(i32(size) - 1));
-        let id = textureLoad(shadow_maps, place, layer, 0).x;
-        if id == 0u {
-            all_behind = false;
-        } else if id != last {
-            let met = obstacle(id, origin, towards, distance);
-            if met.covers > 0.0 {
-                return 0.0;
-            }
-            // Met beside itself: it may still belong to a surface of triangles smaller than a texel.
-            all_behind = all_behind && met.covers < 0.0 && met.distance > margin && met.distance < distance;
-            last = id;
-        }
-    }
-    if all_behind {
-        return 0.0;
-    }
+    let per_view = 1 + i32(frame.veils);
     var visible = 1.0;
-    for (var k = 1; k <= i32(frame.veils); k++) {
-        let id = textureLoad(shadow_maps, clamp(vec2i(floor(at)), vec2i(0), vec2i(i32(size) - 1)), layer + k, 0).x;
-        if id == 0u {
-            break;
-        }
-        visible *= 1.0 - max(obstacle(id, origin, towards, distance).covers, 0.0);
+    // Cluster by cluster; layer 0 of each view holds what is solid or cut out, the others what is blended.
+    for (var k = 0; k < i32(lights[number].clusters) * per_view && visible > 0.0; k++) {
+        let cluster = k / per_view;
+        let face = select(0u, face_towards(-towards), lights[number].maps[cluster].faces == 6u);
+        let clip = lights[number].maps[cluster].clip_from_point[face] * vec4f(origin, 1.0);
+        let is_in_view = clip.w > 0.0 && all(abs(clip.xy) < vec2f(clip.w));
+        let at = (vec2f(clip.x, -clip.y) / max(clip.w, 1e-30) * 0.5 + 0.5) * size;
+        let layer = lights[number].maps[cluster].first + i32(face) * per_view + k % per_view;
+        let width = lights[number].maps[cluster].texel * select(distance, 1.0, lights[number].kind == DIRECTIONAL);
+        let margin = 3.0 * width * (1.0 + grazing);
+        let low = vec2i(floor(select(vec2f(0.0), at, is_in_view) - 0.5));
+        let covers = covered_by(layer, k % per_view == 0, low, origin, towards, distance, margin);
+        visible *= select(1.0, 1.0 - covers, is_in_view);
     }
     return visible;
+}
+
+// How much of the light one layer of a map keeps from a point: the four texels around say which triangles to meet.
+fn covered_by(layer: i32, is_solid: bool, low: vec2i, origin: vec3f, towards: vec3f, distance: f32, margin: f32) -> f32 {
+    let last = vec2i(textureDimensions(shadow_maps)) - 1;
+    var ids = vec4u(0u);
+    for (var k = 0; k < 4; k++) {
+        ids[k] = textureLoad(shadow_maps, clamp(low + vec2i(k & 1, k >> 1), vec2i(0), last), layer, 0).x;
+    }
+    var all_behind = is_solid && all(ids != vec4u(0u));
+    var covers = 0.0;
+    loop {
+        let id = max(max(ids.x, ids.y), max(ids.z, ids.w));
+        if id == 0u || covers > 0.0 {
+            break;
+        }
+        ids = select(ids, vec4u(0u), ids == vec4u(id));
+        let met = obstacle(id, origin, towards, distance);
+        covers = max(met.covers, 0.0);
+        // Met beside itself: it may still belong to a surface of triangles smaller than a texel.
+        all_behind = all_behind && met.covers < 0.0 && met.distance > margin && met.distance < distance;
+    }
+    return select(covers, 1.0, all_behind);
 }

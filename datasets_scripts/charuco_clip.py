@@ -1,0 +1,119 @@
+"""Make a clip of a printed board on a table, ray-traced through a lens and held by hand, with the exact pose of every frame.
+
+    mrbokeh viewfinder board --out board.pdf                      # also writes board.json
+    python -m datasets_scripts.charuco_clip board.json clip.mp4   # and clip.json: the camera of each frame
+
+Any board will do: of board.json only black_mm is read, rectangles of x, y, width, height in millimetres.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from jaxtyping import Float32
+
+from datasets_scripts.hand_held import HandHeld
+from datasets_scripts.sheet_tracer import Sheet, pack_table, trace_sheet, with_noise
+from mrbokeh.atomic_files import read_json, refuse_existing, write_json
+from mrbokeh.camera import Camera
+from mrbokeh.camera_file import camera_from_json, camera_to_json
+from mrbokeh.errors import InputError
+from mrbokeh.lens import Lens
+from mrbokeh.progress import track
+from mrbokeh.video_io import VideoWriter
+
+_FOCAL_LENGTH_MM, _SENSOR_WIDTH_MM = 22.0, 24.0
+
+
+@dataclass(frozen=True)
+class BoardClip:
+    """lens: blurs and gives the angle of view; its focus is where the clip is sharp. noise: see `with_noise`. samples: rays per pixel."""
+
+    sheet: Sheet
+    motion: HandHeld
+    lens: Lens
+    width_px: int = 1280
+    height_px: int = 720
+    frames: int = 90
+    fps: int = 30
+    noise: float = 0.01
+    samples: int = 16
+
+    def camera(self, frame: int) -> Camera:
+        focal_px = self.lens.focal_px(self.width_px)
+        pose = self.motion.camera_from_world(frame / self.fps)
+        return Camera(self.width_px, self.height_px, (focal_px, focal_px), (self.width_px / 2, self.height_px / 2), pose)
+
+    def pictures(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
+        """Scene-linear RGB, frame by frame; the same numbers at every call."""
+        table = pack_table(self.sheet, self.motion.seed)
+        for frame in range(self.frames):
+            rgb = trace_sheet(table, self.camera(frame), self.lens, self.samples, seed=frame)
+            yield with_noise(rgb, self.noise, np.random.default_rng([self.motion.seed, frame]))
+
+
+def write_clip(path: Path, clip: BoardClip, *, overwrite: bool = False) -> None:
+    """The video, and beside it a .json of the same name with the camera of each frame."""
+    for each in (path, path.with_suffix(".json")):
+        refuse_existing(each, overwrite)
+    with VideoWriter(path, clip.width_px, clip.height_px, Fraction(clip.fps)) as video:
+        for number, rgb in enumerate(track(clip.pictures(), "tracing", clip.frames)):
+            video.write(rgb, number / clip.fps)
+    lens = {"focal_length_mm": clip.lens.focal_length_mm, "f_number": clip.lens.f_number, "focus_distance_m": clip.lens.focus_distance_m}
+    cameras = [camera_to_json(clip.camera(frame)) for frame in range(clip.frames)]
+    write_json(path.with_suffix(".json"), {"fps": clip.fps, "lens": lens, "cameras": cameras})
+
+
+def read_clip_cameras(path: Path) -> list[Camera]:
+    """From the .json beside a clip."""
+    document = read_json(path, "the cameras of a clip")
+    return [camera_from_json(each, f"{path}, frame {number}") for number, each in enumerate(document["cameras"])]
+
+
+def read_sheet(path: Path) -> Sheet:
+    document = read_json(path, "a board with black_mm")
+    try:
+        black_mm = np.asarray(document["black_mm"], np.float64).reshape(-1, 4)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: expected black_mm, a list of [x, y, width, height] in millimetres") from None
+    if not len(black_mm) or (black_mm[:, 2:] <= 0).any():
+        raise InputError(f"{path}: expected black_mm with rectangles of positive width and height, got {len(black_mm)} of them")
+    return Sheet(black_mm)
+
+
+def main(
+    board: Annotated[Path, typer.Argument(help="JSON with black_mm, as `mrbokeh viewfinder board` writes it.")],
+    out: Annotated[Path, typer.Argument(help="Clip to write: .mp4 (H.264) or .mkv (lossless).")],
+    frames: Annotated[int, typer.Option(min=1)] = 90,
+    width: Annotated[int, typer.Option(min=16)] = 1280,
+    height: Annotated[int, typer.Option(min=16)] = 720,
+    fps: Annotated[int, typer.Option(min=1)] = 30,
+    distance_m: Annotated[float, typer.Option(help="From the middle of the board.")] = 0.6,
+    elevation_deg: Annotated[float, typer.Option(help="Of the camera above the table.")] = 50.0,
+    focus_m: Annotated[float, typer.Option(help="Focus distance.")] = 0.6,
+    f_number: Annotated[float, typer.Option(help="Of a 22 mm lens on a sensor 24 mm wide.")] = 8.0,
+    noise: Annotated[float, typer.Option(help="Standard deviation of the light at white.")] = 0.01,
+    samples: Annotated[int, typer.Option(help="Rays per pixel.", min=1)] = 16,
+    seed: Annotated[int, typer.Option(help="Motion, table and noise.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing clip.")] = False,
+) -> None:
+    """Trace a hand-held clip of a board, with exact poses."""
+    try:
+        sheet = read_sheet(board)
+        middle = sheet.middle_m
+        target = (float(middle[0]), float(middle[1]), 0.0)
+        motion = HandHeld(target, distance_m, elevation_deg, sway_m=0.1 * distance_m, seed=seed)
+        lens = Lens(_FOCAL_LENGTH_MM, f_number, focus_m, _SENSOR_WIDTH_MM)
+        write_clip(out, BoardClip(sheet, motion, lens, width, height, frames, fps, noise, samples), overwrite=overwrite)
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from None
+    typer.echo(f"{out}: {frames} frames, their cameras in {out.with_suffix('.json')}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

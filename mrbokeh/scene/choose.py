@@ -1,0 +1,32 @@
+"""Which backend renders virtual objects on this machine."""
+
+from mrbokeh.errors import InputError
+from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.wgpu_device import gpu
+from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
+
+
+def scene_renderer(name: str = "auto", threads: int = 0) -> EmbreeRaycaster | WgpuRasterizer:
+    """A renderer by name; threads: of the ray caster, 0 takes all. "auto" takes the graphics card where there is one, and the ray caster otherwise.
+
+    Mesa's device in software is taken only when asked for by "wgpu". Raises InputError where the device asked for is missing.
+    """
+    if name not in ("auto", "wgpu", "embree"):
+        raise InputError(f"expected the scene renderer auto, wgpu or embree, got {name!r}")
+    if name == "embree" or (name == "auto" and not has_graphics_card()):
+        return EmbreeRaycaster(threads=threads)
+    return WgpuRasterizer()
+
+
+def has_graphics_card() -> bool:
+    """Whether wgpu finds a device other than the processor itself."""
+    try:
+        return not gpu().is_software
+    except InputError:
+        return False
+
+
+def described_device() -> str:
+    """The graphics device in words, for `mrbokeh doctor`; raises InputError where there is none."""
+    device = gpu()
+    return f"{device.name}, in software: the ray caster is taken" if device.is_software else device.name

@@ -1,0 +1,156 @@
+"""What the tests of streaming share: pictures, a stream that a thread feeds, and viewers in this process over real DTLS and SRTP."""
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from threading import Event, Thread
+from typing import Any
+
+import aiohttp
+import numpy as np
+from aiohttp import web
+from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpReceiver, RTCSessionDescription
+
+from viewfinder.frames import FrameStatus, OutputFrame
+from viewfinder.streaming.encoded_stream import EncodedStream
+from viewfinder.streaming.encoder import StreamQuality
+from viewfinder.streaming.whep import Whep
+
+WIDTH, HEIGHT = 320, 180
+STATUS = FrameStatus(focus_distance_m=2.0, f_number=2.8, stages_ms={"overlay": 1.5})
+# Blue first: black, white, primaries, grey and two mixed colours.
+BARS = np.array(
+    [[0, 0, 0], [255, 255, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [128, 128, 128], [20, 120, 220], [200, 30, 90]], np.uint8
+)
+
+
+def bars(width_px: int = WIDTH, height_px: int = HEIGHT) -> np.ndarray:
+    """Eight upright bars of even width (H, W, 3), blue first."""
+    return np.ascontiguousarray(np.broadcast_to(BARS[np.arange(width_px) * 8 // width_px][None], (height_px, width_px, 3)))
+
+
+def bar_centres(bgr: np.ndarray) -> np.ndarray:
+    """(8, 3) the colour in the middle of each bar."""
+    width = bgr.shape[1]
+    return bgr[bgr.shape[0] // 2, width // 16 :: width // 8].astype(int)
+
+
+def noise(sequence: int) -> np.ndarray:
+    return np.random.default_rng(sequence).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+
+
+def still(_sequence: int) -> np.ndarray:
+    return bars()
+
+
+def output(bgr: np.ndarray, sequence: int = 0, captured_s: float | None = None) -> OutputFrame:
+    return OutputFrame(bgr, time.monotonic() if captured_s is None else captured_s, sequence, STATUS)
+
+
+class Feed:
+    """A compositor in miniature: shows pictures at a rate while the stream wants them, and remembers when each was captured."""
+
+    def __init__(self, stream: EncodedStream, picture: Callable[[int], np.ndarray] = still, fps: float = 60.0) -> None:
+        self.captured_s: dict[int, float] = {}
+        self._stream, self._picture, self._fps = stream, picture, fps
+        self._stopping = Event()
+        self._thread = Thread(target=self._run, name="feed", daemon=True)
+
+    def __enter__(self) -> "Feed":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        sequence = 0
+        while not self._stopping.wait(1 / self._fps):
+            if self._stream.wants_frame:
+                frame = output(self._picture(sequence), sequence)
+                self.captured_s[sequence] = frame.captured_s
+                self._stream.show(frame)
+                sequence += 1
+
+
+@contextmanager
+def streaming(quality: StreamQuality | None = None, **settings: Any) -> Iterator[EncodedStream]:
+    stream = EncodedStream(quality, **settings)
+    try:
+        yield stream
+    finally:
+        stream.close()
+
+
+@asynccontextmanager
+async def serving(whep: Whep) -> AsyncIterator[str]:
+    """The address of a server that has nothing but the routes."""
+    app = web.Application(client_max_size=1024)
+    app.add_routes(whep.routes())
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    try:
+        await web.TCPSite(runner, "127.0.0.1", 0).start()
+        yield f"http://127.0.0.1:{runner.addresses[0][1]}"
+    finally:
+        await whep.close()
+        await runner.cleanup()
+
+
+class Viewer:
+    """A peer that receives, as the page does: `next` gives decoded pictures (PyAV frames), `messages` what the channel said."""
+
+    def __init__(self, codecs: tuple[str, ...] = ("VP8", "H264")) -> None:
+        self.peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+        self.transceiver = self.peer.addTransceiver("video", "recvonly")
+        known = RTCRtpReceiver.getCapabilities("video").codecs
+        wanted = [each for name in codecs for each in known if each.mimeType == f"video/{name}"]
+        self.transceiver.setCodecPreferences(wanted + [each for each in known if each.mimeType == "video/rtx"])
+        self.channel = self.peer.createDataChannel("status", ordered=False, maxRetransmits=0)
+        self.messages: list[dict[str, Any]] = []
+        self.channel.on("message", lambda text: self.messages.append(json.loads(text)))
+        self.location = ""
+
+    async def connect(self, url: str, session: aiohttp.ClientSession) -> None:
+        await self.peer.setLocalDescription()
+        headers = {"Content-Type": "application/sdp"}
+        async with session.post(f"{url}/whep", data=self.peer.localDescription.sdp, headers=headers) as answer:
+            assert answer.status == 201, await answer.text()
+            self.location = answer.headers["Location"]
+            await self.peer.setRemoteDescription(RTCSessionDescription(await answer.text(), "answer"))
+
+    async def next(self) -> Any:
+        return await asyncio.wait_for(self.transceiver.receiver.track.recv(), 10)
+
+    async def until(self, true: Callable[[], Any], limit_s: float = 10.0) -> None:
+        """Takes pictures until something holds."""
+        async with asyncio.timeout(limit_s):
+            while not true():
+                await self.next()
+
+    def statuses(self) -> list[dict[str, Any]]:
+        return [each for each in self.messages if "sequence" in each]
+
+
+@asynccontextmanager
+async def watching(url: str, codecs: tuple[str, ...] = ("VP8", "H264")) -> AsyncIterator[Viewer]:
+    viewer = Viewer(codecs)
+    try:
+        async with aiohttp.ClientSession() as session:
+            await viewer.connect(url, session)
+        yield viewer
+    finally:
+        await viewer.peer.close()
+
+
+async def comes_true(true: Callable[[], Any], limit_s: float = 10.0) -> None:
+    async with asyncio.timeout(limit_s):
+        while not true():
+            await asyncio.sleep(0.01)
+
+
+def in_time(work: Callable[[], Coroutine[Any, Any, None]], limit_s: float = 30.0) -> None:
+    asyncio.run(asyncio.wait_for(work(), limit_s))

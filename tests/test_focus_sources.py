@@ -1,0 +1,77 @@
+"""Who knows the focus: by hand, with the frame, several in order."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mrbokeh.errors import InputError
+from viewfinder.focus.first_known import FirstKnown
+from viewfinder.focus.frame_focus import FrameFocus
+from viewfinder.focus.manual_focus import ManualFocus
+from viewfinder.frames import CameraFrame, LensState
+from viewfinder.tracking.base import TrackedPose
+
+POSE = TrackedPose(np.eye(4), 1.0, 0.0)
+
+
+def frame(captured_s: float = 0.0, lens: LensState | None = None) -> CameraFrame:
+    return CameraFrame(np.zeros((4, 6, 3), np.uint8), captured_s, 0, lens or LensState())
+
+
+class Counted:
+    """A source that knows one thing and counts how often it is asked and closed."""
+
+    def __init__(self, name: str, lens: LensState) -> None:
+        self.name, self.lens, self.asked, self.closed = name, lens, 0, 0
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:  # noqa: ARG002
+        self.asked += 1
+        return self.lens
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_by_hand() -> None:
+    manual = ManualFocus()
+    assert manual.state(frame(), POSE) == LensState()
+    manual.focus(2.5)
+    manual.set_f_number(2.0)
+    assert manual.state(frame(), None) == LensState(2.5, 2.0)
+    manual.focus(math.inf)
+    assert manual.state(frame(), None).focus_distance_m == math.inf
+    manual.focus(None)
+    assert manual.state(frame(), None) == LensState(None, 2.0)
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, math.nan])
+def test_wrong_by_hand_changes_nothing(wrong: float) -> None:
+    manual = ManualFocus(LensState(1.0, 4.0))
+    for call in (manual.focus, manual.set_f_number):
+        with pytest.raises(InputError, match="expected"):
+            call(wrong)
+    assert manual.state(frame(), None) == LensState(1.0, 4.0)
+
+
+def test_what_a_frame_tells_holds_for_a_while() -> None:
+    source = FrameFocus(hold_s=1.0)
+    assert source.state(frame(0.0), None) == LensState()
+    assert source.state(frame(0.1, LensState(2.0, 4.0)), None) == LensState(2.0, 4.0)
+    assert source.state(frame(0.9, LensState(focus_distance_m=3.0)), None) == LensState(3.0, 4.0)
+    assert source.state(frame(1.8), None) == LensState(3.0, 4.0)
+    assert source.state(frame(2.0), None) == LensState()
+
+
+def test_first_known_of_each_value() -> None:
+    first = Counted("first", LensState(f_number=2.0))
+    second = Counted("second", LensState(3.0, 4.0))
+    third = Counted("third", LensState(5.0, 5.0, 50.0))
+    both = FirstKnown([first, second, third])
+    assert both.state(frame(), POSE) == LensState(3.0, 2.0, 50.0)
+    assert both.focus_from == "second" and both.name == "first, else second, else third"
+    assert (first.asked, second.asked, third.asked) == (1, 1, 1)
+    second.lens = third.lens = LensState()
+    assert both.state(frame(), POSE) == LensState(None, 2.0) and both.focus_from is None
+    both.close()
+    assert (first.closed, second.closed, third.closed) == (1, 1, 1)

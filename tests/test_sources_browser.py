@@ -1,0 +1,373 @@
+"""A browser camera through WHIP, played by aiortc itself over real sockets: pictures, sizes, lens and pose, refusals, coming back."""
+
+import asyncio
+import json
+import math
+import random
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
+from fractions import Fraction
+from threading import Event
+from typing import Any
+
+import aiohttp
+import aiortc
+import av
+import numpy as np
+import pytest
+from aiohttp import web
+
+from mrbokeh.errors import InputError
+from viewfinder.frames import CameraFrame
+from viewfinder.sources.browser_camera import LONGEST_OFFER_BYTES, BrowserCameraSource
+from viewfinder.sources.camera_message import LONGEST_MESSAGE, CameraKnowledge
+
+WIDTH, HEIGHT, FPS = 160, 112, 20
+RED, GREEN = (40, 60, 200), (60, 190, 50)
+
+
+class Canvas(aiortc.VideoStreamTrack):
+    """One colour (blue, green, red) in a size that can be changed while it runs, as browsers do."""
+
+    def __init__(self, bgr: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.bgr, self.size_px, self.noise, self._count = bgr, (WIDTH, HEIGHT), 0, 0
+
+    async def recv(self) -> av.VideoFrame:
+        await asyncio.sleep(1 / FPS)
+        width_px, height_px = self.size_px
+        picture = np.full((height_px, width_px, 3), self.bgr, np.uint8)
+        if self.noise:
+            # So that a frame takes several packets.
+            picture += np.random.default_rng(self._count).integers(0, self.noise, picture.shape, np.uint8) // 2
+        frame = av.VideoFrame.from_ndarray(picture, "bgr24")
+        # What WebRTC codecs take: limited range, BT.601.
+        frame = frame.reformat(format="yuv420p", dst_colorspace=5, dst_color_range=1)
+        self._count += 1
+        frame.pts, frame.time_base = self._count * 90000 // FPS, Fraction(1, 90000)
+        return frame
+
+
+class Sender:
+    """A WHIP client: `location` is where it ends."""
+
+    def __init__(self, url: str, track: Canvas, codec: str = "video/VP8") -> None:
+        self.url, self.track, self.answers = url, track, list[dict[str, Any]]()
+        self.peer = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
+        self.channel = self.peer.createDataChannel("camera")
+        self.channel.on("message", lambda text: self.answers.append(json.loads(text)))
+        transceiver = self.peer.addTransceiver(track, direction="sendonly")
+        codecs = aiortc.RTCRtpSender.getCapabilities("video").codecs
+        transceiver.setCodecPreferences([each for each in codecs if each.mimeType == codec])
+        self.location = ""
+
+    async def start(self, session: aiohttp.ClientSession) -> None:
+        await self.peer.setLocalDescription(await self.peer.createOffer())
+        headers = {"Content-Type": "application/sdp"}
+        async with session.post(self.url + "/whip", data=self.peer.localDescription.sdp.encode(), headers=headers) as answer:
+            text = await answer.text()
+            assert answer.status == 201, text
+            assert answer.content_type == "application/sdp"
+            self.location = answer.headers["Location"]
+        await self.peer.setRemoteDescription(aiortc.RTCSessionDescription(text, "answer"))
+
+
+class Reader:
+    """The capture thread of a pipeline: keeps the newest frame."""
+
+    def __init__(self, source: BrowserCameraSource) -> None:
+        self.newest: CameraFrame | None = None
+        self.failure: BaseException | None = None
+        self.sequences: list[int] = []
+        self._source, self._stopping = source, Event()
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        try:
+            for frame in self._source.frames(self._stopping):
+                self.newest = frame
+                self.sequences.append(frame.sequence)
+        except BaseException as error:
+            self.failure = error
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._thread.join(10)
+        assert not self._thread.is_alive() and self.failure is None, self.failure
+
+    def shows(self, bgr: tuple[int, int, int], width_px: int = WIDTH) -> bool:
+        """The newest frame has that colour but for what the codec leaves, and that width."""
+        frame = self.newest
+        if frame is None or frame.bgr.shape[1] != width_px:
+            return False
+        return bool(np.abs(frame.bgr.reshape(-1, 3).mean(axis=0) - bgr).max() < 8)
+
+
+async def comes_true(condition: Callable[[], object], limit_s: float = 20.0) -> None:
+    for _ in range(int(limit_s / 0.05)):
+        if condition():
+            return
+        await asyncio.sleep(0.05)
+    raise AssertionError("it never came true")
+
+
+@asynccontextmanager
+async def serving(source: BrowserCameraSource) -> AsyncIterator[tuple[str, aiohttp.ClientSession, Reader]]:
+    app = web.Application()
+    app.add_routes(source.routes("/whip"))
+    runner = web.AppRunner(app)
+    await runner.setup()
+    site = web.TCPSite(runner, "127.0.0.1", 0)
+    await site.start()
+    port = site._server.sockets[0].getsockname()[1]  # type: ignore[union-attr]
+    reader = Reader(source)
+    try:
+        async with aiohttp.ClientSession() as session:
+            yield f"http://127.0.0.1:{port}", session, reader
+    finally:
+        reader.stop()
+        await source.close()
+        await runner.cleanup()
+
+
+def in_time(work: Callable[[], Awaitable[None]], limit_s: float = 60.0) -> None:
+    asyncio.run(asyncio.wait_for(work(), limit_s))  # type: ignore[arg-type]
+
+
+@pytest.fixture(autouse=True)
+def no_thread_stays() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    left = [each for each in threading.enumerate() if each not in before and not each.name.startswith("asyncio_")]
+    assert not left
+
+
+@pytest.mark.parametrize("codec", ["video/VP8", "video/H264"])
+def test_pictures_arrive_in_colour_and_follow_the_size_that_is_sent(codec: str) -> None:
+    async def work() -> None:
+        source = BrowserCameraSource()
+        async with serving(source) as (url, session, reader):
+            assert source.status == "waiting for a browser camera"
+            sender = Sender(url, Canvas(RED), codec)
+            await sender.start(session)
+            assert codec.split("/")[1] in sender.peer.remoteDescription.sdp
+            await comes_true(lambda: reader.shows(RED))
+            assert source.status is None and source.transfer == "bt709"
+            sender.track.bgr, sender.track.size_px = GREEN, (WIDTH // 2, HEIGHT // 2)
+            await comes_true(lambda: reader.shows(GREEN, WIDTH // 2))
+            assert np.all(np.diff(reader.sequences) >= 1)
+            await sender.peer.close()
+
+    in_time(work)
+
+
+def test_vp8_of_high_definition_has_the_matrix_of_bt601() -> None:
+    """Untagged pictures of that size are taken for BT.709 elsewhere, which would leave green 20 codes off."""
+
+    async def work() -> None:
+        async with serving(BrowserCameraSource(160, 160)) as (url, session, reader):
+            sender = Sender(url, Canvas(GREEN))
+            sender.track.size_px = (1280, 720)
+            await sender.start(session)
+            await comes_true(lambda: reader.shows(GREEN, 160))
+            assert reader.newest is not None and reader.newest.bgr.shape == (90, 160, 3)
+            await sender.peer.close()
+
+    in_time(work)
+
+
+def test_nobody_reads_and_nothing_piles_up() -> None:
+    """aiortc's queue is emptied whether or not frames are asked for, and the source keeps one frame."""
+
+    async def work() -> None:
+        source = BrowserCameraSource()
+        async with serving(source) as (url, session, reader):
+            reader.stop()
+            sender = Sender(url, Canvas(RED))
+            await sender.start(session)
+            await comes_true(lambda: source._newest.waiting)
+            await asyncio.sleep(0.5)
+            assert source._session is not None
+            (transceiver,) = [each for each in source._session._peer.getTransceivers() if each.kind == "video"]
+            assert transceiver.receiver.track._queue.qsize() <= 1
+            # The buffer that releases on the marker is the one in use.
+            assert type(transceiver.receiver._RTCRtpReceiver__jitter_buffer).__name__ == "MarkerJitterBuffer"
+            taken = source._newest.take(0.0)
+            assert taken is not None and taken[0] > 3
+            await sender.peer.close()
+
+    in_time(work)
+
+
+def test_loss_and_reordering_on_the_way_cost_no_torn_picture(caplog: pytest.LogCaptureFixture) -> None:
+    """Each tenth packet is lost once and some arrive late: pictures go on in order, and the decoder never gets a broken one."""
+    draw = random.Random(4)
+
+    async def work() -> None:
+        source = BrowserCameraSource()
+        async with serving(source) as (url, session, reader):
+            sender = Sender(url, Canvas(RED), "video/H264")
+            sender.track.noise = 120
+            await sender.start(session)
+            await comes_true(lambda: reader.newest is not None)
+            assert source._session is not None
+            (receiver,) = [each.receiver for each in source._session._peer.getTransceivers() if each.kind == "video"]
+            handle, lost, late = receiver._handle_rtp_packet, list[int](), list[Any]()
+
+            async def lossy(packet: Any, arrival_time_ms: int) -> None:
+                if draw.random() < 0.1:
+                    lost.append(packet.sequence_number)
+                elif draw.random() < 0.1 and not late:
+                    late.append(packet)
+                else:
+                    await handle(packet, arrival_time_ms=arrival_time_ms)
+                    while late:
+                        await handle(late.pop(), arrival_time_ms=arrival_time_ms)
+
+            receiver._handle_rtp_packet = lossy
+            before = reader.sequences[-1]
+            await comes_true(lambda: len(lost) > 10 and reader.sequences[-1] > before + 30)
+            assert np.all(np.diff(reader.sequences) >= 1)
+            await sender.peer.close()
+
+    caplog.set_level("WARNING", logger="aiortc.rtcrtpreceiver")
+    in_time(work)
+    assert not [each for each in caplog.records if "failed to decode" in each.getMessage()]
+
+
+def test_focus_and_pose_travel_with_the_frames() -> None:
+    async def work() -> None:
+        source = BrowserCameraSource()
+        async with serving(source) as (url, session, reader):
+            sender = Sender(url, Canvas(RED))
+            await sender.start(session)
+            await comes_true(lambda: sender.channel.readyState == "open" and reader.shows(RED))
+            assert reader.newest is not None and reader.newest.camera_from_world is None
+            identity = [float(i % 5 == 0) for i in range(16)]
+            sender.channel.send(json.dumps({"focusDistance": 0.8, "pose": [*identity[:12], 1.0, 2.0, 3.0, 1.0]}))
+            await comes_true(lambda: reader.newest is not None and reader.newest.lens.focus_distance_m == 0.8)
+            # A camera at (1, 2, 3) of a world with y up and z backward stands at (1, -2, -3) of ours.
+            np.testing.assert_allclose(reader.newest.camera_from_world[:3, 3], (-1.0, 2.0, 3.0))
+            for bad in ("no json", "[]", '{"focusDistance": -1}', "x" * (LONGEST_MESSAGE + 1)):
+                sender.channel.send(bad)
+            await comes_true(lambda: len(sender.answers) == 4)
+            assert all(list(each) == ["error"] for each in sender.answers)
+            assert reader.newest.lens.focus_distance_m == 0.8
+            await sender.peer.close()
+
+    in_time(work)
+
+
+def test_a_camera_goes_is_replaced_and_comes_again() -> None:
+    async def work() -> None:
+        source = BrowserCameraSource()
+        async with serving(source) as (url, session, reader):
+            first = Sender(url, Canvas(RED))
+            await first.start(session)
+            await comes_true(lambda: reader.shows(RED))
+            # The page is loaded anew without a good-bye: the newer camera counts.
+            second = Sender(url, Canvas(GREEN))
+            await second.start(session)
+            await comes_true(lambda: reader.shows(GREEN))
+            assert first.location != second.location
+            await comes_true(lambda: first.peer.connectionState in ("closed", "failed"))
+            async with session.delete(url + first.location) as answer:
+                assert answer.status == 404
+            async with session.delete(url + second.location) as answer:
+                assert answer.status == 200
+            await comes_true(lambda: source.status is not None)
+            assert "waiting" in str(source.status)
+            third = Sender(url, Canvas(RED))
+            await third.start(session)
+            await comes_true(lambda: reader.shows(RED) and source.status is None)
+            for each in (first, second, third):
+                await each.peer.close()
+            await comes_true(lambda: "waiting" in str(source.status))
+
+    in_time(work)
+
+
+def test_offers_that_make_no_sense_change_nothing() -> None:
+    async def work() -> None:
+        source = BrowserCameraSource()
+        async with serving(source) as (url, session, reader):
+            sender = Sender(url, Canvas(RED))
+            await sender.start(session)
+            await comes_true(lambda: reader.shows(RED))
+            sdp = {"Content-Type": "application/sdp"}
+            listener = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
+            listener.addTransceiver("audio", direction="sendrecv")
+            await listener.setLocalDescription(await listener.createOffer())
+            sound_only = listener.localDescription.sdp.encode()
+            cases = [
+                (b"v=0", sdp, 400),
+                (b"\xff\xfe not sdp", sdp, 400),
+                (b"", sdp, 400),
+                (b"v=0\r\nm=video x y\r\n", sdp, 400),
+                (sound_only, sdp, 400),
+                (b"x" * (LONGEST_OFFER_BYTES + 1), sdp, 413),
+                (b"{}", {"Content-Type": "application/json"}, 415),
+            ]
+            for body, headers, status in cases:
+                async with session.post(url + "/whip", data=body, headers=headers) as answer:
+                    assert answer.status == status, body[:30]
+                    assert "expected" in await answer.text()
+            async with session.patch(url + sender.location, data=b"") as answer:
+                assert answer.status == 405
+            before = reader.sequences[-1]
+            await comes_true(lambda: reader.sequences[-1] > before + 2)
+            await listener.close()
+            await sender.peer.close()
+
+    in_time(work)
+
+
+def test_orientations_point_where_the_camera_looks() -> None:
+    """A phone held upright towards the north has its screen's z to the south: turned about x by 90 degrees. Its camera looks north."""
+    known = CameraKnowledge().told(json.dumps({"orientation": [math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4)]}))
+    assert known.camera_from_world is not None
+    np.testing.assert_allclose(known.camera_from_world, np.eye(4), atol=1e-12)
+    # Flat on a table, screen up, its top to the north, the camera looks down (+y of ours), the picture's top is north (+z).
+    flat = CameraKnowledge().told('{"orientation": [0, 0, 0, 1]}').camera_from_world
+    assert flat is not None
+    np.testing.assert_allclose(flat[:3, :3] @ (0, 1, 0), (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(flat[:3, :3] @ (0, 0, 1), (0, -1, 0), atol=1e-12)
+
+
+def test_webxr_poses_become_ours() -> None:
+    """A camera that WebXR turned 90 degrees to the left (about y up) looks along -x; what lies there is ahead of it."""
+    turned = [0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1]
+    pose = CameraKnowledge().told(json.dumps({"pose": turned})).camera_from_world
+    assert pose is not None
+    np.testing.assert_allclose(pose @ (-2, 0, 0, 1), (0, 0, 2, 1), atol=1e-12)
+
+
+def test_messages_keep_what_they_do_not_name() -> None:
+    known = CameraKnowledge().told('{"focusDistance": 2}').told('{"orientation": [0, 0, 0, 1]}')
+    assert known.lens.focus_distance_m == 2.0 and known.camera_from_world is not None
+    assert known.told('{"focusDistance": "infinity"}').lens.focus_distance_m == math.inf
+    assert known.told('{"focusDistance": null, "orientation": null}') == CameraKnowledge()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"other": 1}',
+        '{"focusDistance": true}',
+        '{"focusDistance": NaN}',
+        '{"focusDistance": "near"}',
+        '{"pose": [1, 2]}',
+        '{"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}',
+        '{"pose": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}',
+        '{"pose": [1, 0, 0, 5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}',
+        '{"orientation": [0, 0, 0, 2]}',
+        '{"orientation": [0, 0, 0, Infinity]}',
+        '{"orientation": "north"}',
+        "[" * 4000,
+    ],
+)
+def test_messages_that_make_no_sense_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match="expected"):
+        CameraKnowledge().told(text)

@@ -1,0 +1,383 @@
+"""Streams over real sockets on loopback: MPEG-TS over UDP and HTTP, MJPEG over HTTP; killed, restarted, absent, recorded, turned."""
+
+import socket
+import socketserver
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from aiortc.codecs.h264 import H264Encoder
+from aiortc.rtp import RtpPacket
+
+from viewfinder.frames import CameraFrame
+from viewfinder.sources.network_stream import NetworkStreamSource
+
+WIDTH, HEIGHT, FPS = 160, 112, 25
+RED, GREEN = (40, 60, 200), (60, 190, 50)
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+def encode_live(target: Any, going: Callable[[], bool], bgr: tuple[int, int, int], **color: int) -> None:
+    """H264 in MPEG-TS at 25 frames per second into a URL or a file-like object, a key frame each fifth frame."""
+    with av.open(target, "w", format="mpegts", options={"flush_packets": "1"}) as container:
+        stream: Any = container.add_stream(
+            "libx264", rate=FPS, options={"tune": "zerolatency", "preset": "ultrafast", "g": "5", "crf": "12"}
+        )
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for name, value in color.items():
+            setattr(stream.codec_context, name, value)
+        picture = np.full((HEIGHT, WIDTH, 3), bgr, np.uint8)
+        matrix = {6: 5}.get(color.get("colorspace", 6), color.get("colorspace", 6))
+        encoded = av.VideoFrame.from_ndarray(picture, "bgr24").reformat(format="yuv420p", dst_colorspace=matrix, dst_color_range=1)
+        encoded.colorspace, encoded.color_range = color.get("colorspace", 2), 1
+        for index in range(3000):
+            if not going():
+                return
+            encoded.pts, encoded.time_base = index, Fraction(1, FPS)
+            container.mux(stream.encode(encoded))
+            time.sleep(1 / FPS)
+
+
+@contextmanager
+def udp_sender(port: int, bgr: tuple[int, int, int], **color: int) -> Iterator[None]:
+    stop = Event()
+    url = f"udp://127.0.0.1:{port}?pkt_size=1316"
+    thread = threading.Thread(target=encode_live, args=(url, lambda: not stop.is_set(), bgr), kwargs=color)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(10)
+
+
+class Body:
+    """A response's body as a file that PyAV writes to."""
+
+    def __init__(self, wfile: Any) -> None:
+        self.wfile = wfile
+
+    def write(self, data: bytes) -> int:
+        self.wfile.write(data)
+        return len(data)
+
+
+@contextmanager
+def http_server(port: int, respond: Callable[[BaseHTTPRequestHandler, Event], None]) -> Iterator[str]:
+    stop = Event()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            try:
+                respond(self, stop)
+            except OSError:
+                self.close_connection = True
+
+        def log_message(self, *what: object) -> None: ...
+
+    server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}/live"
+    finally:
+        stop.set()
+        server.shutdown()
+        server.server_close()
+        thread.join(10)
+
+
+def respond_mpegts(handler: BaseHTTPRequestHandler, stop: Event, bgr: tuple[int, int, int]) -> None:
+    handler.send_response(200)
+    handler.send_header("Content-Type", "video/mp2t")
+    handler.end_headers()
+    encode_live(Body(handler.wfile), lambda: not stop.is_set(), bgr)
+
+
+def respond_mjpeg(handler: BaseHTTPRequestHandler, stop: Event, bgr: tuple[int, int, int]) -> None:
+    """As phone apps and network cameras do: multipart/x-mixed-replace."""
+    handler.send_response(200)
+    handler.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+    handler.end_headers()
+    jpeg = cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), bgr, np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    while not stop.is_set():
+        handler.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg) + jpeg + b"\r\n")
+        time.sleep(1 / FPS)
+
+
+def first_like(frames: Iterator[CameraFrame], bgr: tuple[int, int, int], limit_s: float = 25.0) -> CameraFrame:
+    """The first frame of that colour; codecs and chroma leave it within 6 codes."""
+    start_s = time.monotonic()
+    for frame in frames:
+        if np.abs(frame.bgr.reshape(-1, 3).mean(axis=0) - bgr).max() < 6:
+            return frame
+        assert time.monotonic() - start_s < limit_s, frame.bgr[5, 5]
+    raise AssertionError("the stream ended")
+
+
+def until(condition: Callable[[], bool], limit_s: float = 25.0) -> None:
+    start_s = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start_s < limit_s
+        time.sleep(0.02)
+
+
+@contextmanager
+def opened(source: NetworkStreamSource) -> Iterator[tuple[Iterator[CameraFrame], Event]]:
+    stopping = Event()
+    frames = source.frames(stopping)
+    # Where nothing comes the test fails in place of standing still.
+    guard = threading.Timer(30.0, stopping.set)
+    guard.start()
+    try:
+        yield frames, stopping
+    finally:
+        guard.cancel()
+        stopping.set()
+        frames.close()  # type: ignore[attr-defined]
+    assert not [each for each in threading.enumerate() if each.name.startswith("decode ")]
+
+
+def pumped(frames: Iterator[CameraFrame]) -> tuple[threading.Thread, list[CameraFrame]]:
+    """All frames, collected by a thread until the source stops."""
+    got: list[CameraFrame] = []
+    thread = threading.Thread(target=lambda: got.extend(frames))
+    thread.start()
+    return thread, got
+
+
+def test_udp_comes_goes_and_comes_again() -> None:
+    """Tagged BT.709: its matrix is used although so small a picture would be BT.601 untagged (up to 12 codes apart)."""
+    port = free_port(socket.SOCK_DGRAM)
+    source = NetworkStreamSource(f"udp://127.0.0.1:{port}")
+    assert source.status is not None
+    with opened(source) as (frames, stopping):
+        with udp_sender(port, RED, colorspace=1, color_trc=1, color_primaries=1, color_range=1):
+            frame = first_like(frames, RED)
+            assert frame.bgr.shape == (HEIGHT, WIDTH, 3) and source.status is None and source.transfer == "bt709"
+            assert next(frames).sequence > frame.sequence
+        thread, _ = pumped(frames)
+        until(lambda: source.status is not None and "does not answer" in source.status)
+        stopping.set()
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+def test_a_stream_that_is_restarted_goes_on() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    source = NetworkStreamSource(f"http://127.0.0.1:{port}/live", max_width_px=80)
+    with opened(source) as (frames, _):
+        with http_server(port, lambda handler, stop: respond_mpegts(handler, stop, RED)):
+            before = first_like(frames, RED)
+            assert before.bgr.shape == (56, 80, 3)
+        until(lambda: source.status is not None)
+        assert "trying again" in str(source.status) or "waiting" in str(source.status)
+        with http_server(port, lambda handler, stop: respond_mpegts(handler, stop, GREEN)):
+            after = first_like(frames, GREEN)
+            assert after.sequence > before.sequence and after.captured_s > before.captured_s
+            assert source.status is None
+
+
+class RtspHandler(socketserver.StreamRequestHandler):
+    """As little of RTSP (RFC 2326) as a network camera needs to send H264 inside the TCP connection (10.12)."""
+
+    bgr = RED
+    stop: Event
+
+    def handle(self) -> None:
+        try:
+            while not self.stop.is_set() and (request := self._request()) is not None:
+                self._answer(*request)
+                if request[0] == "PLAY":
+                    self._play()
+        except OSError:
+            pass
+
+    def _request(self) -> tuple[str, str] | None:
+        """(method, number)"""
+        line = self.rfile.readline().decode()
+        headers = {}
+        while (header := self.rfile.readline().decode().strip()) != "":
+            name, _, value = header.partition(":")
+            headers[name.lower()] = value.strip()
+        return (line.split()[0], headers["cseq"]) if line else None
+
+    def _answer(self, method: str, number: str) -> None:
+        sdp = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=cam\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\na=rtpmap:96 H264/90000\r\n"
+        sdp += "a=fmtp:96 packetization-mode=1\r\na=control:track1\r\n"
+        extra = {
+            "OPTIONS": "Public: OPTIONS, DESCRIBE, SETUP, PLAY, TEARDOWN\r\n",
+            "DESCRIBE": f"Content-Type: application/sdp\r\nContent-Length: {len(sdp)}\r\n",
+            "SETUP": "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n",
+        }.get(method, "Session: 1\r\n")
+        self.wfile.write(f"RTSP/1.0 200 OK\r\nCSeq: {number}\r\n{extra}\r\n{sdp if method == 'DESCRIBE' else ''}".encode())
+
+    def _play(self) -> None:
+        codec: Any = av.CodecContext.create("libx264", "w")
+        codec.width, codec.height, codec.pix_fmt, codec.time_base = WIDTH, HEIGHT, "yuv420p", Fraction(1, FPS)
+        codec.options = {"tune": "zerolatency", "preset": "ultrafast", "g": "5", "crf": "12"}
+        picture = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), self.bgr, np.uint8), "bgr24")
+        number = 0
+        for index in range(3000):
+            if self.stop.wait(1 / FPS):
+                return
+            frame = picture.reformat(format="yuv420p")
+            frame.pts = index
+            data = b"".join(bytes(each) for each in codec.encode(frame))
+            payloads = H264Encoder._packetize(H264Encoder._split_bitstream(data))
+            for part, payload in enumerate(payloads):
+                made = RtpPacket(96, int(part == len(payloads) - 1), number % 65536, index * 90000 // FPS, 7, payload).serialize()
+                self.wfile.write(b"$\0" + len(made).to_bytes(2, "big") + made)
+                number += 1
+
+
+@contextmanager
+def rtsp_camera(port: int, bgr: tuple[int, int, int]) -> Iterator[None]:
+    stop = Event()
+
+    class Server(socketserver.ThreadingTCPServer):
+        allow_reuse_address, daemon_threads = True, True
+
+    with Server(("127.0.0.1", port), type("Handler", (RtspHandler,), {"bgr": bgr, "stop": stop})) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            server.shutdown()
+            thread.join(10)
+
+
+def test_a_network_camera_over_rtsp_is_switched_off_and_on() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    source = NetworkStreamSource(f"rtsp://127.0.0.1:{port}/cam")
+    with opened(source) as (frames, _):
+        with rtsp_camera(port, RED):
+            before = first_like(frames, RED)
+            assert before.bgr.shape == (HEIGHT, WIDTH, 3)
+        until(lambda: source.status is not None)
+        with rtsp_camera(port, GREEN):
+            assert first_like(frames, GREEN).sequence > before.sequence
+            assert source.status is None
+
+
+def test_mjpeg_of_a_network_camera() -> None:
+    with http_server(0, lambda handler, stop: respond_mjpeg(handler, stop, GREEN)) as url, opened(NetworkStreamSource(url)) as (frames, _):
+        assert first_like(frames, GREEN).bgr.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_a_slow_viewer_gets_the_newest_not_the_oldest() -> None:
+    """0.6 s asleep are about 15 frames at 25 per second: they are dropped, none is queued."""
+    with http_server(0, lambda handler, stop: respond_mpegts(handler, stop, RED)) as url, opened(NetworkStreamSource(url)) as (frames, _):
+        before = first_like(frames, RED)
+        time.sleep(0.6)
+        asleep_until_s = time.monotonic()
+        next(frames)
+        after = next(frames)
+        assert after.sequence - before.sequence > 5
+        assert after.captured_s > asleep_until_s - 0.3
+
+
+def test_a_recording_behind_a_url_plays_in_its_own_time(tmp_path: Path) -> None:
+    """25 frames of 25 per second last a second, over and over: never faster, as a live stream would be read."""
+    clip = tmp_path / "clip.mp4"
+    with av.open(str(clip), "w", options={"movflags": "faststart"}) as container:
+        stream: Any = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for index in range(25):
+            picture = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), GREEN, np.uint8), "bgr24")
+            picture.pts, picture.time_base = index, Fraction(1, 25)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    data = clip.read_bytes()
+
+    def respond(handler: BaseHTTPRequestHandler, _stop: Event) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Type", "video/mp4")
+        handler.send_header("Content-Length", str(len(data)))
+        handler.end_headers()
+        handler.wfile.write(data)
+
+    with http_server(0, respond) as url, opened(NetworkStreamSource(url)) as (frames, _):
+        got = [next(frames) for _ in range(35)]
+    assert got[20].captured_s - got[0].captured_s > 0.7
+    assert got[-1].sequence - got[0].sequence >= 34
+
+
+def test_turned_and_untagged_pictures_are_upright() -> None:
+    """What a stream says by its display matrix: a quarter turn, within a limit that counts for the upright picture."""
+    from mrbokeh.video_color import color_of
+    from viewfinder.sources.received_frame import upright_bgr
+    from viewfinder.sources.size_limit import SizeLimit
+
+    picture = np.zeros((64, 96, 3), np.uint8)
+    picture[:32, :48] = 255
+
+    class Turned:
+        """A PyAV frame whose side data say how it is to be turned, which PyAV cannot write."""
+
+        def __init__(self, rotation: int) -> None:
+            self._frame, self.rotation = av.VideoFrame.from_ndarray(picture, "bgr24").reformat(format="yuv420p"), rotation
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._frame, name)
+
+    for turns in range(4):
+        frame = Turned(90 * turns - 360 * (turns == 3))
+        expected = np.rot90(picture, turns)
+        upright = upright_bgr(frame, color_of(frame, "here"), SizeLimit())
+        assert upright.shape == expected.shape
+        assert np.abs(upright.astype(int) - expected)[4:28, 4:28].max() < 4
+        assert upright_bgr(frame, color_of(frame, "here"), SizeLimit(width_px=32)).shape[1] == 32
+
+
+def test_an_iphone_film_as_a_stream_stands_upright(shared_data: Path) -> None:
+    """A real film with a display matrix, over HTTP: the size of the upright picture, as mrbokeh.video_io has it."""
+    from mrbokeh.video_io import probe
+
+    clip = shared_data / "video" / "iphone_xr_chart.mov"
+    info, data = probe(clip), clip.read_bytes()
+
+    def respond(handler: BaseHTTPRequestHandler, _stop: Event) -> None:
+        start = int((handler.headers.get("Range") or "bytes=0-").split("=")[1].split("-")[0])
+        handler.send_response(206)
+        handler.send_header("Content-Length", str(len(data) - start))
+        handler.send_header("Content-Range", f"bytes {start}-{len(data) - 1}/{len(data)}")
+        handler.send_header("Accept-Ranges", "bytes")
+        handler.end_headers()
+        handler.wfile.write(data[start:])
+
+    with http_server(0, respond) as url, opened(NetworkStreamSource(url, 270, 270)) as (frames, _):
+        height_px, width_px = next(frames).bgr.shape[:2]
+    assert max(width_px, height_px) == 270
+    assert width_px / height_px == pytest.approx(info.width_px / info.height_px, rel=0.02)
+
+
+def test_nobody_there_is_a_sentence_without_the_password() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    source = NetworkStreamSource(f"rtsp://me:secret@127.0.0.1:{port}/cam")
+    stopping = Event()
+    thread, got = pumped(source.frames(stopping))
+    until(lambda: "does not answer" in str(source.status))
+    stopping.set()
+    thread.join(10)
+    assert not thread.is_alive() and got == []
+    assert "secret" not in source.name + str(source.status)
+    assert source.name == f"rtsp://127.0.0.1:{port}/cam"

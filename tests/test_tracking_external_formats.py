@@ -1,0 +1,276 @@
+"""OpenTrackIO and FreeD: bytes, checksums, segments, axes and lens tables."""
+
+import csv
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mrbokeh.errors import InputError
+from viewfinder.frames import LensState
+from viewfinder.tracking.encoder_table import read_encoder_table
+from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, freed_sample, read_freed, write_freed
+from viewfinder.tracking.opentrackio import StageReading, decode_opentrackio, encode_opentrackio, opentrackio_document
+from viewfinder.tracking.opentrackio_packets import CBOR, JSON, Reassembly, fletcher16, packets, read_packet
+from viewfinder.tracking.rigid_motion import between, inverted, rigid, rigid_of
+from viewfinder.tracking.stage_axes import pan_tilt_roll_deg
+from viewfinder.tracking.tracking_sample import MalformedMessageError, TrackingSample, lens_between
+
+IDENTITY = {"pan": 0.0, "tilt": 0.0, "roll": 0.0}
+
+
+def document(translation: tuple[float, float, float], rotation: dict[str, float] | None = None, **lens: object) -> dict[str, object]:
+    """A sample as a sender writes it."""
+    place = dict(zip("xyz", translation, strict=True))
+    return {
+        "protocol": {"name": "OpenTrackIO", "version": [1, 0, 1]},
+        "transforms": [{"translation": place, "rotation": rotation or IDENTITY}],
+        "lens": lens,
+    }
+
+
+def decoded(content: object, reading: StageReading | None = None) -> TrackingSample:
+    return decode_opentrackio(json.dumps(content).encode(), JSON, reading)
+
+
+def seen_at(sample: TrackingSample, stage_m: tuple[float, float, float]) -> np.ndarray:
+    """A point of the stage in camera axes. Ours: the stage's ground with y and z turned round (tracking/stage_axes)."""
+    world = np.array([stage_m[0], -stage_m[1], -stage_m[2], 1.0])
+    return (sample.camera_from_world @ world)[:3]
+
+
+def test_fletchers_checksum_is_that_of_the_specification() -> None:
+    """OpenTrackIO sums modulo 256: "abcde" gives 97, 195, 38, 138, 239 and 97, 36, 74, 212, 195; modulo 255 it would be 0xC8F0."""
+    assert fletcher16(b"abcde") == 0xC3EF
+
+
+
+# Where a point must be seen follows from the words: X right, Y forward, Z up; ours is x right, y down, z forward.
+@pytest.mark.parametrize(
+    ("rotation", "point", "expected"),
+    [
+        (IDENTITY, (0.5, 5.0, 1.2), (0.5, 0.3, 5.0)),  # 0.5 m to the right, 0.3 m below the camera at 1.5 m, 5 m in front
+        (IDENTITY | {"pan": 90.0}, (-4.0, 0.0, 1.5), (0.0, 0.0, 4.0)),  # right-handed about up: looks to the left, along -X
+        (IDENTITY | {"tilt": 90.0}, (0.0, 0.0, 3.5), (0.0, 0.0, 2.0)),  # looks up
+        (IDENTITY | {"roll": 90.0}, (0.0, 5.0, 2.5), (-1.0, 0.0, 5.0)),  # its head to the right: what is above it lies on its left
+        ({"pan": 90.0, "tilt": 90.0, "roll": 0.0}, (0.0, 0.0, 2.5), (0.0, 0.0, 1.0)),  # intrinsic: tilts about its own right side
+    ],
+)
+def test_opentrackio_axes(rotation: dict[str, float], point: tuple[float, float, float], expected: tuple[float, float, float]) -> None:
+    assert seen_at(decoded(document((0.0, 0.0, 1.5), rotation)), point) == pytest.approx(expected, abs=1e-12)
+
+
+def test_transforms_are_composed_and_the_pupil_lies_before_the_sensor() -> None:
+    dolly = {"translation": {"x": 2.0, "y": 0.0, "z": 0.0}, "rotation": IDENTITY | {"pan": 90.0}}
+    head = {"translation": {"x": 0.0, "y": 1.0, "z": 1.5}, "rotation": IDENTITY}
+    content = document((0.0, 0.0, 0.0), entrancePupilOffset=0.1) | {"transforms": [dolly, head]}
+    # The head stands 1 m along the dolly's forward, which is the stage's -X: at X = 1; the pupil 0.1 m farther.
+    assert seen_at(decoded(content), (0.0, 0.0, 1.5)) == pytest.approx((0.0, 0.0, 1.0), abs=1e-12)
+    at_sensor = decoded(content, StageReading(pose_at_sensor=True))
+    assert seen_at(at_sensor, (0.0, 0.0, 1.5)) == pytest.approx((0.0, 0.0, 0.9), abs=1e-12)
+
+
+@pytest.mark.parametrize("encoding", [JSON, CBOR])
+def test_opentrackio_round_trip(encoding: int) -> None:
+    pose = rigid_of(np.array([0.3, -1.2, 0.7, 0.4, -0.1, 3.0]))
+    sample = TrackingSample(pose, LensState(2.5, 2.8, 35.0), 1234567.25)
+    back = decode_opentrackio(encode_opentrackio(opentrackio_document(sample), encoding), encoding)
+    assert back.camera_from_world == pytest.approx(pose, abs=1e-9)
+    assert back.lens == sample.lens and back.sender_s == pytest.approx(1234567.25, abs=1e-6)
+
+
+@pytest.mark.parametrize("tilt_deg", [-90.0, -89.0, 0.0, 30.0, 90.0])
+def test_angles_of_steep_cameras(tilt_deg: float) -> None:
+    turn = Rotation.from_euler("ZXY", [40.0, tilt_deg, 20.0], degrees=True).as_matrix()
+    again = Rotation.from_euler("ZXY", pan_tilt_roll_deg(turn), degrees=True).as_matrix()
+    assert again == pytest.approx(turn, abs=1e-12)
+
+
+def test_opentrackio_says_what_it_leaves_out() -> None:
+    sample = decoded(document((0, 0, 0), distortion=[{"model": "Brown-Conrady D-U", "radial": [0.1]}], tStop=3.1, focusDistance=0))
+    assert sample.ignored == {"lens.distortion", "lens.tStop"}
+    assert sample.lens == LensState()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        [],
+        {},
+        {"protocol": {"name": "other"}},
+        document((0, 0, 0)) | {"transforms": []},
+        document((0, 0, math.nan)),
+        document((0, 0, 0)) | {"transforms": [{"translation": {"x": "1", "y": 0, "z": 0}}]},
+        document((0, 0, 0)) | {"lens": [1]},
+        document((0, 0, 0), fStop="wide open"),
+    ],
+)
+def test_malformed_samples(wrong: object) -> None:
+    for payload, encoding in ((json.dumps(wrong).encode(), JSON), (encode_opentrackio({"a": wrong}, CBOR), CBOR), (b"\xff{[", JSON)):
+        with pytest.raises(MalformedMessageError):
+            decode_opentrackio(payload, encoding)
+
+
+def test_random_bytes_are_malformed_and_nothing_worse() -> None:
+    rng = np.random.default_rng(3)
+    for size in rng.integers(0, 60, 300):
+        for encoding in (JSON, CBOR):
+            with pytest.raises(MalformedMessageError):
+                decode_opentrackio(rng.bytes(size), encoding)
+    for deep in (b"[" * 100_000, b"\x81" * 100_000):
+        with pytest.raises(MalformedMessageError):
+            decode_opentrackio(deep, JSON if deep[:1] == b"[" else CBOR)
+
+
+def fletcher_plainly(data: bytes) -> int:
+    first = second = 0
+    for byte in data:
+        first = (first + byte) % 256
+        second = (second + first) % 256
+    return second << 8 | first
+
+
+def test_fletcher() -> None:
+    # By hand: 1, 1+2, 1+2+3 = 6; second 1+3+6 = 10.
+    assert fletcher16(b"\x01\x02\x03") == 10 << 8 | 6
+    data = np.random.default_rng(1).bytes(70_000)
+    assert fletcher16(data) == fletcher_plainly(data)
+
+
+def test_header_bytes() -> None:
+    (packet,) = packets(b"{}", JSON, 0x1234)
+    assert packet[:14] == b"OTrk\x00\x01\x12\x34\x00\x00\x00\x00\x80\x02"
+    assert struct.unpack(">H", packet[14:16])[0] == fletcher_plainly(packet[:14] + b"{}") and packet[16:] == b"{}"
+
+
+def test_segments_in_any_order() -> None:
+    payload = np.random.default_rng(2).bytes(5000)
+    sent = [read_packet(each) for each in packets(payload, CBOR, 7)]
+    assert [len(each.content) for each in sent] == [1400, 1400, 1400, 800]
+    reassembly = Reassembly()
+    assert [reassembly.add("a", sent[i]) for i in (3, 1, 0)] == [None] * 3
+    assert reassembly.add("b", sent[2]) is None  # of another sender: not the missing part
+    assert reassembly.add("a", sent[2]) == payload
+
+
+def test_unfinished_payloads_are_bounded_and_overlaps_refused() -> None:
+    reassembly = Reassembly()
+    for number in range(1000):
+        first, _ = (read_packet(each) for each in packets(bytes(2000), JSON, number))
+        assert reassembly.add("a", first) is None
+    assert len(reassembly._unfinished) <= 8
+    lying = read_packet(next(packets(bytes(10), JSON, 5000)))
+    assert reassembly.add("a", type(lying)(JSON, 5000, 5, True, bytes(10))) is None
+    with pytest.raises(MalformedMessageError, match="overlap"):
+        reassembly.add("a", type(lying)(JSON, 5000, 0, False, bytes(10)))
+
+
+def test_every_flipped_byte_is_noticed() -> None:
+    (packet,) = packets(b'{"a": 1}', JSON, 9)
+    for place in (*range(4), *range(5, len(packet))):
+        wrong = packet[:place] + bytes([packet[place] ^ 0x10]) + packet[place + 1 :]
+        with pytest.raises(MalformedMessageError):
+            read_packet(wrong)
+
+
+def test_freed_bytes() -> None:
+    """The example is put together by hand: 1 degree is 32768 = 0x008000, 1 m is 64000 = 0x00FA00, -1 degree 0xFF8000."""
+    body = bytes.fromhex("D1 01 008000 FF8000 000000 00FA00 FF0600 01F400 000010 00ABCD 0000")
+    datagram = body + bytes([(0x40 - sum(body)) % 256])
+    message = read_freed(datagram)
+    assert message == FreeDMessage(1, (1.0, -1.0, 0.0), (1.0, -1.0, 2.0), 0x10, 0xABCD)
+    assert write_freed(message) == datagram
+    for wrong in (datagram[:-1], datagram + b"\0", b"\xd2" + datagram[1:], datagram[:5] + b"\x77" + datagram[6:]):
+        with pytest.raises(MalformedMessageError):
+            read_freed(wrong)
+
+
+def test_freed_axes() -> None:
+    message = FreeDMessage(1, (90.0, 0.0, 0.0), (0.0, 0.0, 1.5), 0, 0)
+    assert seen_at(freed_sample(message, FreeDReading()), (4.0, 0.0, 1.5)) == pytest.approx((0.0, 0.0, 4.0), abs=1e-9)
+    turned = freed_sample(message, FreeDReading(signs=(-1, 1, 1, 1, 1, 1), pupil_before_m=0.2))
+    assert seen_at(turned, (-4.0, 0.0, 1.5)) == pytest.approx((0.0, 0.0, 3.8), abs=1e-9)
+    pose = rigid_of(np.array([1.2, -0.2, 0.1, 0.4, -0.1, 3.0]))
+    back = freed_sample(read_freed(write_freed(freed_message(TrackingSample(pose)))), FreeDReading())
+    # Half a step of 1/32768 degree and of 1/64 mm in each number.
+    assert back.camera_from_world == pytest.approx(pose, abs=3e-5)
+
+
+def write_table(path: Path, *rows: str) -> Path:
+    path.write_text("\n".join(("axis,count,value", *rows)) + "\n")
+    return path
+
+
+def test_lens_table(tmp_path: Path) -> None:
+    table = read_encoder_table(write_table(tmp_path / "lens.csv", "focus_m,0,inf", "focus_m,100,1.0", "f_number,0,2", "f_number,10,8"))
+    # Half way from 0 to 1 dioptre; half way between f/2 and f/8 in stops.
+    half = table.lens(focus=50, iris=5)
+    assert half.focus_distance_m == 2.0 and half.f_number == pytest.approx(4.0) and half.focal_length_mm is None
+    assert table.lens(focus=-5).focus_distance_m == math.inf and table.lens(focus=500).focus_distance_m == 1.0
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (["focus_m,0,1.0", "focus_m,0,2.0"], "line 3: the count 0 of focus_m"),
+        (["focus_m,0,1.0", "focus_m,10,2.0", "focus_m,20,1.5"], "turns between 10 and 20"),
+        (["zoom_mm,0,inf"], "line 2: expected one of"),
+        (["iris,0,2"], "line 2: expected one of"),
+        (["focus_m,zero,2"], "line 2: expected one of"),
+        (["focus_m,0,-2"], "line 2: expected one of"),
+        ([], "found none"),
+    ],
+)
+def test_wrong_lens_tables(tmp_path: Path, rows: list[str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read_encoder_table(write_table(tmp_path / "lens.csv", *rows))
+
+
+def test_wrong_table_files(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot read it"):
+        read_encoder_table(tmp_path / "none.csv")
+    (tmp_path / "head.csv").write_text("count,value\n1,2\n")
+    with pytest.raises(InputError, match="first line axis,count,value"):
+        read_encoder_table(tmp_path / "head.csv")
+
+
+def test_real_focus_pull_through_a_table(shared_data: Path, tmp_path: Path) -> None:
+    """A pull of a Sony Venice: its distances as counts of a 16-bit encoder that turns with the square root of dioptres, and back.
+
+    The table knows 17 places. The error is that of interpolating d = g^2 linearly in g: (step / 2)^2 = (g_max / 32)^2 dioptres,
+    and half a count, g_max^2 / 65535 at most.
+    """
+    with (shared_data / "lens" / "metadata" / "sony_venice_focus_pull.csv").open() as file:
+        pulled_m = np.array([float(row["Focus Distance (ft)"]) * 0.3048 for row in csv.DictReader(file)])
+    assert len(pulled_m) == 588 and np.ptp(1 / pulled_m) > 0.05
+    largest = math.sqrt(1 / pulled_m.min())
+    counts = np.round(65535 * np.sqrt(1 / pulled_m) / largest)
+    places = np.linspace(0, 65535, 17)
+    with np.errstate(divide="ignore"):
+        rows = [f"focus_m,{count},{value}" for count, value in zip(places, (65535 / (places * largest)) ** 2, strict=True)]
+    table = read_encoder_table(write_table(tmp_path / "venice.csv", *rows))
+    read_m = np.array([table.lens(focus=count).focus_distance_m for count in counts])
+    assert np.abs(1 / read_m - 1 / pulled_m).max() < (largest / 32) ** 2 + largest**2 / 65535
+
+
+def test_between_two_poses() -> None:
+    """A camera that turns on its tripod stays on it; half way of a turn of 90 degrees are 45."""
+    place = np.array([1.0, 2.0, 3.0])
+    turn = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    a, b = inverted(rigid(np.eye(3), place)), inverted(rigid(turn, place))
+    half = inverted(between(a, b, 0.5))
+    assert half[:3, 3] == pytest.approx(place)
+    assert half[:3, :3] == pytest.approx(Rotation.from_euler("y", 45, degrees=True).as_matrix())
+    assert between(a, b, 0.0) == pytest.approx(a) and between(a, b, 1.0) == pytest.approx(b)
+
+
+def test_between_two_lenses() -> None:
+    # 1/1 and 0 dioptres: half way 0.5. f/2 and f/8: f/4. What one of them does not know comes from the other.
+    half = lens_between(LensState(1.0, 2.0, None), LensState(math.inf, 8.0, 50.0), 0.5)
+    assert half.focus_distance_m == 2.0 and half.f_number == pytest.approx(4.0) and half.focal_length_mm == 50.0
+    assert lens_between(LensState(math.inf), LensState(math.inf), 0.5).focus_distance_m == math.inf
+    assert lens_between(LensState(), LensState(), 0.5) == LensState()

@@ -1,0 +1,187 @@
+"""A phone on the camera: calibrated from pairs of poses, applied to any tracker's poses."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.base import TrackedPose
+from viewfinder.tracking.phone_rig import (
+    PhoneRig,
+    PosePair,
+    calibrate_across_worlds,
+    calibrate_in_one_world,
+    read_phone_rig,
+    write_phone_rig,
+)
+from viewfinder.tracking.phone_tracker import PhoneTracker
+from viewfinder.tracking.rigid_motion import angle_deg, inverted, rigid_of
+
+# The phone 8 cm above the lens, 3 cm to its left, a little askew.
+CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.08, 0.02]))
+INTRINSICS = Camera(64, 48, (60.0, 60.0), (32.0, 24.0))
+
+
+def shaken(pose: np.ndarray, rng: np.random.Generator, turn_deg: float, shift_m: float) -> np.ndarray:
+    """With an error of so much in each of three axes."""
+    return rigid_of(np.concatenate([np.radians(rng.normal(0, turn_deg, 3)), rng.normal(0, shift_m, 3)])) @ pose
+
+
+def pairs(
+    count: int, rng: np.random.Generator, turn_deg: float = 0.0, shift_m: float = 0.0, worlds: np.ndarray | None = None
+) -> list[PosePair]:
+    """Views of a board from about 0.7 m, turned by up to 30 degrees. worlds: the phone's world from that of the camera."""
+    result = []
+    for _ in range(count):
+        turn = np.radians(rng.uniform(-30, 30, 3))
+        phone = rigid_of(np.concatenate([turn, [*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.5, 0.9)]]))
+        camera = CAMERA_FROM_PHONE @ phone @ (np.eye(4) if worlds is None else worlds)
+        result.append(PosePair(shaken(phone, rng, turn_deg, shift_m), shaken(camera, rng, turn_deg, shift_m)))
+    return result
+
+
+def off(rig: PhoneRig) -> tuple[float, float]:
+    """(degrees, mm) by which it misses the truth."""
+    error = rig.camera_from_phone @ inverted(CAMERA_FROM_PHONE)
+    return angle_deg(error), 1000 * float(np.linalg.norm(error[:3, 3]))
+
+
+@pytest.mark.parametrize("calibrate", [calibrate_in_one_world, calibrate_across_worlds])
+def test_exact_pairs_give_the_rig_back(calibrate: object) -> None:
+    worlds = None if calibrate is calibrate_in_one_world else rigid_of(np.array([2.0, 0.5, -1.0, 3.0, 1.0, -2.0]))
+    rig = calibrate(pairs(8, np.random.default_rng(0), worlds=worlds))  # type: ignore[operator]
+    assert off(rig) == (pytest.approx(0.0, abs=1e-4), pytest.approx(0.0, abs=1e-3))
+    assert rig.residual_deg < 1e-3 and rig.residual_mm < 1e-2 and rig.pairs == 8
+
+
+def test_noise_averages_out_and_is_stated() -> None:
+    """0.2 degrees and 2 mm in each axis of both poses: 40 pairs leave about 0.2 sqrt(2 * 3 / 40) = 0.08 degrees.
+
+    A phone that turns by 0.2 degrees 0.7 m before the board moves what it says of itself by 2.4 mm; with both poses and three axes
+    the residual is near sqrt(3 * 2) (0.2 degrees; and 2 mm with what turns of the pose do to a place that far away).
+    """
+    rig = calibrate_in_one_world(pairs(40, np.random.default_rng(1), 0.2, 0.002))
+    degrees, millimetres = off(rig)
+    assert degrees < 0.16 and millimetres < 2.5
+    assert rig.residual_deg == pytest.approx(0.2 * np.sqrt(6), rel=0.25)
+
+
+def test_one_wrong_pair_does_little() -> None:
+    good = pairs(20, np.random.default_rng(2), 0.05, 0.0005)
+    wrong = PosePair(good[0].phone_from_world, rigid_of(np.array([0.1, 0.0, 0.0, 0.02, 0.0, 0.0])) @ good[0].camera_from_world)
+    degrees, millimetres = off(calibrate_in_one_world([*good, wrong]))
+    # The plain mean would be off by 5.7 / 21 degrees.
+    assert degrees < 0.1 and millimetres < 2.0
+
+
+def test_calibrations_that_cannot_be() -> None:
+    rng = np.random.default_rng(3)
+    with pytest.raises(InputError, match="5 pairs of poses or more, got 4"):
+        calibrate_in_one_world(pairs(4, rng))
+    with pytest.raises(InputError, match="disagree by"):
+        calibrate_in_one_world(pairs(10, rng, 10.0, 0.05))
+    one_axis = [rigid_of(np.array([0.0, angle, 0.0, 0.0, 0.0, 0.7])) for angle in np.linspace(-0.5, 0.5, 8)]
+    with pytest.raises(InputError, match="one axis only"):
+        calibrate_across_worlds([PosePair(pose, CAMERA_FROM_PHONE @ pose) for pose in one_axis])
+
+
+def test_rig_file(tmp_path: Path) -> None:
+    rig = PhoneRig(CAMERA_FROM_PHONE, 0.1, 1.5, 20)
+    write_phone_rig(tmp_path / "rig.json", rig)
+    back = read_phone_rig(tmp_path / "rig.json")
+    assert back.camera_from_phone == pytest.approx(CAMERA_FROM_PHONE, abs=1e-15) and (back.residual_mm, back.pairs) == (1.5, 20)
+    text = (tmp_path / "rig.json").read_text()
+    for wrong in (text.replace("mrbokeh-phone-rig", "other"), "[]", text.replace(str(CAMERA_FROM_PHONE[0, 0]), "7.0"), '{"format": 1}'):
+        (tmp_path / "wrong.json").write_text(wrong)
+        with pytest.raises(InputError, match="not a phone rig"):
+            read_phone_rig(tmp_path / "wrong.json")
+
+
+class Phone:
+    """Gives frames at the times told, then waits for its end."""
+
+    name = "test phone"
+
+    def __init__(self, times_s: list[float]) -> None:
+        self.times_s, self.shown = times_s, Event()
+
+    def frames(self, stopping: Event) -> Iterator[CameraFrame]:
+        for number, time_s in enumerate(self.times_s):
+            yield CameraFrame(np.zeros((48, 64, 3), np.uint8), time_s, number)
+        self.shown.set()
+        stopping.wait(10.0)
+
+
+class Slides:
+    """A tracker of a phone that moves 1 m to the right each second, and loses itself after 2 s."""
+
+    name = "slides"
+
+    def __init__(self) -> None:
+        self.closed, self.sizes = False, set[tuple[int, int]]()
+
+    def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
+        self.sizes.add((intrinsics.width_px, intrinsics.height_px))
+        if frame.captured_s > 2.0:
+            return None
+        return TrackedPose(phone_at(frame.captured_s), 0.8, frame.captured_s, 0.5, 20)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def phone_at(time_s: float) -> np.ndarray:
+    return rigid_of(np.array([0.0, 0.0, 0.0, -time_s, 0.0, 1.0]))
+
+
+def test_tracker_of_the_phone() -> None:
+    phone, slides = Phone([0.1 * step for step in range(40)]), Slides()
+    tracker = PhoneTracker(phone, slides, INTRINSICS.resized(640, 480), PhoneRig(CAMERA_FROM_PHONE, 0.1, 1.0, 9), hold_s=0.2)
+    try:
+        assert phone.shown.wait(10.0)
+
+        def at(time_s: float) -> TrackedPose | None:
+            return tracker.track(CameraFrame(np.zeros((4, 4, 3), np.uint8), time_s, 0), INTRINSICS)
+
+        found = at(1.234)
+        assert found is not None and found.quality == 0.8 and found.captured_s == 1.234
+        assert found.camera_from_world == pytest.approx(CAMERA_FROM_PHONE @ phone_at(1.234))
+        tracker.video_delay_s = 0.1
+        delayed = at(1.234)
+        assert delayed is not None and delayed.camera_from_world == pytest.approx(CAMERA_FROM_PHONE @ phone_at(1.134))
+        assert tracker.phone_pose(1.234) == pytest.approx(phone_at(1.134))
+        tracker.video_delay_s = 0.0
+        held = at(2.1)
+        assert held is not None and held.quality == pytest.approx(0.4, abs=0.01)  # 0.1 of 0.2 s after the last pose
+        assert at(2.21) is None and tracker.phone_pose(2.1) is None
+        tracker.rig = None
+        assert at(1.0) is None
+    finally:
+        tracker.close()
+    assert slides.closed and slides.sizes == {(64, 48)} and not tracker._thread.is_alive()
+
+
+def test_a_phone_that_fails_says_so() -> None:
+    class Unplugged(Phone):
+        def frames(self, stopping: Event) -> Iterator[CameraFrame]:  # noqa: ARG002
+            yield from ()
+            raise InputError("the phone went away")
+
+    tracker = PhoneTracker(Unplugged([]), Slides(), INTRINSICS, None)
+    deadline = time.monotonic() + 5.0
+    while tracker.failure is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    tracker.close()
+    assert tracker.failure == "the phone went away"
+
+
+def test_turning_motions() -> None:
+    turn = Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
+    assert angle_deg(rigid_of(np.r_[turn.as_rotvec(), 1, 2, 3])) == pytest.approx(np.degrees(turn.magnitude()))

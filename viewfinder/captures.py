@@ -1,0 +1,60 @@
+"""Captures: moments of the viewfinder saved as bundles that `mrbokeh composite` renders at full quality."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from mrbokeh.capture_bundle import write_bundle
+from mrbokeh.errors import InputError
+from viewfinder.frames import Bgr
+from viewfinder.live_compositor import LiveCompositor, Moment
+
+
+class Captures:
+    """folder: bundles go there, named by date and time. extra: files whose text a bundle keeps (the scene file)."""
+
+    def __init__(self, folder: Path, compositor: LiveCompositor, renderer_name: str, scene: Path | None = None) -> None:
+        self._folder, self._compositor, self.renderer_name, self._scene = folder, compositor, renderer_name, scene
+
+    def capture(self) -> str:
+        """The newest picture; the name of its bundle. Raises InputError before the first, and while the track is lost."""
+        moment = self._compositor.last
+        if moment is None:
+            raise InputError("there is nothing to capture yet: the camera has not given a picture")
+        if moment.pose is None:
+            raise InputError("the camera's pose is not known now, so that the object has no place: show the board, then capture")
+        name = self._free_name()
+        layers = self._compositor.scenery.sharp_layers(moment.camera)
+        write_bundle(
+            self._folder / name,
+            _encoded(".png", moment.frame.bgr),
+            _encoded(".jpg", moment.output.bgr),
+            layers,
+            moment.lens,
+            moment.camera,
+            self.renderer_name,
+            self._facts(moment),
+        )
+        return name
+
+    def _free_name(self) -> str:
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        names = (stamp, *(f"{stamp}-{count}" for count in range(2, 1000)))
+        return next(name for name in names if not (self._folder / name).exists())
+
+    def _facts(self, moment: Moment) -> dict[str, Any]:
+        status, pose = moment.output.status, moment.pose
+        assert pose is not None, "asked before"
+        return {
+            "captured": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+            "sequence": moment.frame.sequence,
+            "tracking": {"quality": pose.quality, "residual_px": pose.residual_px, "points": pose.points},
+            "stages_ms": dict(status.stages_ms),
+            "scene": None if self._scene is None else self._scene.read_text(encoding="utf-8"),
+        }
+
+
+def _encoded(suffix: str, bgr: Bgr) -> bytes:
+    import cv2
+
+    return bytes(cv2.imencode(suffix, bgr)[1].tobytes())

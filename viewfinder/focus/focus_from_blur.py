@@ -1,0 +1,91 @@
+"""Where a lens is focused, from how blurred things of known depth are: c = k |1/d_f - 1/z| (Lens.coc_px) fitted over many edges.
+
+One depth leaves two answers, one nearer and one farther than it. Edges at several depths tell them apart: towards the focus
+plane the blur shrinks. How surely is the difference of what the two leave unexplained.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.optimize import minimize_scalar
+
+from mrbokeh.lens import MM_PER_M, Lens
+from viewfinder.focus.edge_spread import EdgeBlurs
+
+FEWEST_EDGES = 8
+
+_STEP_PX = 0.2
+_CLOSEST_FOCAL_LENGTHS = 4.0
+_MOST_STEPS = 4000
+_CAUCHY = 2.385
+_APART_PX = 0.5
+
+
+@dataclass(frozen=True)
+class FocusCandidate:
+    """cost: half the squares that are left, robust and in units of their variance. sigma_dioptres: standard deviation."""
+
+    dioptres: float
+    cost: float
+    sigma_dioptres: float
+
+    @property
+    def focus_distance_m(self) -> float:
+        return 1.0 / self.dioptres if self.dioptres > 0.0 else float("inf")
+
+
+def focus_candidates(blurs: EdgeBlurs, lens: Lens, width_px: int) -> tuple[FocusCandidate, ...]:
+    """The best answer first, then the best one on the other side of the board, where there is one; none with too few edges.
+
+    lens: its focus distance is not looked at. width_px: of the picture in which the blurs were measured.
+    """
+    if len(blurs) < FEWEST_EDGES:
+        return ()
+    steps = _dioptres(lens, width_px)
+    costs = np.array([blur_cost(blurs, lens, width_px, each) for each in steps])
+    low = np.flatnonzero((np.r_[np.inf, costs[:-1]] >= costs) & (costs < np.r_[costs[1:], np.inf]))
+    found = sorted((_refined(blurs, lens, width_px, steps, int(index)) for index in low), key=lambda each: each.cost)
+    if not found:
+        return ()
+    best, middle = found[0], float(np.median(1.0 / blurs.depth_m))
+    apart = _APART_PX / lens.coc_px_per_dioptre(width_px)
+    others = [
+        each
+        for each in found[1:]
+        if (each.dioptres - middle) * (best.dioptres - middle) <= 0 and abs(each.dioptres - best.dioptres) > apart
+    ]
+    return best, *others[:1]
+
+
+def blur_cost(blurs: EdgeBlurs, lens: Lens, width_px: int, dioptres: float) -> float:
+    """Cauchy's loss (95 % efficient for normal errors, Holland and Welsch 1977) of what a focus leaves unexplained."""
+    return float(_losses(blurs, lens, width_px, dioptres).sum())
+
+
+def total_cost(history: Sequence[EdgeBlurs], lens: Lens, width_px: int, dioptres: float) -> float:
+    return sum(blur_cost(blurs, lens, width_px, dioptres) for blurs in history)
+
+
+def _losses(blurs: EdgeBlurs, lens: Lens, width_px: int, dioptres: float) -> Float64[np.ndarray, " edges"]:
+    focused = lens.focused_at(1.0 / dioptres if dioptres > 0.0 else np.inf)
+    off = (np.abs(focused.coc_px(blurs.depth_m, width_px)) - blurs.diameter_px) / blurs.sigma_px
+    return 0.5 * _CAUCHY**2 * np.log1p((off / _CAUCHY) ** 2)
+
+
+def _dioptres(lens: Lens, width_px: int) -> Float64[np.ndarray, " steps"]:
+    """From infinity to four focal lengths, finely enough for a fifth of a pixel."""
+    nearest = MM_PER_M / (_CLOSEST_FOCAL_LENGTHS * lens.focal_length_mm)
+    per_dioptre = lens.focused_at(np.inf).coc_px_per_dioptre(width_px)
+    return np.linspace(0.0, nearest, int(np.clip(nearest * per_dioptre / _STEP_PX, 50, _MOST_STEPS)))
+
+
+def _refined(blurs: EdgeBlurs, lens: Lens, width_px: int, steps: Float64[np.ndarray, " steps"], index: int) -> FocusCandidate:
+    between = (steps[max(index - 1, 0)], steps[min(index + 1, len(steps) - 1)])
+    found = minimize_scalar(lambda each: blur_cost(blurs, lens, width_px, float(each)), bounds=between, method="bounded")
+    dioptres, cost = float(found.x), float(found.fun)
+    # The error of one edge is sigma / k; of all together, where they err on their own.
+    per_dioptre = lens.focused_at(1.0 / dioptres if dioptres > 0 else np.inf).coc_px_per_dioptre(width_px)
+    spread = max(1.0, 2.0 * cost / len(blurs)) ** 0.5
+    return FocusCandidate(dioptres, cost, spread / (per_dioptre * float(np.sqrt(np.sum(blurs.sigma_px**-2.0)))))

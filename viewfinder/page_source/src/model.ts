@@ -1,0 +1,101 @@
+// What the page knows: the state of the viewfinder, the picture that is shown, and a sentence for the user.
+
+export type Matrix3 = [[number, number, number], [number, number, number], [number, number, number]];
+
+/** GET /state; what is missing is not offered. Distances in metres, null is infinity. */
+export interface State {
+  role: "view" | "control";
+  transports: string[];
+  matte: boolean;
+  can_send: boolean;
+  source?: string;
+  width_px?: number;
+  height_px?: number;
+  dioptre_range?: [number, number];
+  focus_distance_m?: number | null;
+  f_number?: number;
+  f_numbers?: number[];
+  lens?: string;
+  lenses?: string[];
+  renderer?: string;
+  renderers?: string[];
+  view?: string;
+  views?: string[];
+  objects?: { name: string; visible: boolean }[];
+  ground_from_picture?: Matrix3 | null;
+  can_capture?: boolean;
+  can_record?: boolean;
+  recording?: boolean;
+  smoothing?: boolean | null;
+  failure?: string | null;
+}
+
+/** What comes with each picture. captured_ms: in the server's time. */
+export interface FrameHeader {
+  sequence: number;
+  captured_ms: number;
+  focus_distance_m?: number | null;
+  f_number?: number;
+  focus_pending?: boolean;
+  tracking?: number | null;
+  layer_age_ms?: number;
+  stages_ms?: Record<string, number>;
+  dropped?: number;
+}
+
+/** A picture on the page: where its pixels are, and what is known of it. */
+export interface ShownFrame {
+  pixels: HTMLCanvasElement | HTMLVideoElement;
+  header: FrameHeader | null;
+}
+
+class Model extends EventTarget {
+  state: State | null = null;
+  shown: ShownFrame | null = null;
+  way = "";
+  sentence = "";
+  private silence = 0;
+  private failing = false;
+
+  setState(state: State): void {
+    this.state = state;
+    this.dispatchEvent(new Event("state"));
+  }
+
+  show(frame: ShownFrame): void {
+    this.shown = frame;
+    if (this.failing) this.say("");
+    this.dispatchEvent(new Event("frame"));
+  }
+
+  setWay(way: string): void {
+    this.way = way;
+    this.dispatchEvent(new Event("way"));
+  }
+
+  /** Show a sentence; forSeconds null keeps it until another one comes. */
+  say(sentence: string, forSeconds: number | null = null): void {
+    clearTimeout(this.silence);
+    this.failing = false;
+    this.sentence = sentence;
+    this.dispatchEvent(new Event("sentence"));
+    if (forSeconds !== null) this.silence = window.setTimeout(() => this.say(""), 1000 * forSeconds);
+  }
+
+  /** The stream stands still for a reason, until the next picture. */
+  fail(sentence: string): void {
+    this.say(sentence);
+    this.failing = true;
+  }
+
+  get mayControl(): boolean {
+    return this.state?.role === "control";
+  }
+}
+
+export const model = new Model();
+
+export function distanceText(metres: number | null): string {
+  if (metres === null || metres > 100) return "∞";
+  return metres < 1 ? `${(100 * metres).toFixed(0)} cm` : `${metres.toFixed(2)} m`;
+}

@@ -1,0 +1,133 @@
+"""Access: who may ask for what; the middleware that every request of the viewfinder passes, and the exchange of a token for a cookie."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+
+from aiohttp import web
+
+from viewfinder.server.bounded import json_value, message_body
+from viewfinder.server.origins import LOOPBACK_NAMES, objection
+from viewfinder.server.rate_limit import RateLimit
+from viewfinder.server.sessions import Role, Sessions
+
+_PAGE_PATHS = frozenset({"/", "/viewfinder.js", "/style.css", "/camera", "/camera.js", "/obs"})
+# The page for OBS is one file, with its script in it.
+_INLINE_PATHS = frozenset({"/obs"})
+_VIEW_PATHS = frozenset({"state", "stream", "whep", "matte", "obs"})
+_SAFETY_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(self), microphone=(), geolocation=()",
+}
+_Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass
+class Access:
+    """names: what a Host header may say. sessions: None lets in everybody who reaches the server, with the role control.
+
+    secure: the server speaks TLS, and the cookie never travels without it. Requests and attempts to enter are limited per address.
+    """
+
+    names: frozenset[str] = LOOPBACK_NAMES
+    sessions: Sessions | None = None
+    secure: bool = False
+    requests: RateLimit = field(default_factory=lambda: RateLimit(per_s=60.0, burst=240.0))
+    entries: RateLimit = field(default_factory=lambda: RateLimit(per_s=0.1, burst=8.0))
+
+    @web.middleware
+    async def middleware(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        """Refuses with {"error": sentence}; nothing of a refused request has any effect."""
+        path = _canonical(request)
+        refusal = self._refusal(request, path)
+        if refusal is not None:
+            refusal.headers.update(_SAFETY_HEADERS)
+            return refusal
+        answer = await _answered(request, handler)
+        # A WebSocket has sent its headers already.
+        if not answer.prepared:
+            answer.headers.update(
+                self._page_headers(request, path) if path in _PAGE_PATHS else _SAFETY_HEADERS | {"Cache-Control": "no-store"}
+            )
+        return answer
+
+    def _refusal(self, request: web.Request, path: str) -> web.Response | None:
+        problem = objection(request.headers, self.names, opens_page=request.method == "GET" and path in _PAGE_PATHS)
+        if problem is not None:
+            return error(problem, 403)
+        if not self.requests.allows(request.remote or ""):
+            return error("too many requests from this address: wait a moment", 429)
+        role, needed = self.role(request), needed_role(path)
+        if needed is None or (role is not None and role >= needed):
+            return None
+        if role is None:
+            return error("nobody was let in with this: open the address with its token that the viewfinder printed last", 401)
+        return error("you may watch but not control: open the address for control that the viewfinder printed", 403)
+
+    def role(self, request: web.Request) -> Role | None:
+        """Of the one who asks; None for a stranger, who gets to open routes only."""
+        if self.sessions is None:
+            return Role.CONTROL
+        return self.sessions.role_of(request.cookies.get(cookie_name(request)), request.headers.get("Authorization"))
+
+    async def enter(self, request: web.Request) -> web.Response:
+        """POST /enter {"token": text}: sets the cookie and answers {"role": "view" or "control"}."""
+        if self.sessions is None:
+            return web.json_response({"role": Role.CONTROL.word})
+        if not self.entries.allows(request.remote or ""):
+            return error("too many attempts from this address: wait a minute", 429)
+        body = json_value(await message_body(request))
+        token = body.get("token") if isinstance(body, dict) else None
+        entered = self.sessions.enter(token) if isinstance(token, str) else None
+        if entered is None:
+            return error("this token is wrong or was used before: open the address that the viewfinder printed last", 403)
+        cookie, role = entered
+        answer = web.json_response({"role": role.word})
+        answer.set_cookie(cookie_name(request), cookie, httponly=True, samesite="Strict", secure=self.secure, path="/")
+        return answer
+
+    def _page_headers(self, request: web.Request, path: str) -> dict[str, str]:
+        """Of the page: it may load and reach nothing but this server, and no other page may frame it."""
+        # Older Safari does not count the WebSocket of the same host as 'self'.
+        socket = f"{'wss' if self.secure else 'ws'}://{request.headers['Host']}"
+        policy = f"default-src 'self'; connect-src 'self' {socket}; img-src 'self' blob: data:; media-src 'self' blob:"
+        if path in _INLINE_PATHS:
+            policy += "; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'"
+        policy += "; object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        return _SAFETY_HEADERS | {"Content-Security-Policy": policy, "Cache-Control": "no-cache"}
+
+
+def needed_role(path: str) -> Role | None:
+    """For the path of a route; None is open to all (the page itself, which then enters). What is not listed needs control."""
+    if path in _PAGE_PATHS or path == "/enter":
+        return None
+    return Role.VIEW if path.split("/")[1:2] and path.split("/")[1] in _VIEW_PATHS else Role.CONTROL
+
+
+def cookie_name(request: web.Request) -> str:
+    """With the port in it, for browsers give a cookie to every port of a host and two viewfinders may run beside each other."""
+    port = request.headers.get("Host", "").rpartition(":")[2]
+    return f"mrbokeh_{port}" if port.isdecimal() else "mrbokeh"
+
+
+def error(sentence: str, status: int) -> web.Response:
+    """{"error": sentence}."""
+    return web.json_response({"error": sentence}, status=status)
+
+
+def _canonical(request: web.Request) -> str:
+    """The path as its route was declared; what matches no route counts as needing control."""
+    resource = request.match_info.route.resource
+    return "" if resource is None else resource.canonical
+
+
+async def _answered(request: web.Request, handler: _Handler) -> web.StreamResponse:
+    """Errors of aiohttp (unknown path, wrong method, body too large) as JSON too."""
+    try:
+        return await handler(request)
+    except web.HTTPException as problem:
+        if problem.status < 400:
+            raise
+        return error(f"{problem.reason.lower()}: {request.method} {request.path[:80]}", problem.status)

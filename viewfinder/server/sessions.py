@@ -1,0 +1,81 @@
+"""Sessions: one-time invitations, which become cookies, and the two roles. Everything is kept in memory and ends with the server."""
+
+import hashlib
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from enum import IntEnum
+
+_TOKEN_BYTES = 24
+_MOST_SESSIONS = 64
+
+
+class Role(IntEnum):
+    """What somebody may do; who may control may also view."""
+
+    VIEW = 1
+    CONTROL = 2
+
+    @property
+    def word(self) -> str:
+        """ "view" or "control"."""
+        return self.name.lower()
+
+
+def _ignore(_role: Role) -> None:
+    """Where nobody listens."""
+
+
+class Sessions:
+    """An invitation per role, each good for one entry; `renewed` is told the role when the next invitation is ready.
+
+    Programs such as OBS, which begin anew without asking anybody, use a standing token: to enter, or as a bearer (RFC 6750).
+    """
+
+    def __init__(self, renewed: Callable[[Role], None] = _ignore) -> None:
+        self.renewed = renewed
+        self._invitations = {role: secrets.token_urlsafe(_TOKEN_BYTES) for role in Role}
+        self._roles: OrderedDict[str, Role] = OrderedDict()
+        self._standing = {role: secrets.token_urlsafe(_TOKEN_BYTES) for role in Role}
+
+    def invitation(self, role: Role) -> str:
+        """The token that the next one who enters in this role must bring."""
+        return self._invitations[role]
+
+    def standing_token(self, role: Role) -> str:
+        """The token of a role that is never used up."""
+        return self._standing[role]
+
+    def enter(self, token: str) -> tuple[str, Role] | None:
+        """Exchange a token for (the value of a cookie, a role); None if it is wrong or spent."""
+        invited, standing = _role_of(token, self._invitations), _role_of(token, self._standing)
+        role = invited or standing
+        if role is None:
+            return None
+        cookie = secrets.token_urlsafe(_TOKEN_BYTES)
+        self._roles[_digest(cookie)] = role
+        if len(self._roles) > _MOST_SESSIONS:
+            self._roles.popitem(last=False)
+        if invited is not None:
+            self._invitations[role] = secrets.token_urlsafe(_TOKEN_BYTES)
+            self.renewed(role)
+        return cookie, role
+
+    def role_of(self, cookie: str | None, authorization: str | None) -> Role | None:
+        """Of the value of a cookie, or of an Authorization header; None for a stranger."""
+        if authorization is not None:
+            return _role_of(authorization.removeprefix("Bearer "), self._standing)
+        return None if cookie is None else self._roles.get(_digest(cookie))
+
+
+def _role_of(token: str, tokens: dict[Role, str]) -> Role | None:
+    return next((role for role, expected in tokens.items() if _same(token, expected)), None)
+
+
+def _digest(secret: str) -> str:
+    """Looked up instead of the secret itself, so that the time a look-up takes tells nothing about it."""
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _same(given: str, expected: str) -> bool:
+    return secrets.compare_digest(_digest(given), _digest(expected))

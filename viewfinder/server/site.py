@@ -1,0 +1,101 @@
+"""Site: everything that one viewfinder shows to browsers, and its routes; each part but the controls may be missing."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from aiohttp import web
+from jaxtyping import UInt8
+
+from viewfinder.server.access import Access, error
+from viewfinder.server.bounded import LARGEST_BODY, message_body
+from viewfinder.server.controls import Controls
+from viewfinder.server.dispatcher import Dispatcher
+from viewfinder.server.jpeg_socket import JpegSocket
+from viewfinder.server.page_files import page_routes
+from viewfinder.server.sessions import Role
+from viewfinder.server.waiting_room import WaitingRoom
+
+Matte = UInt8[np.ndarray, "height width"]
+
+
+@runtime_checkable
+class Part(Protocol):
+    """Something else with routes (WHEP, WHIP). Their role is what `access.needed_role` says of their path: whip needs control."""
+
+    def routes(self) -> Sequence[web.AbstractRouteDef]: ...
+
+    async def close(self) -> None: ...
+
+
+def _no_matte() -> None:
+    """Where the stage gives none."""
+
+
+@dataclass
+class Site:
+    """dispatcher: of the controls; the data channel of a WebRTC part calls the same one.
+
+    room: of the JPEG stream, None without it. parts: by name; "whep" tells the page to try it first, "whip" offers the camera page.
+    matte: the newest coverage of the virtual layer, small and 8-bit, for the peaking of real and virtual things apart.
+    """
+
+    controls: Controls
+    dispatcher: Dispatcher = field(init=False)
+    access: Access = field(default_factory=Access)
+    room: WaitingRoom | None = None
+    parts: dict[str, Part] = field(default_factory=dict)
+    matte: Callable[[], Matte | None] = _no_matte
+
+    def __post_init__(self) -> None:
+        self.dispatcher = Dispatcher(self.controls)
+
+    def application(self) -> web.Application:
+        """All routes behind the rules of access."""
+        app = web.Application(middlewares=[self.access.middleware], client_max_size=LARGEST_BODY)
+        app.add_routes(page_routes())
+        app.add_routes([web.post("/enter", self.access.enter), web.get("/state", self._state), web.post("/control", self._control)])
+        app.add_routes([web.get("/matte", self._matte)])
+        if self.room is not None:
+            app.add_routes([web.get("/stream", JpegSocket(self.room, self.dispatcher, self.access).handle)])
+        for part in self.parts.values():
+            app.add_routes(part.routes())
+        app.on_startup.append(self._open)
+        app.on_shutdown.append(self._close)
+        return app
+
+    def _role(self, request: web.Request) -> Role:
+        return self.access.role(request) or Role.VIEW
+
+    async def _state(self, request: web.Request) -> web.Response:
+        """GET /state: the State, the role of the one who asks, and the ways to watch, best first."""
+        ways = [name for name, present in (("whep", "whep" in self.parts), ("jpeg", self.room is not None)) if present]
+        own = {"role": self._role(request).word, "transports": ways, "matte": self.matte() is not None, "can_send": "whip" in self.parts}
+        return web.json_response(self.controls.state() | own)
+
+    async def _control(self, request: web.Request) -> web.Response:
+        """POST /control, a control message."""
+        body = await message_body(request)
+        answer = await self.dispatcher.answer(body, self._role(request), request.remote or "")
+        return web.json_response(answer, status=400 if "error" in answer else 200)
+
+    async def _matte(self, _request: web.Request) -> web.Response:
+        """GET /matte: coverage as a grey PNG."""
+        import cv2
+
+        matte = self.matte()
+        if matte is None:
+            return error("there is no matte now", 404)
+        return web.Response(body=cv2.imencode(".png", matte)[1].tobytes(), content_type="image/png")
+
+    async def _open(self, _app: web.Application) -> None:
+        if self.room is not None:
+            self.room.open()
+
+    async def _close(self, _app: web.Application) -> None:
+        if self.room is not None:
+            await self.room.close()
+        for part in self.parts.values():
+            await part.close()
+        self.dispatcher.close()

@@ -1,0 +1,124 @@
+"""A browser (a phone's, OBS) as the camera: WebRTC in through WHIP (RFC 9725)."""
+
+import asyncio
+import itertools
+import json
+import secrets
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from threading import Event
+from typing import Any
+
+from aiohttp import web
+
+from mrbokeh.errors import InputError
+from mrbokeh.video_color import UNSPECIFIED, color_of
+from viewfinder.frames import CameraFrame
+from viewfinder.newest import Newest
+from viewfinder.sources.camera_message import CameraKnowledge
+from viewfinder.sources.received_frame import upright_bgr
+from viewfinder.sources.size_limit import SizeLimit
+from viewfinder.sources.whip_session import WhipSession
+
+LONGEST_OFFER_BYTES = 65536
+_SDP = "application/sdp"
+_POLL_S, _SILENT_S = 0.1, 2.0
+_WAITING = "waiting for a browser camera"
+_BT601 = 6
+
+
+class BrowserCameraSource:
+    """A FrameSource that a web server feeds: add `routes` to its application, and `close` to what runs when it ends.
+
+    One camera at a time; a new one takes the place of the old one, for a page that was loaded anew says no good-bye. Frames have the
+    size that came, which browsers change as they like, or are scaled down with their aspect to the largest size given here.
+    Who may send is for the server's middleware to say (RFC 9725, 4.8: a bearer token).
+    """
+
+    name = "browser camera"
+
+    def __init__(self, max_width_px: int | None = None, max_height_px: int | None = None) -> None:
+        self.transfer = "bt709"
+        self.status: str | None = _WAITING
+        self._limit = SizeLimit(max_width_px, max_height_px)
+        self._newest: Newest[tuple[int, Any, float, CameraKnowledge, bool]] = Newest()
+        self._sequence = itertools.count()
+        self._knowledge = CameraKnowledge()
+        self._session: WhipSession | None = None
+        self._token: str | None = None
+        self._changing = asyncio.Lock()
+
+    def routes(self, path: str = "/whip") -> list[web.RouteDef]:
+        """POST an offer to the path; DELETE the address that came back to end."""
+        return [web.post(path, self._offered), web.delete(path + "/{token}", self._deleted)]
+
+    def frames(self, stopping: Event) -> Iterator[CameraFrame]:
+        last_s = time.monotonic()
+        while not stopping.is_set():
+            newest = self._newest.take(_POLL_S)
+            if newest is not None:
+                yield self._frame(*newest)
+                last_s = time.monotonic()
+            elif time.monotonic() - last_s > _SILENT_S:
+                self.status = _WAITING if self._session is None else "the browser camera is connected but sends no picture: waiting for it"
+
+    async def close(self) -> None:
+        """Ends the connection; to be called in the loop of the server."""
+        session, self._session, self._token = self._session, None, None
+        if session is not None:
+            self.status = _WAITING
+            await session.close()
+
+    def _frame(self, sequence: int, frame: Any, captured_s: float, known: CameraKnowledge, is_vp8: bool) -> CameraFrame:
+        color = color_of(frame, self.name)
+        if is_vp8 and frame.colorspace == UNSPECIFIED:
+            # RFC 6386, 9.2: VP8 knows BT.601 only, at every size.
+            color = replace(color, matrix=_BT601)
+        self.transfer, self.status = color.transfer_name, None
+        return CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence, known.lens, known.camera_from_world)
+
+    async def _offered(self, request: web.Request) -> web.Response:
+        if request.content_type != _SDP:
+            return web.Response(status=415, text=f"expected {_SDP}, got {request.content_type}")
+        offer = await request.content.read(LONGEST_OFFER_BYTES + 1)
+        while len(offer) <= LONGEST_OFFER_BYTES and (more := await request.content.read(LONGEST_OFFER_BYTES + 1 - len(offer))):
+            offer += more
+        if len(offer) > LONGEST_OFFER_BYTES:
+            return web.Response(status=413, text=f"expected an offer of at most {LONGEST_OFFER_BYTES} bytes")
+        async with self._changing:
+            return await self._answered(request, offer.decode("utf-8", "replace"))
+
+    async def _answered(self, request: web.Request, offer: str) -> web.Response:
+        session = WhipSession(lambda frame: self._came(session, frame), self._heard, lambda: self._ended(session))
+        try:
+            answer = await session.answer(offer)
+        except InputError as error:
+            await session.close()
+            return web.Response(status=400, text=str(error))
+        await self.close()
+        self._session, self._token, self._knowledge = session, secrets.token_urlsafe(16), CameraKnowledge()
+        headers = {"Location": f"{request.path}/{self._token}"}
+        return web.Response(status=201, text=answer, content_type=_SDP, headers=headers)
+
+    async def _deleted(self, request: web.Request) -> web.Response:
+        if self._token is None or not secrets.compare_digest(request.match_info["token"], self._token):
+            return web.Response(status=404, text="there is no such camera")
+        await self.close()
+        return web.Response()
+
+    def _came(self, session: WhipSession, frame: Any) -> None:
+        if session is self._session:
+            self._newest.put((next(self._sequence), frame, time.monotonic(), self._knowledge, session.is_vp8))
+
+    def _heard(self, message: str) -> str | None:
+        try:
+            self._knowledge = self._knowledge.told(message)
+        except InputError as error:
+            return json.dumps({"error": str(error)})
+        return None
+
+    def _ended(self, session: WhipSession) -> None:
+        if session is self._session:
+            self._session, self._token = None, None
+            self.status = "the browser camera is gone: waiting for it"

@@ -1,0 +1,131 @@
+"""The live view of a DSLR or mirrorless camera on a cable, through libgphoto2."""
+
+import itertools
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
+from threading import Event
+from typing import Any
+
+import numpy as np
+
+from mrbokeh.errors import InputError, MissingExtraError
+from viewfinder.frames import UNKNOWN_LENS, Bgr, CameraFrame
+from viewfinder.sources.gphoto2_lens import lens_state
+from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
+from viewfinder.sources.size_limit import SizeLimit
+
+_LENS_EVERY_S = 1.0
+_BUSY, _BUSY_WAIT_S, _MOST_BUSY = -110, 0.1, 30
+_LIVE_VIEW_SWITCH = ("viewfinder", "eosviewfinder")
+
+
+class Gphoto2PreviewSource:
+    """A FrameSource. port: such as usb:001,005, or None for the only camera. A camera that is switched off is waited for.
+
+    max_width_px, max_height_px: larger pictures are scaled down with their aspect. open_camera: gives an initialised gphoto2.Camera.
+    Frames carry what the camera tells of its lens. Raises InputError where there is no camera at the start, or no live view.
+    """
+
+    transfer = "srgb"
+
+    def __init__(
+        self,
+        port: str | None = None,
+        max_width_px: int | None = None,
+        max_height_px: int | None = None,
+        *,
+        open_camera: Callable[[str | None], Any] | None = None,
+    ) -> None:
+        self.name = "gphoto2 camera" if port is None else f"gphoto2 camera at {port}"
+        self.status: str | None = None
+        self._port, self._limit = port, SizeLimit(max_width_px, max_height_px)
+        self._open_camera = open_camera or _open_camera
+        try:
+            self._opened: Any = self._open_camera(port)
+        except CameraAwayError as error:
+            raise InputError(f"{error}; connect it, switch it on, and close other programs that hold it") from None
+
+    def frames(self, stopping: Event) -> Iterator[CameraFrame]:
+        sequence = itertools.count()
+        return reconnecting(lambda: self._session(sequence, stopping), stopping, self._tell)
+
+    def _tell(self, sentence: str | None) -> None:
+        self.status = sentence
+
+    def _session(self, sequence: Iterator[int], stopping: Event) -> Generator[CameraFrame, None, None]:
+        import gphoto2 as gp
+
+        camera, self._opened = self._opened or self._open_camera(self._port), None
+        try:
+            _switch_live_view(camera, 1)
+            lens, read_s = UNKNOWN_LENS, -_LENS_EVERY_S
+            while not stopping.is_set():
+                bgr, captured_s = self._preview(camera, stopping), time.monotonic()
+                if captured_s - read_s > _LENS_EVERY_S:
+                    lens, read_s = lens_state(camera), captured_s
+                yield CameraFrame(self._limit.applied(bgr), captured_s, next(sequence), lens)
+        except gp.GPhoto2Error as error:
+            if error.code == gp.GP_ERROR_NOT_SUPPORTED:
+                raise InputError(f"{self.name} gives no live view over the cable: use its HDMI output with a capture card") from None
+            raise CameraAwayError(f"{self.name} is away ({error.string or error}): waiting for it") from None
+        finally:
+            # A camera that is gone already does not matter.
+            with suppress(gp.GPhoto2Error):
+                _switch_live_view(camera, 0)
+            with suppress(gp.GPhoto2Error):
+                camera.exit()
+
+    def _preview(self, camera: Any, stopping: Event) -> Bgr:
+        """The next picture; asked for again while the camera is busy, as it is while the mirror goes up."""
+        import cv2
+        import gphoto2 as gp
+
+        for attempt in itertools.count():
+            try:
+                data = np.frombuffer(bytes(memoryview(camera.capture_preview().get_data_and_size())), np.uint8)
+            except gp.GPhoto2Error as error:
+                if error.code != _BUSY or attempt >= _MOST_BUSY:
+                    raise
+                stopping.wait(_BUSY_WAIT_S)
+                continue
+            bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+            if bgr is not None:
+                return bgr
+            if attempt >= _MOST_BUSY or stopping.wait(_BUSY_WAIT_S):
+                break
+        raise CameraAwayError(f"{self.name} sends something that is no JPEG: switch it off and on")
+
+
+def _switch_live_view(camera: Any, on: int) -> None:
+    import gphoto2 as gp
+
+    for name in _LIVE_VIEW_SWITCH:
+        with suppress(gp.GPhoto2Error):
+            widget = camera.get_single_config(name)
+            widget.set_value(on)
+            camera.set_single_config(name, widget)
+            return
+
+
+def _open_camera(port: str | None) -> Any:
+    """The only camera, or the one at that port. Raises CameraAwayError where there is none."""
+    try:
+        import gphoto2 as gp
+    except ImportError:
+        raise MissingExtraError("gphoto2", "tether") from None
+    try:
+        found = gp.Camera.autodetect()
+        ports = [found.get_value(index) for index in range(found.count())]
+        chosen = [each for each in ports if port in (None, each)]
+        if not chosen:
+            raise CameraAwayError("no camera is found" if not ports else f"no camera is at {port}, only at {', '.join(ports)}")
+        if len(chosen) > 1:
+            raise InputError(f"several cameras are connected (at {', '.join(ports)}): choose one with gphoto2:PORT")
+        camera, known = gp.Camera(), gp.PortInfoList()
+        known.load()
+        camera.set_port_info(known.get_info(known.lookup_path(chosen[0])))
+        camera.init()
+        return camera
+    except gp.GPhoto2Error as error:
+        raise CameraAwayError(f"the camera cannot be opened ({error.string or error})") from None

@@ -1,0 +1,100 @@
+"""A stream over the network (RTSP, HTTP, MPEG-TS over UDP) through FFmpeg, with as little delay as it allows."""
+
+import itertools
+import time
+from collections.abc import Generator, Iterator
+from functools import partial
+from threading import Event
+from typing import Any
+from urllib.parse import urlsplit
+
+from mrbokeh.video_color import color_of
+from viewfinder.frames import CameraFrame
+from viewfinder.sources.newest_of import newest_of
+from viewfinder.sources.received_frame import upright_bgr
+from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
+from viewfinder.sources.rhythm import Rhythm
+from viewfinder.sources.size_limit import SizeLimit
+
+SCHEMES = ("rtsp", "rtsps", "http", "https", "udp")
+OPEN_TIMEOUT_S, READ_TIMEOUT_S = 4.0, 2.0
+# A short look at the stream before it starts. What came meanwhile is decoded at once and passed over (FFmpeg's nobuffer would
+# throw the first key frame away instead).
+_LOW_DELAY = {"flags": "low_delay", "probesize": "500000", "analyzeduration": "500000", "max_delay": "100000"}
+_OF_SCHEME = {
+    "rtsp": {"rtsp_transport": "tcp"},
+    "rtsps": {"rtsp_transport": "tcp"},
+    "udp": {"overrun_nonfatal": "1", "fifo_size": "50000"},
+}
+
+
+class NetworkStreamSource:
+    """A FrameSource. A thread decodes all that comes, the newest frame is taken; a stream that dies is opened again.
+
+    url: of one of SCHEMES; `udp://@:5000` listens. A recording behind a URL is played in its own rhythm, again and again.
+    max_width_px, max_height_px: larger pictures are scaled down with their aspect.
+    """
+
+    def __init__(self, url: str, max_width_px: int | None = None, max_height_px: int | None = None) -> None:
+        self.name, self.transfer = _without_password(url), "bt709"
+        self.status: str | None = f"{self.name}: connecting"
+        self._url, self._limit = url, SizeLimit(max_width_px, max_height_px)
+
+    def frames(self, stopping: Event) -> Iterator[CameraFrame]:
+        decoded = newest_of(self._decoded, stopping, name=f"decode {self.name}", leave_s=OPEN_TIMEOUT_S + READ_TIMEOUT_S)
+        for sequence, frame, captured_s in decoded:
+            color = color_of(frame, self.name)
+            self.transfer = color.transfer_name
+            yield CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence)
+
+    def _tell(self, sentence: str | None) -> None:
+        self.status = sentence
+
+    def _decoded(self, stopping: Event) -> Iterator[tuple[int, Any, float]]:
+        """(number, PyAV frame, when it came), connection after connection."""
+        return reconnecting(partial(self._connection, stopping, itertools.count()), stopping, self._tell)
+
+    def _connection(self, stopping: Event, sequence: Iterator[int]) -> Generator[tuple[int, Any, float], None, None]:
+        import av
+
+        try:
+            with self._opened() as container:
+                rhythm = Rhythm(stopping) if container.duration else None
+                for frame in _frames_of(container):
+                    if stopping.is_set() or (rhythm and not rhythm.wait_for(frame.time or 0.0)):
+                        return
+                    yield next(sequence), frame, time.monotonic()
+        except av.FFmpegError as error:
+            raise CameraAwayError(f"{self.name} does not answer ({error.strerror}): trying again") from None
+        if rhythm is None:
+            raise CameraAwayError(f"{self.name} has ended: waiting for it to begin again")
+
+    def _opened(self) -> Any:
+        import av
+
+        options = {**_LOW_DELAY, **_OF_SCHEME.get(urlsplit(self._url).scheme.lower(), {})}
+        container = av.open(self._url, options=options, timeout=(OPEN_TIMEOUT_S, READ_TIMEOUT_S))
+        if not container.streams.video:
+            container.close()
+            raise CameraAwayError(f"{self.name} has no picture: waiting for one")
+        return container
+
+
+def _frames_of(container: Any) -> Iterator[Any]:
+    """Whole pictures as they come; what cannot be decoded, as before the first key frame, is left out."""
+    import av
+
+    stream = container.streams.video[0]
+    # Threads that work on several frames at once would hold each of these frames back.
+    stream.thread_type = "SLICE"
+    for packet in container.demux(stream):
+        try:
+            frames = packet.decode()
+        except av.InvalidDataError:
+            continue
+        yield from (frame for frame in frames if not frame.is_corrupt)
+
+
+def _without_password(url: str) -> str:
+    parts = urlsplit(url)
+    return parts._replace(netloc=parts.netloc.rsplit("@", 1)[-1], query="").geturl() if "@" in parts.netloc else url

@@ -1,0 +1,91 @@
+"""Late reprojection: a blurred layer, drawn for one pose, moved to a newer one by its depth (Mark et al. 1997, Post-rendering 3D warping).
+
+Not the sharp picture is moved and blurred again, which would cost a drawing, but the blurred one: each of its pixels by the depth of
+what it shows (mrbokeh's circles of confusion change little while the camera moves by a few pixels). The map is the inverse one, from new
+pixels to old: a fixed point, for the depth is known in the old picture. It is solved on every 4th pixel and bilinear between.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mrbokeh.camera import Camera
+from mrbokeh.overlay import Overlay
+from viewfinder.stage._reprojection_numba import sample, source_nodes
+from viewfinder.stage.layer_depth import GRID_PX
+
+NODE_PX = 4
+_ROUNDS = 4
+_PAD_PX = 1
+
+
+@dataclass(frozen=True, eq=False)
+class MovableLayer:
+    """A picture with the depth by which it moves.
+
+    rgba: (H, W, 4) premultiplied. dioptres: 1 / depth on a grid of every 4th pixel. camera: cut to this picture, with its pose.
+    left_px, top_px: of the picture in the frame for which it was drawn, at full resolution.
+    """
+
+    rgba: Float32[np.ndarray, "height width 4"]
+    dioptres: Float32[np.ndarray, "rows columns"]
+    camera: Camera
+    left_px: int
+    top_px: int
+    resolution: float = 1.0
+
+    def moved_to(self, camera: Camera, opacity: float = 1.0) -> Overlay:
+        """What a camera with any pose, size and focal length sees of it. In the pose of the drawing it is the drawing, bit for bit."""
+        if self._is_drawn_for(camera):
+            return _cut_to_frame(self.rgba, self.left_px, self.top_px, camera, opacity)
+        from_drawn = camera.camera_from_world @ self.camera.world_from_camera
+        left, top, right, bottom = self._lands_in(camera, from_drawn)
+        if left >= right or top >= bottom:
+            return _nothing()
+        view = np.array([*self.camera.focal_px, *self.camera.principal_px, *camera.focal_px, *camera.principal_px])
+        nodes = np.empty((-(-(bottom - top) // NODE_PX) + 1, -(-(right - left) // NODE_PX) + 1, 2))
+        middle = float(np.median(self.dioptres))
+        turn, shift = np.ascontiguousarray(from_drawn[:3, :3]), np.ascontiguousarray(from_drawn[:3, 3])
+        source_nodes(nodes, left, top, NODE_PX, self.dioptres, GRID_PX, middle, _ROUNDS, view, turn, shift)
+        rgb, shines_through = np.empty((bottom - top, right - left, 3), np.float32), np.empty((bottom - top, right - left), np.float32)
+        sample(rgb, shines_through, self.rgba, nodes, NODE_PX, np.float32(opacity))
+        return Overlay(top, left, rgb, shines_through)
+
+    def _is_drawn_for(self, camera: Camera) -> bool:
+        principal = (camera.principal_px[0] - self.left_px, camera.principal_px[1] - self.top_px)
+        same_view = self.resolution == 1.0 and camera.focal_px == self.camera.focal_px and principal == self.camera.principal_px
+        return same_view and np.array_equal(camera.camera_from_world, self.camera.camera_from_world)
+
+    def _lands_in(self, camera: Camera, from_drawn: Float[np.ndarray, "4 4"]) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom of where the picture lands in the frame: of its grid of depths, corners and all."""
+        rows, columns = self.dioptres.shape
+        x = np.minimum(np.linspace(0.0, self.rgba.shape[1], columns + 1), self.rgba.shape[1])
+        y = np.minimum(np.linspace(0.0, self.rgba.shape[0], rows + 1), self.rgba.shape[0])
+        nearby = np.pad(self.dioptres, ((0, 1), (0, 1)), mode="edge")
+        rays = np.stack(np.broadcast_arrays(
+            (x[None, :] - self.camera.principal_px[0]) / self.camera.focal_px[0],
+            (y[:, None] - self.camera.principal_px[1]) / self.camera.focal_px[1],
+            1.0,
+        ), axis=-1)  # fmt: skip
+        points = rays @ from_drawn[:3, :3].T + nearby[..., None] * from_drawn[:3, 3]
+        if not (points[..., 2] > 1e-3).all():
+            return 0, 0, camera.width_px, camera.height_px
+        xy_px = points[..., :2] / points[..., 2:] * camera.focal_px + camera.principal_px
+        low, high = np.floor(xy_px.min((0, 1))) - _PAD_PX, np.ceil(xy_px.max((0, 1))) + _PAD_PX
+        size = np.array([camera.width_px, camera.height_px])
+        (left, top), (right, bottom) = (np.clip(corner, 0, size).astype(int).tolist() for corner in (low, high))
+        return left, top, right, bottom
+
+
+def _cut_to_frame(rgba: Float32[np.ndarray, "height width 4"], left_px: int, top_px: int, camera: Camera, opacity: float) -> Overlay:
+    top, left = max(top_px, 0), max(left_px, 0)
+    inside = rgba[top - top_px : max(camera.height_px - top_px, 0), left - left_px : max(camera.width_px - left_px, 0)]
+    if not inside.size:
+        return _nothing()
+    faded = inside if opacity == 1.0 else inside * np.float32(opacity)
+    return Overlay(top, left, np.ascontiguousarray(faded[..., :3]), np.float32(1.0) - faded[..., 3])
+
+
+def _nothing() -> Overlay:
+    return Overlay(0, 0, np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.float32))

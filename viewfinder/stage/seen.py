@@ -1,0 +1,20 @@
+"""Seen: what the newest frame shows of the scene, for those who ask about it: picking and views."""
+
+from dataclasses import dataclass
+
+from mrbokeh.camera import Camera
+from mrbokeh.overlay import Overlay
+from viewfinder.stage.drawn_layer import Drawing
+from viewfinder.stage.occlusion import Occlusion
+from viewfinder.stage.staged_scene import StagedScene
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """camera: of the newest frame, upright. drawing: the one that was moved to it to become the overlay."""
+
+    overlay: Overlay
+    camera: Camera
+    drawing: Drawing
+    staged: StagedScene
+    occlusion: Occlusion | None = None

@@ -1,0 +1,176 @@
+"""Stage: the virtual scene for every frame of the stream, at its newest pose, however long a drawing takes."""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mrbokeh.camera import Camera
+from mrbokeh.compositing import covered_by
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.overlay import CodeTables, Overlay
+from mrbokeh.renderers.base import Renderer
+from viewfinder.frames import Bgr
+from viewfinder.stage.backend import Backend
+from viewfinder.stage.drawing_thread import DrawingThread, Drawn
+from viewfinder.stage.drawn_layer import DrawRequest, sharp_layers
+from viewfinder.stage.fade import Fade
+from viewfinder.stage.picking import depth_at_m
+from viewfinder.stage.redraw import blur_changed, is_outdated
+from viewfinder.stage.scene_description import PlacedObject, Triple
+from viewfinder.stage.seen import Seen
+from viewfinder.stage.stage_setup import SetupLoader, live_renderer
+from viewfinder.stage.upright import upright_camera
+from viewfinder.stage.views import VIEWS, view_picture
+from viewfinder.tracking.base import TrackedPose
+
+_STILL_S = 0.4
+"""After so long without movement a drawing of reduced resolution is drawn again at every pixel."""
+
+
+@dataclass(frozen=True)
+class StageStatus:
+    """layer_age_ms: since the drawing that is shown was begun, None before the first. lens: that blurred it.
+
+    focus_pending: another blur was asked for and is not shown yet. draws_per_s: over the last two seconds. busy: drawing now.
+    resolution: of the drawing, 1 is every pixel. opacity: 0 where the track is lost. problem: a sentence for the page, or None.
+    """
+
+    layer_age_ms: float | None
+    lens: Lens | None
+    focus_pending: bool
+    draws_per_s: float
+    busy: bool
+    resolution: float
+    opacity: float
+    triangles: int
+    renderer: str
+    problem: str | None
+
+
+class Stage:
+    """A Scenery. `overlay` and `picture` belong to one thread, the compositing one; everything else may be called from any."""
+
+    views = VIEWS
+
+    def __init__(self, scene: Path, backend: Backend | None = None) -> None:
+        """scene: a scene file (viewfinder.stage.scene_file). backend: None takes the graphics card where there is one, else the ray caster. InputError for what is wrong in it."""
+        self._thread = DrawingThread(SetupLoader(scene, backend))
+        self._fade = Fade()
+        self._camera: Camera | None = None
+        self._began_s: float | None = None
+        self._still_since_s = 0.0
+        self._wanted: DrawRequest | None = None
+        self.seen: Seen | None = None
+
+    @property
+    def lens(self) -> Lens | None:
+        """The lens that the scene file names."""
+        return self._thread.setup.lens
+
+    @property
+    def up(self) -> str:
+        """Which direction of the tracker's world is up, as the scene file says it."""
+        return self._thread.setup.staged.description.up
+
+    @property
+    def objects(self) -> tuple[PlacedObject, ...]:
+        """As they stand now."""
+        return self._thread.setup.staged.description.objects
+
+    def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:
+        """The newest drawing, moved to this pose; asks for a new one where it is too old. Takes about a millisecond.
+
+        pose None: the track is lost; what is shown fades where it was. intrinsics: of this frame's size, its pose is not looked
+        at. lens: as it is focused now. time_s: of the frame, `CameraFrame.captured_s`; animations and fading go by it.
+        """
+        opacity = self._fade.at(pose is not None, time_s)
+        pose_now = pose.camera_from_world if pose is not None else None if self._camera is None else self._camera.camera_from_world
+        if pose_now is None:
+            return _nothing()
+        self._camera = replace(intrinsics, camera_from_world=pose_now)
+        self._began_s = time_s if self._began_s is None else self._began_s
+        self._wanted = DrawRequest(self._camera, lens, time_s - self._began_s)
+        if pose is not None:
+            self._ask_where_outdated(self._wanted)
+        return self._shown(self._wanted, opacity)
+
+    def _ask_where_outdated(self, wanted: DrawRequest) -> None:
+        drawn, setup = self._thread.newest, self._thread.setup
+        if drawn is None or drawn.setup is not setup or is_outdated(drawn.drawing, wanted, setup.staged.is_animated):
+            self._still_since_s = wanted.time_s
+            self._thread.ask(wanted)
+        elif drawn.drawing.request.resolution < 1.0 and wanted.time_s - self._still_since_s > _STILL_S:
+            self._still_since_s = wanted.time_s
+            self._thread.ask(wanted, finest=True)
+
+    def _shown(self, wanted: DrawRequest, opacity: float) -> Overlay:
+        drawn = self._thread.newest
+        if drawn is None:
+            return _nothing()
+        camera = upright_camera(wanted.camera, drawn.setup.staged.description.up)
+        layer = drawn.drawing.layer
+        overlay = _nothing() if layer is None or opacity == 0.0 else layer.moved_to(camera, opacity)
+        self.seen = Seen(overlay, camera, drawn.drawing, drawn.setup.staged, drawn.setup.brushes.occlusion)
+        return overlay
+
+    @property
+    def status(self) -> StageStatus:
+        drawn, setup, wanted = self._thread.newest, self._thread.setup, self._wanted
+        return StageStatus(
+            layer_age_ms=None if drawn is None else 1e3 * (time.monotonic() - drawn.started_s),
+            lens=None if drawn is None else drawn.drawing.request.lens,
+            focus_pending=wanted is not None and (drawn is None or _blurred_otherwise(drawn, wanted)),
+            draws_per_s=self._thread.draws_per_s,
+            busy=self._thread.busy,
+            resolution=1.0 if drawn is None else drawn.drawing.request.resolution,
+            opacity=self._fade.opacity,
+            triangles=sum(each.triangle_count for each in setup.staged.objects),
+            renderer=setup.renderer_name,
+            problem=self._thread.problem,
+        )
+
+    def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
+        """One of `views`, of the frame for which `overlay` was asked last."""
+        return view_picture(view, plate_bgr, self.seen, tables)
+
+    def depth_at_m(self, x_px: float, y_px: float) -> float:
+        """What a tap there focuses on; InputError where nothing is known."""
+        if self.seen is None:
+            raise InputError("cannot focus there yet: the scene has not been drawn; wait until the camera is tracked")
+        return depth_at_m(self.seen, x_px, y_px)
+
+    def sharp_layers(self, camera: Camera) -> list[Layer]:
+        """Objects, then their shadow, in focus and at every pixel, as a camera (with its pose in the tracker's world) sees them now."""
+        setup, wanted = self._thread.setup, self._wanted
+        frame = upright_camera(camera, setup.staged.description.up)
+        layers = sharp_layers(setup.staged, wanted.time_s if wanted else 0.0, frame, setup.brushes)
+        occlusion = setup.brushes.occlusion
+        return layers if occlusion is None else [covered_by(layer, occlusion.matte(layer.depth_m, frame, frame)) for layer in layers]
+
+    def set_renderer(self, name: str, renderer: Renderer | None = None) -> None:
+        """Blur by another renderer from the next drawing on: a name of mrbokeh.renderers.choose, or a renderer that is there already."""
+        chosen = renderer or live_renderer(name)
+        self._thread.change(lambda setup: setup.with_renderer(name, chosen))
+
+    def move_object(self, name: str, position_m: Triple) -> None:
+        """Stand an object elsewhere, in the tracker's world; until the scene file is written again. InputError for an unknown name."""
+        self._thread.change(lambda setup: setup.with_staged(setup.staged.with_object(name, position_m=position_m)))
+
+    def show_object(self, name: str, visible: bool) -> None:
+        """The same for whether it is there at all."""
+        self._thread.change(lambda setup: setup.with_staged(setup.staged.with_object(name, visible=visible)))
+
+    def close(self) -> None:
+        self._thread.close()
+
+
+def _blurred_otherwise(drawn: Drawn, wanted: DrawRequest) -> bool:
+    return blur_changed(drawn.drawing.request.lens, wanted.lens, drawn.drawing)
+
+
+def _nothing() -> Overlay:
+    return Overlay(0, 0, np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.float32))

@@ -1,0 +1,171 @@
+"""EncodedStream: finished pictures encoded once for each codec in use, whoever many watch."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from threading import Event, Lock, Thread
+from typing import Any
+
+import numpy as np
+
+from viewfinder.frame_header import frame_header
+from viewfinder.frames import OutputFrame
+from viewfinder.newest import Newest
+from viewfinder.streaming.encoder import TICKS_PER_S, StreamQuality, VideoEncoder
+from viewfinder.streaming.h264 import h264_encoder
+from viewfinder.streaming.i420 import even_size, i420_frame
+from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
+from viewfinder.streaming.vp8 import vp8_encoder
+
+# In the order in which they are preferred.
+ENCODERS: dict[str, Callable[[int, int, StreamQuality], VideoEncoder]] = {"H264": h264_encoder, "VP8": vp8_encoder}
+_POLL_S = 0.1
+
+log = logging.getLogger(__name__)
+
+
+class EncodedStream:
+    """A FrameSink with one thread: the newest picture is encoded, older ones that waited are dropped before they cost anything.
+
+    capacity: packets that may wait for one viewer before it counts as fallen behind. keyframe_gap_s: keyframes that viewers ask
+    for come at least so far apart. keyframe_every_s: one is made at least so often, for receivers that cannot ask.
+    `encoded` counts packets by codec, `keyframes` those that stand alone; `encode_ms` is that of the last frame.
+    """
+
+    def __init__(
+        self,
+        quality: StreamQuality | None = None,
+        *,
+        capacity: int = 8,
+        keyframe_gap_s: float = 0.5,
+        keyframe_every_s: float | None = None,
+    ) -> None:
+        self._quality, self._capacity = quality or StreamQuality(), capacity
+        self._keyframe_gap_s, self.keyframe_every_s = keyframe_gap_s, keyframe_every_s
+        self._newest: Newest[OutputFrame] = Newest()
+        self._viewers: tuple[ViewerQueue, ...] = ()
+        self._lock, self._stopping = Lock(), Event()
+        self._encoders: dict[str, VideoEncoder] = {}
+        self._keyframe_s: dict[str, float] = {}
+        self._origin_s: float | None = None
+        self._last_ticks = -1
+        self.encoded: Counter[str] = Counter()
+        self.keyframes: Counter[str] = Counter()
+        self.encode_ms = 0.0
+        self.failure: str | None = None
+        self._thread = Thread(target=self._work, name="encode", daemon=True)
+        self._thread.start()
+
+    @property
+    def wants_frame(self) -> bool:
+        return any(viewer.wants_frames for viewer in self._viewers)
+
+    @property
+    def viewers(self) -> tuple[ViewerQueue, ...]:
+        return self._viewers
+
+    def show(self, frame: OutputFrame) -> None:
+        if self.failure is not None:
+            self._tell(None)
+        self._newest.put(frame)
+
+    def fail(self, sentence: str) -> None:
+        self._tell(sentence)
+
+    def watch(self, codec: str, wake: Callable[[], None]) -> ViewerQueue:
+        """A new viewer's queue, which begins with a keyframe. codec: of ENCODERS. wake: called in the encoder's thread."""
+        if codec not in ENCODERS:
+            raise ValueError(f"expected a codec of {list(ENCODERS)}, got {codec!r}")
+        viewer = ViewerQueue(codec, self._capacity, wake)
+        viewer.failure = self.failure
+        with self._lock:
+            self._viewers = (*self._viewers, viewer)
+        return viewer
+
+    def leave(self, viewer: ViewerQueue) -> None:
+        with self._lock:
+            self._viewers = tuple(each for each in self._viewers if each is not viewer)
+
+    def close(self) -> None:
+        """End the thread; viewers get nothing more."""
+        self._stopping.set()
+        self._thread.join()
+
+    def _tell(self, failure: str | None) -> None:
+        self.failure = failure
+        for viewer in self._viewers:
+            viewer.fail(failure)
+
+    def _work(self) -> None:
+        # The compiled conversion is loaded before the first viewer waits for it.
+        i420_frame(np.zeros((2, 2, 3), np.uint8))
+        while not self._stopping.is_set():
+            frame = self._newest.take(_POLL_S)
+            viewers = self._viewers
+            self._close_encoders(set(self._encoders) - {viewer.codec for viewer in viewers})
+            if frame is None:
+                continue
+            try:
+                self._encode_for(frame, viewers)
+            except Exception:
+                # A new encoder may succeed with the next picture; the stream must not end with one.
+                log.exception("a picture of %sx%s px could not be encoded", frame.bgr.shape[1], frame.bgr.shape[0])
+                self._close_encoders(set(self._encoders))
+        self._close_encoders(set(self._encoders))
+
+    def _encode_for(self, frame: OutputFrame, viewers: tuple[ViewerQueue, ...]) -> None:
+        codecs = dict.fromkeys(viewer.codec for viewer in viewers if viewer.wants_frames)
+        if not codecs:
+            return
+        started_s = time.perf_counter()
+        picture = i420_frame(frame.bgr)
+        converted_ms = 1000 * (time.perf_counter() - started_s)
+        ticks = self._ticks(frame.captured_s)
+        for codec in codecs:
+            listeners = [viewer for viewer in viewers if viewer.codec == codec]
+            encoder = self._encoder(codec, even_size(frame.bgr))
+            if self._keyframe_due(codec, listeners):
+                encoder.force_keyframe()
+            packet = encoder.encode(picture, ticks)
+            self.encode_ms = converted_ms + encoder.encode_ms
+            self._count(codec, packet)
+            encoded = EncodedFrame(packet, frame.captured_s, self._header(frame, codec))
+            for viewer in listeners:
+                viewer.put(encoded)
+
+    def _header(self, frame: OutputFrame, codec: str) -> dict[str, Any]:
+        header = frame_header(frame)
+        header["stages_ms"][codec.lower()] = round(self.encode_ms, 2)
+        return header
+
+    def _encoder(self, codec: str, size_px: tuple[int, int]) -> VideoEncoder:
+        """The encoder in use, or a new one where the size changed; a new one begins with a keyframe."""
+        if codec in self._encoders and self._encoders[codec].size_px != size_px:
+            self._close_encoders({codec})
+        if codec not in self._encoders:
+            self._encoders[codec] = ENCODERS[codec](*size_px, self._quality)
+        return self._encoders[codec]
+
+    def _close_encoders(self, codecs: set[str]) -> None:
+        for codec in codecs:
+            self._encoders.pop(codec).close()
+
+    def _keyframe_due(self, codec: str, listeners: list[ViewerQueue]) -> bool:
+        since_s = time.monotonic() - self._keyframe_s.get(codec, -1e9)
+        if self.keyframe_every_s is not None and since_s >= self.keyframe_every_s:
+            return True
+        return since_s >= self._keyframe_gap_s and any(viewer.wants_keyframe for viewer in listeners)
+
+    def _count(self, codec: str, packet: Any) -> None:
+        self.encoded[codec] += 1
+        if packet.is_keyframe:
+            self.keyframes[codec] += 1
+            self._keyframe_s[codec] = time.monotonic()
+
+    def _ticks(self, captured_s: float) -> int:
+        """The capture time on the clock of RTP; grows also where a picture is shown twice or a camera's clock steps back."""
+        if self._origin_s is None:
+            self._origin_s = captured_s
+        self._last_ticks = max(self._last_ticks + 1, round((captured_s - self._origin_s) * TICKS_PER_S))
+        return self._last_ticks

@@ -1,0 +1,177 @@
+"""Recorder: a FrameSink that writes what the viewer shows to a file, each picture at the time at which it was captured."""
+
+import logging
+import queue
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from fractions import Fraction
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from mrbokeh.atomic_files import refuse_existing
+from mrbokeh.errors import InputError
+from mrbokeh.overlay import code_tables
+from mrbokeh.video_frames import encoding_for
+from mrbokeh.video_io import VideoWriter
+from viewfinder.frames import Bgr, OutputFrame
+from viewfinder.streaming.encoder import TIME_BASE
+from viewfinder.streaming.i420 import even_size
+
+_POLL_S = 0.1
+# The compositor must not starve: the quality of files that are made at leisure in half of the time, at 2.5 times the size.
+_LIVE_H264 = {"crf": "14", "preset": "superfast"}
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A finished file. dropped: pictures that came while the encoder was busy; their time is shown by the picture before.
+
+    note: why it ended before it was stopped, None where it did not.
+    """
+
+    path: Path
+    frame_count: int
+    dropped: int
+    duration_s: float
+    note: str | None = None
+
+
+class Recorder:
+    """Writes MP4 (H.264) or QuickTime (.mov, ProRes 4444 unless `encoding` says otherwise), one recording at a time.
+
+    transfer: of the codes of the pictures (see FrameSource); files are BT.709. waiting: how many pictures the encoder may lag behind.
+    Files appear whole when they are stopped, and none is overwritten.
+    """
+
+    def __init__(self, transfer: str, *, frame_rate: float = 30.0, encoding: str | None = None, waiting: int = 8) -> None:
+        self._tables, self._encoding = code_tables(transfer), encoding
+        self._frame_rate, self._waiting = Fraction(frame_rate).limit_denominator(1001), waiting
+        self._frames: queue.Queue[OutputFrame] = queue.Queue(waiting)
+        self._stopping = Event()
+        self._thread: Thread | None = None
+        self._path = Path()
+        self._failure: InputError | None = None
+        self._note: str | None = None
+        self._dropped, self._count, self._first_s, self._last_s = 0, 0, 0.0, 0.0
+
+    @property
+    def wants_frame(self) -> bool:
+        return self._thread is not None and self._thread.is_alive() and not self._stopping.is_set()
+
+    @property
+    def dropped(self) -> int:
+        return self._dropped
+
+    def start(self, path: Path) -> None:
+        """Begin a file; InputError where one is under way, the name is taken or its suffix unknown."""
+        if self._thread is not None:
+            raise InputError(f"expected one recording at a time, but {self._path.name} is not stopped yet: stop it first")
+        encoding_for(path, self._encoding)
+        refuse_existing(path, overwrite=False)
+        self._path, self._failure, self._note = path, None, None
+        self._dropped, self._count = 0, 0
+        self._frames = queue.Queue(self._waiting)
+        self._stopping.clear()
+        self._thread = Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    def show(self, frame: OutputFrame) -> None:
+        if not self.wants_frame:
+            return
+        try:
+            self._frames.put_nowait(frame)
+        except queue.Full:
+            self._dropped += 1
+
+    def fail(self, _sentence: str) -> None:
+        """The camera may come back; until then the last picture stands."""
+
+    def stop(self) -> Recording:
+        """End the file with what was shown until now; InputError where nothing was or it could not be written."""
+        if self._thread is None:
+            raise InputError("expected a recording under way, but none was started")
+        self._stopping.set()
+        self._thread.join()
+        self._thread = None
+        if self._failure is not None:
+            raise self._failure
+        return Recording(self._path, self._count, self._dropped, self._last_s - self._first_s, self._note)
+
+    def close(self) -> None:
+        """Stop if a recording is under way; what went wrong with it goes to the log."""
+        try:
+            if self._thread is not None:
+                self.stop()
+        except InputError as error:
+            log.warning("%s", error)
+
+    def _work(self) -> None:
+        try:
+            self._record()
+        except InputError as error:
+            self._failure = error
+        except Exception as error:
+            log.debug("the recording failed", exc_info=True)
+            self._failure = InputError(f"{self._path} could not be written ({error}): check the folder and the space on the disk")
+
+    def _record(self) -> None:
+        frames = self._shown()
+        first = next(frames, None)
+        if first is None:
+            raise InputError(f"{self._path}: expected at least one picture, got none; the video was not written")
+        height, width = self._stored(first.bgr).shape[:2]
+        self._first_s = first.captured_s
+        with self._writer(width, height) as writer:
+            self._write(writer, first)
+            for frame in frames:
+                if self._stored(frame.bgr).shape[:2] != (height, width):
+                    self._note = f"the size of the picture changed from {width}x{height} px: the recording ended there"
+                    return
+                # A picture that is shown twice, or that a camera's clock set back, has no time of its own.
+                if frame.captured_s - self._last_s >= float(TIME_BASE):
+                    self._write(writer, frame)
+
+    def _writer(self, width_px: int, height_px: int) -> VideoWriter:
+        writer = VideoWriter(self._path, width_px, height_px, self._frame_rate, TIME_BASE, encoding=self._encoding)
+        if writer.encoding.codec == "libx264":
+            writer.encoding = writer.encoding._replace(options=_LIVE_H264)
+        return writer
+
+    def _write(self, writer: VideoWriter, frame: OutputFrame) -> None:
+        writer.write(self._linear(self._stored(frame.bgr)), frame.captured_s - self._first_s)
+        self._last_s, self._count = frame.captured_s, writer.frame_count
+
+    def _shown(self) -> Iterator[OutputFrame]:
+        """Pictures as they come; after the stop those that wait already."""
+        while True:
+            try:
+                yield self._frames.get(timeout=_POLL_S)
+            except queue.Empty:
+                if self._stopping.is_set():
+                    return
+
+    def _stored(self, bgr: Bgr) -> UInt8[np.ndarray, "rows columns 3"]:
+        """Without a last odd row and column where chroma is halved."""
+        if "420" not in encoding_for(self._path, self._encoding).pixel_format:
+            return bgr
+        width, height = even_size(bgr)
+        return bgr[:height, :width]
+
+    def _linear(self, bgr: Bgr) -> Float32[np.ndarray, "height width 3"]:
+        return self._tables.linear_from_code[bgr[..., ::-1]]
+
+
+def recording_path(folder: Path, suffix: str = ".mp4") -> Path:
+    """A name in the folder that is not taken: the date and time, and a number where one second sees two recordings."""
+    stem = f"viewfinder-{datetime.now():%Y%m%d-%H%M%S}"
+    path, number = folder / f"{stem}{suffix}", 1
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}-{number}{suffix}"
+    return path

@@ -1,0 +1,97 @@
+"""What waits for one viewer between the encoder and the network: a few packets, or nothing until a keyframe."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from threading import Lock
+from typing import Any
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """packet: an `av.Packet`, shared by all viewers, not to be changed; its times are in units of `encoder.TIME_BASE`.
+
+    captured_s: of the OutputFrame. header: what the page is told of it (see `frame_header`); stages_ms ends with the encoding.
+    """
+
+    packet: Any
+    captured_s: float
+    header: Mapping[str, Any]
+
+    @property
+    def is_keyframe(self) -> bool:
+        return bool(self.packet.is_keyframe)
+
+
+class _State(Enum):
+    # Nothing can be shown before a keyframe.
+    AWAITING_KEYFRAME = auto()
+    FLOWING = auto()
+    # Fell behind and has not come back: gets nothing, and nobody makes an effort for it.
+    STALLED = auto()
+
+
+class ViewerQueue:
+    """Filled by the encoder's thread (`put`), emptied by one consumer (`take`); `wake` is called when there is something new.
+
+    A viewer that lets the queue overflow loses all of it: a packet left out spoils all up to the next keyframe. When it comes
+    back for more it gets a keyframe.
+    """
+
+    def __init__(self, codec: str, capacity: int, wake: Callable[[], None]) -> None:
+        self.codec = codec
+        self._capacity, self._wake = capacity, wake
+        self._frames: deque[EncodedFrame] = deque()
+        self._lock = Lock()
+        self._state, self._asked = _State.AWAITING_KEYFRAME, False
+        self.dropped = 0
+        self.failure: str | None = None
+
+    @property
+    def waiting(self) -> int:
+        """How many packets wait to be taken."""
+        return len(self._frames)
+
+    @property
+    def wants_frames(self) -> bool:
+        return self._state is not _State.STALLED
+
+    @property
+    def wants_keyframe(self) -> bool:
+        with self._lock:
+            return self._state is _State.AWAITING_KEYFRAME or (self._asked and self._state is _State.FLOWING)
+
+    def ask_keyframe(self) -> None:
+        """The viewer lost something on the way; packets go on until the keyframe comes."""
+        with self._lock:
+            self._asked = True
+
+    def put(self, frame: EncodedFrame) -> None:
+        with self._lock:
+            if self._state is _State.STALLED or (self._state is _State.AWAITING_KEYFRAME and not frame.is_keyframe):
+                self.dropped += 1
+                return
+            if len(self._frames) == self._capacity:
+                self.dropped += len(self._frames) + 1
+                self._frames.clear()
+                self._state = _State.STALLED
+            else:
+                self._frames.append(frame)
+                self._state = _State.FLOWING
+                self._asked = self._asked and not frame.is_keyframe
+        self._wake()
+
+    def take(self) -> EncodedFrame | None:
+        """The oldest packet, which leaves the queue; None where there is none (yet)."""
+        with self._lock:
+            if self._frames:
+                return self._frames.popleft()
+            if self._state is _State.STALLED:
+                self._state = _State.AWAITING_KEYFRAME
+            return None
+
+    def fail(self, sentence: str | None) -> None:
+        """Tell the viewer why there are no more pictures; None: there are again."""
+        self.failure = sentence
+        self._wake()

@@ -1,0 +1,133 @@
+"""Which board to print for a lens, a distance and a picture size, so that its markers are read through the blur.
+
+The rule: a marker of the 4x4 dictionary (6 cells with its border) must span 6 diameters of the blur on the screen. On traced
+pictures with discs of 4 to 12 px, 62 to 100 % of the corners were found at 6 diameters, 0 to 58 % at 4.5, none at 4.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrbokeh.errors import InputError
+from mrbokeh.lens import MM_PER_M, Lens
+from viewfinder.tracking.board_pdf import PAPERS_MM, Page, page_of
+from viewfinder.tracking.charuco_board import DICTIONARY, CharucoGrid, TrackingBoard
+
+BLURS_PER_MARKER = 6.0
+SHARP_MARKER_PX = 24.0
+"""Of a sharp marker: 4 px for each of its cells."""
+
+MARKER_PER_SQUARE = 0.75
+_FEWEST_COLUMNS, _FEWEST_ROWS = 4, 3
+_MOST_COLUMNS, _MOST_ROWS = 9, 7
+_WORTH_A_SECOND_SCALE = 1.8
+_GAP_SQUARES = 0.25
+_STEPS = 33
+
+
+@dataclass(frozen=True)
+class View:
+    """How a board is going to be seen: from nearest_m to farthest_m, in pictures width_px wide, elevation_deg above its plane."""
+
+    lens: Lens
+    nearest_m: float
+    farthest_m: float
+    width_px: int
+    elevation_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.nearest_m <= self.farthest_m < np.inf and 0.0 < self.elevation_deg <= 90.0 and self.width_px > 0):
+            raise InputError(
+                f"expected 0 < nearest <= farthest distance, an elevation of 0 to 90 degrees and a width in pixels, got "
+                f"{self.nearest_m:g} to {self.farthest_m:g} m, {self.elevation_deg:g} degrees, {self.width_px} px"
+            )
+
+    def needed_marker_mm(self, distance_m: float) -> float:
+        """The least marker at that distance; its shorter side on the screen counts, which the elevation foreshortens."""
+        needed_px = max(BLURS_PER_MARKER * abs(float(self.lens.coc_px(distance_m, self.width_px))), SHARP_MARKER_PX)
+        return needed_px / self.px_per_mm(distance_m) / float(np.sin(np.deg2rad(self.elevation_deg)))
+
+    def px_per_mm(self, distance_m: float) -> float:
+        return self.lens.focal_px(self.width_px) / (distance_m * MM_PER_M)
+
+
+@dataclass(frozen=True)
+class BoardPlan:
+    """marker_mm: the least that is read at every distance. blur_px: the largest blur. board: None where no paper holds one.
+
+    paper: the one to print on. sentence: all of it, for people.
+    """
+
+    marker_mm: float
+    blur_px: float
+    board: TrackingBoard | None
+    paper: str | None
+    sentence: str
+
+
+def plan_board(view: View, paper: str = "a4") -> BoardPlan:
+    """A board for that paper; for the next larger one where its markers would be too small."""
+    distances = np.linspace(1.0 / view.farthest_m, 1.0 / view.nearest_m, _STEPS)
+    markers_mm = [view.needed_marker_mm(1.0 / float(each)) for each in distances]
+    blur_px = max(abs(float(view.lens.coc_px(1.0 / float(each), view.width_px))) for each in distances)
+    needed = (
+        f"from {view.nearest_m:g} to {view.farthest_m:g} m the blur grows to {blur_px:.1f} px, so markers must be at least "
+        f"{max(markers_mm):.0f} mm ({BLURS_PER_MARKER:g} blurs)"
+    )
+    for name in _from(paper):
+        board = _board_on(page_of(name), max(markers_mm), min(markers_mm))
+        if board is not None:
+            larger = "" if name == paper.lower() else f", which {paper} cannot hold"
+            return BoardPlan(max(markers_mm), blur_px, board, name, f"{needed}{larger}: print {_words(board)} on {name}")
+    advice = "stop the lens down, stay nearer to its focus, or track with a phone on the camera, whose own lens is sharp at all distances"
+    return BoardPlan(max(markers_mm), blur_px, None, None, f"{needed}, which no paper up to a3 holds: {advice}")
+
+
+def _from(paper: str) -> list[str]:
+    """That paper and larger ones."""
+    wanted = page_of(paper)
+    larger = [name for name, (width, height) in PAPERS_MM.items() if width * height > wanted.width_mm * wanted.height_mm]
+    return [paper.lower(), *sorted(larger, key=lambda name: PAPERS_MM[name])]
+
+
+def _board_on(page: Page, coarse_mm: float, fine_mm: float) -> TrackingBoard | None:
+    """Of both directions of the paper the one with more corners."""
+    boards = [board for each in (page, page.turned) if (board := _board_in(each.room_mm, coarse_mm, fine_mm)) is not None]
+    return max(boards, key=lambda board: len(board.corners_m), default=None)
+
+
+def _board_in(room_mm: tuple[float, float], coarse_mm: float, fine_mm: float) -> TrackingBoard | None:
+    """One grid, and a fine one below it where the distances differ so much that small markers are read at some of them."""
+    square_mm = _whole_mm(coarse_mm / MARKER_PER_SQUARE)
+    columns = min(int(room_mm[0] / square_mm), _MOST_COLUMNS)
+    rows = min(int(room_mm[1] / square_mm), _MOST_ROWS)
+    if columns < _FEWEST_COLUMNS or rows < _FEWEST_ROWS:
+        return None
+    fine_square_mm = _whole_mm(fine_mm / MARKER_PER_SQUARE)
+    top_mm = _FEWEST_ROWS * square_mm + _GAP_SQUARES * square_mm
+    fine_columns = min(int(room_mm[0] / fine_square_mm), _MOST_COLUMNS)
+    fine_rows = min(int((room_mm[1] - top_mm) / fine_square_mm), _MOST_ROWS)
+    if square_mm / fine_square_mm < _WORTH_A_SECOND_SCALE or fine_columns < _FEWEST_COLUMNS or fine_rows < _FEWEST_ROWS:
+        return _within_dictionary((_grid(columns, rows, square_mm),))
+    coarse = _grid(columns, _FEWEST_ROWS, square_mm)
+    fine = _grid(fine_columns, fine_rows, fine_square_mm)
+    below = CharucoGrid(fine.squares, fine.square_mm, fine.marker_mm, (0.0, top_mm), coarse.marker_ids.stop)
+    return _within_dictionary((coarse, below))
+
+
+def _grid(columns: int, rows: int, square_mm: float) -> CharucoGrid:
+    return CharucoGrid((columns, rows), square_mm, MARKER_PER_SQUARE * square_mm)
+
+
+def _within_dictionary(grids: tuple[CharucoGrid, ...]) -> TrackingBoard:
+    """The smallest dictionary has the markers that differ most."""
+    needed = max(grid.marker_ids.stop for grid in grids)
+    return TrackingBoard(grids, DICTIONARY if needed <= 50 else "DICT_4X4_100")
+
+
+def _whole_mm(size_mm: float) -> float:
+    return float(np.ceil(size_mm - 1e-9))
+
+
+def _words(board: TrackingBoard) -> str:
+    return " and ".join(f"{grid.squares[0]}x{grid.squares[1]} squares of {grid.square_mm:g} mm" for grid in board.grids)

@@ -1,0 +1,83 @@
+"""Tracks a printed board: detected now and then in a thread, carried by flow in every frame, a pose from each."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from mrbokeh.camera import Camera
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.base import TrackedPose
+from viewfinder.tracking.board_alignment import AlignedDetector
+from viewfinder.tracking.charuco_board import TrackingBoard
+from viewfinder.tracking.charuco_detector import NO_CORNERS, Corners
+from viewfinder.tracking.corner_flow import FrameHistory
+from viewfinder.tracking.detection_thread import Detections, DetectionThread
+from viewfinder.tracking.pose_from_points import PoseFit, pose_from_plane
+
+GRACE_S = 0.25
+_ENOUGH_CORNERS = 16
+_ENOUGH_SPREAD = 0.15
+_GOOD_RESIDUAL_PX = 1.0
+
+
+class CharucoTracker:
+    """grace_s: for so long after the board is lost the last pose is given again, with its own time and falling quality.
+
+    detections: who searches frames; a DetectionThread unless given. corners: those that made the last pose.
+    """
+
+    name = "board"
+
+    def __init__(self, board: TrackingBoard, detections: Detections | None = None, grace_s: float = GRACE_S) -> None:
+        self.board, self._grace_s = board, grace_s
+        self._detections = detections or DetectionThread(AlignedDetector(board))
+        self._history = FrameHistory()
+        self._last: TrackedPose | None = None
+        self.corners = NO_CORNERS
+        self.detection_s = 0.0
+
+    def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
+        grey = cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
+        if not self._history.add(frame.sequence, grey):
+            self.corners = NO_CORNERS
+        self._detections.offer(frame.sequence, grey, hurry=not len(self.corners))
+        corners = self._newest_corners()
+        before = None if self._last is None else self._last.camera_from_world
+        fit = pose_from_plane(self.board.corners_m[corners.ids], corners.xy_px, intrinsics, before)
+        if fit is None:
+            self.corners = NO_CORNERS
+            return self._held(frame.captured_s)
+        self.corners = corners.only(fit.inliers)
+        self._last = TrackedPose(
+            fit.camera_from_world, self._quality(fit, intrinsics), frame.captured_s, fit.residual_px, int(fit.inliers.sum())
+        )
+        return self._last
+
+    def close(self) -> None:
+        self._detections.close()
+
+    def _newest_corners(self) -> Corners:
+        """A detection, carried to this frame, goes before flow, which may have slipped by a square."""
+        flowed = self._history.from_before(self.corners)
+        detection = self._detections.take()
+        if detection is None:
+            return flowed
+        self.detection_s = detection.took_s
+        detected = self._history.carry(detection.corners, detection.sequence)
+        return flowed if detected is None else detected.with_more(flowed)
+
+    def _held(self, now_s: float) -> TrackedPose | None:
+        if self._last is None or now_s - self._last.captured_s > self._grace_s:
+            self._last = None
+            return None
+        share = 1.0 - (now_s - self._last.captured_s) / self._grace_s
+        return replace(self._last, quality=self._last.quality * share)
+
+    def _quality(self, fit: PoseFit, camera: Camera) -> float:
+        """1 for 16 corners that fit to the pixel and span 15 % of the picture's diagonal both ways; a product of three shares."""
+        xy_px = self.corners.xy_px
+        spread = np.linalg.svd(xy_px - xy_px.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(xy_px))
+        across = 2.0 * spread / np.hypot(camera.width_px, camera.height_px) / _ENOUGH_SPREAD
+        exact = 1.0 / (1.0 + (fit.residual_px / _GOOD_RESIDUAL_PX) ** 2)
+        return float(min(len(xy_px) / _ENOUGH_CORNERS, 1.0) * min(across, 1.0) * exact)

@@ -1,0 +1,43 @@
+"""A camera on a tripod: its pose, measured once, holds for every frame."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mrbokeh.atomic_files import read_json
+from mrbokeh.camera import Camera
+from mrbokeh.camera_file import camera_from_json
+from mrbokeh.errors import InputError
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.base import TrackedPose
+
+
+class FixedPose:
+    """camera: pose and intrinsics; who composites takes `camera.resized` to the size of its frames for intrinsics."""
+
+    name = "fixed pose"
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+
+    def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose:  # noqa: ARG002
+        return TrackedPose(self.camera.camera_from_world, 1.0, frame.captured_s)
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+def read_fixed_pose(path: Path | str) -> FixedPose:
+    """From the JSON of `mrbokeh.camera_file`."""
+    document = read_json(path, "a camera with its pose")
+    camera = camera_from_json(document if isinstance(document, dict) else {}, str(path))
+    if not is_rigid(camera.camera_from_world):
+        raise InputError(f"{path}: camera_from_world must be a rigid transform (4x4: a rotation and a shift in metres), but it is not one")
+    return FixedPose(camera)
+
+
+def is_rigid(pose: np.ndarray) -> bool:
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        return False
+    turn = pose[:3, :3]
+    return bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0 and np.array_equal(pose[3], (0, 0, 0, 1)))

@@ -1,0 +1,98 @@
+"""FreeD D1 (Vinten free-d): camera place and angles in 29 bytes, zoom and focus as raw counts of their encoders.
+
+    0  0xD1      1  camera      2  pan, tilt, roll: 3 bytes each, signed, degrees * 32768     11  x, y, z: 3 bytes each, signed, mm * 64
+   20  zoom, focus: 3 bytes each, unsigned counts     26  spare     28  checksum: 0x40 less the sum of the others, modulo 256
+
+z is up; with all angles 0 the camera looks along y with x to its right. Pan counts to the right, tilt up, roll clockwise as seen
+from behind. Senders differ in this more than in anything else: `FreeDReading.signs` turns it round.
+"""
+
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from viewfinder.frames import UNKNOWN_LENS, Pose
+from viewfinder.tracking.encoder_table import EncoderTable
+from viewfinder.tracking.rigid_motion import inverted, rigid
+from viewfinder.tracking.stage_axes import CAMERA_FROM_STAGE_CAMERA, STAGE_FROM_BOARD, pan_tilt_roll_deg
+from viewfinder.tracking.tracking_sample import MalformedMessageError, TrackingSample
+
+PORT = 40000
+MESSAGE_BYTES = 29
+
+_TYPE = 0xD1
+_CHECKSUM_START = 0x40
+_PER_DEGREE = 32768.0
+_PER_M = 64.0 * 1000.0
+_FIELD_BYTES = 3
+
+
+@dataclass(frozen=True)
+class FreeDMessage:
+    """pan_tilt_roll_deg, xyz_m: as sent. zoom, focus: counts of the encoders, 0 to 2**24 - 1."""
+
+    camera: int
+    pan_tilt_roll_deg: tuple[float, float, float]
+    xyz_m: tuple[float, float, float]
+    zoom: int
+    focus: int
+
+
+@dataclass(frozen=True)
+class FreeDReading:
+    """How a sender's numbers are meant: signs of (pan, tilt, roll, x, y, z); where our world lies on its stage; its lens.
+
+    pupil_before_m: how far the entrance pupil lies before the point whose place is sent (often the head of the tripod).
+    """
+
+    signs: tuple[int, int, int, int, int, int] = (1, 1, 1, 1, 1, 1)
+    stage_from_world: Pose = field(default_factory=STAGE_FROM_BOARD.copy)
+    pupil_before_m: float = 0.0
+    table: EncoderTable | None = None
+
+
+def read_freed(datagram: bytes) -> FreeDMessage:
+    """Raises MalformedMessageError where length, type or checksum are wrong."""
+    if len(datagram) != MESSAGE_BYTES or datagram[0] != _TYPE:
+        raise MalformedMessageError("not a D1 message of FreeD")
+    if datagram[-1] != _checksum(datagram[:-1]):
+        raise MalformedMessageError("the checksum of a FreeD message is wrong")
+    numbers = [datagram[first : first + _FIELD_BYTES] for first in range(2, 26, _FIELD_BYTES)]
+    pan, tilt, roll = (int.from_bytes(each, "big", signed=True) / _PER_DEGREE for each in numbers[:3])
+    x, y, z = (int.from_bytes(each, "big", signed=True) / _PER_M for each in numbers[3:6])
+    zoom, focus = (int.from_bytes(each, "big") for each in numbers[6:])
+    return FreeDMessage(datagram[1], (pan, tilt, roll), (x, y, z), zoom, focus)
+
+
+def write_freed(message: FreeDMessage) -> bytes:
+    """Raises OverflowError where a number does not fit: angles to 256 degrees, places to 131 m."""
+    signed = [round(angle * _PER_DEGREE) for angle in message.pan_tilt_roll_deg] + [round(place * _PER_M) for place in message.xyz_m]
+    body = bytes([_TYPE, message.camera]) + b"".join(number.to_bytes(_FIELD_BYTES, "big", signed=True) for number in signed)
+    body += b"".join(count.to_bytes(_FIELD_BYTES, "big") for count in (message.zoom, message.focus)) + struct.pack(">H", 0)
+    return body + bytes([_checksum(body)])
+
+
+def freed_sample(message: FreeDMessage, reading: FreeDReading) -> TrackingSample:
+    """In our conventions; without a table the counts of the lens say nothing and are told as ignored."""
+    numbers = np.array([*message.pan_tilt_roll_deg, *message.xyz_m]) * reading.signs
+    pan, tilt, roll = numbers[:3]
+    stage_from_camera = rigid(Rotation.from_euler("ZXY", [-pan, tilt, roll], degrees=True).as_matrix(), numbers[3:])
+    stage_from_pupil = stage_from_camera @ rigid(np.eye(3), np.array([0.0, reading.pupil_before_m, 0.0]))
+    camera_from_world = CAMERA_FROM_STAGE_CAMERA @ inverted(stage_from_pupil) @ reading.stage_from_world
+    if reading.table is None:
+        return TrackingSample(camera_from_world, UNKNOWN_LENS, ignored=frozenset({"zoom and focus counts (no lens table)"}))
+    return TrackingSample(camera_from_world, reading.table.lens(focus=message.focus, zoom=message.zoom))
+
+
+def freed_message(sample: TrackingSample, camera: int = 1, zoom: int = 0, focus: int = 0) -> FreeDMessage:
+    """As a sender with the usual signs would write it, whose stage has our world for its ground; the counts are not looked up."""
+    stage_from_camera = STAGE_FROM_BOARD @ inverted(sample.camera_from_world) @ CAMERA_FROM_STAGE_CAMERA
+    pan, tilt, roll = pan_tilt_roll_deg(stage_from_camera[:3, :3])
+    x, y, z = stage_from_camera[:3, 3].tolist()
+    return FreeDMessage(camera, (-pan, tilt, roll), (x, y, z), zoom, focus)
+
+
+def _checksum(body: bytes) -> int:
+    return (_CHECKSUM_START - sum(body)) % 256

@@ -1,0 +1,84 @@
+"""PhoneTracker: the camera is where the phone on it is; the phone sees a board sharply that the camera blurs."""
+
+import logging
+from collections.abc import Iterator
+from threading import Event, Thread
+from typing import Protocol, runtime_checkable
+
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
+from viewfinder.frames import CameraFrame, Pose
+from viewfinder.tracking.base import TrackedPose, Tracker
+from viewfinder.tracking.phone_rig import PhoneRig
+from viewfinder.tracking.pose_history import PoseHistory
+from viewfinder.tracking.tracking_sample import TrackingSample
+
+_LEAVE_S = 3.0
+
+log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class PhoneFrames(Protocol):
+    """The frames of the phone: any FrameSource of viewfinder/sources."""
+
+    name: str
+
+    def frames(self, stopping: Event) -> Iterator[CameraFrame]: ...
+
+
+class PhoneTracker:
+    """A Tracker. phone_tracker: any Tracker, which gets the phone's frames (in a thread of its own) and `phone_intrinsics` in their size.
+
+    rig: None while it is being calibrated; nothing is tracked then, `phone_pose` serves. video_delay_s: how much later the camera's
+    picture of a moment comes than the phone's; may be set at any time. failure: one sentence if the phone's frames ended in an error.
+    """
+
+    def __init__(
+        self, source: PhoneFrames, phone_tracker: Tracker, phone_intrinsics: Camera, rig: PhoneRig | None, hold_s: float = 0.1
+    ) -> None:
+        self.name, self.rig = f"phone ({source.name})", rig
+        self.video_delay_s, self._hold_s = 0.0, hold_s
+        self.failure: str | None = None
+        self._source, self._tracker, self._intrinsics = source, phone_tracker, phone_intrinsics
+        self._history, self._newest = PoseHistory(joined_s=2.0 * hold_s), (0.0, 0.0, 0)
+        self._stopping = Event()
+        self._thread = Thread(target=self._run, name="phone", daemon=True)
+        self._thread.start()
+
+    def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:  # noqa: ARG002
+        rig = self.rig
+        found = self._history.at(frame.captured_s - self.video_delay_s)
+        if rig is None or found is None or found.beyond_s >= self._hold_s:
+            return None
+        quality, residual_px, points = self._newest
+        pose = rig.camera_from_phone @ found.camera_from_world
+        return TrackedPose(pose, quality * (1.0 - found.beyond_s / self._hold_s), frame.captured_s, residual_px, points)
+
+    def phone_pose(self, captured_s: float) -> Pose | None:
+        """phone_from_world at the time of a frame of the camera, for pairs to calibrate with; None where it is not known."""
+        found = self._history.at(captured_s - self.video_delay_s)
+        return None if found is None or found.beyond_s > 0.0 else found.camera_from_world
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join(_LEAVE_S)
+        self._tracker.close()
+
+    def _run(self) -> None:
+        try:
+            for frame in self._source.frames(self._stopping):
+                self._take(frame)
+        except InputError as error:
+            self.failure = str(error)
+        except Exception:
+            log.exception("the phone failed")
+            self.failure = f"{self.name} failed; see the terminal"
+
+    def _take(self, frame: CameraFrame) -> None:
+        height_px, width_px = frame.bgr.shape[:2]
+        pose = self._tracker.track(frame, self._intrinsics.resized(width_px, height_px))
+        # A tracker may give its last pose again for a while; that tells nothing new of this moment.
+        if pose is not None and pose.captured_s == frame.captured_s:
+            self._newest = (pose.quality, pose.residual_px, pose.points)
+            self._history.add(frame.captured_s, TrackingSample(pose.camera_from_world))
