@@ -5,23 +5,27 @@ RUN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= demo_out
 
-.PHONY: demo test test-slow check bench clean
+.PHONY: demo test test-slow test-browser check bench clean
 
 demo: $(READY)
 	$(RUN)/mrbokeh demo --out $(OUT)
 
 test: $(READY)
-	$(RUN)/python -m pytest -n 2 -m "not slow"
+	$(RUN)/python -m pytest -n 2 -m "not slow and not browser"
 
 test-slow: $(READY)
 	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,datasets]"
 	$(RUN)/python -m pytest -m slow
 
+test-browser: $(READY)
+	command -v chromium chromium-browser google-chrome > /dev/null || apt-get install --yes chromium
+	$(RUN)/python -m pytest -m browser
+
 check: $(READY)
 	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
-	$(RUN)/python -m pytest -n 2 -m "not slow"
+	$(RUN)/python -m pytest -n 2 -m "not slow and not browser"
 
 bench: $(READY)
 	for bench in tests/bench_*.py; do $(RUN)/python -m tests.$$(basename $$bench .py) || exit 1; done
