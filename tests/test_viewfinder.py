@@ -360,7 +360,7 @@ def test_what_a_finished_layer_cannot_do_is_said(tmp_path: Path) -> None:
             controls.focus_at_distance(0.02)
         with pytest.raises(InputError, match="--scene"):
             controls.move_object("lantern", (0.1, 0.0))
-        assert controls.state()["dioptre_range"] == (0.0, pytest.approx(1 / 0.075)), "1.5 focal lengths of 50 mm"
+        assert controls.state()["dioptre_range"] == (0.0, pytest.approx(1 / 0.3)), "6 focal lengths of 50 mm"
 
 
 @contextmanager

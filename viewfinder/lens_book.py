@@ -9,6 +9,7 @@ from viewfinder.frames import LensState
 
 F_NUMBERS = (0.95, 1.2, 1.4, 1.8, 2.0, 2.4, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)
 _CLOSEST_FOCAL_LENGTHS = 1.5
+_SLIDER_FOCAL_LENGTHS = 6.0
 
 
 class LensBook:
@@ -36,6 +37,11 @@ class LensBook:
     def closest_m(self) -> float:
         """Nearer than this the thin lens of that focal length would need more than three times its extension."""
         return _CLOSEST_FOCAL_LENGTHS * self.lens.focal_length_mm / MM_PER_M
+
+    @property
+    def slider_dioptres(self) -> tuple[float, float]:
+        """From infinity to a fifth of life size, where lenses that are not for macro end; a tap may go nearer."""
+        return 0.0, MM_PER_M / (_SLIDER_FOCAL_LENGTHS * self.lens.focal_length_mm)
 
     @property
     def f_numbers(self) -> list[float]:

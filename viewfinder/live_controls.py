@@ -100,7 +100,7 @@ class LiveControls:
             source=self._source_name,
             width_px=width,
             height_px=height,
-            dioptre_range=(0.0, 1.0 / lenses.closest_m),
+            dioptre_range=lenses.slider_dioptres,
             focus_distance_m=lens.focus_distance_m if math.isfinite(lens.focus_distance_m) else None,
             f_number=lens.f_number,
             f_numbers=lenses.f_numbers,
