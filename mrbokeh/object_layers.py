@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
 
 from mrbokeh.camera import Camera
 from mrbokeh.image_io import read_image
 from mrbokeh.layer import Layer
 from mrbokeh.scene import Environment, Scene, shadow_catcher, split_sun, sun, world_from_scene_placing
+from mrbokeh.scene.shadow_layer import shadow_layer
 
 SUN_DIRECTION = (0.45, 1.0, 0.55)
 
@@ -49,8 +49,7 @@ def object_layers(glb: Path, staging: Staging, camera: Camera) -> list[Layer]:
     if staging.shadow > 0:
         low, high = scene.bounds_m
         catcher = shadow_catcher(float(foot_m[1]), (float(foot_m[0]), float(foot_m[2])), 4.0 * float(np.max(high - low)))
-        mask = raycaster.render_shadow_mask(scene, upright, catcher)
-        layers.append(_shadow_layer(mask, staging.shadow, _ground_depth_m(upright, float(foot_m[1]))))
+        layers.append(shadow_layer(raycaster, scene, upright, catcher, staging.shadow))
     return layers
 
 
@@ -68,19 +67,3 @@ def _lit(scene: Scene, staging: Staging) -> Scene:
         return scene.with_environment(grey).with_lights(sun(SUN_DIRECTION, 1.6 * staging.exposure))
     sky, light = split_sun(Environment(read_image(staging.environment)))
     return scene.with_environment(sky.brighter(staging.exposure)).with_lights(light.brighter(staging.exposure))
-
-
-def _shadow_layer(mask: Float32[np.ndarray, "height width"], darkness: float, ground_m: Float32[np.ndarray, "height width"]) -> Layer:
-    """Shadow as premultiplied black on the ground: the lens then blurs it like anything that lies there."""
-    alpha = (darkness * (1.0 - mask)).astype(np.float32)
-    depth_m = np.where(alpha > 0, ground_m, np.inf).astype(np.float32)
-    return Layer(np.zeros((*alpha.shape, 3), np.float32), alpha, depth_m)
-
-
-def _ground_depth_m(camera: Camera, ground_y_m: float) -> Float32[np.ndarray, "height width"]:
-    """Depth along the optical axis of the level plane y = ground_y_m at every pixel; inf above the horizon."""
-    eye = camera.world_from_camera[:3, 3]
-    ahead = camera.unproject(camera.pixel_centres_px(), np.ones((camera.height_px, camera.width_px))) - eye
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth_m = (ground_y_m - eye[1]) / ahead[..., 1]
-    return np.where((depth_m > 0) & np.isfinite(depth_m), depth_m, np.inf).astype(np.float32)

@@ -8,6 +8,7 @@ of the same pixels with the map known already; the yardstick of its quality is t
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,8 +18,9 @@ import numpy as np
 from mrbokeh.camera import Camera
 from mrbokeh.lens import Lens
 from mrbokeh.overlay import code_tables
-from mrbokeh.scene import Scene
+from mrbokeh.scene import Environment, Scene
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.environment_filter import lighting_maps
 from mrbokeh.scene.gltf_loader import GltfAsset
 from tests.machine import machine_line, memory_line
 from tests.stage_scenes import looking
@@ -28,7 +30,7 @@ from viewfinder.stage.layer_depth import LayerDepth
 from viewfinder.stage.resolution import RESOLUTIONS
 from viewfinder.stage.scene_description import PlacedObject, SceneDescription, ShadowPlane
 from viewfinder.stage.stage import Stage
-from viewfinder.stage.stage_setup import live_renderer
+from viewfinder.stage.stage_setup import live_backend, live_renderer
 from viewfinder.stage.staged_scene import StagedObject, StagedScene
 from viewfinder.stage.upright import upright_camera
 from viewfinder.tracking.base import TrackedPose
@@ -52,10 +54,10 @@ class PartOfAsset(GltfAsset):
         return replace(scene, meshes=tuple(kept))
 
 
-def helmet() -> StagedScene:
+def helmet(asset: type[GltfAsset] = PartOfAsset) -> StagedScene:
     placed = PlacedObject("helmet", HELMET, height_m=0.3)
     described = SceneDescription(Path("scene.toml"), objects=(placed,), shadow=ShadowPlane(size_m=1.0))
-    return StagedScene(described, (StagedObject(placed, PartOfAsset(HELMET), "-z"),), Assets().light(described.light, "-z"))
+    return StagedScene(described, (StagedObject(placed, asset(HELMET), "-z"),), Assets().light(described.light, "-z"))
 
 
 def hand_held(time_s: float) -> Camera:
@@ -83,8 +85,8 @@ def psnr_db(result: np.ndarray, truth: np.ndarray, box: tuple[slice, slice]) -> 
 
 def main() -> None:
     cv2.setNumThreads(1)
-    staged = helmet()
-    brushes = Brushes(EmbreeRaycaster(threads=1), live_renderer("polygon"), LayerDepth())
+    raycaster, staged = EmbreeRaycaster(threads=1), helmet()
+    brushes = Brushes(raycaster, live_renderer("polygon"), LayerDepth(), live=live_backend(raycaster))
 
     def drawn(time_s: float, resolution: float = 1.0) -> Drawing:
         return draw(staged, DrawRequest(hand_held(time_s), LENS, 0.0, resolution), brushes)
@@ -92,17 +94,62 @@ def main() -> None:
     started_s = time.perf_counter()
     first = drawn(0.0)
     print(f"scene: {sum(each.triangle_count for each in staged.objects)} triangles; first drawing {time.perf_counter() - started_s:.2f} s")
-    for resolution in RESOLUTIONS:
-        drawn(0.0, resolution)
-        wall_ms, processor_ms = best_ms(lambda resolution=resolution: drawn(0.0, resolution), 5)
-        rate = f"{1e3 / wall_ms:.1f} per second"
-        print(f"drawing at {resolution:.2f} of the pixels: {wall_ms:.0f} ms, {processor_ms:.0f} ms of processor time, {rate}")
+    print_rates(staged, brushes)
+    print_price_of_speed(staged, brushes)
     print_warp(first)
     for step_ms in STEPS_MS:
         print_quality(drawn, step_ms / 1e3)
+    whole = helmet(GltfAsset)
+    print(f"the whole helmet: {sum(each.triangle_count for each in whole.objects)} triangles")
+    print_rates(whole, brushes)
+    print_changes(whole, brushes)
     print_stream()
     print(memory_line())
     print(machine_line())
+
+
+def print_rates(staged: StagedScene, brushes: Brushes) -> None:
+    for resolution in RESOLUTIONS:
+        request = DrawRequest(hand_held(0.0), LENS, 0.0, resolution)
+        draw(staged, request, brushes)
+        wall_ms, processor_ms = best_ms(partial(draw, staged, request, brushes), 9)
+        rate = f"{1e3 / processor_ms:.1f} per second of it"
+        print(f"drawing at {resolution:.2f} of the pixels: {wall_ms:.0f} ms, {processor_ms:.0f} ms of processor time, {rate}")
+
+
+def print_price_of_speed(staged: StagedScene, brushes: Brushes) -> None:
+    """The live backend beside the one for captures: time, and the picture over a grey plate."""
+    request, view, plate = (
+        DrawRequest(hand_held(0.0), LENS),
+        upright_camera(hand_held(0.0), "-z"),
+        np.full((HEIGHT, WIDTH, 3), 0.2, np.float32),
+    )
+    best, pictures = replace(brushes, live=None), []
+    for each in (brushes, best):
+        layer = draw(staged, request, each).layer
+        assert layer is not None
+        pictures.append(layer.moved_to(view).over(plate))
+    _, processor_ms = best_ms(partial(draw, staged, request, best), 5)
+    near_db = psnr_db(pictures[0], pictures[1], np.s_[:, :])
+    print(f"with 16 rays at edges and the whole shadow: {processor_ms:.0f} ms; the live picture is {near_db:.1f} dB near it")
+
+
+def print_changes(staged: StagedScene, brushes: Brushes) -> None:
+    """What a scene that was changed costs before its first drawing, and with it."""
+    request, moved = DrawRequest(hand_held(0.0), LENS, 0.0, 0.5), staged
+    steady_ms = best_ms(partial(draw, staged, request, brushes), 3)[1]
+    took_ms = []
+    for number in range(5):
+        started_s = time.process_time()
+        moved = moved.with_object("helmet", position_m=(0.01 * number, 0.0, 0.0), yaw_rad=0.1 * number)
+        draw(moved, request, brushes)
+        took_ms.append(1e3 * (time.process_time() - started_s) - steady_ms)
+    print(f"moving it costs {min(took_ms):.0f} ms of processor time beside the drawing itself")
+    panorama = Environment(np.random.default_rng(1).uniform(0.0, 1.0, (512, 1024, 3)).astype(np.float32))
+    for name, light in (("new", panorama), ("brighter", panorama.brighter(1.5)), ("turned", panorama.turned(0.3))):
+        started_s = time.process_time()
+        lighting_maps(light)
+        print(f"{name} panorama of 1024x512 px: {1e3 * (time.process_time() - started_s):.0f} ms of processor time")
 
 
 def print_warp(drawing: Drawing) -> None:

@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.charuco.detector import CharucoDetector, Grey
 from mrbokeh.lens import Lens
 from mrbokeh.video_io import read_display_frames
 from tests.machine import machine_line, memory_line
@@ -23,8 +25,6 @@ from tests.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.board_alignment import AlignedDetector, aligned_corners
-from viewfinder.tracking.charuco_board import CharucoGrid, TrackingBoard
-from viewfinder.tracking.charuco_detector import CharucoDetector, Grey
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.corner_flow import flow
 from viewfinder.tracking.detection_thread import Detector, ImmediateDetections
@@ -32,7 +32,7 @@ from viewfinder.tracking.pose_from_points import pose_from_plane
 
 FRAMES = 30
 REAL_CLIP = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "video" / "charuco_handheld.mp4"
-REAL_BOARD = TrackingBoard((CharucoGrid((5, 5), 28.8, 21.6),))
+REAL_BOARD = CharucoBoard((CharucoGrid((5, 5), 28.8, 21.6),))
 REAL_FOCAL_PX = 300.0
 
 Frames = list[tuple[CameraFrame, Camera]]

@@ -29,7 +29,7 @@ ROWS = (
     ("video_frames", "video_audio"),
     ("video_color", "_video_frames_numba"),
     ("capture_bundle",),
-    ("lens_file", "camera_file"),
+    ("lens_file", "camera_file", "charuco."),
     ("lens_file_values",),
     ("image_io", "camera_rgb"),
     ("exr_primaries",),
@@ -56,10 +56,10 @@ ROWS = (
     ("aperture_modifiers",),
     ("aperture_shapes",),
     ("psf", "_polygon_coverage_numba", "psf_bank"),
-    ("nested_grid", "proportional_grid", "psf_axis"),
+    ("nested_grid", "proportional_grid", "psf_axis", "level_plane"),
     ("layer", "camera", "color", "image_metrics", "field_position"),
     ("html_page",),
-    ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device"),
+    ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device", "gphoto2_library"),
     ("errors",),
 )
 ALLOWED_ACROSS = {
@@ -159,14 +159,15 @@ def test_no_cycles() -> None:
     [("torch", {"training"})]
     + [(name, {"viewfinder"}) for name in ("aiohttp", "aiortc", "segno", "reportlab")]
     + [(name, {"capture"}) for name in ("rawpy", "pyexiv2", "exifread", "lensfunpy")]
-    + [(name, {"capture", "viewfinder"}) for name in ("pycolmap", "gphoto2")],
+    + [("pycolmap", {"capture", "viewfinder"}), ("gphoto2", set())],
 )
 def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -> None:
     """commands/doctor.py may ask torch for a GPU; two renderers have twins on devices; data sets may write metadata.
 
-    COLMAP's maps are made by capture and localised in by the viewfinder; tethered cameras shoot for one and look for the other.
+    COLMAP's maps are made by capture and localised in by the viewfinder; tethered cameras shoot for one and look for the other,
+    both through mrbokeh.gphoto2_library.
     """
-    asking = {"mrbokeh.commands.doctor", "datasets_scripts.dng_writer"}
+    asking = {"mrbokeh.commands.doctor", "datasets_scripts.dng_writer", "mrbokeh.gphoto2_library"}
     users = {
         module
         for module, path in MODULES.items()

@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 import capture.tether.gphoto2_cameras as cameras_module
 from capture.commands.cameras import cameras_command
-from capture.tether.gphoto2_library import explained, library
+from capture.tether.gphoto2_errors import explained
 from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.gphoto2_library import library
 from tests.test_capture_tether_gphoto2 import card, in_own_interpreter
 
 __all__ = ["card"]

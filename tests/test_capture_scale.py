@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.views.charuco_board import CharucoBoard, board_from_options, read_board
+from capture.views.board_options import board_from_options
+from capture.views.board_search import BoardSearch
 from capture.views.scale_answer import ScaleAnswer
 from capture.views.scale_board import POSES_SIGMA, BoardDetections, detect_board, scale_of_detections, triangulate, umeyama
 from capture.views.scale_distance import distance_scale, parse_distance
@@ -20,11 +21,13 @@ from capture.views.scale_sharpness import SharpnessPeaks, sharpness_curves, shar
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.charuco.board_file import read_board
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack, Slice
 
 METRES_PER_UNIT = 0.2
-BOARD = CharucoBoard((8, 6), 0.03, 0.022)
+BOARD = CharucoBoard((CharucoGrid((8, 6), 30.0, 22.0),))
 
 
 def ring_of_views(count: int = 5) -> tuple[SparseView, ...]:
@@ -111,12 +114,12 @@ def test_a_board_that_is_not_there_says_what_was_looked_for() -> None:
 @pytest.mark.parametrize("legacy", [False, True])
 def test_corners_are_found_where_they_are_printed(legacy: bool) -> None:
     """32 texels a square and a margin of 40: inner corner (i, j) lies at 40 + 32 (i, j), counted from the picture's corner."""
-    printed = BOARD.opencv_board(legacy).generateImage((32 * 8, 32 * 6), marginSize=0)
+    printed = replace(BOARD, legacy=legacy).opencv_board(0).generateImage((32 * 8, 32 * 6), marginSize=0)
     picture = np.full((32 * 6 + 80, 32 * 8 + 80, 3), 255, np.uint8)
     picture[40:-40, 40:-40] = printed[..., None]
-    ids, xy_px = BOARD.detect(picture)
-    assert len(ids) == 35
-    np.testing.assert_allclose(xy_px, 40.0 + 32.0 * BOARD.corners_m[ids, :2] / BOARD.square_m, atol=0.03)
+    found = BoardSearch(BOARD).corners(picture)
+    assert len(found) == 35
+    np.testing.assert_allclose(found.xy_px, 40.0 + 32.0 * BOARD.corners_m[found.ids, :2] / 0.03, atol=0.03)
 
 
 def test_boards_come_from_options_and_files(tmp_path: Path) -> None:

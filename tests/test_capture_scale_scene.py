@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture.views.board_search import BoardSearch
 from capture.views.colmap import PoseSettings, find_scene_poses
 from capture.views.lens_calibration import read_lens_calibration, stated_distances_m
 from capture.views.metric_scale import ScaledScene, ScaleRequest, scale_scene
@@ -14,9 +15,22 @@ from capture.views.scale_board import Similarity, umeyama
 from capture.views.scale_text import scale_lines
 from capture.views.sparse_model import SparseModel
 from capture.views.sparse_model_file import read_sparse_model
+from mrbokeh.color import display_rgb8
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import read_focal_stack
-from tests.traced_views import BOARD, FOCUS_M, LENS, POSITIONS_M, WIDTH_PX, Traced, registered_slices, traced, true_camera, write_views
+from tests.traced_views import (
+    BOARD,
+    FOCUS_M,
+    LENS,
+    POSITIONS_M,
+    WIDTH_PX,
+    Traced,
+    board_corners_m,
+    registered_slices,
+    traced,
+    true_camera,
+    write_views,
+)
 
 pytestmark = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap (extra `capture`) is not installed")
 
@@ -50,6 +64,16 @@ def truth(model: SparseModel) -> Similarity:
 def scaled(folder: Path, model: SparseModel) -> ScaledScene:
     assert len(model.views) == len(POSITIONS_M)
     return scale_scene(folder, ScaleRequest(BOARD, ("view_0", "view_5", DISTANCE_M)))
+
+
+def test_corners_of_the_board_are_where_they_are(pictures: Traced) -> None:
+    """RMS over six views: 0.069 px were measured, for 105 of 120 corners; the search before had 0.073 px for 98."""
+    off_px = []
+    for view, sharp in enumerate(pictures.sharp):
+        found = BoardSearch(BOARD).corners(display_rgb8(sharp))
+        off_px.append(found.xy_px - true_camera(view).project(board_corners_m()[found.ids])[0])
+    assert sum(map(len, off_px)) >= 100
+    assert np.sqrt(np.mean(np.sum(np.concatenate(off_px) ** 2, axis=1))) < 0.08
 
 
 def test_poses_of_all_views(model: SparseModel, truth: Similarity) -> None:

@@ -19,7 +19,7 @@ COMMANDS = [
     ["train", "ablate"],
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
     ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"],
-    ["viewfinder"], ["viewfinder", "board"], ["demo"], ["doctor"],
+    ["viewfinder"], ["viewfinder", "board"], ["viewfinder", "calibrate-phone"], ["demo"], ["doctor"],
 ]  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.lens import Lens
 from tests.thin_lens_board import DARK, LIGHT, Shot, camera_over, display_bgr, photograph
 from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus, BlurSettings
@@ -17,9 +18,8 @@ from viewfinder.focus.focus_from_blur import focus_candidates
 from viewfinder.focus.focus_side import Evidence, settled
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.charuco_board import CharucoGrid, TrackingBoard
 
-BOARD = TrackingBoard((CharucoGrid((6, 4), 30.0, 22.0),))
+BOARD = CharucoBoard((CharucoGrid((6, 4), 30.0, 22.0),))
 LENS = Lens(35.0, 2.8, 1.0, 23.5)
 WIDTH_PX, HEIGHT_PX = 320, 214
 DISTANCE_M = 0.45

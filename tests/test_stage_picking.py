@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.errors import InputError
+from mrbokeh.level_plane import level_plane_dioptres
 from mrbokeh.overlay import code_tables
 from tests.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
 from viewfinder.stage.drawn_layer import DrawRequest, draw
@@ -14,7 +15,7 @@ from viewfinder.stage.occlusion import Occlusion, RealDepth
 from viewfinder.stage.picking import depth_at_m, object_at, table_point_m
 from viewfinder.stage.reprojection import MovableLayer
 from viewfinder.stage.seen import Seen
-from viewfinder.stage.upright import UPRIGHT_FROM_WORLD, table_dioptres, turned, turned_back, upright_camera
+from viewfinder.stage.upright import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
 from viewfinder.stage.views import VIEWS, view_picture
 
 TWO_CARDS = ONE_CARD + ONE_CARD.replace('"card"', '"far"') + "position_m = [0.3, -0.5, 0]\n"
@@ -44,12 +45,12 @@ def test_worlds_turn_without_mirroring_and_back() -> None:
 
 def test_the_table_as_the_camera_sees_it() -> None:
     upright = upright_camera(ABOVE, "-z")
-    dioptres = table_dioptres(upright)
+    dioptres = level_plane_dioptres(upright)
     for x_m, y_m in ((0.0, 0.0), (0.2, -0.3)):
         (x_px, y_px), depth_m = ABOVE.project(np.array([x_m, y_m, 0.0]))
         assert 1.0 / dioptres[int(y_px), int(x_px)] == pytest.approx(depth_m, rel=0.01)
     # Level along the table, the upper half of the picture sees none of it.
-    level = table_dioptres(upright_camera(camera(), "-z"))
+    level = level_plane_dioptres(upright_camera(camera(), "-z"))
     assert not level[: HEIGHT // 2].any() and (level[HEIGHT // 2 + 1 :] > 0).all()
 
 

@@ -116,7 +116,7 @@ def test_obs_gets_colour_and_alpha(tmp_path: Path) -> None:
             alpha, whep = AlphaStream(stream, "srgb"), Whep(stream)
             feeding = asyncio.ensure_future(feed(alpha))
             async with page_of(obs_routes(whep), whep, "/obs", tmp_path) as value:
-                await comes_true(value, "document.querySelector('canvas').height === 180")
+                await comes_true(value, "document.querySelector('canvas')?.height === 180")
                 # Straight from the drawing buffer, which is premultiplied; the row in the middle, first column of each quarter's middle.
                 expression = """(() => { const gl = document.querySelector("canvas").getContext("webgl"), all = [];
                   for (const x of [40, 120, 200, 280]) { const one = new Uint8Array(4);

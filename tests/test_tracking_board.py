@@ -11,18 +11,18 @@ import pytest
 from datasets_scripts.hand_held import HandHeld
 from datasets_scripts.sheet_tracer import Sheet, pack_table, trace_sheet
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.charuco.board_file import board_from_json, board_to_json, read_board, write_board
+from mrbokeh.charuco.detector import CharucoDetector
+from mrbokeh.charuco.drawing import black_rectangles_mm
 from mrbokeh.color import display_rgb8
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
 from tests.traced_board_clip import BOARD
-from viewfinder.tracking.board_drawing import black_rectangles_mm
-from viewfinder.tracking.board_file import board_from_json, board_to_json, read_board, write_board
 from viewfinder.tracking.board_pdf import MARGIN_MM, page_for, write_board_pdf
 from viewfinder.tracking.board_planner import View, plan_board
-from viewfinder.tracking.charuco_board import CharucoGrid, TrackingBoard
-from viewfinder.tracking.charuco_detector import CharucoDetector
 
-SIMPLE = TrackingBoard((CharucoGrid((5, 4), 24.0, 18.0),))
+SIMPLE = CharucoBoard((CharucoGrid((5, 4), 24.0, 18.0),))
 POINTS_PER_MM = 72.0 / 25.4
 
 
@@ -74,7 +74,7 @@ def test_json_keeps_the_board(tmp_path: Path) -> None:
         ({"grids": [{"squares": [5, 4], "square_mm": 20.0, "marker_mm": 15.0, "colour": 1}]}, "colour"),
         ({"dictionary": "DICT_9X9"}, "DICT_4X4_50"),
         ({"dictionary": "DICT_4X4_50", "grids": [{"squares": [12, 11], "square_mm": 20.0, "marker_mm": 15.0}]}, "66 markers"),
-        ({"squares": [5, 4]}, "expected a tracking board"),
+        ({"squares": [5, 4]}, "expected a ChArUco board"),
     ],
 )
 def test_what_is_no_board_is_refused_with_a_sentence(change: dict[str, object], sentence: str) -> None:
@@ -85,10 +85,10 @@ def test_what_is_no_board_is_refused_with_a_sentence(change: dict[str, object], 
 def test_grids_must_not_share_markers_or_paper() -> None:
     one = CharucoGrid((4, 4), 20.0, 15.0)
     with pytest.raises(InputError, match="share marker ids"):
-        TrackingBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (0.0, 90.0), 7)))
+        CharucoBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (0.0, 90.0), 7)))
     with pytest.raises(InputError, match="overlap"):
-        TrackingBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (79.0, 0.0), 8)))
-    assert TrackingBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (80.0, 0.0), 8))).size_mm == (160.0, 80.0)
+        CharucoBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (79.0, 0.0), 8)))
+    assert CharucoBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (80.0, 0.0), 8))).size_mm == (160.0, 80.0)
 
 
 def drawn_in(pdf: bytes) -> tuple[np.ndarray, tuple[float, float]]:
@@ -129,9 +129,9 @@ def test_the_ruler_is_100_mm_and_the_text_says_what_it_is(tmp_path: Path) -> Non
 
 
 def test_paper_is_turned_chosen_or_refused() -> None:
-    wide = TrackingBoard((CharucoGrid((9, 4), 30.0, 22.0),))
+    wide = CharucoBoard((CharucoGrid((9, 4), 30.0, 22.0),))
     assert (page_for(wide, "A4").width_mm, page_for(wide, "A4").height_mm) == (297.0, 210.0)
-    large = TrackingBoard((CharucoGrid((8, 6), 60.0, 45.0),))
+    large = CharucoBoard((CharucoGrid((8, 6), 60.0, 45.0),))
     with pytest.raises(InputError, match="480x360 mm, but a3 has room for 277x378 or 400x255 mm"):
         page_for(large, "a3")
     assert page_for(large, "board").holds(large.size_mm)
@@ -156,7 +156,7 @@ def test_the_marker_needed_follows_from_the_thin_lens() -> None:
     assert view.needed_marker_mm(1.0) == pytest.approx(24.0 / (px_per_mm * 0.8) / 0.5)
 
 
-def corners_read(board: TrackingBoard, lens: Lens, distance_m: float) -> int:
+def corners_read(board: CharucoBoard, lens: Lens, distance_m: float) -> int:
     sheet = Sheet(black_rectangles_mm(board))
     middle = sheet.middle_m
     pose = HandHeld((float(middle[0]), float(middle[1]), 0.0), distance_m, 45.0, 0.0, 0.0, 0.0, 0.0).camera_from_world(0.0)
@@ -175,7 +175,7 @@ def test_the_planned_board_is_read_at_both_ends_and_smaller_markers_are_not() ->
     assert min(corners_read(plan.board, lens, distance_m) for distance_m in (0.5, 0.9)) >= 6
     marker_mm = view.needed_marker_mm(0.5) * 4.0 / 6.0
     assert abs(float(lens.coc_px(0.5, 640))) * 6.0 > 24.0
-    assert corners_read(TrackingBoard((CharucoGrid((6, 5), marker_mm / 0.75, marker_mm),)), lens, 0.5) < 6
+    assert corners_read(CharucoBoard((CharucoGrid((6, 5), marker_mm / 0.75, marker_mm),)), lens, 0.5) < 6
 
 
 def test_two_scales_where_sharpness_varies_and_a_larger_paper_where_needed() -> None:

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
 from mrbokeh.video_io import read_display_frames
 from tests.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.charuco_board import CharucoGrid, TrackingBoard
-from viewfinder.tracking.charuco_detector import CharucoDetector, Corners, Grey
 from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker
 from viewfinder.tracking.corner_flow import FrameHistory, flow
 from viewfinder.tracking.detection_thread import DetectionThread, ImmediateDetections
@@ -26,7 +26,7 @@ from viewfinder.tracking.detection_thread import DetectionThread, ImmediateDetec
 class CountingDetector:
     """Counts its searches."""
 
-    def __init__(self, board: TrackingBoard = BOARD) -> None:
+    def __init__(self, board: CharucoBoard = BOARD) -> None:
         self._detector, self.searches = CharucoDetector(board), 0
 
     def detect(self, grey: Grey) -> Corners:
@@ -222,7 +222,7 @@ def test_a_real_dark_clip_is_tracked_in_most_frames(shared_data: Path) -> None:
     path = shared_data / "video" / "charuco_handheld.mp4"
     if not path.is_file():
         pytest.skip("video/charuco_handheld.mp4 is not in the shared test data")
-    board = TrackingBoard((CharucoGrid((5, 5), 28.8, 21.6),))
+    board = CharucoBoard((CharucoGrid((5, 5), 28.8, 21.6),))
     tracker = CharucoTracker(board, ImmediateDetections(CharucoDetector(board), every=6))
     camera = Camera(320, 180, (300.0, 300.0), (160.0, 90.0))
     poses = [tracker.track(CameraFrame(bgr, number / 60.0, number), camera) for number, bgr in enumerate(dark_clip(path))]

@@ -48,7 +48,6 @@ def test_fletchers_checksum_is_that_of_the_specification() -> None:
     assert fletcher16(b"abcde") == 0xC3EF
 
 
-
 # Where a point must be seen follows from the words: X right, Y forward, Z up; ours is x right, y down, z forward.
 @pytest.mark.parametrize(
     ("rotation", "point", "expected"),

@@ -107,7 +107,7 @@ def test_rig_file(tmp_path: Path) -> None:
 class Phone:
     """Gives frames at the times told, then waits for its end."""
 
-    name = "test phone"
+    name, status = "test phone", None
 
     def __init__(self, times_s: list[float]) -> None:
         self.times_s, self.shown = times_s, Event()

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard
+from mrbokeh.charuco.drawing import black_rectangles_mm
 from mrbokeh.color import linear_to_srgb
 from mrbokeh.lens import MM_PER_M, Lens
-from viewfinder.tracking.board_drawing import black_rectangles_mm
-from viewfinder.tracking.charuco_board import TrackingBoard
 
 DARK, LIGHT, TABLE = 0.03, 0.75, 0.3
 _RIM_MM = 10.0
@@ -31,7 +31,7 @@ class Shot:
     rng: np.random.Generator | None = None
 
 
-def camera_over(board: TrackingBoard, lens: Lens, width_px: int, height_px: int, distance_m: float, tilt_deg: float) -> Camera:
+def camera_over(board: CharucoBoard, lens: Lens, width_px: int, height_px: int, distance_m: float, tilt_deg: float) -> Camera:
     """Looks at the middle of the board from so far away, tilted about the picture's x axis; 0 is straight down."""
     middle = np.array([*board.size_mm, 0.0]) / 2.0 / MM_PER_M
     angle = np.radians(tilt_deg)
@@ -42,7 +42,7 @@ def camera_over(board: TrackingBoard, lens: Lens, width_px: int, height_px: int,
     return Camera(width_px, height_px, (focal_px, focal_px), (width_px / 2, height_px / 2), pose)
 
 
-def board_texture(board: TrackingBoard, per_mm: float) -> tuple[np.ndarray, np.ndarray]:
+def board_texture(board: CharucoBoard, per_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """(linear luminance, the place in metres on the board of texture coordinates (x, y, 1), by a 3x3 matrix)."""
     width, height = (int(round((size + 2 * _RIM_MM) * per_mm)) for size in board.size_mm)
     texture = np.full((height, width), LIGHT, np.float32)
@@ -61,7 +61,7 @@ def disc_points(count: int) -> np.ndarray:
     return np.sqrt(numbers / count)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def photograph(board: TrackingBoard, shot: Shot, rays: int = 96) -> np.ndarray:
+def photograph(board: CharucoBoard, shot: Shot, rays: int = 96) -> np.ndarray:
     """Linear luminance (H, W)."""
     camera, lens = shot.camera, shot.lens
     texture, metres_from_texture = board_texture(board, per_mm=4.0)

@@ -10,13 +10,13 @@ from datasets_scripts.charuco_clip import BoardClip
 from datasets_scripts.hand_held import HandHeld
 from datasets_scripts.sheet_tracer import Sheet
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.charuco.drawing import black_rectangles_mm
 from mrbokeh.color import display_rgb8
 from mrbokeh.lens import MM_PER_M, Lens
 from viewfinder.frames import CameraFrame, Pose
-from viewfinder.tracking.board_drawing import black_rectangles_mm
-from viewfinder.tracking.charuco_board import CharucoGrid, TrackingBoard
 
-BOARD = TrackingBoard((CharucoGrid((4, 3), 46.0, 34.0), CharucoGrid((9, 5), 20.0, 15.0, (0.0, 143.0), 6)))
+BOARD = CharucoBoard((CharucoGrid((4, 3), 46.0, 34.0), CharucoGrid((9, 5), 20.0, 15.0, (0.0, 143.0), 6)))
 """Fits on A4: 184 x 243 mm."""
 
 LENS = Lens(22.0, 8.0, 0.6, 24.0)

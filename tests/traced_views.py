@@ -7,18 +7,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from capture.views.charuco_board import CharucoBoard
 from datasets_scripts.procedural_textures import mottled, page_of_text, spots
 from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
 from datasets_scripts.traced_scene import Quad, Scene, Vector, emissive_quad
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.image_io import write_image
-from mrbokeh.lens import Lens
+from mrbokeh.lens import MM_PER_M, Lens
 
 WIDTH_PX, HEIGHT_PX = 400, 280
-BOARD = CharucoBoard((6, 5), 0.05, 0.037, "DICT_4X4_50")
+GRID = CharucoGrid((6, 5), 50.0, 37.0)
+BOARD = CharucoBoard((GRID,))
+BOARD_CORNER_M, BOARD_LEANS_RAD = (-0.16, 0.0, 1.0), np.deg2rad(40.0)
 FOCUS_M = tuple(float(each) for each in 1.0 / np.linspace(1.0 / 0.62, 1.0 / 1.9, 8))
 LENS = Lens(28.0, 2.0, FOCUS_M[0], 23.5, Aperture.disc())
 POSITIONS_M = ((0.0, 0.0, 0.0), (0.13, -0.03, 0.02), (-0.12, 0.02, 0.03), (0.05, 0.1, -0.02), (-0.06, -0.11, 0.0), (0.19, 0.05, 0.05))
@@ -54,13 +56,18 @@ def _card(corner_m: Vector, width_m: float, height_m: float, yaw_rad: float, rng
 
 def _board() -> Quad:
     """Lying on its back at half height: 48 texels for each square, black ink on white paper."""
-    columns, rows = BOARD.squares
-    printed = BOARD.opencv_board().generateImage((48 * columns, 48 * rows), marginSize=0).astype(np.float32) / 255.0
+    columns, rows = GRID.squares
+    printed = BOARD.opencv_board(0).generateImage((48 * columns, 48 * rows), marginSize=0).astype(np.float32) / 255.0
     texture = np.repeat((0.03 + 0.77 * printed)[..., None], 3, axis=2)
-    lean = np.deg2rad(40.0)
-    down = BOARD.square_m * rows * np.array([0.0, np.cos(lean), -np.sin(lean)])
-    corner = (-0.16, 0.0, 1.0)
-    return emissive_quad(corner, (BOARD.square_m * columns, 0.0, 0.0), (0.0, float(down[1]), float(down[2])), texture)
+    width_m, height_m = (side / MM_PER_M for side in BOARD.size_mm)
+    down = height_m * np.array([0.0, np.cos(BOARD_LEANS_RAD), -np.sin(BOARD_LEANS_RAD)])
+    return emissive_quad(BOARD_CORNER_M, (width_m, 0.0, 0.0), (0.0, float(down[1]), float(down[2])), texture)
+
+
+def board_corners_m() -> np.ndarray:
+    """Where the corners of the board are in the world, by id."""
+    x, y, _ = BOARD.corners_m.T
+    return np.stack([x, y * np.cos(BOARD_LEANS_RAD), -y * np.sin(BOARD_LEANS_RAD)], axis=1) + BOARD_CORNER_M
 
 
 def true_camera(view: int) -> Camera:

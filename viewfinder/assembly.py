@@ -1,113 +1,21 @@
-"""From what the command line says to the parts of a viewfinder."""
+"""From what the command line says to the lenses, renderers and scenery of a viewfinder."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import DEFAULT, WITH_BANKS
-from viewfinder.focus.base import FocusSource
-from viewfinder.focus.first_known import FirstKnown
-from viewfinder.focus.frame_focus import FrameFocus
-from viewfinder.focus.manual_focus import ManualFocus
-from viewfinder.focus.tracked_lens_focus import TrackedLensFocus
+from mrbokeh.renderers.choose import BY_NAME, DEFAULT, WITH_BANKS
 from viewfinder.lens_book import LensBook
 from viewfinder.scenery import Scenery
 from viewfinder.stage.stage import Stage
 from viewfinder.stage.stage_setup import LIVE_LAYERING, live_renderer
 from viewfinder.still_layer import StillLayer
-from viewfinder.tracking.base import Tracker
-from viewfinder.tracking.tracking_socket import SocketTracker, TrackingAddress
 
 MakeRenderer = Callable[[], Renderer]
-
-
-@dataclass(frozen=True)
-class TrackingChoice:
-    """At most one of them. opentrackio, freed: UDP ports; lens_table: of FreeD's encoders. host: the
-    address at which packets are waited for. metres_per_unit: of a map without a scale."""
-
-    board: Path | None = None
-    pose: Path | None = None
-    map: Path | None = None
-    metres_per_unit: float | None = None
-    opentrackio: int | None = None
-    freed: int | None = None
-    lens_table: Path | None = None
-    host: str = "127.0.0.1"
-
-
-def open_tracker(choice: TrackingChoice) -> Tracker | None:
-    """None where nothing was asked for. Raises InputError where several were, or a file is not what it should be."""
-    chosen = [name for name in ("board", "pose", "map", "opentrackio", "freed") if getattr(choice, name) is not None]
-    if len(chosen) > 1:
-        raise InputError(f"expected one way to track the camera, got --{' and --'.join(chosen)}: give one of them")
-    if choice.lens_table is not None and chosen != ["freed"]:
-        raise InputError("--lens-table is for the encoders of --freed: leave it out")
-    return _TRACKERS[chosen[0]](choice) if chosen else None
-
-
-def _board(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.board_file import read_board
-    from viewfinder.tracking.charuco_tracker import CharucoTracker
-
-    assert choice.board is not None, "chosen"
-    return CharucoTracker(read_board(choice.board))
-
-
-def _pose(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.fixed_pose import read_fixed_pose
-
-    assert choice.pose is not None, "chosen"
-    return read_fixed_pose(choice.pose)
-
-
-def _map(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.map_localiser import MapLocaliser
-    from viewfinder.tracking.map_tracker import MapTracker
-    from viewfinder.tracking.sparse_map import read_sparse_map
-
-    assert choice.map is not None, "chosen"
-    # The tracker gives the intrinsics of each frame before it is looked at.
-    nominal = Camera(640, 360, (640.0, 640.0), (320.0, 180.0))
-    return MapTracker(MapLocaliser(read_sparse_map(choice.map, choice.metres_per_unit), nominal))
-
-
-def _opentrackio(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.tracking_socket import opentrackio_decoder
-
-    assert choice.opentrackio is not None, "chosen"
-    return SocketTracker(TrackingAddress(choice.opentrackio, host=choice.host), opentrackio_decoder())
-
-
-def _freed(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.encoder_table import read_encoder_table
-    from viewfinder.tracking.freed import FreeDReading
-    from viewfinder.tracking.tracking_socket import freed_decoder
-
-    assert choice.freed is not None, "chosen"
-    reading = FreeDReading() if choice.lens_table is None else FreeDReading(table=read_encoder_table(choice.lens_table))
-    return SocketTracker(TrackingAddress(choice.freed, host=choice.host), freed_decoder(reading))
-
-
-_TRACKERS: dict[str, Callable[[TrackingChoice], Tracker]] = {
-    "board": _board,
-    "pose": _pose,
-    "map": _map,
-    "opentrackio": _opentrackio,
-    "freed": _freed,
-}
-
-
-def open_focus(manual: ManualFocus, tracker: Tracker | None) -> FocusSource:
-    """By hand before all others, then the tracking system, then what comes with the frame."""
-    tracked = [TrackedLensFocus(tracker)] if isinstance(tracker, SocketTracker) else []
-    return FirstKnown([manual, *tracked, FrameFocus()])
 
 
 def read_lenses(paths: Sequence[Path], of_scene: Lens | None) -> tuple[LensBook, dict[str, MakeRenderer]]:
@@ -134,8 +42,14 @@ def _same(renderer: Renderer) -> Renderer:
 
 
 def renderers_of(names: Sequence[str], bank: Path | None, networks: dict[str, MakeRenderer]) -> dict[str, MakeRenderer]:
-    """What the page can switch between, the first is used first; bank: of measured kernels, for the renderers that take one."""
+    """What the page can switch between, the first is used first; bank: of measured kernels, for the renderers that take one.
+
+    InputError for a name that nothing has, and for a bank that none of them takes: a mistake is told now, not when the page switches.
+    """
     wanted = list(names) or ([*networks, DEFAULT] if networks else [DEFAULT, "scatter"])
+    _refuse_unknown(wanted, networks)
+    if bank is not None and not set(wanted) & set(WITH_BANKS):
+        raise InputError(f"--psf is for --renderer {', '.join(WITH_BANKS)}, got {', '.join(wanted)}: leave --psf out, or name one of them")
     made: dict[str, MakeRenderer] = {}
     for name in wanted:
         if name in networks:
@@ -145,6 +59,15 @@ def renderers_of(names: Sequence[str], bank: Path | None, networks: dict[str, Ma
         else:
             made[name] = _plain(name)
     return made
+
+
+def _refuse_unknown(names: Sequence[str], networks: dict[str, MakeRenderer]) -> None:
+    for name in names:
+        is_file = name.lower().endswith(".onnx")
+        if is_file and not Path(name).is_file():
+            raise InputError(f"--renderer: expected a network in an .onnx file, got {name}, where there is no such file")
+        if not is_file and name not in networks and name not in BY_NAME:
+            raise InputError(f"--renderer: expected one of {', '.join([*networks, *BY_NAME])}, or a network (.onnx), got {name!r}")
 
 
 def _plain(name: str) -> MakeRenderer:

@@ -4,8 +4,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import UInt16
+
 from mrbokeh.capture_bundle import write_bundle
+from mrbokeh.color import linear_to_srgb
 from mrbokeh.errors import InputError
+from mrbokeh.overlay import code_tables
 from viewfinder.frames import Bgr
 from viewfinder.live_compositor import LiveCompositor, Moment
 
@@ -27,7 +32,7 @@ class Captures:
         layers = self._compositor.scenery.sharp_layers(moment.camera)
         write_bundle(
             self._folder / name,
-            _encoded(".png", moment.frame.bgr),
+            plate_png(moment.frame.bgr, self._compositor.transfer),
             _encoded(".jpg", moment.output.bgr),
             layers,
             moment.lens,
@@ -54,7 +59,18 @@ class Captures:
         }
 
 
-def _encoded(suffix: str, bgr: Bgr) -> bytes:
+def plate_png(bgr: Bgr, transfer: str) -> bytes:
+    """The camera's picture as an sRGB file: its codes as they came where they are sRGB, else their light in 16 bits.
+
+    A bundle then composites in the same light as the stream did, whatever the camera's curve was.
+    """
+    if transfer == "srgb":
+        return _encoded(".png", bgr)
+    table = np.rint(65535.0 * linear_to_srgb(code_tables(transfer).linear_from_code)).astype(np.uint16)
+    return _encoded(".png", table[bgr])
+
+
+def _encoded(suffix: str, bgr: Bgr | UInt16[np.ndarray, "height width 3"]) -> bytes:
     import cv2
 
     return bytes(cv2.imencode(suffix, bgr)[1].tobytes())

@@ -2,25 +2,27 @@
 
 import logging
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.errors import InputError
+from viewfinder.commands import option_words as words
 from viewfinder.commands.board import board_command
+from viewfinder.commands.calibrate_phone import calibrate_phone_command
+
+if TYPE_CHECKING:
+    from viewfinder.tracking_choice import PhoneChoice
 
 app = typer.Typer(add_completion=False)
 app.command("board")(board_command)
+app.command("calibrate-phone")(calibrate_phone_command)
 
 
 @app.callback(invoke_without_command=True)
 def viewfinder(
     context: typer.Context,
-    source: Annotated[
-        str | None,
-        typer.Option(
-            help="Video played in a loop, number of a webcam, rtsp/http/udp URL, folder:PATH, gphoto2, whip (a browser), or test."
-        ),
-    ] = None,
+    source: Annotated[str | None, typer.Option(help=words.SOURCE_HELP)] = None,
     scene: Annotated[Path | None, typer.Option(help="SCENE.toml: objects, light, shadow, lens; read again when it changes.")] = None,
     layer: Annotated[
         Path | None, typer.Option(metavar="RGBAZ.exr", help="Instead of a scene: an all-in-focus layer before a camera that stands still.")
@@ -36,27 +38,34 @@ def viewfinder(
     psf: Annotated[
         Path | None, typer.Option(help="A measured bank of kernels (of `mrbokeh lens fit`) in place of the lens's opening.")
     ] = None,
-    board: Annotated[Path | None, typer.Option(help="BOARD.json of `mrbokeh viewfinder board`: the camera is tracked by it.")] = None,
+    board: words.BoardOption = None,
     pose: Annotated[Path | None, typer.Option(help="CAMERA.json: the camera stands still, with this pose and these intrinsics.")] = None,
     map_: Annotated[
         Path | None, typer.Option("--map", help="Folder of a COLMAP map with its pictures: the camera is localised in it.")
     ] = None,
     metres_per_unit: Annotated[float | None, typer.Option(help="Scale of --map, where it does not tell.")] = None,
-    opentrackio: Annotated[int | None, typer.Option(metavar="PORT", help="UDP port where OpenTrackIO comes in.")] = None,
-    freed: Annotated[int | None, typer.Option(metavar="PORT", help="UDP port where FreeD comes in.")] = None,
+    opentrackio: Annotated[int | None, typer.Option(min=1, max=65535, metavar="PORT", help="UDP port where OpenTrackIO comes in.")] = None,
+    freed: Annotated[int | None, typer.Option(min=1, max=65535, metavar="PORT", help="UDP port where FreeD comes in.")] = None,
     lens_table: Annotated[Path | None, typer.Option(help="CSV that turns FreeD's encoder counts into focus and zoom.")] = None,
-    camera: Annotated[Path | None, typer.Option(help="CAMERA.json with the source's intrinsics; else those of the lens.")] = None,
+    phone: words.PhoneOption = None,
+    phone_camera: words.PhoneCameraOption = None,
+    rig: Annotated[Path | None, typer.Option(help="RIG.json of `mrbokeh viewfinder calibrate-phone`: where --phone sits.")] = None,
+    delay_ms: Annotated[float, typer.Option(help="How much later the picture comes than a pose from --phone or a tracking system.")] = 0.0,
+    camera: words.CameraOption = None,
+    focus_from: Annotated[
+        list[str] | None,
+        typer.Option(help="Who is asked first for the focus: hand (the page), tracking, source, board (its blur); repeat for an order."),
+    ] = None,
     smoothing: Annotated[bool, typer.Option(help="Smooth the track (One-Euro); the page can switch it.")] = False,
-    width: Annotated[int | None, typer.Option(min=16, metavar="PX", help="Wider pictures are made smaller.")] = 640,
+    width: words.WidthOption = 640,
     fps: Annotated[float | None, typer.Option(help="At most so many frames per second.")] = None,
     captures: Annotated[Path, typer.Option(help="Folder for captured bundles and recordings.")] = Path("captures"),
-    port: Annotated[int, typer.Option(help="Port of the page; 0 takes a free one.")] = 8080,
-    lan: Annotated[bool, typer.Option(help="Let this network in, with a one-time token; else only this machine.")] = False,
-    interface: Annotated[str | None, typer.Option(help="With --lan: name or address of the one interface to listen on.")] = None,
-    tls: Annotated[
-        Path | None, typer.Option(metavar="CERTIFICATE", help="PEM certificate: phones lend their camera over https only.")
-    ] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="PEM key, where it is not in the certificate's file.")] = None,
+    port: words.PortOption = 8080,
+    lan: words.LanOption = False,
+    interface: words.InterfaceOption = None,
+    tls: words.TlsOption = None,
+    tls_key: words.TlsKeyOption = None,
+    qr: words.QrOption = True,
 ) -> None:
     """Show a camera with virtual objects in it, blurred by the lens, on a page for phones; Ctrl-C ends it.
 
@@ -69,15 +78,49 @@ def viewfinder(
     if source is None:
         typer.echo(context.get_help())
         raise typer.Exit(2)
-    from viewfinder.assembly import TrackingChoice
-    from viewfinder.commands.serve import ServeOptions, listening_address, serve
+    from viewfinder.commands.listening import ListeningOptions
+    from viewfinder.commands.serve import serve
+    from viewfinder.commands.serve_options import ServeOptions
+    from viewfinder.tracking_choice import TrackingChoice
 
     logging.basicConfig(level=logging.WARNING)
-    at = (interface or "") if lan else None
-    tracking = TrackingChoice(board, pose, map_, metres_per_unit, opentrackio, freed, lens_table, listening_address(at))
-    lenses, renderers = tuple(lens or ()), tuple(renderer or ())
+    listening = ListeningOptions(port, lan, interface, tls, tls_key, qr)
+    of_phone = _phone_choice(phone, phone_camera, rig)
+    host = listening.host if opentrackio is not None or freed is not None else "127.0.0.1"
+    tracking = TrackingChoice(board, pose, map_, metres_per_unit, opentrackio, freed, lens_table, host, of_phone, delay_ms)
     serve(
         ServeOptions(
-            source, scene, layer, lenses, renderers, psf, tracking, camera, smoothing, width, fps, captures, port, at, tls, tls_key, backend
+            source,
+            scene,
+            layer,
+            tuple(lens or ()),
+            tuple(renderer or ()),
+            psf,
+            backend,
+            tracking,
+            camera,
+            tuple(focus_from or ()),
+            smoothing,
+            width,
+            fps,
+            captures,
+            listening,
         )
     )
+
+
+def _phone_choice(source: str | None, camera: Path | None, rig: Path | None) -> "PhoneChoice | None":
+    """All three of them or none."""
+    from viewfinder.tracking_choice import PhoneChoice
+
+    for word, given in (("--phone-camera", camera), ("--rig", rig)):
+        if source is None and given is not None:
+            raise InputError(f"{word} is for --phone: say where the phone's camera comes from, or leave it out")
+        if source is not None and given is None:
+            made = (
+                "CAMERA.json, its intrinsics"
+                if word == "--phone-camera"
+                else "RIG.json (make it with `mrbokeh viewfinder calibrate-phone`)"
+            )
+            raise InputError(f"--phone needs {word} {made}")
+    return None if source is None or camera is None or rig is None else PhoneChoice(source, camera, rig)

@@ -45,6 +45,11 @@ class LiveCompositor:
         self.view = "final"
         self.last: Moment | None = None
 
+    @property
+    def transfer(self) -> str:
+        """The curve of the codes of the source's frames."""
+        return self._source.transfer
+
     def __call__(self, frame: CameraFrame, dropped: int) -> OutputFrame:
         watch = Stopwatch()
         intrinsics = self._intrinsics(frame.bgr)
@@ -70,13 +75,17 @@ class LiveCompositor:
         return Camera(width, height, (focal_px, focal_px), (width / 2, height / 2))
 
     def _pose(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
+        last = self.last
+        if last is not None and last.frame is frame and last.pose is not None and last.pose.captured_s == frame.captured_s:
+            # Shown again because no newer one came: trackers carry points from one frame to the next, and this is no next one.
+            return last.pose
         if self._tracker is not None:
             return self._tracker.track(frame, intrinsics)
         known = frame.camera_from_world
         return TrackedPose(intrinsics.camera_from_world if known is None else known, 1.0, frame.captured_s)
 
     def _picture(self, plate_bgr: Bgr, overlay: Overlay) -> Bgr:
-        tables = code_tables(self._source.transfer)
+        tables = code_tables(self.transfer)
         return overlay.over_codes(plate_bgr, tables) if self.view == "final" else self.scenery.picture(self.view, plate_bgr, tables)
 
     def _status(self, lens: Lens, pose: TrackedPose | None, watch: Stopwatch, dropped: int) -> FrameStatus:

@@ -7,6 +7,7 @@ from pathlib import Path
 from mrbokeh.errors import InputError
 from mrbokeh.renderers.base import Renderer
 from viewfinder.captures import Captures
+from viewfinder.focus.first_known import FirstKnown
 from viewfinder.focus.manual_focus import ManualFocus
 from viewfinder.ground_plane import ground_from_picture
 from viewfinder.live_compositor import LiveCompositor, Moment
@@ -102,6 +103,7 @@ class LiveControls:
             height_px=height,
             dioptre_range=lenses.slider_dioptres,
             focus_distance_m=lens.focus_distance_m if math.isfinite(lens.focus_distance_m) else None,
+            focus_from=compositor.focus.focus_from if isinstance(compositor.focus, FirstKnown) else None,
             f_number=lens.f_number,
             f_numbers=lenses.f_numbers,
             lens=lenses.chosen,

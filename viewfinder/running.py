@@ -1,6 +1,6 @@
 """A running viewfinder: its parts put together, and their threads ended with the block."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,13 +9,17 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard
+from mrbokeh.lens import Lens
 from mrbokeh.overlay import Overlay
-from viewfinder.assembly import MakeRenderer, open_focus
+from viewfinder.assembly import MakeRenderer
 from viewfinder.captures import Captures
+from viewfinder.focus.base import FocusSource
 from viewfinder.focus.manual_focus import ManualFocus
+from viewfinder.focus_choice import blur_of_board, open_focus
 from viewfinder.frames import OutputFrame
 from viewfinder.lens_book import LensBook
-from viewfinder.live_compositor import LiveCompositor
+from viewfinder.live_compositor import LiveCompositor, Moment
 from viewfinder.live_controls import LiveControls
 from viewfinder.pipeline import FrameSink, Pipeline
 from viewfinder.scenery import Scenery
@@ -38,7 +42,9 @@ _MATTE_WIDTH_PX = 320
 class Parts:
     """What a viewfinder is made of. renderers: by name, the scenery begins with the first. captures: folder of bundles and recordings.
 
-    scene: the scene file, whose text bundles keep. smoothing: whether the track is smoothed to begin with.
+    scene: the scene file, whose text bundles keep. smoothing: whether the track is smoothed to begin with. focus_from: names of
+    `focus_choice.FOCUS_SOURCES` that are asked first; focus_board: the board whose blur tells the focus. cameras: what else browsers
+    send to, by name.
     """
 
     source: FrameSource
@@ -51,6 +57,9 @@ class Parts:
     scene: Path | None = None
     smoothing: bool = False
     access: Access = field(default_factory=Access)
+    focus_from: tuple[str, ...] = ()
+    focus_board: CharucoBoard | None = None
+    cameras: Mapping[str, Part] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,7 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
     with ExitStack() as closing:
         smoothed = None if parts.tracker is None else SmoothedTracker(parts.tracker, parts.smoothing)
         manual = ManualFocus()
-        focus = open_focus(manual, parts.tracker)
+        focus = open_focus(manual, parts.tracker, parts.focus_from, _blur_focus(parts, lambda: compositor.last))
         compositor = LiveCompositor(parts.scenery, parts.source, parts.lenses, focus, smoothed, parts.camera)
         closing.callback(compositor.close)
         jpeg, stream, alone, recorder = JpegStream(), EncodedStream(), EncodedStream(), Recorder(parts.source.transfer)
@@ -93,7 +102,20 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         of_site: dict[str, Part] = {"whep": Whep(stream), "obs": ObsPart(Whep(alone))}
         if isinstance(parts.source, Part):
             of_site["whip"] = parts.source
+        of_site |= parts.cameras
         yield Viewfinder(pipeline, compositor, Site(controls, parts.access, jpeg.room, of_site, lambda: matte_of(compositor)))
+
+
+def _blur_focus(parts: Parts, last: Callable[[], Moment | None]) -> FocusSource | None:
+    """last: what the newest picture was made of; its lens has the f-number and the focal length that the page shows."""
+    if parts.focus_board is None:
+        return None
+
+    def optics() -> tuple[Lens, Camera] | None:
+        moment = last()
+        return None if moment is None else (moment.lens, moment.camera)
+
+    return blur_of_board(parts.focus_board, parts.lenses.lens, optics)
 
 
 class OverlaySink:

@@ -9,7 +9,7 @@ from mrbokeh.overlay import CodeTables, Overlay
 from mrbokeh.renderers.base import Renderer
 from viewfinder.frames import Bgr
 from viewfinder.stage.scene_description import Triple
-from viewfinder.stage.stage import StageStatus
+from viewfinder.stage.stage_status import StageStatus
 from viewfinder.tracking.base import TrackedPose
 
 

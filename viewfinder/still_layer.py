@@ -16,8 +16,8 @@ from mrbokeh.renderers.base import Renderer
 from viewfinder.frames import Bgr
 from viewfinder.newest import Newest
 from viewfinder.stage.scene_description import Triple
-from viewfinder.stage.stage import StageStatus
 from viewfinder.stage.stage_setup import live_renderer
+from viewfinder.stage.stage_status import StageStatus
 from viewfinder.tracking.base import TrackedPose
 
 # A third of the light that the darkest step of 8-bit sRGB needs: weaker traces of a blur cannot be seen in the stream.

@@ -21,7 +21,13 @@ HELP = "\n\n".join(
 
 def scale_command(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder that `mrbokeh capture poses` worked on")],
-    board: Annotated[str | None, typer.Option(metavar="COLUMNSxROWS|board.toml", help="squares of a ChArUco board in the scene")] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLUMNSxROWS|board.toml|board.json",
+            help="squares of a ChArUco board in the scene, or its file, as `mrbokeh viewfinder board` writes one",
+        ),
+    ] = None,
     square_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a square as measured on the print")] = None,
     marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
     dictionary: Annotated[str, typer.Option(help="of cv2.aruco")] = "DICT_4X4_50",
@@ -32,7 +38,7 @@ def scale_command(
     calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="calibrate the focus of the stacks")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find the scale again")] = False,
 ) -> None:
-    from capture.views.charuco_board import board_from_options
+    from capture.views.board_options import board_from_options
     from capture.views.metric_scale import ScaleRequest, scale_scene
     from capture.views.scale_distance import parse_distance
     from capture.views.scale_text import scale_lines

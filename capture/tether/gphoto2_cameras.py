@@ -4,13 +4,9 @@ from dataclasses import dataclass
 
 from capture.tether.camera_driver import CameraDescription, CameraError
 from capture.tether.gphoto2_camera import Gphoto2Camera
-from capture.tether.gphoto2_library import UDEV_HINT, explained, library
-from mrbokeh.errors import InputError
-
-NOTHING_FOUND = (
-    "no camera found: connect it by USB, switch it on, wake it up and, where its menu asks, choose PTP or PC remote (not mass storage). "
-    f"No other program may hold it; {UDEV_HINT}"
-)
+from capture.tether.gphoto2_errors import explained
+from mrbokeh import gphoto2_library
+from mrbokeh.gphoto2_library import NoCameraError, chosen_of, opened
 
 
 @dataclass(frozen=True)
@@ -25,10 +21,8 @@ class FoundCamera:
 
 def detected() -> list[tuple[str, str]]:
     """(model, port) of everything connected."""
-    gp = library()
     with explained("looking for cameras"):
-        found = gp.Camera.autodetect()
-        return [(found.get_name(index), found.get_value(index)) for index in range(found.count())]
+        return gphoto2_library.detected()
 
 
 def list_cameras() -> list[FoundCamera]:
@@ -49,20 +43,9 @@ def list_cameras() -> list[FoundCamera]:
 
 def open_camera(port: str | None = None, *, focus_level: int = 1, reverse_focus: bool = False) -> Gphoto2Camera:
     """The only camera, or the one at a port such as usb:001,005. Raises CameraError where there is none, InputError where many."""
-    gp, found = library(), detected()
-    chosen = [each for each in found if port is None or each[1] == port]
-    if not chosen:
-        raise CameraError(NOTHING_FOUND if port is None or not found else f"no camera at {port}, only at {_listed(found)}")
-    if len(chosen) > 1:
-        raise InputError(f"several cameras are connected ({_listed(found)}): choose one with --camera gphoto2:PORT")
-    with explained(f"opening {chosen[0][0]} at {chosen[0][1]}"):
-        camera = gp.Camera()
-        ports = gp.PortInfoList()
-        ports.load()
-        camera.set_port_info(ports.get_info(ports.lookup_path(chosen[0][1])))
-        camera.init()
-        return Gphoto2Camera(camera, chosen[0][1], focus_level=focus_level, reverse_focus=reverse_focus)
-
-
-def _listed(found: list[tuple[str, str]]) -> str:
-    return ", ".join(f"{model} at {port}" for model, port in found)
+    try:
+        model, at = chosen_of(detected(), port, "--camera")
+    except NoCameraError as error:
+        raise CameraError(str(error)) from None
+    with explained(f"opening {model} at {at}"):
+        return Gphoto2Camera(opened(at), at, focus_level=focus_level, reverse_focus=reverse_focus)

@@ -4,8 +4,9 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from capture.tether.gphoto2_library import explained, library
+from capture.tether.gphoto2_errors import explained
 from mrbokeh.errors import InputError
+from mrbokeh.gphoto2_library import library
 
 
 class CameraConfig:

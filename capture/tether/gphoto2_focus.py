@@ -14,8 +14,9 @@ from typing import Protocol, runtime_checkable
 from capture.tether.camera_driver import CameraError, EndStop
 from capture.tether.focus_steps import Stop
 from capture.tether.gphoto2_config import CameraConfig
-from capture.tether.gphoto2_library import explained, library
+from capture.tether.gphoto2_errors import explained
 from capture.tether.gphoto2_settings import FOCUS_DRIVE
+from mrbokeh.gphoto2_library import library
 
 LARGEST_NIKON_STEPS = 32767
 # "Nikon manual focus at limit" and "stepping too small": the motor could not make its steps.

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.views.charuco_board import CharucoBoard
 from capture.views.colmap_job import job_from_json
 from capture.views.focus_calibration_stacks import StackFocus, calibrated_stack, focus_start, lens_calibrations, stack_focus, with_view
 from capture.views.lens_calibration import FILE_NAME as CALIBRATION_NAME
@@ -21,6 +20,7 @@ from capture.views.scale_focus import FocusSample, focus_sample, focus_scale
 from capture.views.sparse_model import SparseModel
 from capture.views.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
 from mrbokeh.atomic_files import read_json
+from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME as STACK_NAME
 from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack

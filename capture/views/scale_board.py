@@ -8,10 +8,11 @@ from jaxtyping import Float, Int, UInt8
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from capture.views.charuco_board import CharucoBoard
+from capture.views.board_search import BoardSearch
 from capture.views.distortion import undistorted_px
 from capture.views.scale_answer import ScaleAnswer
 from capture.views.sparse_model import SparseModel, SparseView
+from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.errors import InputError
 from mrbokeh.lens import MM_PER_M
 
@@ -54,9 +55,10 @@ def board_scale(model: SparseModel, board: CharucoBoard, pictures: Iterator[UInt
 
 
 def detect_board(board: CharucoBoard, pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> BoardDetections:
-    found = [board.detect(picture) for picture in pictures]
-    views = np.concatenate([np.full(len(ids), index, np.int64) for index, (ids, _) in enumerate(found)])
-    return BoardDetections(views, np.concatenate([ids for ids, _ in found]), np.concatenate([xy_px for _, xy_px in found]))
+    search = BoardSearch(board)
+    found = [search.corners(picture) for picture in pictures]
+    views = np.concatenate([np.full(len(each), index, np.int64) for index, each in enumerate(found)])
+    return BoardDetections(views, np.concatenate([each.ids for each in found]), np.concatenate([each.xy_px for each in found]))
 
 
 def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> ScaleAnswer:
@@ -65,7 +67,7 @@ def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDete
     corners = np.unique(seen.corners)
     if len(corners) < FEWEST_CORNERS:
         raise InputError(
-            f"looked for a ChArUco board of {board.squares[0]}x{board.squares[1]} squares ({board.dictionary}) in {len(model.views)} views "
+            f"looked for a ChArUco board of {board.squares_text} squares ({board.dictionary}) in {len(model.views)} views "
             f"and found {len(corners)} corners seen by two or more, but {FEWEST_CORNERS} are needed: check --board, --dictionary and "
             f"that the board is sharp in the all-in-focus pictures"
         )
@@ -93,8 +95,8 @@ def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDete
 
 def board_outlines(model: SparseModel, board: CharucoBoard, seen: BoardDetections, fit: Similarity) -> dict[str, list[list[float]]]:
     """The four corners of the board in the picture of every view that saw it; beyond the frame where the board is."""
-    columns, rows = board.squares
-    corners_m = board.square_m * np.array([(0.0, 0.0, 0.0), (columns, 0.0, 0.0), (columns, rows, 0.0), (0.0, rows, 0.0)])
+    width_m, height_m = (side / MM_PER_M for side in board.size_mm)
+    corners_m = np.array([(0.0, 0.0, 0.0), (width_m, 0.0, 0.0), (width_m, height_m, 0.0), (0.0, height_m, 0.0)])
     views = [model.views[index] for index in np.unique(seen.views)]
     return {view.name: view.project(fit(corners_m))[0].tolist() for view in views}
 
@@ -136,7 +138,7 @@ def _fit_to_pixels(model: SparseModel, board: CharucoBoard, seen: BoardDetection
     def residuals(parameters: np.ndarray) -> np.ndarray:
         return _residuals_px(model, board, seen, similarity(parameters)).ravel()
 
-    length = start.scale * board.square_m
+    length = start.scale * board.grids[0].square_mm / MM_PER_M
     result = least_squares(residuals, np.zeros(7), loss="soft_l1", f_scale=0.5, x_scale="jac")
     freedom = max(result.fun.size - 7, 1)
     covariance = np.linalg.inv(result.jac.T @ result.jac) * float(result.fun @ result.fun) / freedom

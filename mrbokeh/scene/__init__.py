@@ -16,6 +16,7 @@ What lies where:
     shapes             sphere, rectangle, shadow_catcher
     gltf_loader        load_glb(path, time_s, animation) -> Scene; GltfAsset for many moments of one file (needs pygltflib)
     base               SceneRenderer: render(scene, camera) -> Layer, render_shadow_mask(scene, camera, catcher)
+    shadow_layer       shadow_layer: the shadow on a level catcher as a Layer
     embree_raycaster   EmbreeRaycaster, the backend for any CPU (needs embreex and numba)
     wgpu_rasterizer    WgpuRasterizer, the backend for graphics cards (needs wgpu)
     choose             scene_renderer("auto"): the card where there is one, else the ray caster

@@ -30,20 +30,36 @@ def _index(x: int, y: int, height: int, width: int) -> int:
 @compiled
 def look_up(levels: PanoramaLevels, level: int, x: float, y: float, z: float) -> Vector:
     """Radiance from the unit direction (x, y, z), bilinearly."""
+    u, v = _place(x, y, z)
+    return _bilinear(levels, level, u, v)
+
+
+@compiled
+def _place(x: float, y: float, z: float) -> tuple[float, float]:
+    """Column and row of a direction as shares of the panorama's width and height."""
+    return atan2(x, z) / (2 * pi) + 0.5, acos(min(max(-y, -1.0), 1.0)) / pi
+
+
+@compiled
+def _bilinear(levels: PanoramaLevels, level: int, u: float, v: float) -> Vector:
     height, width = levels.size[level, 0], levels.size[level, 1]
     start = levels.start[level]
-    column = (atan2(x, z) / (2 * pi) + 0.5) * width - 0.5
-    row = acos(min(max(-y, -1.0), 1.0)) / pi * height - 0.5
+    column, row = u * width - 0.5, v * height - 0.5
     left, top = int(np.floor(column)), int(np.floor(row))
     right, down = column - left, row - top
-    a, b = start + _index(left, top, height, width), start + _index(left + 1, top, height, width)
-    c, d = start + _index(left, top + 1, height, width), start + _index(left + 1, top + 1, height, width)
+    if left >= 0 and left + 1 < width and top >= 0 and top + 1 < height:
+        a = start + top * width + left
+        b, c, d = a + 1, a + width, a + width + 1
+    else:
+        a, b = start + _index(left, top, height, width), start + _index(left + 1, top, height, width)
+        c, d = start + _index(left, top + 1, height, width), start + _index(left + 1, top + 1, height, width)
     w_a, w_b, w_c, w_d = (1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down
-    v = levels.radiance
+    values = levels.radiance
+    i, j, k, m = np.uintp(a), np.uintp(b), np.uintp(c), np.uintp(d)  # unsigned: no index is tried for being negative
     return (
-        w_a * v[a, 0] + w_b * v[b, 0] + w_c * v[c, 0] + w_d * v[d, 0],
-        w_a * v[a, 1] + w_b * v[b, 1] + w_c * v[c, 1] + w_d * v[d, 1],
-        w_a * v[a, 2] + w_b * v[b, 2] + w_c * v[c, 2] + w_d * v[d, 2],
+        w_a * values[i, 0] + w_b * values[j, 0] + w_c * values[k, 0] + w_d * values[m, 0],
+        w_a * values[i, 1] + w_b * values[j, 1] + w_c * values[k, 1] + w_d * values[m, 1],
+        w_a * values[i, 2] + w_b * values[j, 2] + w_c * values[k, 2] + w_d * values[m, 2],
     )
 
 
@@ -53,10 +69,11 @@ def look_up_between(levels: PanoramaLevels, level: float, x: float, y: float, z:
     level = min(max(level, 0.0), levels.start.size - 1.0)
     low = int(level)
     fraction = level - low
-    fine = look_up(levels, low, x, y, z)
+    u, v = _place(x, y, z)
+    fine = _bilinear(levels, low, u, v)
     if fraction == 0.0:
         return fine
-    coarse = look_up(levels, low + 1, x, y, z)
+    coarse = _bilinear(levels, low + 1, u, v)
     return (
         fine[0] + fraction * (coarse[0] - fine[0]),
         fine[1] + fraction * (coarse[1] - fine[1]),
@@ -93,14 +110,30 @@ def _radical_inverse(i: int) -> float:
 
 
 @compiled
-def ggx_convolved(source: PanoramaLevels, directions: np.ndarray, roughness: float, samples: int, out: np.ndarray) -> None:
-    """The panorama as a rough mirror sees it, with normal = view = reflection (Karis 2013, "Real Shading in Unreal Engine 4").
+def ggx_lobe(roughness: float, texel_sr: float, samples: int, lobe: np.ndarray) -> None:
+    """Directions around a mirrored ray in which a rough mirror looks, with normal = view = reflection.
 
-    Each GGX sample reads a level of the panorama about as coarse as the sample's share of the sphere (filtered importance
-    sampling: Krivanek and Colbert 2008), so that a small bright sun gives no noise.
+    lobe: (samples, 4), written: across and along the tangent plane, cosine (0 or less: not seen), level of the panorama about as
+    coarse as the sample's share of the sphere. texel_sr: solid angle of a texel of level 0.
     """
     alpha2 = max(roughness, 1e-3) ** 4
-    texel_sr = 4 * pi / (source.size[0, 0] * source.size[0, 1])
+    for k in range(samples):
+        u, phi = (k + 0.5) / samples, 2 * pi * _radical_inverse(k)
+        cos2 = (1.0 - u) / (1.0 + (alpha2 - 1.0) * u)
+        n_l = 2.0 * cos2 - 1.0
+        sin_l = sqrt(max(1.0 - n_l * n_l, 0.0))
+        density = alpha2 / (pi * (cos2 * (alpha2 - 1.0) + 1.0) ** 2) / 4.0
+        lobe[k, 0], lobe[k, 1], lobe[k, 2] = sin_l * cos(phi), sin_l * sin(phi), n_l
+        lobe[k, 3] = 0.5 * log2(1.0 / (samples * density * texel_sr)) + 0.5
+
+
+@compiled
+def ggx_convolved(source: PanoramaLevels, directions: np.ndarray, lobe: np.ndarray, out: np.ndarray) -> None:
+    """The panorama as a rough mirror sees it, with normal = view = reflection (Karis 2013, "Real Shading in Unreal Engine 4").
+
+    lobe: of `ggx_lobe`. Each sample reads a level about as coarse as its share of the sphere (filtered importance sampling: Krivanek
+    and Colbert 2008), so that a small bright sun gives no noise.
+    """
     for i in range(directions.shape[0]):
         rx, ry, rz = directions[i, 0], directions[i, 1], directions[i, 2]
         # A frame around the reflection (Duff et al. 2017).
@@ -110,20 +143,16 @@ def ggx_convolved(source: PanoramaLevels, directions: np.ndarray, roughness: flo
         tx, ty, tz = 1.0 + sign * rx * rx * a, sign * b, -sign * rx
         bx, by, bz = b, sign + ry * ry * a, -ry
         # Turned by a different angle per texel, the pattern's own shape does not show.
-        start = 2 * pi * _radical_inverse(i * 7 + 1)
+        turn = 2 * pi * _radical_inverse(i * 7 + 1)
+        cosine, sine = cos(turn), sin(turn)
         red, green, blue, weight = 0.0, 0.0, 0.0, 0.0
-        for k in range(samples):
-            u, phi = (k + 0.5) / samples, 2 * pi * _radical_inverse(k) + start
-            cos2 = (1.0 - u) / (1.0 + (alpha2 - 1.0) * u)
-            n_l = 2.0 * cos2 - 1.0
+        for k in range(lobe.shape[0]):
+            n_l = lobe[k, 2]
             if n_l <= 0.0:
                 continue
-            sin_l = sqrt(max(1.0 - n_l * n_l, 0.0))
-            across, along = sin_l * cos(phi), sin_l * sin(phi)
+            across, along = cosine * lobe[k, 0] - sine * lobe[k, 1], sine * lobe[k, 0] + cosine * lobe[k, 1]
             x, y, z = across * tx + along * bx + n_l * rx, across * ty + along * by + n_l * ry, across * tz + along * bz + n_l * rz
-            density = alpha2 / (pi * (cos2 * (alpha2 - 1.0) + 1.0) ** 2) / 4.0
-            level = 0.5 * log2(1.0 / (samples * density * texel_sr)) + 0.5
-            light = look_up_between(source, level, x, y, z)
+            light = look_up_between(source, lobe[k, 3], x, y, z)
             red, green, blue, weight = red + n_l * light[0], green + n_l * light[1], blue + n_l * light[2], weight + n_l
         out[i, 0], out[i, 1], out[i, 2] = red / weight, green / weight, blue / weight
 

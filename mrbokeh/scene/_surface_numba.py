@@ -230,17 +230,19 @@ def _fill_material(
     """Reflection and emission (glTF 2.0, sections 3.9.2 and 3.9.3)."""
     slots = materials.textures
     metallic, roughness = float(materials.metallic_roughness[material, 0]), float(materials.metallic_roughness[material, 1])
+    occlusion, is_occluded = 1.0, slots[material, 4] >= 0
     if slots[material, 1] >= 0:
         texel = read_texture(textures, slots[material, 1], uv, footprint)
         metallic, roughness = metallic * texel[2], roughness * texel[1]
+        if slots[material, 4] == slots[material, 1]:  # one picture holds both, as most files have it
+            occlusion, is_occluded = texel[0], False
     emissive = row(materials.emissive, material)
     if slots[material, 2] >= 0:
         texel = read_texture(textures, slots[material, 2], uv, footprint)
         emissive = (emissive[0] * texel[0], emissive[1] * texel[1], emissive[2] * texel[2])
-    out.occlusion[i] = 1.0
-    if slots[material, 4] >= 0:
-        texel = read_texture(textures, slots[material, 4], uv, footprint)
-        out.occlusion[i] = 1.0 + materials.occlusion_strength[material] * (texel[0] - 1.0)
+    if is_occluded:
+        occlusion = read_texture(textures, slots[material, 4], uv, footprint)[0]
+    out.occlusion[i] = 1.0 + materials.occlusion_strength[material] * (occlusion - 1.0)
     write(out.base, i, base)
     write(out.emissive, i, emissive)
     write(out.diffuse, i, scaled(base, 1.0 - metallic))

@@ -2,6 +2,8 @@
 
 from math import floor, log2, sqrt
 
+import numpy as np
+
 from mrbokeh.scene._compiled_numba import compiled
 from mrbokeh.scene.packed_scene import CLAMP, MIRROR, PackedTextures
 
@@ -10,6 +12,8 @@ Texel = tuple[float, float, float, float]
 
 @compiled
 def _wrapped(index: int, size: int, wrap: int) -> int:
+    if 0 <= index < size:
+        return index  # by far most often, and a division costs as much as the rest of a lookup
     if wrap == CLAMP:
         return min(max(index, 0), size - 1)
     if wrap == MIRROR:
@@ -29,8 +33,9 @@ def _bilinear(textures: PackedTextures, texture: int, level: int, s: float, t: f
     right, down = x - x_low, y - y_low
     x0, x1 = _wrapped(x_low, width, wrap_s), _wrapped(x_low + 1, width, wrap_s)
     y0, y1 = _wrapped(y_low, height, wrap_t), _wrapped(y_low + 1, height, wrap_t)
-    a, b = start + y0 * width + x0, start + y0 * width + x1
-    c, d = start + y1 * width + x0, start + y1 * width + x1
+    # Unsigned, so that no index is tried for being negative.
+    a, b = np.uintp(start + y0 * width + x0), np.uintp(start + y0 * width + x1)
+    c, d = np.uintp(start + y1 * width + x0), np.uintp(start + y1 * width + x1)
     w_a, w_b, w_c, w_d = (1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down
     v = textures.texels
     return (

@@ -1,6 +1,6 @@
 """The protocol of everything that turns a virtual scene and a camera into a Layer."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -11,6 +11,7 @@ from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.virtual_scene import Scene
 
 
+@runtime_checkable
 class SceneRenderer(Protocol):
     """Renders virtual objects with everything in focus; the lens blur comes afterwards.
 

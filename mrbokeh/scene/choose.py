@@ -7,9 +7,10 @@ from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
 
 
 def scene_renderer(name: str = "auto", threads: int = 0) -> EmbreeRaycaster | WgpuRasterizer:
-    """A renderer by name; threads: of the ray caster, 0 takes all. "auto" takes the graphics card where there is one, and the ray caster otherwise.
+    """A renderer by name; threads: of the ray caster, 0 takes all.
 
-    Mesa's device in software is taken only when asked for by "wgpu". Raises InputError where the device asked for is missing.
+    "auto" takes the graphics card where there is one, and the ray caster otherwise. Mesa's device in software
+    is taken only when asked for by "wgpu". Raises InputError where the device asked for is missing.
     """
     if name not in ("auto", "wgpu", "embree"):
         raise InputError(f"expected the scene renderer auto, wgpu or embree, got {name!r}")

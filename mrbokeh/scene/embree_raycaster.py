@@ -1,29 +1,30 @@
 """EmbreeRaycaster: virtual scenes to Layers on any CPU, by Embree's rays (Wald et al. 2014) and compiled shading."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from copy import copy
 from typing import TypeVar
-from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer, clear
-from mrbokeh.scene.embree_scene import PreparedScene, RaySamples, prepared
-from mrbokeh.scene.environment import Environment
-from mrbokeh.scene.environment_filter import LightingMaps, lighting_maps
+from mrbokeh.scene.embree_scene import PreparedScene, RaySamples
 from mrbokeh.scene.light import Light
-from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh
-from mrbokeh.scene.pixel_edges import edge_pixels, sixteen_offsets_px
+from mrbokeh.scene.pixel_edges import SAMPLE_COUNTS, edge_pixels, sample_offsets_px
+from mrbokeh.scene.prepared_scenes import PlacedScene, PreparedScenes
 from mrbokeh.scene.silhouettes import silhouette_pixels
 from mrbokeh.scene.virtual_scene import Scene
 from mrbokeh.workers import cores
 
-_RAYS_AT_ONCE = 1 << 16
+_RAYS_AT_ONCE = 1 << 14
+"""So few that the shading points of one part stay in the processor's cache, and that Python's lock is free again after 2 ms."""
+_EDGES_AT_ONCE = 1 << 15
+_ROOM_PX = 2
 _Result = TypeVar("_Result")
 
 
@@ -34,94 +35,105 @@ class EmbreeRaycaster:
     hard shadows, partly through BLEND surfaces. The environment lights without shadows of its own.
 
     What a scene and a panorama need before the first picture is kept as long as they live, so a film of one Scene under many
-    cameras is cheap. Memory is bounded by tracing 65536 rays at a time in each of `threads` threads.
+    cameras is cheap, and so is one Scene moved as a rigid body. Memory is bounded by tracing 16384 rays at a time in each of
+    `threads` threads.
     """
 
-    def __init__(self, threads: int | None = None, most_layers: int = 16) -> None:
-        """threads: None takes all cores. most_layers: how many see-through surfaces a ray follows behind each other."""
-        if most_layers < 1 or (threads is not None and threads < 1):
+    def __init__(self, threads: int | None = None, most_layers: int = 16, edge_samples: int = 16, shadow_step_px: int = 1) -> None:
+        """threads: None or 0 takes all cores. most_layers: how many see-through surfaces a ray follows behind each other.
+
+        For pictures that are drawn again and again: edge_samples: rays in a pixel at an edge, 16 or 4; with 4 the coverage of an
+        edge comes in steps of a quarter. shadow_step_px: of shadow masks only every so manieth pixel is traced, and what lies
+        between is interpolated.
+        """
+        if most_layers < 1 or (threads or 0) < 0:
             raise InputError(f"expected at least one thread and one layer, got {threads} and {most_layers}")
         self._threads = threads or cores()
         self._most_layers = most_layers
-        self._scenes: WeakKeyDictionary[Scene, PreparedScene] = WeakKeyDictionary()
-        self._grounds: WeakKeyDictionary[Mesh, PreparedScene] = WeakKeyDictionary()
-        self._maps: WeakKeyDictionary[Environment, LightingMaps] = WeakKeyDictionary()
+        self._offsets, self._shadow_step_px = _checked(edge_samples, shadow_step_px)
+        self._kept = PreparedScenes()
+
+    def with_quality(self, edge_samples: int = 16, shadow_step_px: int = 1) -> "EmbreeRaycaster":
+        """Another ray caster that shares what this one has prepared and will prepare."""
+        other = copy(self)
+        other._offsets, other._shadow_step_px = _checked(edge_samples, shadow_step_px)
+        return other
 
     def render(self, scene: Scene, camera: Camera) -> Layer:
         """The scene as the camera sees it, without lens blur; see SceneRenderer."""
-        ready = self._prepared(scene)
+        placed = self._kept.placed(scene)
+        layer = clear(camera.height_px, camera.width_px)
+        if placed is None:
+            return layer
+        rows, columns = _window(placed.ready, placed.camera(camera))
+        if rows.start >= rows.stop or columns.start >= columns.stop:
+            return layer
+        part = self._rendered(placed, scene, _cut(placed.camera(camera), rows, columns))
+        layer.rgb[rows, columns], layer.alpha[rows, columns], layer.depth_m[rows, columns] = part.rgb, part.alpha, part.depth_m
+        return layer
+
+    def _rendered(self, placed: PlacedScene, scene: Scene, camera: Camera) -> Layer:
+        """The whole picture of a camera in the prepared scene's axes."""
         height, width = camera.height_px, camera.width_px
-        if ready is None:
-            return clear(height, width)
         directions = _directions(camera, camera.pixel_centres_px().reshape(-1, 2))
-        centres = self._traced(ready, scene, camera, directions, pixel_share=1.0)
+        centres = self._traced(placed, scene, camera, directions, pixel_share=1.0)
         rgb, alpha, depth_m = centres.rgb.copy(), centres.alpha.copy(), centres.depth_m.copy()
 
-        edges = np.flatnonzero(_edges(ready, camera, directions, centres))
-        offsets = sixteen_offsets_px()
-        for some in np.array_split(edges, max(1, len(edges) * len(offsets) // (8 * _RAYS_AT_ONCE))):
-            corner = np.stack([some % width, some // width], axis=-1)
-            fine = _directions(camera, (corner[:, None] + offsets).reshape(-1, 2).astype(np.float64))
-            samples = self._traced(ready, scene, camera, fine, pixel_share=0.25)
-            rgb[some] = samples.rgb.reshape(-1, len(offsets), 3).mean(1)
-            alpha[some] = samples.alpha.reshape(-1, len(offsets)).mean(1)
-            nearest_m = samples.depth_m.reshape(-1, len(offsets)).min(1)
+        edges, count = np.flatnonzero(_edges(placed.ready, camera, directions, centres)), len(self._offsets)
+        for some in np.array_split(edges, max(1, len(edges) // _EDGES_AT_ONCE)):
+            samples = self._traced(placed, scene, camera, _directions(camera, self._within(some, width)), pixel_share=count**-0.5)
+            rgb[some] = samples.rgb.reshape(-1, count, 3).mean(1)
+            alpha[some] = samples.alpha.reshape(-1, count).mean(1)
+            nearest_m = samples.depth_m.reshape(-1, count).min(1)
             depth_m[some] = np.where(np.isfinite(depth_m[some]), depth_m[some], nearest_m)
         depth_m = np.where(alpha > 0, depth_m, np.inf).astype(np.float32)
         return Layer(rgb.reshape(height, width, 3), alpha.reshape(height, width), depth_m.reshape(height, width))
 
     def render_shadow_mask(self, scene: Scene, camera: Camera, catcher: Mesh) -> Float32[np.ndarray, "height width"]:
         """(H, W) share of the lights' irradiance on the catcher that the scene lets through, 1 is lit; see SceneRenderer."""
-        lights, _ = scene.lighting
-        ready, ground = self._prepared(scene), self._ground(catcher)
+        placed = self._kept.placed(scene)
+        if placed is None or not scene.lighting[0]:
+            return np.ones((camera.height_px, camera.width_px), np.float32)
+        step = self._shadow_step_px
+        if step == 1:
+            return self._shadow_mask(placed, scene.lighting[0], camera, catcher)
+        columns, rows = -(-camera.width_px // step), -(-camera.height_px // step)
+        covering = Camera(columns * step, rows * step, camera.focal_px, camera.principal_px, camera.camera_from_world)
+        mask = self._shadow_mask(placed, scene.lighting[0], covering.resized(columns, rows), catcher)
+        whole = cv2.resize(mask, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
+        return np.ascontiguousarray(whole[: camera.height_px, : camera.width_px])
+
+    def _shadow_mask(
+        self, placed: PlacedScene, lights: Sequence[Light], camera: Camera, catcher: Mesh
+    ) -> Float32[np.ndarray, "height width"]:
+        ground, world_from_ready = self._kept.ground(catcher), placed.world_from_ready
         height, width, eye_m = camera.height_px, camera.width_px, camera.world_from_camera[:3, 3]
-        if ready is None or not lights:
-            return np.ones((height, width), np.float32)
 
         def lit_share(xy_px: Float[np.ndarray, "points 2"]) -> Float32[np.ndarray, " points"]:
             directions = _directions(camera, xy_px)
-            return np.concatenate(self._in_threads(lambda part: ready.lit_share(ground, lights, eye_m, part), directions))
+            parts = self._in_threads(lambda part: placed.ready.lit_share(ground, lights, world_from_ready, eye_m, part), directions)
+            return np.concatenate(parts)
 
         mask = lit_share(camera.pixel_centres_px().reshape(-1, 2))
         edges = np.flatnonzero(_steps(mask.reshape(height, width)))
         if len(edges):
-            offsets = sixteen_offsets_px()
-            corner = np.stack([edges % width, edges // width], axis=-1)
-            mask[edges] = lit_share((corner[:, None] + offsets).reshape(-1, 2).astype(np.float64)).reshape(-1, len(offsets)).mean(1)
+            mask[edges] = lit_share(self._within(edges, width)).reshape(-1, len(self._offsets)).mean(1)
         return mask.reshape(height, width)
 
-    def _prepared(self, scene: Scene) -> PreparedScene | None:
-        """What depends on the scene only; None where it has nothing to draw."""
-        if scene not in self._scenes:
-            drawn = [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
-            if not drawn:
-                return None
-            self._scenes[scene] = prepared(drawn)
-        return self._scenes[scene]
-
-    def _ground(self, catcher: Mesh) -> PreparedScene:
-        """A catcher by itself, receiving light from the side that is seen."""
-        if catcher not in self._grounds:
-            self._grounds[catcher] = prepared([replace(catcher, material=Material(double_sided=True))])
-        return self._grounds[catcher]
-
-    def _lighting(self, scene: Scene) -> tuple[tuple[Light, ...], LightingMaps | None]:
-        lights, environment = scene.lighting
-        if environment is None:
-            return lights, None
-        if environment not in self._maps:
-            self._maps[environment] = lighting_maps(environment)
-        return lights, self._maps[environment]
+    def _within(self, pixels: Int64[np.ndarray, " pixels"], width_px: int) -> Float64[np.ndarray, "samples 2"]:
+        """The points of pixels (row after row) at which edges are sampled."""
+        corner = np.stack([pixels % width_px, pixels // width_px], axis=-1)
+        return (corner[:, None] + self._offsets).reshape(-1, 2)
 
     def _traced(
-        self, ready: PreparedScene, scene: Scene, camera: Camera, directions: Float[np.ndarray, "rays 3"], pixel_share: float
+        self, placed: PlacedScene, scene: Scene, camera: Camera, directions: Float[np.ndarray, "rays 3"], pixel_share: float
     ) -> RaySamples:
         """Rays from the camera, shaded. pixel_share: the width of what a ray stands for, in pixels."""
-        lights, maps = self._lighting(scene)
+        maps = placed.maps(self._kept.maps(scene))
         footprint = pixel_share / float(np.sqrt(camera.focal_px[0] * camera.focal_px[1]))
         eye_m = camera.world_from_camera[:3, 3]
         return RaySamples.joined(
-            self._in_threads(lambda part: ready.shaded(eye_m, part, footprint, lights, maps, self._most_layers), directions)
+            self._in_threads(lambda part: placed.ready.shaded(eye_m, part, footprint, placed.lights, maps, self._most_layers), directions)
         )
 
     def _in_threads(self, work: Callable[[Float[np.ndarray, "some 3"]], _Result], directions: Float[np.ndarray, "rays 3"]) -> list[_Result]:
@@ -131,6 +143,36 @@ class EmbreeRaycaster:
             return [work(part) for part in parts]
         with ThreadPoolExecutor(self._threads) as pool:
             return list(pool.map(work, parts))
+
+
+def _checked(edge_samples: int, shadow_step_px: int) -> tuple[Float[np.ndarray, "samples 2"], int]:
+    if edge_samples not in SAMPLE_COUNTS or shadow_step_px < 1:
+        raise InputError(
+            f"expected 4 or 16 rays in a pixel at an edge and a step of whole pixels from 1 on, got {edge_samples} and {shadow_step_px}"
+        )
+    return sample_offsets_px(edge_samples), shadow_step_px
+
+
+def _window(ready: PreparedScene, camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns outside which nothing of the scene is; the whole picture where the camera is within or before its box."""
+    signs = np.array(np.meshgrid((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0))).reshape(3, -1).T
+    low, high, size = np.zeros(2), np.zeros(2), np.array([camera.width_px, camera.height_px])
+    corners_m = ready.centre_m + signs * ready.half_size_m
+    ahead_m = corners_m @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+    if ahead_m.max() <= 0:
+        return slice(0, 0), slice(0, 0)
+    if ahead_m.min() <= 1e-3 * ready.reach_m:
+        return slice(0, camera.height_px), slice(0, camera.width_px)
+    xy_px, _ = camera.project(corners_m)
+    low, high = (np.clip(each, -_ROOM_PX, size + _ROOM_PX) for each in (np.floor(xy_px.min(0)), np.ceil(xy_px.max(0))))
+    (left, top), (right, bottom) = (np.clip(each, 0, size).astype(int).tolist() for each in (low - _ROOM_PX, high + _ROOM_PX))
+    return slice(top, bottom), slice(left, right)
+
+
+def _cut(camera: Camera, rows: slice, columns: slice) -> Camera:
+    """The camera that sees only these pixels."""
+    principal = (camera.principal_px[0] - columns.start, camera.principal_px[1] - rows.start)
+    return Camera(columns.stop - columns.start, rows.stop - rows.start, camera.focal_px, principal, camera.camera_from_world)
 
 
 def _directions(camera: Camera, xy_px: Float[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points 3"]:
@@ -155,7 +197,5 @@ def _edges(
 
 def _steps(mask: Float32[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """Pixels that differ from one of their eight neighbours."""
-    padded = np.pad(mask, 1, mode="edge")
-    height, width = mask.shape
-    neighbours = [padded[row : row + height, column : column + width] for row in range(3) for column in range(3)]
-    return np.ptp(np.stack(neighbours), axis=0) > 0.02
+    around = np.ones((3, 3), np.uint8)
+    return cv2.dilate(mask, around) - cv2.erode(mask, around) > 0.02

@@ -6,20 +6,22 @@ from dataclasses import dataclass
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Float, Float32, Float64, Int32
+from jaxtyping import Float, Float32, Float64, Int32, Int64
 
 from mrbokeh.color import luminance
+from mrbokeh.scene._catcher_numba import mark_reachable
 from mrbokeh.scene._lighting_numba import add_emission, add_environment, add_light
 from mrbokeh.scene._surface_numba import Surfaces, empty_surfaces, fill_surfaces
 from mrbokeh.scene.environment_filter import LightingMaps, reflected_share_table
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.mesh import Mesh
-from mrbokeh.scene.packed_scene import OPAQUE, PackedMaterials, PackedTextures, PackedTriangles, packed
+from mrbokeh.scene.packed_scene import OPAQUE, KeptTextures, PackedMaterials, PackedTextures, PackedTriangles, packed
 from mrbokeh.scene.silhouettes import MeshEdges, mesh_edges
 
 _STEP = 2.0**-18
 """Relative step past a surface, 32 float32 roundings: what keeps a ray from meeting again where it starts."""
 _MOST_SHADOW_LAYERS = 16
+_FLAT = 1e-5
 _NOTHING_LEFT = 1.0 / 1024
 """Once less than this shines through, what lies behind is not followed."""
 
@@ -44,13 +46,18 @@ class RaySamples:
 
 @dataclass(frozen=True, eq=False)
 class PreparedScene:
-    """Triangles relative to centre_m. all_rays sees every triangle; for shadows opaque_rays and see_through_rays part them."""
+    """Triangles relative to centre_m, within half_size_m of it. all_rays sees every triangle; for shadows opaque_rays and
+    see_through_rays part them. is_flat: all vertex normals are one."""
 
+    meshes: tuple[Mesh, ...]
     centre_m: Float64[np.ndarray, "3"]
+    half_size_m: Float64[np.ndarray, "3"]
     reach_m: float
+    is_flat: bool
     triangles: PackedTriangles
     materials: PackedMaterials
     textures: PackedTextures
+    kept_textures: KeptTextures
     edges: MeshEdges
     all_rays: EmbreeScene
     opaque_rays: EmbreeScene | None
@@ -99,23 +106,75 @@ class PreparedScene:
         return RaySamples(rgb, alpha, depth_m, mesh, normal, lit)
 
     def lit_share(
-        self, ground: "PreparedScene", lights: Sequence[Light], eye_m: Float[np.ndarray, "3"], directions: Float[np.ndarray, "rays 3"]
+        self,
+        ground: "PreparedScene",
+        lights: Sequence[Light],
+        world_from_self: Float[np.ndarray, "4 4"],
+        eye_m: Float[np.ndarray, "3"],
+        directions: Float[np.ndarray, "rays 3"],
     ) -> Float32[np.ndarray, " rays"]:
-        """Share of the lights' irradiance that reaches the ground where rays from the eye meet it; 1 where they do not."""
-        eye = eye_m - ground.centre_m
+        """Share of the lights' irradiance that reaches the ground where rays from the eye meet it; 1 where they do not.
+
+        Ground, lights, eye and rays are in world axes.
+        """
+        eye, share = eye_m - ground.centre_m, np.ones(len(directions), np.float32)
         hits = _closest(ground.all_rays, np.broadcast_to(eye, directions.shape), directions)
-        surfaces = ground._surfaces(eye, np.ascontiguousarray(directions), hits, 0.0)
-        points_m = surfaces.shadow_origin + ground.centre_m
-        arriving, unobstructed = np.zeros(len(hits)), np.zeros(len(hits))
+        some = self._in_reach(ground, lights, world_from_self, eye, directions, hits)
+        if not len(some):
+            return share
+        surfaces = ground._surfaces(eye, np.ascontiguousarray(directions[some]), hits[some], 0.0)
+        points_m, turn = surfaces.shadow_origin + ground.centre_m, world_from_self[:3, :3]
+        arriving, unobstructed = np.zeros(len(some)), np.zeros(len(some))
         for light in lights:
             towards, distance_m, irradiance = light.arriving_at(points_m)
             cosine = np.maximum(np.einsum("rk,rk->r", surfaces.normal, towards), 0.0)
             amount = cosine * luminance(np.asarray(irradiance, np.float64)) * surfaces.alpha
             lit = np.flatnonzero(amount > 0)
             unobstructed[lit] += amount[lit]
-            visible = self._visible(points_m[lit] - self.centre_m, towards[lit], distance_m[lit]) if light.casts_shadow else 1.0
+            own_m = (points_m[lit] - world_from_self[:3, 3]) @ turn - self.centre_m
+            visible = self._visible(own_m, towards[lit] @ turn, distance_m[lit]) if light.casts_shadow else 1.0
             arriving[lit] += amount[lit] * visible
-        return np.where(unobstructed > 0, arriving / np.maximum(unobstructed, 1e-30), 1.0).astype(np.float32)
+        share[some] = np.where(unobstructed > 0, arriving / np.maximum(unobstructed, 1e-30), 1.0)
+        return share
+
+    def _in_reach(
+        self,
+        ground: "PreparedScene",
+        lights: Sequence[Light],
+        world_from_self: Float[np.ndarray, "4 4"],
+        eye: Float[np.ndarray, "3"],
+        directions: Float[np.ndarray, "rays 3"],
+        hits: Int32[np.ndarray, " rays"],
+    ) -> Int64[np.ndarray, " some"]:
+        """Rays that meet the ground where the box around this scene can stand between it and a light.
+
+        On a curved ground shadow rays do not start where the triangles are: all of it counts as in reach.
+        """
+        if not ground.is_flat:
+            return np.flatnonzero(hits >= 0)
+        own_from_ground = world_from_self[:3, :3].T
+        shift = own_from_ground @ (ground.centre_m - world_from_self[:3, 3]) - self.centre_m
+        sources = [light for light in lights if light.casts_shadow]
+        at_infinity = np.array([light.kind == "directional" for light in sources], np.bool_)
+        places = [
+            own_from_ground @ (-np.asarray(light.direction) if far else np.asarray(light.position_m) - world_from_self[:3, 3])
+            - (0.0 if far else self.centre_m)
+            for light, far in zip(sources, at_infinity, strict=True)
+        ]
+        reached = np.zeros(len(hits), np.bool_)
+        mark_reachable(
+            ground.triangles.corners_m,
+            hits,
+            eye,
+            np.ascontiguousarray(directions),
+            np.ascontiguousarray(own_from_ground),
+            shift,
+            np.array(places).reshape(-1, 3),
+            at_infinity,
+            self.half_size_m + 1e-3 * self.reach_m,
+            reached,
+        )
+        return np.flatnonzero(reached)
 
     def _surfaces(
         self, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "rays 3"], hits: Int32[np.ndarray, " rays"], footprint: float
@@ -139,7 +198,7 @@ class PreparedScene:
             arriving = np.array(irradiance, np.float32)
             if light.casts_shadow:
                 facing = np.einsum("rk,rk->r", surfaces.normal, towards) > 0
-                lit = np.flatnonzero(facing & (surfaces.alpha > 0) & (surfaces.roughness >= 0) & (arriving > 0).any(1))
+                lit = np.flatnonzero(facing & (surfaces.alpha > 0) & (surfaces.roughness >= 0) & (arriving @ np.ones(3, np.float32) > 0))
                 origins = surfaces.shadow_origin[lit] + 2 * _STEP * self.reach_m * surfaces.face_normal[lit]
                 visible = self._visible(origins, towards[lit], distance_m[lit])
                 arriving[lit] *= visible[:, None]
@@ -175,19 +234,23 @@ class PreparedScene:
         return visible
 
 
-def prepared(meshes: Sequence[Mesh]) -> PreparedScene:
-    """Pack meshes (at least one triangle) and build their hierarchies."""
+def prepared(meshes: Sequence[Mesh], like: PreparedScene | None = None) -> PreparedScene:
+    """Pack meshes (at least one triangle) and build their hierarchies. like: its textures are used where they are the same."""
     points = np.concatenate([mesh.positions_m[mesh.triangles].reshape(-1, 3) for mesh in meshes])
     centre_m = (points.min(0) + points.max(0)) / 2
-    triangles, materials, textures = packed(meshes, centre_m)
+    triangles, materials, kept_textures = packed(meshes, centre_m, None if like is None else like.kept_textures)
     is_opaque = materials.alpha_mode[triangles.material] == OPAQUE
     all_rays = _hierarchy(triangles.corners_m)
     return PreparedScene(
+        meshes=tuple(meshes),
         centre_m=centre_m,
+        half_size_m=np.abs(triangles.corners_m).max((0, 1)),
         reach_m=float(np.abs(triangles.corners_m).max()),
+        is_flat=bool(np.abs(triangles.normals - triangles.normals[0, 0]).max() < _FLAT),
         triangles=triangles,
         materials=materials,
-        textures=textures,
+        textures=kept_textures.packed,
+        kept_textures=kept_textures,
         edges=mesh_edges(triangles.corners_m),
         all_rays=all_rays,
         opaque_rays=all_rays if is_opaque.all() else _hierarchy(triangles.corners_m[is_opaque]),

@@ -1,21 +1,23 @@
 """An Environment made ready for image-based lighting: once per panorama, then every surface reads it in constant time."""
 
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.scene._environment_numba import PanoramaLevels, brdf_integral, cosine_convolved, ggx_convolved
+from mrbokeh.scene._environment_numba import PanoramaLevels, brdf_integral, cosine_convolved, ggx_convolved, ggx_lobe
 from mrbokeh.scene.environment import Environment, directions, solid_angles_sr
 
 _LARGEST_WIDTH_PX = 2048
 _MATTE_SIZE_PX = (32, 64)
 _BLOCKS = (64, 128)
 _PEAKS = 16
+_SAME = 1e-5
 _ROUGH_LEVELS = ((512, 16), (256, 32), (128, 64), (128, 64), (64, 128), (64, 128), (64, 256), (64, 256))
 """(width in pixels, samples) of the reflections at roughness (k / 8)**1.5, k = 1 to 8: as fine as each lobe is wide."""
 
@@ -31,16 +33,60 @@ class LightingMaps:
     reflections: PanoramaLevels
     environment_from_world: Float[np.ndarray, "3 3"]
 
+    def brighter(self, factor: float) -> "LightingMaps":
+        """The maps of the same panorama at another exposure: filtering is linear."""
+        if factor == 1.0:
+            return self
+        irradiance, reflections = (
+            levels._replace(radiance=levels.radiance * np.float32(factor)) for levels in (self.irradiance, self.reflections)
+        )
+        return replace(self, peaks=self.peaks * factor, irradiance=irradiance, reflections=reflections)
+
 
 def lighting_maps(environment: Environment) -> LightingMaps:
     """Filter a panorama for matte and glossy surfaces.
+
+    Takes half a second; but where the panorama is one of the last two at another exposure or turned, as it is while somebody tries
+    light, what was filtered then is scaled and turned.
+    """
+    radiance = _at_most(np.ascontiguousarray(environment.radiance), _LARGEST_WIDTH_PX)
+    from_world = np.ascontiguousarray(environment.world_from_environment.T)
+    for known, maps in tuple(_last_filtered):
+        factor = _brighter_by(known, radiance)
+        if factor is not None:
+            return replace(maps.brighter(factor), environment_from_world=from_world)
+    maps = replace(filtered(radiance), environment_from_world=from_world)
+    _last_filtered.append((radiance, maps))
+    return maps
+
+
+_last_filtered: deque[tuple[Float32[np.ndarray, "height width 3"], LightingMaps]] = deque(maxlen=2)
+
+
+def _brighter_by(known: Float32[np.ndarray, "h w 3"], radiance: Float32[np.ndarray, "height width 3"]) -> float | None:
+    """The factor from one panorama to another; None where it is not the same everywhere."""
+    if known.shape != radiance.shape or not known.any():
+        return None
+    if known is radiance:
+        return 1.0
+    factor = float(radiance.sum(dtype=np.float64) / known.sum(dtype=np.float64))
+    if not factor > 0:
+        return None
+    for step in (16, 1):  # most others are told apart by few pixels
+        few, others = radiance[::step, ::step], known[::step, ::step] * np.float32(factor)
+        if (np.abs(few - others) > _SAME * others).any():
+            return None
+    return 1.0 if abs(factor - 1.0) < _SAME else factor
+
+
+def filtered(radiance: Float32[np.ndarray, "height width 3"]) -> LightingMaps:
+    """The maps of a panorama in its own axes.
 
     Matte light is the exact cosine convolution (`cosine_convolved`), not spherical harmonics of order 2 (Ramamoorthi and
     Hanrahan 2001): measured over all normals those are 2 % off on average under a smooth sky with two wide lamps, but 10 %
     on average and by a factor of 2 in the shade under a photographed sky with its sun. The brightest blocks are kept apart,
     as interpolating in a map would round off the terminator of a small sun.
     """
-    radiance = _at_most(np.ascontiguousarray(environment.radiance), _LARGEST_WIDTH_PX)
     smooth = np.zeros((_MATTE_SIZE_PX[0] * _MATTE_SIZE_PX[1], 3), np.float32)
     moments = _moments(radiance)
     brightest = np.argsort(-np.abs(moments).sum((1, 2)))[:_PEAKS]
@@ -52,7 +98,9 @@ def lighting_maps(environment: Environment) -> LightingMaps:
     def blurred(number: int) -> Float32[np.ndarray, "_ _ 3"]:
         width, samples = _ROUGH_LEVELS[number - 1]
         result = np.zeros((width * width // 2, 3), np.float32)
-        ggx_convolved(source, directions(width // 2, width).reshape(-1, 3), (number / count) ** 1.5, samples, result)
+        lobe = np.zeros((samples, 4))
+        ggx_lobe((number / count) ** 1.5, 4 * np.pi / float(source.size[0].prod()), samples, lobe)
+        ggx_convolved(source, directions(width // 2, width).reshape(-1, 3), lobe, result)
         return result.reshape(width // 2, width, 3)
 
     with ThreadPoolExecutor() as pool:
@@ -61,7 +109,7 @@ def lighting_maps(environment: Environment) -> LightingMaps:
         peaks=peaks,
         irradiance=_joined([smooth.reshape(*_MATTE_SIZE_PX, 3)]),
         reflections=_joined(reflections),
-        environment_from_world=np.ascontiguousarray(environment.world_from_environment.T),
+        environment_from_world=np.eye(3),
     )
 
 
@@ -99,11 +147,16 @@ def _moments(radiance: Float32[np.ndarray, "height width 3"]) -> Float[np.ndarra
     # Few large pixels are cut up first, so that the horizon cuts small blocks only.
     radiance = radiance.repeat(-(-_BLOCKS[0] // radiance.shape[0]), axis=0).repeat(-(-_BLOCKS[1] // radiance.shape[1]), axis=1)
     height, width = radiance.shape[:2]
-    light = radiance * solid_angles_sr(height, width)[..., None]
-    towards = directions(height, width)
     rows, columns = (np.linspace(0, size, blocks + 1).astype(int)[:-1] for size, blocks in zip((height, width), _BLOCKS, strict=True))
-    sums = [np.add.reduceat(np.add.reduceat(light[..., k : k + 1] * towards, rows, axis=0), columns, axis=1) for k in range(3)]
-    return np.ascontiguousarray(np.stack([part.reshape(-1, 3) for part in sums], axis=1))
+    row_sr = solid_angles_sr(height, width)[:, :1, None]
+    # A direction is a part that depends on the column, (sin, 1, cos) of the longitude, times one that depends on the row:
+    # so the columns are summed first.
+    level, upright = directions(1, width)[0], directions(height, 1)[:, 0]
+    around = np.stack([level[:, 0], np.ones(width), level[:, 2]], axis=1).astype(np.float32)
+    rising = np.stack([upright[:, 2], upright[:, 1], upright[:, 2]], axis=1)
+    sums = [np.add.reduceat(radiance * around[:, axis, None], columns, axis=1, dtype=np.float64) for axis in range(3)]
+    parts = [np.add.reduceat(part * (row_sr * rising[:, axis, None, None]), rows, axis=0) for axis, part in enumerate(sums)]
+    return np.ascontiguousarray(np.stack([part.reshape(-1, 3) for part in parts], axis=2))
 
 
 def _joined(levels: Sequence[Float32[np.ndarray, "_ _ 3"]]) -> PanoramaLevels:

@@ -1,6 +1,7 @@
 """A Scene as flat arrays, the form in which compiled kernels read it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -58,14 +59,30 @@ class PackedTextures(NamedTuple):
     texture_from_uv: Float32[np.ndarray, "textures 2 3"]
 
 
-def packed(meshes: Sequence[Mesh], centre_m: Float[np.ndarray, "3"]) -> tuple[PackedTriangles, PackedMaterials, PackedTextures]:
-    """Meshes, materials and textures as arrays; shared materials and textures are stored once."""
+@dataclass(frozen=True, eq=False)
+class KeptTextures:
+    """Packed textures and what they were packed from, in that order."""
+
+    sources: tuple[Texture, ...]
+    packed: PackedTextures
+
+
+def packed(
+    meshes: Sequence[Mesh], centre_m: Float[np.ndarray, "3"], kept: KeptTextures | None = None
+) -> tuple[PackedTriangles, PackedMaterials, KeptTextures]:
+    """Meshes, materials and textures as arrays; shared materials and textures are stored once.
+
+    kept: what another call packed; it is handed back where the textures are the very same.
+    """
     materials = list({id(mesh.material): mesh.material for mesh in meshes}.values())
-    textures = list({id(texture): texture for material in materials for texture in textures_of(material) if texture is not None}.values())
+    used = (texture for material in materials for texture in textures_of(material) if texture is not None)
+    textures = list({_reads(texture): texture for texture in used}.values())
     number = {id(material): index for index, material in enumerate(materials)}
     parts = [packed_triangles(mesh, centre_m, number[id(mesh.material)], index) for index, mesh in enumerate(meshes)]
     triangles = PackedTriangles(*(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts, strict=True)))
-    return triangles, packed_materials(materials, textures), packed_textures(textures)
+    if kept is None or [_reads(texture) for texture in kept.sources] != [_reads(texture) for texture in textures]:
+        kept = KeptTextures(tuple(textures), packed_textures(textures))
+    return triangles, packed_materials(materials, textures), kept
 
 
 def textures_of(material: Material) -> tuple[Texture | None, ...]:
@@ -76,6 +93,11 @@ def textures_of(material: Material) -> tuple[Texture | None, ...]:
         material.normal_texture,
         material.occlusion_texture,
     )
+
+
+def _reads(texture: Texture) -> tuple[object, ...]:
+    """What decides about a texture's values: two that agree are one, such as roughness and occlusion in one picture."""
+    return id(texture.texels), texture.wrap, texture.uv_set, np.asarray(texture.texture_from_uv, np.float64).tobytes()
 
 
 def packed_triangles(mesh: Mesh, centre_m: Float[np.ndarray, "3"], material: int, index: int) -> PackedTriangles:
@@ -103,8 +125,7 @@ def packed_triangles(mesh: Mesh, centre_m: Float[np.ndarray, "3"], material: int
 
 
 def packed_materials(materials: list[Material], textures: list[Texture]) -> PackedMaterials:
-    number = {id(texture): index for index, texture in enumerate(textures)}
-    number[id(None)] = -1
+    number = {_reads(texture): index for index, texture in enumerate(textures)}
 
     def column(values: list[object], dtype: type) -> np.ndarray:
         return np.array(values, dtype)
@@ -121,7 +142,7 @@ def packed_materials(materials: list[Material], textures: list[Texture]) -> Pack
         alpha_cutoff=column([m.alpha_cutoff for m in materials], np.float32),
         double_sided=column([m.double_sided for m in materials], np.bool_),
         unlit=column([m.unlit for m in materials], np.bool_),
-        textures=column([[number[id(texture)] for texture in textures_of(m)] for m in materials], np.int32),
+        textures=column([[-1 if texture is None else number[_reads(texture)] for texture in textures_of(m)] for m in materials], np.int32),
     )
 
 

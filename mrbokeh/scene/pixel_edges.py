@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
+from mrbokeh.scene._pixel_edges_numba import mark_edges
+
 _DEPTH_STEP = 0.02
 """Relative distance from the neighbour's tangent plane beyond which two pixels do not show one surface."""
 _LARGEST_TURN_RAD = 0.5
@@ -14,11 +16,14 @@ _SIXTEENTHS = (
 """One sample in each cell of 4x4 and in each of sixteen rows and columns. Of such patterns this one came out of an annealing
 for the least error of coverage over straight edges of all directions: 0.031 RMS, and 0.018 for upright and level edges,
 where the centres of 4x4 cells have 0.031 and 0.072."""
+_FOUR_EIGHTHS = ((2, 0), (6, 2), (0, 4), (4, 6))
+"""The same in 2x2 cells and four rows and columns: the turned grid of graphics cards. Error of coverage 0.093 RMS."""
+SAMPLE_COUNTS = (4, 16)
 
 
-def sixteen_offsets_px() -> Float[np.ndarray, "16 2"]:
-    """Sixteen points of a pixel, (x, y) from 0 to 1."""
-    return (np.array(_SIXTEENTHS) + 0.5) / 16
+def sample_offsets_px(count: int) -> Float[np.ndarray, "samples 2"]:
+    """Points of a pixel, (x, y) from 0 to 1. count: one of SAMPLE_COUNTS."""
+    return (np.array(_FOUR_EIGHTHS) + 1.0) / 8 if count == 4 else (np.array(_SIXTEENTHS) + 0.5) / 16
 
 
 def edge_pixels(
@@ -35,24 +40,9 @@ def edge_pixels(
     directions: of the pixels' rays, 1 long along the optical axis; normals in the same axes.
     """
     edges = np.zeros(mesh.shape, np.bool_)
-    height, width = mesh.shape
-    facing = _dot(normal, directions)
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = slice(0, height - down), slice(max(-right, 0), width - max(right, 0))
-        there = slice(down, height), slice(max(right, 0), width - max(-right, 0))
-        differs = (mesh[here] != mesh[there]) | (np.abs(alpha[here] - alpha[there]) > _SHARE_STEP)
-        differs |= np.abs(lit[here] - lit[there]) > _SHARE_STEP
-        if not (down and right):
-            # The neighbour's ray meets this pixel's tangent plane at this depth:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                expected_m = depth_m[here] * facing[here] / _dot(normal[here], directions[there])
-                near_enough = np.abs(depth_m[there] - expected_m) < _DEPTH_STEP * np.minimum(depth_m[here], depth_m[there])
-            alike = near_enough & (_dot(normal[here], normal[there]) > np.cos(_LARGEST_TURN_RAD))
-            differs |= (mesh[here] >= 0) & (mesh[there] >= 0) & ~alike
-        edges[here] |= differs
-        edges[there] |= differs
+    flat = (np.ascontiguousarray(values).ravel() for values in (mesh, alpha, depth_m))
+    vectors = (np.ascontiguousarray(values).reshape(-1, 3) for values in (normal, directions))
+    steps = np.array([_SHARE_STEP, _DEPTH_STEP, np.cos(_LARGEST_TURN_RAD)])
+    normals, rays = vectors
+    mark_edges(*flat, normals, np.ascontiguousarray(lit).ravel(), rays, mesh.shape[1], steps, edges.ravel())
     return edges
-
-
-def _dot(a: Float[np.ndarray, "height width 3"], b: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]

@@ -26,8 +26,8 @@ def board_command(
     Example: mrbokeh viewfinder board --lens lens.json --distance-m 0.5,1.2 --paper a4 --out board.pdf
     """
     from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.charuco.board_file import write_board
     from mrbokeh.lens_file import read_lens
-    from viewfinder.tracking.board_file import write_board
     from viewfinder.tracking.board_pdf import write_board_pdf
     from viewfinder.tracking.board_planner import View, plan_board
 

@@ -3,7 +3,7 @@
 import logging
 from collections import deque
 from dataclasses import dataclass
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.color import srgb_to_linear
 from mrbokeh.lens import Lens
 from viewfinder.focus.board_edges import board_edges
@@ -20,7 +21,6 @@ from viewfinder.focus.focus_side import Evidence, settled
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.newest import Newest
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.charuco_board import TrackingBoard
 
 _POLL_S = 0.1
 _LEAVE_S = 3.0
@@ -44,7 +44,7 @@ class BlurSettings:
 
 
 class BlurOfBoardFocus:
-    """A FocusSource. lens: the focal length, f-number and sensor; its focus is what is looked for. May be replaced when one changes.
+    """A FocusSource. lens: the focal length, f-number and sensor; its focus is what is looked for. `follow` tells when one changes.
 
     intrinsics: of the camera, in any size of its frames. answer: the last one, with its standard deviation; candidates: what it was
     chosen from (both sides of the board, where its tilt does not tell them apart).
@@ -52,8 +52,9 @@ class BlurOfBoardFocus:
 
     name = "blur of the board"
 
-    def __init__(self, board: TrackingBoard, lens: Lens, intrinsics: Camera, settings: BlurSettings | None = None) -> None:
+    def __init__(self, board: CharucoBoard, lens: Lens, intrinsics: Camera, settings: BlurSettings | None = None) -> None:
         self.lens, self._intrinsics, self._settings = lens, intrinsics, settings or BlurSettings()
+        self._changing = Lock()
         self._edges = board_edges(board)
         self.answer: FocusCandidate | None = None
         self.candidates: tuple[FocusCandidate, ...] = ()
@@ -63,6 +64,15 @@ class BlurOfBoardFocus:
         self._stopping = Event()
         self._thread = Thread(target=self._run, name="focus from blur", daemon=True)
         self._thread.start()
+
+    def follow(self, lens: Lens, intrinsics: Camera) -> None:
+        """The lens and the camera as they are now. What was learned with others is forgotten: their blurs mean another focus."""
+        if _optics(lens, intrinsics) == _optics(self.lens, self._intrinsics):
+            return
+        with self._changing:
+            self.lens, self._intrinsics = lens, intrinsics
+            self.answer, self._answered_s, self._asked_s = None, -np.inf, -np.inf
+            self._before.clear()
 
     def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:
         """Hands the frame to the thread now and then; says what it found last."""
@@ -76,19 +86,23 @@ class BlurOfBoardFocus:
     def solve(self, frame: CameraFrame, pose: TrackedPose) -> FocusCandidate | None:
         """From one frame and those before, while the caller waits; the thread does the same."""
         height_px, width_px = frame.bgr.shape[:2]
-        resized = self._intrinsics.resized(width_px, height_px)
+        with self._changing:
+            lens, intrinsics, before = self.lens, self._intrinsics, tuple(self._before)
+            last = self.answer.dioptres if self.answer is not None and frame.captured_s - self._answered_s <= _REMEMBERED_S else None
+        resized = intrinsics.resized(width_px, height_px)
         camera = Camera(width_px, height_px, resized.focal_px, resized.principal_px, pose.camera_from_world)
         blurs = edge_blurs(_linear_green(frame.bgr), camera, self._edges, self._settings.sharpest_px)
-        lens = self.lens
         self.candidates = focus_candidates(blurs, lens, width_px)
         if not self.candidates:
             return None
-        before = [each for when_s, each in self._before if 0.0 <= frame.captured_s - when_s <= _REMEMBERED_S]
-        last = self.answer.dioptres if self.answer is not None and frame.captured_s - self._answered_s <= _REMEMBERED_S else None
-        found = settled(self.candidates, Evidence(blurs, before, lens, width_px, last))
-        self._before.append((frame.captured_s, blurs))
-        if found is not None:
-            self.answer, self._answered_s = found, frame.captured_s
+        recent = [each for when_s, each in before if 0.0 <= frame.captured_s - when_s <= _REMEMBERED_S]
+        found = settled(self.candidates, Evidence(blurs, recent, lens, width_px, last))
+        with self._changing:
+            if self.lens is not lens:
+                return None
+            self._before.append((frame.captured_s, blurs))
+            if found is not None:
+                self.answer, self._answered_s = found, frame.captured_s
         return found
 
     def close(self) -> None:
@@ -105,6 +119,14 @@ class BlurOfBoardFocus:
             except Exception:
                 # One odd frame must not end this for good.
                 log.exception("the focus could not be solved from the blur of the board")
+
+
+def _optics(lens: Lens, intrinsics: Camera) -> tuple[float, ...]:
+    """What the size of a blur at a known focus depends on, whatever the size of the frames."""
+    (fx, fy), (cx, cy) = intrinsics.focal_px, intrinsics.principal_px
+    width, height = intrinsics.width_px, intrinsics.height_px
+    of_camera = (round(each, 6) for each in (fx / width, fy / height, cx / width, cy / height))
+    return lens.focal_length_mm, lens.f_number, lens.sensor_width_mm, *of_camera
 
 
 def _linear_green(bgr: np.ndarray) -> Float32[np.ndarray, "height width"]:

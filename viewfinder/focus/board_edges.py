@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.lens import MM_PER_M
-from viewfinder.tracking.charuco_board import CharucoGrid, TrackingBoard
 
 # Of an edge only the middle is used: towards its ends the squares change colour.
 _USED = 0.4
@@ -27,7 +27,7 @@ class BoardEdges:
     border_m: Float64[np.ndarray, " edges"]
 
 
-def board_edges(board: TrackingBoard) -> BoardEdges:
+def board_edges(board: CharucoBoard) -> BoardEdges:
     """Of all grids, each inner edge once."""
     cells = int(board.opencv_dictionary().markerSize) + 2
     rows = np.array([row for grid in board.grids for row in _edges_mm(grid, cells)], np.float64)

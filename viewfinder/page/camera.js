@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e3d55b926506a33a4b6de6d205467255beb3088b3bd280fd0c9c9e1588c4bca1
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5ef19728dd5e66b3d395c1f0b2a206ece800053f9aab3c47e59cc221af7ca1e8
 "use strict";
 (() => {
   // src/model.ts
@@ -91,6 +91,9 @@
   };
   var button = document.getElementById("send");
   var ending = null;
+  function target() {
+    return new URLSearchParams(location.search).get("to") === "phone-whip" ? "phone-whip" : "whip";
+  }
   async function send() {
     const stream = await navigator.mediaDevices.getUserMedia({
       video: { facingMode: "environment", width: { ideal: 1280 }, height: { ideal: 720 }, frameRate: { ideal: 30 } },
@@ -114,7 +117,7 @@
     const sender = peer.addTransceiver(track, { direction: "sendonly", streams: [stream] }).sender;
     tellFocus(peer, track);
     peer.onconnectionstatechange = () => onState(peer);
-    resource = await offerTo("/whip", peer);
+    resource = await offerTo(`/${target()}`, peer);
     await keepResolution(sender);
     button.textContent = "Stop";
   }

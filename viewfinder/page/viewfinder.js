@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e3d55b926506a33a4b6de6d205467255beb3088b3bd280fd0c9c9e1588c4bca1
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5ef19728dd5e66b3d395c1f0b2a206ece800053f9aab3c47e59cc221af7ca1e8
 "use strict";
 (() => {
   // src/aids.ts

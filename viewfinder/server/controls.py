@@ -15,7 +15,8 @@ class ObjectState(TypedDict):
 class State(TypedDict, total=False):
     """What the page shows; what is missing is not offered. Distances in metres, None is infinity.
 
-    dioptre_range: the ends of the focus slider, (far, near), 1/m. f_numbers: what may be set, ascending. lens, renderer, view: which of
+    dioptre_range: the ends of the focus slider, (far, near), 1/m. focus_from: who told the focus, None where nobody did and the lens's
+    file holds. f_numbers: what may be set, ascending. lens, renderer, view: which of
     lenses, renderers, views is on. ground_from_picture: (3, 3) homography from the picture (x right, y down, 0 to 1) to metres on the
     plane on which objects stand, (x, z) of `move_object`, as nested lists; None while nothing is tracked. can_record, can_capture: whether
     the buttons are shown. failure: a sentence if the source died.
@@ -26,6 +27,7 @@ class State(TypedDict, total=False):
     height_px: int
     dioptre_range: tuple[float, float]
     focus_distance_m: float | None
+    focus_from: str | None
     f_number: float
     f_numbers: list[float]
     lens: str

@@ -15,6 +15,7 @@ from aiohttp import web
 from mrbokeh.errors import InputError
 from mrbokeh.video_color import UNSPECIFIED, color_of
 from viewfinder.frames import CameraFrame
+from viewfinder.mdns_candidates import with_address
 from viewfinder.newest import Newest
 from viewfinder.sources.camera_message import CameraKnowledge
 from viewfinder.sources.received_frame import upright_bgr
@@ -87,7 +88,7 @@ class BrowserCameraSource:
         if len(offer) > LONGEST_OFFER_BYTES:
             return web.Response(status=413, text=f"expected an offer of at most {LONGEST_OFFER_BYTES} bytes")
         async with self._changing:
-            return await self._answered(request, offer.decode("utf-8", "replace"))
+            return await self._answered(request, with_address(offer.decode("utf-8", "replace"), request.remote))
 
     async def _answered(self, request: web.Request, offer: str) -> web.Response:
         session = WhipSession(lambda frame: self._came(session, frame), self._heard, lambda: self._ended(session))

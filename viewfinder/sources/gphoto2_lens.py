@@ -3,6 +3,7 @@
 import re
 from typing import Any
 
+from mrbokeh.gphoto2_library import library
 from viewfinder.frames import LensState
 
 _F_NUMBER = ("f-number", "aperture")
@@ -24,8 +25,7 @@ def lens_state(camera: Any) -> LensState:
 
 def _number(camera: Any, name: str) -> float | None:
     """The number above 0 in a setting such as "f/5.6"; None where the camera has no such setting or it says a word."""
-    import gphoto2 as gp
-
+    gp = library()
     try:
         text = str(camera.get_single_config(name).get_value())
     except gp.GPhoto2Error as error:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.errors import InputError
+from mrbokeh.gphoto2_library import NoCameraError, chosen_of, detected, explanation, library, opened
 from viewfinder.frames import UNKNOWN_LENS, Bgr, CameraFrame
 from viewfinder.sources.gphoto2_lens import lens_state
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
@@ -44,7 +45,7 @@ class Gphoto2PreviewSource:
         try:
             self._opened: Any = self._open_camera(port)
         except CameraAwayError as error:
-            raise InputError(f"{error}; connect it, switch it on, and close other programs that hold it") from None
+            raise InputError(str(error)) from None
 
     def frames(self, stopping: Event) -> Iterator[CameraFrame]:
         sequence = itertools.count()
@@ -54,8 +55,7 @@ class Gphoto2PreviewSource:
         self.status = sentence
 
     def _session(self, sequence: Iterator[int], stopping: Event) -> Generator[CameraFrame, None, None]:
-        import gphoto2 as gp
-
+        gp = library()
         camera, self._opened = self._opened or self._open_camera(self._port), None
         try:
             _switch_live_view(camera, 1)
@@ -68,7 +68,7 @@ class Gphoto2PreviewSource:
         except gp.GPhoto2Error as error:
             if error.code == gp.GP_ERROR_NOT_SUPPORTED:
                 raise InputError(f"{self.name} gives no live view over the cable: use its HDMI output with a capture card") from None
-            raise CameraAwayError(f"{self.name} is away ({error.string or error}): waiting for it") from None
+            raise CameraAwayError(f"{self.name} is away: {explanation(error)}") from None
         finally:
             # A camera that is gone already does not matter.
             with suppress(gp.GPhoto2Error):
@@ -79,8 +79,8 @@ class Gphoto2PreviewSource:
     def _preview(self, camera: Any, stopping: Event) -> Bgr:
         """The next picture; asked for again while the camera is busy, as it is while the mirror goes up."""
         import cv2
-        import gphoto2 as gp
 
+        gp = library()
         for attempt in itertools.count():
             try:
                 data = np.frombuffer(bytes(memoryview(camera.capture_preview().get_data_and_size())), np.uint8)
@@ -98,8 +98,7 @@ class Gphoto2PreviewSource:
 
 
 def _switch_live_view(camera: Any, on: int) -> None:
-    import gphoto2 as gp
-
+    gp = library()
     for name in _LIVE_VIEW_SWITCH:
         with suppress(gp.GPhoto2Error):
             widget = camera.get_single_config(name)
@@ -110,22 +109,10 @@ def _switch_live_view(camera: Any, on: int) -> None:
 
 def _open_camera(port: str | None) -> Any:
     """The only camera, or the one at that port. Raises CameraAwayError where there is none."""
+    gp = library()
     try:
-        import gphoto2 as gp
-    except ImportError:
-        raise MissingExtraError("gphoto2", "tether") from None
-    try:
-        found = gp.Camera.autodetect()
-        ports = [found.get_value(index) for index in range(found.count())]
-        chosen = [each for each in ports if port in (None, each)]
-        if not chosen:
-            raise CameraAwayError("no camera is found" if not ports else f"no camera is at {port}, only at {', '.join(ports)}")
-        if len(chosen) > 1:
-            raise InputError(f"several cameras are connected (at {', '.join(ports)}): choose one with gphoto2:PORT")
-        camera, known = gp.Camera(), gp.PortInfoList()
-        known.load()
-        camera.set_port_info(known.get_info(known.lookup_path(chosen[0])))
-        camera.init()
-        return camera
+        return opened(chosen_of(detected(), port, "--source")[1])
+    except NoCameraError as error:
+        raise CameraAwayError(str(error)) from None
     except gp.GPhoto2Error as error:
-        raise CameraAwayError(f"the camera cannot be opened ({error.string or error})") from None
+        raise CameraAwayError(f"the camera cannot be opened: {explanation(error)}") from None

@@ -1,11 +1,12 @@
 """Assets: opened GLB files and lighting, kept until their files change, so that an edit of the scene reloads only what it touched."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_linear
@@ -33,7 +34,8 @@ class Assets:
         path = light.environment
         if path is None:
             return self._kept_while((light, up), "light", lambda: _made_up_light(light, up))
-        return self._kept_while((light, up, modified_s(path)), "light", lambda: _panorama_light(path, light, up))
+        panorama = self._kept_while((path, modified_s(path)), "panorama", lambda: Panorama(read_linear(path)))
+        return self._kept_while((light, up, modified_s(path)), "light", lambda: _panorama_light(panorama, light, up))
 
     def _kept_while(self, stamp: object, key: object, load: Callable[[], Any]) -> Any:
         if key not in self._kept or self._kept[key][0] != stamp:
@@ -63,13 +65,28 @@ def _made_up_light(light: Lighting, up: str) -> tuple[Environment | None, tuple[
     return _even_grey(_GREY * light.exposure), _suns(light, up) or (sun(SUN_DIRECTION, _SUN * light.exposure),)
 
 
-def _panorama_light(path: Path, light: Lighting, up: str) -> tuple[Environment | None, tuple[Light, ...]]:
-    panorama = Environment(read_linear(path)).turned(light.rotation_rad).brighter(light.exposure)
-    if light.suns:
-        return panorama, _suns(light, up)
-    try:
-        sky, brightest = split_sun(panorama)
-    except InputError:
-        # A sky without a sun lights without shadows; that is no mistake.
-        return panorama, ()
-    return sky, (brightest,)
+class Panorama:
+    """A panorama's file as it is, and without its sun; turned and exposed otherwise it is not read and split again."""
+
+    def __init__(self, radiance: Float32[np.ndarray, "height width 3"]) -> None:
+        self.whole = Environment(radiance)
+
+    @cached_property
+    def split(self) -> tuple[Environment, Light | None]:
+        """A sky without a sun lights without shadows; that is no mistake."""
+        try:
+            return split_sun(self.whole)
+        except InputError:
+            return self.whole, None
+
+
+def _panorama_light(panorama: Panorama, light: Lighting, up: str) -> tuple[Environment | None, tuple[Light, ...]]:
+    sky, brightest = (panorama.whole, None) if light.suns else panorama.split
+    turned_sky = sky.turned(light.rotation_rad)
+    if light.exposure != 1.0:
+        turned_sky = turned_sky.brighter(light.exposure)
+    if light.suns or brightest is None:
+        return turned_sky, _suns(light, up)
+    turn = np.eye(4)
+    turn[:3, :3] = turned_sky.world_from_environment
+    return turned_sky, (brightest.transformed(turn).brighter(light.exposure),)

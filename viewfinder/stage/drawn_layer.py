@@ -1,5 +1,6 @@
 """Drawing: the virtual scene as a lens shows it for one pose, drawn only where it is in the picture, ready to be moved to other poses."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,12 +12,12 @@ from mrbokeh.compositing import covered_by
 from mrbokeh.layer import Layer, flatten
 from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from viewfinder.stage.backend import Backend
+from mrbokeh.scene import SceneRenderer as Backend
+from mrbokeh.scene.shadow_layer import shadow_layer
 from viewfinder.stage.layer_depth import GRID_PX, LayerDepth
 from viewfinder.stage.occlusion import Occlusion
-from viewfinder.stage.picture_box import NEAREST_M, PictureBox, box_around, drawn_points_m
+from viewfinder.stage.picture_box import NEAREST_M, PictureBox, box_around
 from viewfinder.stage.reprojection import MovableLayer
-from viewfinder.stage.shadow import shadow_layer
 from viewfinder.stage.staged_scene import StagedScene
 from viewfinder.stage.upright import upright_camera
 
@@ -53,23 +54,27 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class Brushes:
-    """What draws: a backend for the objects, a renderer for the lens, and what real things hide."""
+    """What draws: a backend for the objects, a renderer for the lens, and what real things hide.
+
+    live: a faster backend for what is drawn again and again; None takes `backend` for that too.
+    """
 
     backend: Backend
     renderer: Renderer
     depth: LayerDepth
     occlusion: Occlusion | None = None
+    live: Backend | None = None
 
 
 def draw(staged: StagedScene, request: DrawRequest, brushes: Brushes) -> Drawing:
     """Draw the scene for one pose: the box around its projection and blur, at the resolution asked for."""
     frame = upright_camera(request.camera, staged.description.up)
-    points_m = drawn_points_m(staged.scene_at(request.time_s), staged.catcher)
+    points_m = staged.drawn_points_m(request.time_s)
     box = box_around(points_m, frame, request.lens)
     if box is None:
         return Drawing(request)
     camera, lens = box.cut(frame, request.resolution), box.lens_of(request.lens, frame.width_px)
-    layers = sharp_layers(staged, request.time_s, camera, brushes)
+    layers = sharp_layers(staged, request.time_s, camera, replace(brushes, backend=brushes.live or brushes.backend))
     if brushes.occlusion is not None:
         layers = [covered_by(layer, brushes.occlusion.matte(layer.depth_m, camera, frame)) for layer in layers]
     blurred, sharp = brushes.renderer.render(layers, lens), flatten(layers)
@@ -86,7 +91,7 @@ def _depth_range_m(points_m: Float[np.ndarray, "points 3"], camera: Camera) -> t
 
 
 def sharp_layers(staged: StagedScene, time_s: float, camera: Camera, brushes: Brushes) -> list[Layer]:
-    """Object, then shadow."""
+    """Object, then shadow, as `brushes.backend` draws them."""
     scene, shadow, catcher = staged.scene_at(time_s), staged.description.shadow, staged.catcher
     layers = [brushes.backend.render(scene, camera)]
     if shadow is not None and catcher is not None and scene.lighting[0] and shadow.strength > 0:
@@ -113,7 +118,7 @@ def _padded(layers: Sequence[Layer]) -> Sequence[Layer]:
 
 def _trimmed(layer: MovableLayer) -> MovableLayer | None:
     """Cut to the pixels that it touches, in whole cells of the grid of depths and whole pixels of the frame; None if there are none."""
-    touched = np.abs(layer.rgba).max(axis=2) > _INVISIBLE
+    touched = functools.reduce(np.maximum, [np.abs(layer.rgba[..., channel]) for channel in range(4)]) > _INVISIBLE
     rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
     if not len(rows):
         return None

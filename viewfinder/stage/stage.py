@@ -1,7 +1,6 @@
 """Stage: the virtual scene for every frame of the stream, at its newest pose, however long a drawing takes."""
 
-import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +12,17 @@ from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.overlay import CodeTables, Overlay
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.scene import SceneRenderer
 from viewfinder.frames import Bgr
-from viewfinder.stage.backend import Backend
-from viewfinder.stage.drawing_thread import DrawingThread, Drawn
+from viewfinder.stage.drawing_thread import DrawingThread
 from viewfinder.stage.drawn_layer import DrawRequest, sharp_layers
 from viewfinder.stage.fade import Fade
 from viewfinder.stage.picking import depth_at_m
-from viewfinder.stage.redraw import blur_changed, is_outdated
+from viewfinder.stage.redraw import is_outdated
 from viewfinder.stage.scene_description import PlacedObject, Triple
 from viewfinder.stage.seen import Seen
 from viewfinder.stage.stage_setup import SetupLoader, live_renderer
+from viewfinder.stage.stage_status import StageStatus, status_of
 from viewfinder.stage.upright import upright_camera
 from viewfinder.stage.views import VIEWS, view_picture
 from viewfinder.tracking.base import TrackedPose
@@ -31,33 +31,16 @@ _STILL_S = 0.4
 """After so long without movement a drawing of reduced resolution is drawn again at every pixel."""
 
 
-@dataclass(frozen=True)
-class StageStatus:
-    """layer_age_ms: since the drawing that is shown was begun, None before the first. lens: that blurred it.
-
-    focus_pending: another blur was asked for and is not shown yet. draws_per_s: over the last two seconds. busy: drawing now.
-    resolution: of the drawing, 1 is every pixel. opacity: 0 where the track is lost. problem: a sentence for the page, or None.
-    """
-
-    layer_age_ms: float | None
-    lens: Lens | None
-    focus_pending: bool
-    draws_per_s: float
-    busy: bool
-    resolution: float
-    opacity: float
-    triangles: int
-    renderer: str
-    problem: str | None
-
-
 class Stage:
     """A Scenery. `overlay` and `picture` belong to one thread, the compositing one; everything else may be called from any."""
 
     views = VIEWS
 
-    def __init__(self, scene: Path, backend: Backend | None = None) -> None:
-        """scene: a scene file (viewfinder.stage.scene_file). backend: None takes the graphics card where there is one, else the ray caster. InputError for what is wrong in it."""
+    def __init__(self, scene: Path, backend: SceneRenderer | None = None) -> None:
+        """scene: a scene file (viewfinder.stage.scene_file); InputError for what is wrong in it.
+
+        backend: None takes the graphics card where there is one, else the ray caster.
+        """
         self._thread = DrawingThread(SetupLoader(scene, backend))
         self._fade = Fade()
         self._camera: Camera | None = None
@@ -119,19 +102,7 @@ class Stage:
 
     @property
     def status(self) -> StageStatus:
-        drawn, setup, wanted = self._thread.newest, self._thread.setup, self._wanted
-        return StageStatus(
-            layer_age_ms=None if drawn is None else 1e3 * (time.monotonic() - drawn.started_s),
-            lens=None if drawn is None else drawn.drawing.request.lens,
-            focus_pending=wanted is not None and (drawn is None or _blurred_otherwise(drawn, wanted)),
-            draws_per_s=self._thread.draws_per_s,
-            busy=self._thread.busy,
-            resolution=1.0 if drawn is None else drawn.drawing.request.resolution,
-            opacity=self._fade.opacity,
-            triangles=sum(each.triangle_count for each in setup.staged.objects),
-            renderer=setup.renderer_name,
-            problem=self._thread.problem,
-        )
+        return status_of(self._thread, self._wanted, self._fade.opacity)
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
         """One of `views`, of the frame for which `overlay` was asked last."""
@@ -166,10 +137,6 @@ class Stage:
 
     def close(self) -> None:
         self._thread.close()
-
-
-def _blurred_otherwise(drawn: Drawn, wanted: DrawRequest) -> bool:
-    return blur_changed(drawn.drawing.request.lens, wanted.lens, drawn.drawing)
 
 
 def _nothing() -> Overlay:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +12,15 @@ from mrbokeh.errors import InputError
 from mrbokeh.scene import Environment, Light, Mesh, Scene, shadow_catcher, world_from_scene_placing
 from mrbokeh.scene.gltf_loader import GltfAsset
 from viewfinder.stage.assets import Assets
+from viewfinder.stage.picture_box import drawn_points_m
 from viewfinder.stage.scene_description import PlacedObject, SceneDescription
 from viewfinder.stage.upright import turned
 
 _MOMENT_S = 1 / 120
 """Animations are posed at whole multiples of this, so that two frames of one moment share one scene."""
+
+
+_first_scenes: WeakKeyDictionary[GltfAsset, dict[str | None, Scene]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,16 +43,21 @@ class StagedObject:
         return time_s % duration_s if self.placed.loop and duration_s > 0 else min(time_s, duration_s)
 
     def scene_at(self, time_s: float) -> Scene:
-        bare = self.asset.scene_at(self.pose_time_s(time_s), self.placed.animation).without_lights()
-        return bare.transformed(self._upright_from_asset)
+        animation = self.placed.animation
+        bare = self._first if animation is None else self.asset.scene_at(self.pose_time_s(time_s), animation)
+        return bare.without_lights().transformed(self._upright_from_asset)
 
     @property
     def triangle_count(self) -> int:
         return sum(len(mesh.triangles) for mesh in self._first.meshes) if self.placed.visible else 0
 
-    @cached_property
+    @property
     def _first(self) -> Scene:
-        return self.asset.scene_at(0.0, self.placed.animation)
+        """The very same for every version of the object: by its arrays a backend knows that it was only moved."""
+        of_asset = _first_scenes.setdefault(self.asset, {})
+        if self.placed.animation not in of_asset:
+            of_asset[self.placed.animation] = self.asset.scene_at(0.0, self.placed.animation)
+        return of_asset[self.placed.animation]
 
     @cached_property
     def _upright_from_asset(self) -> Float[np.ndarray, "4 4"]:
@@ -68,6 +78,7 @@ class StagedScene:
     ) -> None:
         self.description, self.objects, self._lighting = description, objects, lighting
         self._made: tuple[float, Scene, Mapping[str, Scene]] | None = None
+        self._points: tuple[Scene, Float[np.ndarray, "points 3"]] | None = None
 
     @classmethod
     def load(cls, description: SceneDescription, assets: Assets) -> "StagedScene":
@@ -97,6 +108,13 @@ class StagedScene:
     def parts_at(self, time_s: float) -> Mapping[str, Scene]:
         """Each visible object by its name."""
         return self._made_at(time_s)[1]
+
+    def drawn_points_m(self, time_s: float) -> Float[np.ndarray, "points 3"]:
+        """Vertices of all that is drawn, and of its shadow on the catcher."""
+        scene, points = self.scene_at(time_s), self._points
+        if points is None or points[0] is not scene:
+            points = self._points = scene, drawn_points_m(scene, self.catcher)
+        return points[1]
 
     def with_object(self, name: str, **changes: object) -> "StagedScene":
         """One object changed (fields of PlacedObject); InputError where no object has that name."""

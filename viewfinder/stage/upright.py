@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from mrbokeh.camera import Camera
 
@@ -13,8 +13,8 @@ UPRIGHT_FROM_WORLD = {
     "-y": np.eye(4),
     "+y": np.diag([1.0, -1.0, -1.0, 1.0]),
 }
-"""By what points up. "-z" is a board as OpenCV has it (x right, y down along the board, z into the table), "+z" OpenTrackIO and
-FreeD, "-y" mrbokeh and most COLMAP maps, "+y" ARKit and Blender's glTF. None of them mirrors."""
+"""By what points up. "-z" is a board as OpenCV has it (x right, y down along the board, z into the table), OpenTrackIO and FreeD are turned into one
+where they are read; "+z" is a floor with z up, "-y" mrbokeh and most COLMAP maps, "+y" ARKit and Blender's glTF. None of them mirrors."""
 
 
 def upright_camera(camera: Camera, up: str) -> Camera:
@@ -32,18 +32,6 @@ def turned_back(vector: tuple[float, float, float], up: str) -> tuple[float, flo
     """The inverse of `turned`."""
     x, y, z = (UPRIGHT_FROM_WORLD[up][:3, :3].T @ np.asarray(vector, np.float64)).tolist()
     return x, y, z
-
-
-def table_dioptres(camera: Camera) -> Float32[np.ndarray, "height width"]:
-    """(H, W): 1 / depth along the optical axis of the table y = 0 at every pixel of an upright camera; 0 where it is not seen.
-
-    On a plane it is linear in the pixel's position, so that it is finite up to the horizon and beyond.
-    """
-    eye_m = camera.world_from_camera[:3, 3]
-    ahead = camera.unproject(camera.pixel_centres_px(), np.ones((camera.height_px, camera.width_px))) - eye_m
-    if eye_m[1] == 0.0:
-        return np.zeros(ahead.shape[:2], np.float32)
-    return np.maximum(-ahead[..., 1] / eye_m[1], 0.0).astype(np.float32)
 
 
 def rays(camera: Camera, xy_px: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 3"]:

@@ -4,7 +4,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,11 @@ import numpy as np
 from viewfinder.frame_header import frame_header
 from viewfinder.frames import OutputFrame
 from viewfinder.newest import Newest
-from viewfinder.streaming.encoder import TICKS_PER_S, StreamQuality, VideoEncoder
+from viewfinder.streaming.audience import Audience
+from viewfinder.streaming.encoder import StreamQuality, VideoEncoder
 from viewfinder.streaming.h264 import h264_encoder
 from viewfinder.streaming.i420 import even_size, i420_frame
+from viewfinder.streaming.rtp_clock import RtpClock
 from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
 from viewfinder.streaming.vp8 import vp8_encoder
 
@@ -41,68 +43,60 @@ class EncodedStream:
         keyframe_gap_s: float = 0.5,
         keyframe_every_s: float | None = None,
     ) -> None:
-        self._quality, self._capacity = quality or StreamQuality(), capacity
+        self._quality, self._audience = quality or StreamQuality(), Audience(capacity)
         self._keyframe_gap_s, self.keyframe_every_s = keyframe_gap_s, keyframe_every_s
         self._newest: Newest[OutputFrame] = Newest()
-        self._viewers: tuple[ViewerQueue, ...] = ()
-        self._lock, self._stopping = Lock(), Event()
+        self._stopping = Event()
         self._encoders: dict[str, VideoEncoder] = {}
         self._keyframe_s: dict[str, float] = {}
-        self._origin_s: float | None = None
-        self._last_ticks = -1
+        self._clock = RtpClock()
         self.encoded: Counter[str] = Counter()
         self.keyframes: Counter[str] = Counter()
         self.encode_ms = 0.0
-        self.failure: str | None = None
         self._thread = Thread(target=self._work, name="encode", daemon=True)
         self._thread.start()
 
     @property
     def wants_frame(self) -> bool:
-        return any(viewer.wants_frames for viewer in self._viewers)
+        return self._audience.wants_frames
 
     @property
     def viewers(self) -> tuple[ViewerQueue, ...]:
-        return self._viewers
+        return self._audience.viewers
+
+    @property
+    def failure(self) -> str | None:
+        """Why there are no pictures; None where there are."""
+        return self._audience.failure
 
     def show(self, frame: OutputFrame) -> None:
         if self.failure is not None:
-            self._tell(None)
+            self._audience.tell(None)
         self._newest.put(frame)
 
     def fail(self, sentence: str) -> None:
-        self._tell(sentence)
+        self._audience.tell(sentence)
 
     def watch(self, codec: str, wake: Callable[[], None]) -> ViewerQueue:
         """A new viewer's queue, which begins with a keyframe. codec: of ENCODERS. wake: called in the encoder's thread."""
         if codec not in ENCODERS:
             raise ValueError(f"expected a codec of {list(ENCODERS)}, got {codec!r}")
-        viewer = ViewerQueue(codec, self._capacity, wake)
-        viewer.failure = self.failure
-        with self._lock:
-            self._viewers = (*self._viewers, viewer)
-        return viewer
+        return self._audience.join(codec, wake)
 
     def leave(self, viewer: ViewerQueue) -> None:
-        with self._lock:
-            self._viewers = tuple(each for each in self._viewers if each is not viewer)
+        self._audience.leave(viewer)
 
     def close(self) -> None:
         """End the thread; viewers get nothing more."""
         self._stopping.set()
         self._thread.join()
 
-    def _tell(self, failure: str | None) -> None:
-        self.failure = failure
-        for viewer in self._viewers:
-            viewer.fail(failure)
-
     def _work(self) -> None:
         # The compiled conversion is loaded before the first viewer waits for it.
         i420_frame(np.zeros((2, 2, 3), np.uint8))
         while not self._stopping.is_set():
             frame = self._newest.take(_POLL_S)
-            viewers = self._viewers
+            viewers = self.viewers
             self._close_encoders(set(self._encoders) - {viewer.codec for viewer in viewers})
             if frame is None:
                 continue
@@ -121,7 +115,7 @@ class EncodedStream:
         started_s = time.perf_counter()
         picture = i420_frame(frame.bgr)
         converted_ms = 1000 * (time.perf_counter() - started_s)
-        ticks = self._ticks(frame.captured_s)
+        ticks = self._clock.ticks(frame.captured_s)
         for codec in codecs:
             listeners = [viewer for viewer in viewers if viewer.codec == codec]
             encoder = self._encoder(codec, even_size(frame.bgr))
@@ -162,10 +156,3 @@ class EncodedStream:
         if packet.is_keyframe:
             self.keyframes[codec] += 1
             self._keyframe_s[codec] = time.monotonic()
-
-    def _ticks(self, captured_s: float) -> int:
-        """The capture time on the clock of RTP; grows also where a picture is shown twice or a camera's clock steps back."""
-        if self._origin_s is None:
-            self._origin_s = captured_s
-        self._last_ticks = max(self._last_ticks + 1, round((captured_s - self._origin_s) * TICKS_PER_S))
-        return self._last_ticks

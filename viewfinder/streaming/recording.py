@@ -9,21 +9,14 @@ from fractions import Fraction
 from pathlib import Path
 from threading import Event, Thread
 
-import numpy as np
-from jaxtyping import Float32, UInt8
-
 from mrbokeh.atomic_files import refuse_existing
 from mrbokeh.errors import InputError
 from mrbokeh.overlay import code_tables
 from mrbokeh.video_frames import encoding_for
-from mrbokeh.video_io import VideoWriter
-from viewfinder.frames import Bgr, OutputFrame
-from viewfinder.streaming.encoder import TIME_BASE
-from viewfinder.streaming.i420 import even_size
+from viewfinder.frames import OutputFrame
+from viewfinder.streaming.recorded_file import FileForm, Written, write_recording
 
 _POLL_S = 0.1
-# The compositor must not starve: the quality of files that are made at leisure in half of the time, at 2.5 times the size.
-_LIVE_H264 = {"crf": "14", "preset": "superfast"}
 
 log = logging.getLogger(__name__)
 
@@ -50,15 +43,15 @@ class Recorder:
     """
 
     def __init__(self, transfer: str, *, frame_rate: float = 30.0, encoding: str | None = None, waiting: int = 8) -> None:
-        self._tables, self._encoding = code_tables(transfer), encoding
-        self._frame_rate, self._waiting = Fraction(frame_rate).limit_denominator(1001), waiting
+        self._form = FileForm(code_tables(transfer), Fraction(frame_rate).limit_denominator(1001), encoding)
+        self._waiting = waiting
         self._frames: queue.Queue[OutputFrame] = queue.Queue(waiting)
         self._stopping = Event()
         self._thread: Thread | None = None
         self._path = Path()
         self._failure: InputError | None = None
-        self._note: str | None = None
-        self._dropped, self._count, self._first_s, self._last_s = 0, 0, 0.0, 0.0
+        self._written = Written(0, 0.0)
+        self._dropped = 0
 
     @property
     def wants_frame(self) -> bool:
@@ -72,10 +65,9 @@ class Recorder:
         """Begin a file; InputError where one is under way, the name is taken or its suffix unknown."""
         if self._thread is not None:
             raise InputError(f"expected one recording at a time, but {self._path.name} is not stopped yet: stop it first")
-        encoding_for(path, self._encoding)
+        encoding_for(path, self._form.encoding)
         refuse_existing(path, overwrite=False)
-        self._path, self._failure, self._note = path, None, None
-        self._dropped, self._count = 0, 0
+        self._path, self._failure, self._dropped = path, None, 0
         self._frames = queue.Queue(self._waiting)
         self._stopping.clear()
         self._thread = Thread(target=self._work, name="recorder", daemon=True)
@@ -101,7 +93,8 @@ class Recorder:
         self._thread = None
         if self._failure is not None:
             raise self._failure
-        return Recording(self._path, self._count, self._dropped, self._last_s - self._first_s, self._note)
+        written = self._written
+        return Recording(self._path, written.frame_count, self._dropped, written.duration_s, written.note)
 
     def close(self) -> None:
         """Stop if a recording is under way; what went wrong with it goes to the log."""
@@ -113,39 +106,12 @@ class Recorder:
 
     def _work(self) -> None:
         try:
-            self._record()
+            self._written = write_recording(self._path, self._shown(), self._form)
         except InputError as error:
             self._failure = error
         except Exception as error:
             log.debug("the recording failed", exc_info=True)
             self._failure = InputError(f"{self._path} could not be written ({error}): check the folder and the space on the disk")
-
-    def _record(self) -> None:
-        frames = self._shown()
-        first = next(frames, None)
-        if first is None:
-            raise InputError(f"{self._path}: expected at least one picture, got none; the video was not written")
-        height, width = self._stored(first.bgr).shape[:2]
-        self._first_s = first.captured_s
-        with self._writer(width, height) as writer:
-            self._write(writer, first)
-            for frame in frames:
-                if self._stored(frame.bgr).shape[:2] != (height, width):
-                    self._note = f"the size of the picture changed from {width}x{height} px: the recording ended there"
-                    return
-                # A picture that is shown twice, or that a camera's clock set back, has no time of its own.
-                if frame.captured_s - self._last_s >= float(TIME_BASE):
-                    self._write(writer, frame)
-
-    def _writer(self, width_px: int, height_px: int) -> VideoWriter:
-        writer = VideoWriter(self._path, width_px, height_px, self._frame_rate, TIME_BASE, encoding=self._encoding)
-        if writer.encoding.codec == "libx264":
-            writer.encoding = writer.encoding._replace(options=_LIVE_H264)
-        return writer
-
-    def _write(self, writer: VideoWriter, frame: OutputFrame) -> None:
-        writer.write(self._linear(self._stored(frame.bgr)), frame.captured_s - self._first_s)
-        self._last_s, self._count = frame.captured_s, writer.frame_count
 
     def _shown(self) -> Iterator[OutputFrame]:
         """Pictures as they come; after the stop those that wait already."""
@@ -155,16 +121,6 @@ class Recorder:
             except queue.Empty:
                 if self._stopping.is_set():
                     return
-
-    def _stored(self, bgr: Bgr) -> UInt8[np.ndarray, "rows columns 3"]:
-        """Without a last odd row and column where chroma is halved."""
-        if "420" not in encoding_for(self._path, self._encoding).pixel_format:
-            return bgr
-        width, height = even_size(bgr)
-        return bgr[:height, :width]
-
-    def _linear(self, bgr: Bgr) -> Float32[np.ndarray, "height width 3"]:
-        return self._tables.linear_from_code[bgr[..., ::-1]]
 
 
 def recording_path(folder: Path, suffix: str = ".mp4") -> Path:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from aiohttp import web
 
 from mrbokeh.errors import InputError
+from viewfinder.mdns_candidates import with_address
 from viewfinder.streaming.encoded_stream import EncodedStream
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ class Whep:
         viewer = self._viewers[name] = self._new_viewer(name)
         try:
             async with asyncio.timeout(self._connect_within_s):
-                answer = await viewer.answer(await _text(request), self._connect_within_s)
+                offer = with_address(await _text(request), request.remote)
+                answer = await viewer.answer(offer, self._connect_within_s)
         except (InputError, TimeoutError) as error:
             await viewer.close()
             return _refusal(400, str(error) or f"expected an SDP offer within {self._connect_within_s:g} s")
@@ -87,7 +89,7 @@ class Whep:
         if request.content_type != "application/trickle-ice-sdpfrag":
             return _refusal(415, f"expected Content-Type application/trickle-ice-sdpfrag, got {request.content_type}")
         try:
-            await _add_candidates(viewer, await _text(request))
+            await _add_candidates(viewer, with_address(await _text(request), request.remote))
         except InputError as error:
             return _refusal(400, str(error))
         return web.Response(status=204)

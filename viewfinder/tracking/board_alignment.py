@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from viewfinder.tracking.board_drawing import black_rectangles_mm
-from viewfinder.tracking.charuco_board import TrackingBoard
-from viewfinder.tracking.charuco_detector import CharucoDetector, Corners, Grey
+from mrbokeh.charuco.board import CharucoBoard
+from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
+from mrbokeh.charuco.drawing import black_rectangles_mm
 
 _FEWEST_CORNERS = 4
 _LEAST_CORRELATION = 0.9
@@ -37,7 +37,7 @@ Drawing = UInt8[np.ndarray, "drawn_height drawn_width"]
 class AlignedDetector:
     """A CharucoDetector whose corners are aligned with the whole print where that is seen. Not to be shared between threads."""
 
-    def __init__(self, board: TrackingBoard) -> None:
+    def __init__(self, board: CharucoBoard) -> None:
         self._detector, self._board = CharucoDetector(board), board
 
     def detect(self, grey: Grey) -> Corners:
@@ -46,7 +46,7 @@ class AlignedDetector:
         return read if aligned is None else aligned
 
 
-def aligned_corners(board: TrackingBoard, grey: Grey, read: Corners) -> Corners | None:
+def aligned_corners(board: CharucoBoard, grey: Grey, read: Corners) -> Corners | None:
     """All corners of the board that lie in the picture; None where too few were read to begin with or the print does not fit."""
     picture_from_board = _from_corners(board, read)
     if picture_from_board is None:
@@ -77,11 +77,11 @@ def _laid_over(drawing: Drawing, picture: Grey, start: Homography) -> Homography
     return np.asarray(found, np.float64) if fit > _LEAST_CORRELATION else None
 
 
-def _margin_mm(board: TrackingBoard) -> float:
+def _margin_mm(board: CharucoBoard) -> float:
     return _MARGIN_SQUARES * min(grid.square_mm for grid in board.grids)
 
 
-def _from_corners(board: TrackingBoard, read: Corners) -> Homography | None:
+def _from_corners(board: CharucoBoard, read: Corners) -> Homography | None:
     """Picture (OpenCV's pixels) from millimetres on the board."""
     if len(read) < _FEWEST_CORNERS:
         return None
@@ -89,7 +89,7 @@ def _from_corners(board: TrackingBoard, read: Corners) -> Homography | None:
     return None if found is None or not np.isfinite(found).all() or abs(np.linalg.det(found)) < 1e-12 else np.asarray(found, np.float64)
 
 
-def _checked(board: TrackingBoard, grey: Grey, read: Corners, picture_from_board: Homography) -> Corners | None:
+def _checked(board: CharucoBoard, grey: Grey, read: Corners, picture_from_board: Homography) -> Corners | None:
     """None if what was read lies elsewhere: the print may have slid by a square."""
     height, width = grey.shape
     xy_px = _through(picture_from_board, 1000.0 * board.corners_m[:, :2]) + 0.5
@@ -104,7 +104,7 @@ def _through(homography: Homography, xy: Float64[np.ndarray, "points 2"]) -> Flo
     return mapped[:, :2] / mapped[:, 2:]
 
 
-def _scale(board: TrackingBoard, picture_from_board: Homography) -> float:
+def _scale(board: CharucoBoard, picture_from_board: Homography) -> float:
     """Pixels of the drawing per millimetre: about as many as in the picture, in steps of sqrt(2), and not more than time allows."""
     width, height = board.size_mm
     outline = _through(picture_from_board, np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]))
@@ -114,7 +114,7 @@ def _scale(board: TrackingBoard, picture_from_board: Homography) -> float:
 
 
 @lru_cache(maxsize=8)
-def _drawing(board: TrackingBoard, px_per_mm: float) -> Drawing:
+def _drawing(board: CharucoBoard, px_per_mm: float) -> Drawing:
     """The print with its margin, black 0 and white 255, each pixel the mean of 16."""
     margin_mm = _margin_mm(board)
     size_px = [int(np.ceil((side + 2 * margin_mm) * px_per_mm)) for side in board.size_mm]

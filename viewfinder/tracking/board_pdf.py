@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from mrbokeh.atomic_files import atomic_path, refuse_existing
+from mrbokeh.charuco.board import CharucoBoard
+from mrbokeh.charuco.drawing import black_rectangles_mm
 from mrbokeh.errors import InputError, MissingExtraError
-from viewfinder.tracking.board_drawing import black_rectangles_mm
-from viewfinder.tracking.charuco_board import TrackingBoard
 
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 MARGIN_MM = 10.0
@@ -45,7 +45,7 @@ def page_of(paper: str) -> Page:
     return Page(*PAPERS_MM[paper.lower()])
 
 
-def page_for(board: TrackingBoard, paper: str) -> Page:
+def page_for(board: CharucoBoard, paper: str) -> Page:
     """The paper turned so that the board fits; paper: a4, a3, letter, or board (a page made for it)."""
     size_mm = board.size_mm
     if paper.lower() == "board":
@@ -61,7 +61,7 @@ def page_for(board: TrackingBoard, paper: str) -> Page:
     )
 
 
-def write_board_pdf(path: Path, board: TrackingBoard, paper: str = "a4", *, overwrite: bool = False) -> None:
+def write_board_pdf(path: Path, board: CharucoBoard, paper: str = "a4", *, overwrite: bool = False) -> None:
     """Refuses a board that does not fit, and an existing file without `overwrite`."""
     page = page_for(board, paper)
     refuse_existing(path, overwrite)
@@ -79,7 +79,7 @@ def write_board_pdf(path: Path, board: TrackingBoard, paper: str = "a4", *, over
         canvas.save()
 
 
-def _draw_board(canvas: Any, board: TrackingBoard, page: Page) -> None:
+def _draw_board(canvas: Any, board: CharucoBoard, page: Page) -> None:
     """All rectangles in one path: filled one by one, neighbours would show hairlines where they touch."""
     left_mm = (page.width_mm - board.size_mm[0]) / 2
     top_mm = page.height_mm - MARGIN_MM
@@ -91,7 +91,7 @@ def _draw_board(canvas: Any, board: TrackingBoard, page: Page) -> None:
     canvas.drawPath(path, fill=1, stroke=0)
 
 
-def _draw_foot(canvas: Any, board: TrackingBoard) -> None:
+def _draw_foot(canvas: Any, board: CharucoBoard) -> None:
     base = MARGIN_MM + 14.0
     canvas.setLineWidth(0.2 * _POINTS_PER_MM)
     marks = [(MARGIN_MM, base, MARGIN_MM + RULER_MM, base)]
@@ -106,7 +106,7 @@ def _draw_foot(canvas: Any, board: TrackingBoard) -> None:
         canvas.drawString(MARGIN_MM * _POINTS_PER_MM, (base - 4.0 - 3.0 * number) * _POINTS_PER_MM, line)
 
 
-def describe(board: TrackingBoard) -> list[str]:
+def describe(board: CharucoBoard) -> list[str]:
     """A line for the board and one for its origin."""
     grids = [
         f"{grid.squares[0]}x{grid.squares[1]} squares of {grid.square_mm:g} mm, markers of {grid.marker_mm:g} mm" for grid in board.grids

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mrbokeh.charuco.board import DICTIONARY, CharucoBoard, CharucoGrid
 from mrbokeh.errors import InputError
 from mrbokeh.lens import MM_PER_M, Lens
 from viewfinder.tracking.board_pdf import PAPERS_MM, Page, page_of
-from viewfinder.tracking.charuco_board import DICTIONARY, CharucoGrid, TrackingBoard
 
 BLURS_PER_MARKER = 6.0
 SHARP_MARKER_PX = 24.0
@@ -60,7 +60,7 @@ class BoardPlan:
 
     marker_mm: float
     blur_px: float
-    board: TrackingBoard | None
+    board: CharucoBoard | None
     paper: str | None
     sentence: str
 
@@ -90,13 +90,13 @@ def _from(paper: str) -> list[str]:
     return [paper.lower(), *sorted(larger, key=lambda name: PAPERS_MM[name])]
 
 
-def _board_on(page: Page, coarse_mm: float, fine_mm: float) -> TrackingBoard | None:
+def _board_on(page: Page, coarse_mm: float, fine_mm: float) -> CharucoBoard | None:
     """Of both directions of the paper the one with more corners."""
     boards = [board for each in (page, page.turned) if (board := _board_in(each.room_mm, coarse_mm, fine_mm)) is not None]
     return max(boards, key=lambda board: len(board.corners_m), default=None)
 
 
-def _board_in(room_mm: tuple[float, float], coarse_mm: float, fine_mm: float) -> TrackingBoard | None:
+def _board_in(room_mm: tuple[float, float], coarse_mm: float, fine_mm: float) -> CharucoBoard | None:
     """One grid, and a fine one below it where the distances differ so much that small markers are read at some of them."""
     square_mm = _whole_mm(coarse_mm / MARKER_PER_SQUARE)
     columns = min(int(room_mm[0] / square_mm), _MOST_COLUMNS)
@@ -119,15 +119,15 @@ def _grid(columns: int, rows: int, square_mm: float) -> CharucoGrid:
     return CharucoGrid((columns, rows), square_mm, MARKER_PER_SQUARE * square_mm)
 
 
-def _within_dictionary(grids: tuple[CharucoGrid, ...]) -> TrackingBoard:
+def _within_dictionary(grids: tuple[CharucoGrid, ...]) -> CharucoBoard:
     """The smallest dictionary has the markers that differ most."""
     needed = max(grid.marker_ids.stop for grid in grids)
-    return TrackingBoard(grids, DICTIONARY if needed <= 50 else "DICT_4X4_100")
+    return CharucoBoard(grids, DICTIONARY if needed <= 50 else "DICT_4X4_100")
 
 
 def _whole_mm(size_mm: float) -> float:
     return float(np.ceil(size_mm - 1e-9))
 
 
-def _words(board: TrackingBoard) -> str:
+def _words(board: CharucoBoard) -> str:
     return " and ".join(f"{grid.squares[0]}x{grid.squares[1]} squares of {grid.square_mm:g} mm" for grid in board.grids)

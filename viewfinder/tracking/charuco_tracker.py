@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board import CharucoBoard
+from mrbokeh.charuco.detector import NO_CORNERS, Corners
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.board_alignment import AlignedDetector
-from viewfinder.tracking.charuco_board import TrackingBoard
-from viewfinder.tracking.charuco_detector import NO_CORNERS, Corners
 from viewfinder.tracking.corner_flow import FrameHistory
 from viewfinder.tracking.detection_thread import Detections, DetectionThread
 from viewfinder.tracking.pose_from_points import PoseFit, pose_from_plane
@@ -29,7 +29,7 @@ class CharucoTracker:
 
     name = "board"
 
-    def __init__(self, board: TrackingBoard, detections: Detections | None = None, grace_s: float = GRACE_S) -> None:
+    def __init__(self, board: CharucoBoard, detections: Detections | None = None, grace_s: float = GRACE_S) -> None:
         self.board, self._grace_s = board, grace_s
         self._detections = detections or DetectionThread(AlignedDetector(board))
         self._history = FrameHistory()

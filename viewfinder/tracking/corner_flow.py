@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from viewfinder.tracking.charuco_detector import NO_CORNERS, Corners, Grey
+from mrbokeh.charuco.detector import NO_CORNERS, Corners, Grey
 
 _WINDOW_PX = (21, 21)
 _LEVELS = 4

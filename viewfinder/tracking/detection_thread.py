@@ -6,8 +6,8 @@ from threading import Event, Thread
 from time import monotonic
 from typing import Protocol, runtime_checkable
 
+from mrbokeh.charuco.detector import Corners, Grey
 from viewfinder.newest import Newest
-from viewfinder.tracking.charuco_detector import Corners, Grey
 
 _POLL_S = 0.1
 _LEAVE_S = 3.0

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.detector import NO_CORNERS, Corners, Grey
 from viewfinder.frames import Pose
-from viewfinder.tracking.charuco_detector import NO_CORNERS, Corners, Grey
 from viewfinder.tracking.map_pose import pose_in_map
 from viewfinder.tracking.sift_features import find_features
 from viewfinder.tracking.sparse_map import SparseMap

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.detector import NO_CORNERS, Corners
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.charuco_detector import NO_CORNERS, Corners
 from viewfinder.tracking.corner_flow import FrameHistory
 from viewfinder.tracking.detection_thread import Detections, DetectionThread
 from viewfinder.tracking.map_localiser import MapLocaliser

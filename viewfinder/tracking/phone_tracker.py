@@ -14,6 +14,7 @@ from viewfinder.tracking.pose_history import PoseHistory
 from viewfinder.tracking.tracking_sample import TrackingSample
 
 _LEAVE_S = 3.0
+_ASPECT_TOLERANCE = 0.01
 
 log = logging.getLogger(__name__)
 
@@ -23,6 +24,9 @@ class PhoneFrames(Protocol):
     """The frames of the phone: any FrameSource of viewfinder/sources."""
 
     name: str
+
+    @property
+    def status(self) -> str | None: ...
 
     def frames(self, stopping: Event) -> Iterator[CameraFrame]: ...
 
@@ -40,8 +44,10 @@ class PhoneTracker:
         self.name, self.rig = f"phone ({source.name})", rig
         self.video_delay_s, self._hold_s = 0.0, hold_s
         self.failure: str | None = None
-        self._source, self._tracker, self._intrinsics = source, phone_tracker, phone_intrinsics
+        self._wrong_size: str | None = None
+        self.source, self._tracker, self._intrinsics = source, phone_tracker, phone_intrinsics
         self._history, self._newest = PoseHistory(joined_s=2.0 * hold_s), (0.0, 0.0, 0)
+        self._shown_s = 0.0
         self._stopping = Event()
         self._thread = Thread(target=self._run, name="phone", daemon=True)
         self._thread.start()
@@ -55,6 +61,16 @@ class PhoneTracker:
         pose = rig.camera_from_phone @ found.camera_from_world
         return TrackedPose(pose, quality * (1.0 - found.beyond_s / self._hold_s), frame.captured_s, residual_px, points)
 
+    @property
+    def remark(self) -> str | None:
+        """One sentence where something is wrong: the phone's camera is away or failed, is held otherwise, or does not see the board."""
+        trouble = self.failure or self.source.status or self._wrong_size
+        if trouble is not None:
+            return f"the phone on the camera: {trouble}"
+        newest_s = self._history.newest_s
+        unseen = newest_s is None or self._shown_s - newest_s > self._hold_s
+        return "the phone on the camera does not see what it tracks" if unseen else None
+
     def phone_pose(self, captured_s: float) -> Pose | None:
         """phone_from_world at the time of a frame of the camera, for pairs to calibrate with; None where it is not known."""
         found = self._history.at(captured_s - self.video_delay_s)
@@ -67,7 +83,7 @@ class PhoneTracker:
 
     def _run(self) -> None:
         try:
-            for frame in self._source.frames(self._stopping):
+            for frame in self.source.frames(self._stopping):
                 self._take(frame)
         except InputError as error:
             self.failure = str(error)
@@ -77,8 +93,20 @@ class PhoneTracker:
 
     def _take(self, frame: CameraFrame) -> None:
         height_px, width_px = frame.bgr.shape[:2]
+        self._shown_s, self._wrong_size = frame.captured_s, self._objection(width_px, height_px)
+        if self._wrong_size is not None:
+            return
         pose = self._tracker.track(frame, self._intrinsics.resized(width_px, height_px))
         # A tracker may give its last pose again for a while; that tells nothing new of this moment.
         if pose is not None and pose.captured_s == frame.captured_s:
             self._newest = (pose.quality, pose.residual_px, pose.points)
             self._history.add(frame.captured_s, TrackingSample(pose.camera_from_world))
+
+    def _objection(self, width_px: int, height_px: int) -> str | None:
+        """Intrinsics follow the size of the frames, but not their shape: a phone that is turned shows another part of its sensor."""
+        known = self._intrinsics
+        if abs(width_px * known.height_px / (height_px * known.width_px) - 1.0) <= _ASPECT_TOLERANCE:
+            return None
+        return (
+            f"its pictures are {width_px}x{height_px} px, those of its camera file {known.width_px}x{known.height_px} px: hold it as there"
+        )

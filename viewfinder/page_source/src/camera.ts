@@ -11,6 +11,11 @@ const say = (sentence: string): void => {
 const button = document.getElementById("send") as HTMLButtonElement;
 let ending: (() => void) | null = null;
 
+/** Where the camera goes: the viewfinder's own picture, or with ?to=phone-whip the phone that stands on a camera. */
+function target(): string {
+  return new URLSearchParams(location.search).get("to") === "phone-whip" ? "phone-whip" : "whip";
+}
+
 async function send(): Promise<void> {
   const stream = await navigator.mediaDevices.getUserMedia({
     video: { facingMode: "environment", width: { ideal: 1280 }, height: { ideal: 720 }, frameRate: { ideal: 30 } },
@@ -36,7 +41,7 @@ async function send(): Promise<void> {
   const sender = peer.addTransceiver(track, { direction: "sendonly", streams: [stream] }).sender;
   tellFocus(peer, track);
   peer.onconnectionstatechange = () => onState(peer);
-  resource = await offerTo("/whip", peer);
+  resource = await offerTo(`/${target()}`, peer);
   await keepResolution(sender);
   button.textContent = "Stop";
 }

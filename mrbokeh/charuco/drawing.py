@@ -5,30 +5,31 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from viewfinder.tracking.charuco_board import CharucoGrid, TrackingBoard
+from mrbokeh.charuco.board import CharucoBoard
 
 Rectangle = tuple[float, float, float, float]
 
 
-def black_rectangles_mm(board: TrackingBoard) -> Float64[np.ndarray, "rectangles 4"]:
+def black_rectangles_mm(board: CharucoBoard) -> Float64[np.ndarray, "rectangles 4"]:
     """x, y (of the top left corner, y down), width, height; they touch but do not overlap."""
-    return np.array([rectangle for grid in board.grids for rectangle in _of_grid(board, grid)])
+    return np.array([rectangle for index in range(len(board.grids)) for rectangle in _of_grid(board, index)])
 
 
-def _of_grid(board: TrackingBoard, grid: CharucoGrid) -> Iterator[Rectangle]:
+def _of_grid(board: CharucoBoard, index: int) -> Iterator[Rectangle]:
+    grid, first_black = board.grids[index], int(board.begins_white(index))
     columns, rows = grid.squares
     ids, side = iter(grid.marker_ids), grid.square_mm
     for row in range(rows):
         for column in range(columns):
             x, y = grid.offset_mm[0] + column * side, grid.offset_mm[1] + row * side
-            if (row + column) % 2 == 0:
+            if (row + column) % 2 == first_black:
                 yield x, y, side, side
             else:
                 inset = (side - grid.marker_mm) / 2
                 yield from _of_marker(marker_is_black(board, next(ids)), x + inset, y + inset, grid.marker_mm)
 
 
-def marker_is_black(board: TrackingBoard, marker: int) -> Bool[np.ndarray, "cells cells"]:
+def marker_is_black(board: CharucoBoard, marker: int) -> Bool[np.ndarray, "cells cells"]:
     """The cells of a marker with its black border of one cell, row by row."""
     dictionary = board.opencv_dictionary()
     return dictionary.generateImageMarker(marker, dictionary.markerSize + 2, None, 1) == 0

@@ -1,4 +1,4 @@
-"""A printed board to track by: one or more ChArUco grids of different scale, so that one of them outlives any defocus.
+"""A printed board to track and measure by: one or more ChArUco grids; of different scale, so that one of them outlives any defocus.
 
 A ChArUco grid is a chessboard with a marker in each white square (Garrido-Jurado et al. 2014; corners of squares are saddle
 points, which defocus does not move, as it does the corners of markers). Board axes are those of OpenCV: x right, y down, z into
@@ -47,7 +47,7 @@ class CharucoGrid:
 
     @property
     def marker_ids(self) -> range:
-        """One for each white square; the top left square is black (as OpenCV prints since 4.6)."""
+        """One for each white square, row by row."""
         return range(self.first_marker, self.first_marker + self.squares[0] * self.squares[1] // 2)
 
     @property
@@ -58,15 +58,19 @@ class CharucoGrid:
 
 
 @dataclass(frozen=True)
-class TrackingBoard:
-    """dictionary: a name in cv2.aruco. Ids of corners count through the grids in their order."""
+class CharucoBoard:
+    """dictionary: a name in cv2.aruco. Ids of corners count through the grids in their order.
+
+    legacy: printed by OpenCV before 4.6, which began with a white square where the number of rows is even.
+    """
 
     grids: tuple[CharucoGrid, ...]
     dictionary: str = DICTIONARY
+    legacy: bool = False
 
     def __post_init__(self) -> None:
         if not self.grids:
-            raise InputError("a tracking board needs at least one ChArUco grid, but came with none")
+            raise InputError("a board needs at least one ChArUco grid, but came with none")
         if not (self.dictionary.startswith("DICT_") and hasattr(cv2.aruco, self.dictionary)):
             raise InputError(f"expected a dictionary of cv2.aruco such as DICT_4X4_50 or DICT_5X5_100, got {self.dictionary!r}")
         highest, known = max(grid.marker_ids.stop for grid in self.grids), len(self.opencv_dictionary().bytesList)
@@ -92,6 +96,15 @@ class TrackingBoard:
         """Which grid each corner belongs to."""
         return np.repeat(np.arange(len(self.grids)), [len(_corners_mm(grid)) for grid in self.grids])
 
+    @property
+    def squares_text(self) -> str:
+        """For sentences: 8x6, or 4x3 and 9x5."""
+        return " and ".join(f"{columns}x{rows}" for columns, rows in (grid.squares for grid in self.grids))
+
+    def begins_white(self, grid: int) -> bool:
+        """Whether the top left square of a grid is white."""
+        return self.legacy and self.grids[grid].squares[1] % 2 == 0
+
     def opencv_dictionary(self) -> Any:
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
 
@@ -99,7 +112,9 @@ class TrackingBoard:
         """One grid for OpenCV, in millimetres from its own corner."""
         it = self.grids[grid]
         ids = np.array(it.marker_ids, np.int32)
-        return cv2.aruco.CharucoBoard(it.squares, it.square_mm, it.marker_mm, self.opencv_dictionary(), ids)
+        board = cv2.aruco.CharucoBoard(it.squares, it.square_mm, it.marker_mm, self.opencv_dictionary(), ids)
+        board.setLegacyPattern(self.legacy)
+        return board
 
 
 def _corners_mm(grid: CharucoGrid) -> Float64[np.ndarray, "corners 3"]:

@@ -1,4 +1,4 @@
-"""Finds the corners of a tracking board in a grey picture, with settings for blur and dim light."""
+"""Finds the corners of a board in a grey picture, with settings for blur and dim light."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-from viewfinder.tracking.charuco_board import TrackingBoard
+from mrbokeh.charuco.board import CharucoBoard
 
 _ENLARGED_UP_TO_PX = 640
 _FEWEST_MARKERS = 1
 _ITERATIONS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 1e-3)
-_WINDOW_PX = (2, 12)
+_WINDOW_PX = (2, 15)
 
 Grey = UInt8[np.ndarray, "height width"]
 Marker = tuple[int, np.ndarray]
@@ -43,7 +43,7 @@ NO_CORNERS = Corners(np.zeros(0, np.int64), np.zeros((0, 2)))
 class CharucoDetector:
     """One search for markers serves all grids of the board. Not to be shared between threads."""
 
-    def __init__(self, board: TrackingBoard) -> None:
+    def __init__(self, board: CharucoBoard) -> None:
         self.board = board
         self._markers = cv2.aruco.ArucoDetector(board.opencv_dictionary(), _marker_parameters())
         settings = cv2.aruco.CharucoParameters()
@@ -52,7 +52,10 @@ class CharucoDetector:
 
     def detect(self, grey: Grey) -> Corners:
         """Small pictures are searched enlarged: their markers have too few pixels for OpenCV's contours."""
-        enlarged = 2 if max(grey.shape) <= _ENLARGED_UP_TO_PX else 1
+        return self.detect_enlarged(grey, 2 if max(grey.shape) <= _ENLARGED_UP_TO_PX else 1)
+
+    def detect_enlarged(self, grey: Grey, enlarged: int) -> Corners:
+        """The same with markers searched in a picture so many times as wide; places are always those in the picture given."""
         picture = grey if enlarged == 1 else cv2.resize(grey, None, fx=enlarged, fy=enlarged, interpolation=cv2.INTER_CUBIC)
         corners, ids, _ = self._markers.detectMarkers(picture)
         read = [(int(number), each.reshape(1, 4, 2)) for number, each in zip(np.ravel(ids), corners, strict=True)] if len(corners) else []
