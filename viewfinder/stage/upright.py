@@ -13,8 +13,9 @@ UPRIGHT_FROM_WORLD = {
     "-y": np.eye(4),
     "+y": np.diag([1.0, -1.0, -1.0, 1.0]),
 }
-"""By what points up. "-z" is a board as OpenCV has it (x right, y down along the board, z into the table), OpenTrackIO and FreeD are turned into one
-where they are read; "+z" is a floor with z up, "-y" mrbokeh and most COLMAP maps, "+y" ARKit and Blender's glTF. None of them mirrors."""
+"""By what points up. "-z" is a board as OpenCV has it (x right, y down along the board, z into the table); OpenTrackIO and FreeD are
+turned into one where they are read. "+z" is a floor with z up, "-y" mrbokeh and most COLMAP maps, "+y" ARKit and Blender's glTF.
+None of them mirrors."""
 
 
 def upright_camera(camera: Camera, up: str) -> Camera:

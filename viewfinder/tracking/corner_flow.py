@@ -54,7 +54,7 @@ class FrameHistory:
     def add(self, sequence: int, grey: Grey) -> bool:
         """Whether the frames before are still of use: not so when the size changed or the numbers went backwards."""
         newest = next(reversed(self._frames), None)
-        goes_on = newest is not None and newest < sequence and self._frames[newest].shape == grey.shape
+        goes_on = newest is not None and newest <= sequence and self._frames[newest].shape == grey.shape
         if not goes_on:
             self._frames.clear()
         self._frames[sequence] = grey
