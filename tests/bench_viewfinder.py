@@ -50,7 +50,7 @@ class Watched:
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--seconds", type=float, default=15.0)
-    arguments.add_argument("--object", type=Path, default=HELMET if HELMET.is_file() else None, help="a GLB")
+    arguments.add_argument("--object", type=lambda text: Path(text).resolve(), default=HELMET if HELMET.is_file() else None, help="a GLB")
     asked = arguments.parse_args()
     cv2.setNumThreads(1)
     with TemporaryDirectory() as name:
