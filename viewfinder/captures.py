@@ -5,38 +5,40 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt16
+from jaxtyping import UInt8, UInt16
 
 from mrbokeh.capture_bundle import write_bundle
 from mrbokeh.color import linear_to_srgb
 from mrbokeh.errors import InputError
 from mrbokeh.overlay import code_tables
-from viewfinder.frames import Bgr
+from viewfinder.frames import Bgr, CameraFrame
 from viewfinder.live_compositor import LiveCompositor, Moment
+
+_RECENT_S = 1.0
 
 
 class Captures:
-    """folder: bundles go there, named by date and time. extra: files whose text a bundle keeps (the scene file)."""
+    """folder: bundles go there, named by date and time. scene: the file whose text a bundle keeps."""
 
     def __init__(self, folder: Path, compositor: LiveCompositor, renderer_name: str, scene: Path | None = None) -> None:
         self._folder, self._compositor, self.renderer_name, self._scene = folder, compositor, renderer_name, scene
 
     def capture(self) -> str:
-        """The newest picture; the name of its bundle. Raises InputError before the first, and while the track is lost."""
-        moment = self._compositor.last
-        if moment is None:
+        """The newest picture with a pose, if it is recent; the name of its bundle. Raises InputError where there is none."""
+        moment = self._compositor.last_tracked
+        if self._compositor.last is None:
             raise InputError("there is nothing to capture yet: the camera has not given a picture")
-        if moment.pose is None:
+        if moment is None or self._compositor.last.frame.captured_s - moment.frame.captured_s > _RECENT_S:
             raise InputError("the camera's pose is not known now, so that the object has no place: show the board, then capture")
-        name = self._free_name()
-        layers = self._compositor.scenery.sharp_layers(moment.camera)
+        name, bgr = self._free_name(), full_picture(moment.frame)
+        camera = moment.camera.resized(bgr.shape[1], bgr.shape[0])
         write_bundle(
             self._folder / name,
-            plate_png(moment.frame.bgr, self._compositor.transfer),
+            plate_png(bgr, self._compositor.transfer),
             _encoded(".jpg", moment.output.bgr),
-            layers,
+            self._compositor.scenery.sharp_layers(camera),
             moment.lens,
-            moment.camera,
+            camera,
             self.renderer_name,
             self._facts(moment),
         )
@@ -57,6 +59,11 @@ class Captures:
             "stages_ms": dict(status.stages_ms),
             "scene": None if self._scene is None else self._scene.read_text(encoding="utf-8"),
         }
+
+
+def full_picture(frame: CameraFrame) -> UInt8[np.ndarray, "full_height full_width 3"]:
+    """As large as the camera gave it."""
+    return frame.bgr if frame.full_picture is None else frame.full_picture()
 
 
 def plate_png(bgr: Bgr, transfer: str) -> bytes:

@@ -1,6 +1,6 @@
 """What travels through the viewfinder: a frame of the camera with what is known of it, and the finished picture."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,6 +34,7 @@ class CameraFrame:
     """bgr: (H, W, 3) 8-bit display codes, blue first. captured_s: `time.monotonic` when the camera gave it. sequence: counts captures.
 
     lens, camera_from_world: what the source itself knows (a tracked camera, the Exif of a tethered one); most know nothing.
+    full_picture: gives the picture as large as the camera gave it, where bgr was made smaller; for captures, it may take its time.
     """
 
     bgr: Bgr
@@ -41,6 +42,7 @@ class CameraFrame:
     sequence: int
     lens: LensState = UNKNOWN_LENS
     camera_from_world: Pose | None = None
+    full_picture: Callable[[], Bgr] | None = None
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class LiveCompositor:
 
     camera: intrinsics of the source in any size; None takes the pinhole of the lens, in the middle of the picture.
     tracker: None is a camera that stands where the world begins, unless the source knows its pose.
-    last: what the newest picture was made of, for those who capture it or ask what lies where.
+    last: what the newest picture was made of, for those who ask what lies where; last_tracked: the newest with a pose, to be captured.
     """
 
     def __init__(
@@ -44,6 +44,7 @@ class LiveCompositor:
         self._source, self._tracker, self._camera = source, tracker, camera
         self.view = "final"
         self.last: Moment | None = None
+        self.last_tracked: Moment | None = None
 
     @property
     def transfer(self) -> str:
@@ -64,6 +65,7 @@ class LiveCompositor:
         camera = replace(intrinsics, camera_from_world=pose.camera_from_world) if pose else intrinsics
         output = OutputFrame(bgr, frame.captured_s, frame.sequence, self._status(lens, pose, watch, dropped))
         self.last = Moment(frame, output, overlay, camera, lens, pose)
+        self.last_tracked = self.last_tracked if pose is None else self.last
         return output
 
     def _intrinsics(self, bgr: Bgr) -> Camera:

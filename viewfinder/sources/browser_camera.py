@@ -7,6 +7,7 @@ import secrets
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from threading import Event
 from typing import Any
 
@@ -77,7 +78,8 @@ class BrowserCameraSource:
             # RFC 6386, 9.2: VP8 knows BT.601 only, at every size.
             color = replace(color, matrix=_BT601)
         self.transfer, self.status = color.transfer_name, None
-        return CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence, known.lens, known.camera_from_world)
+        full = partial(upright_bgr, frame, color, SizeLimit())
+        return CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence, known.lens, known.camera_from_world, full)
 
     async def _offered(self, request: web.Request) -> web.Response:
         if request.content_type != _SDP:

@@ -32,7 +32,7 @@ class ExactSize:
 
     def frames(self, stopping: Event) -> Iterator[CameraFrame]:
         for frame in self._source.frames(stopping):
-            yield replace(frame, bgr=self._scaled(frame.bgr))
+            yield replace(frame, bgr=self._scaled(frame.bgr), full_picture=None)
 
     def _scaled(self, bgr: Bgr) -> UInt8[np.ndarray, "scaled_height scaled_width 3"]:
         import cv2

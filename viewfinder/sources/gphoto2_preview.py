@@ -64,7 +64,7 @@ class Gphoto2PreviewSource:
                 bgr, captured_s = self._preview(camera, stopping), time.monotonic()
                 if captured_s - read_s > _LENS_EVERY_S:
                     lens, read_s = lens_state(camera), captured_s
-                yield CameraFrame(self._limit.applied(bgr), captured_s, next(sequence), lens)
+                yield CameraFrame(self._limit.applied(bgr), captured_s, next(sequence), lens, full_picture=bgr.copy)
         except gp.GPhoto2Error as error:
             if error.code == gp.GP_ERROR_NOT_SUPPORTED:
                 raise InputError(f"{self.name} gives no live view over the cable: use its HDMI output with a capture card") from None

@@ -45,7 +45,8 @@ class NetworkStreamSource:
         for sequence, frame, captured_s in decoded:
             color = color_of(frame, self.name)
             self.transfer = color.transfer_name
-            yield CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence)
+            full = partial(upright_bgr, frame, color, SizeLimit())
+            yield CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence, full_picture=full)
 
     def _tell(self, sentence: str | None) -> None:
         self.status = sentence

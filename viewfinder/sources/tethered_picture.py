@@ -1,6 +1,7 @@
 """A photograph that another program writes: read when it is whole, with what its Exif tells of the lens."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,11 @@ class NotWholeError(Exception):
 
 @dataclass(frozen=True)
 class TetheredPicture:
-    """bgr: upright 8-bit codes (H, W, 3), blue first."""
+    """bgr: upright 8-bit codes (H, W, 3), blue first. full: reads the file once more, at its own size."""
 
     bgr: Bgr
     lens: LensState
+    full: Callable[[], Bgr]
 
 
 def read_tethered(path: Path, limit: SizeLimit) -> TetheredPicture:
@@ -42,7 +44,8 @@ def read_tethered(path: Path, limit: SizeLimit) -> TetheredPicture:
     except (OSError, SyntaxError, ValueError) as error:
         raise NotWholeError(f"{path.name} cannot be read: {error}") from None
     facts = read_facts(path, size_px)
-    return TetheredPicture(bgr, LensState(facts.focus_distance_m, facts.f_number, facts.focal_length_mm))
+    lens = LensState(facts.focus_distance_m, facts.f_number, facts.focal_length_mm)
+    return TetheredPicture(bgr, lens, lambda: read_tethered(path, SizeLimit()).bgr)
 
 
 def _upright_bgr(picture: Any) -> Bgr:

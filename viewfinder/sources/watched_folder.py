@@ -45,7 +45,7 @@ class WatchedFolderSource:
         while not stopping.is_set():
             picture = self._newer() or picture
             if picture is not None:
-                yield CameraFrame(picture.bgr, time.monotonic(), next(sequence), picture.lens)
+                yield CameraFrame(picture.bgr, time.monotonic(), next(sequence), picture.lens, full_picture=picture.full)
             stopping.wait(self._pause_s)
 
     def _newer(self) -> TetheredPicture | None:

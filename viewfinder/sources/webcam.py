@@ -57,7 +57,7 @@ class WebcamSource:
                 captured_s = time.monotonic()
                 if not there:
                     raise CameraAwayError(f"{self.name} stopped giving pictures: plug it in again")
-                yield CameraFrame(self._limit.applied(bgr), captured_s, next(sequence))
+                yield CameraFrame(self._limit.applied(bgr), captured_s, next(sequence), full_picture=bgr.copy)
         finally:
             camera.release()
 
