@@ -1,5 +1,6 @@
 """Shapes and types of array annotations are checked while tests run (jaxtyping + beartype); shared places of test data."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,10 @@ def _modules() -> list[str]:
 
 
 install_import_hook(_modules(), "beartype.beartype")
+
+# Tests send Ctrl-C to themselves and to programs they start; what runs in the background of a shell is deaf to it, and so are its children.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -122,9 +122,6 @@ def test_ctrl_c_leaves_no_half_file(tmp_path: Path, shared_data: Path) -> None:
         cwd=Path(__file__).parent.parent,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(
-            signal.SIGINT, signal.SIG_DFL
-        ),  # tests in the background of a shell would pass on that it is ignored
     )
     deadline_s = time.monotonic() + 40
     # A few frames are in the file under its temporary name: the command is in the middle of its work.
