@@ -58,7 +58,7 @@ def test_the_plate_is_as_large_as_the_camera_can(compositor: Compositor, tmp_pat
 
 
 def test_a_track_that_was_lost_just_now_does_not_cost_the_picture(compositor: Compositor, tmp_path: Path) -> None:
-    compositor.last, compositor.last_tracked = moment(1.5, False, 50), moment(1.0, True, 100)
+    compositor.last, compositor.last_tracked = moment(1.3, False, 50), moment(1.0, True, 100)
     captures = Captures(tmp_path, compositor, "polygon")
     assert read_bundle(tmp_path / captures.capture()).facts["sequence"] == 10
     compositor.last = moment(2.5, False, 50)

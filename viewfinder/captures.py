@@ -14,7 +14,7 @@ from mrbokeh.overlay import code_tables
 from viewfinder.frames import Bgr, CameraFrame
 from viewfinder.live_compositor import LiveCompositor, Moment
 
-_RECENT_S = 1.0
+_RECENT_S = 0.4  # less than the object takes to fade once the track is lost
 
 
 class Captures:
