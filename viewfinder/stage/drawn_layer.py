@@ -12,7 +12,7 @@ from mrbokeh.compositing import covered_by
 from mrbokeh.layer import Layer, flatten
 from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.scene import SceneRenderer as Backend
+from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.shadow_layer import shadow_layer
 from viewfinder.stage.layer_depth import GRID_PX, LayerDepth
 from viewfinder.stage.occlusion import Occlusion
@@ -59,11 +59,11 @@ class Brushes:
     live: a faster backend for what is drawn again and again; None takes `backend` for that too.
     """
 
-    backend: Backend
+    backend: SceneRenderer
     renderer: Renderer
     depth: LayerDepth
     occlusion: Occlusion | None = None
-    live: Backend | None = None
+    live: SceneRenderer | None = None
 
 
 def draw(staged: StagedScene, request: DrawRequest, brushes: Brushes) -> Drawing:

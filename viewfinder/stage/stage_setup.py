@@ -8,7 +8,7 @@ from mrbokeh.lens import Lens
 from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.scene import SceneRenderer as Backend
+from mrbokeh.scene import SceneRenderer
 from viewfinder.stage.assets import Assets
 from viewfinder.stage.drawn_layer import Brushes
 from viewfinder.stage.layer_depth import LayerDepth
@@ -48,7 +48,7 @@ def live_renderer(name: str) -> Renderer:
 _LIVE_EDGE_SAMPLES, _LIVE_SHADOW_STEP_PX = 4, 2
 
 
-def live_backend(backend: Backend) -> Backend:
+def live_backend(backend: SceneRenderer) -> SceneRenderer:
     """A backend as it suits a stream: the ray caster with fewer rays at edges and in shadows; any other as it is.
 
     A drawing of tests/bench_stage.py takes 0.54 of the time and is 66 dB near the best one. What the ray
@@ -62,7 +62,7 @@ def live_backend(backend: Backend) -> Backend:
 class SetupLoader:
     """Loads a scene file, again and again; what did not change is kept. One core is left for whoever composites the frames."""
 
-    def __init__(self, path: Path, backend: Backend | None = None) -> None:
+    def __init__(self, path: Path, backend: SceneRenderer | None = None) -> None:
         self.path, self._backend, self._assets, self._depth = path, backend, Assets(), LayerDepth()
 
     def load(self, before: StageSetup | None = None) -> StageSetup:
@@ -78,7 +78,7 @@ class SetupLoader:
         backend = self._own_backend()
         return StageSetup(staged, Brushes(backend, renderer, self._depth, occlusion, live_backend(backend)), name, lens)
 
-    def _own_backend(self) -> Backend:
+    def _own_backend(self) -> SceneRenderer:
         if self._backend is None:
             from mrbokeh.scene.choose import scene_renderer
 

@@ -27,11 +27,6 @@ _LARGEST_PAYLOAD = 1 << 20
 _UNFINISHED_AT_ONCE = 8
 
 
-def multicast_group(source_number: int) -> str:
-    """The group of the camera with that number, 1 to 200."""
-    return f"239.135.1.{source_number}"
-
-
 def fletcher16(data: bytes) -> int:
     """Fletcher's checksum (1982) with sums modulo 256, the second sum in the high byte.
 
