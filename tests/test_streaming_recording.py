@@ -84,6 +84,15 @@ def test_a_recording_of_nothing_leaves_nothing(tmp_path: Path) -> None:
     assert not any(thread.name == "recorder" for thread in threading.enumerate())
 
 
+def test_stopped_before_the_first_picture_it_waits_for_one(tmp_path: Path) -> None:
+    recorder = Recorder("bt709")
+    recorder.start(tmp_path / "clip.mp4")
+    late = threading.Timer(0.3, lambda: recorder.show(output(bars(), 0, 1.0)))
+    late.start()
+    assert recorder.stop().frame_count == 1
+    late.join()
+
+
 def test_repeated_captures_and_clocks_that_step_back_are_left_out(tmp_path: Path) -> None:
     frames = [output(bars(), i, captured_s) for i, captured_s in enumerate([5.0, 5.1, 5.1, 5.05, 5.2])]
     recording = recorded(tmp_path / "clip.mp4", frames)

@@ -17,6 +17,7 @@ from viewfinder.frames import OutputFrame
 from viewfinder.streaming.recorded_file import FileForm, Written, write_recording
 
 _POLL_S = 0.1
+_FIRST_PICTURE_S = 2.0
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ class Recorder:
         self._form = FileForm(code_tables(transfer), Fraction(frame_rate).limit_denominator(1001), encoding)
         self._waiting = waiting
         self._frames: queue.Queue[OutputFrame] = queue.Queue(waiting)
-        self._stopping = Event()
+        self._stopping, self._shown_one = Event(), Event()
         self._thread: Thread | None = None
         self._path = Path()
         self._failure: InputError | None = None
@@ -70,6 +71,7 @@ class Recorder:
         self._path, self._failure, self._dropped = path, None, 0
         self._frames = queue.Queue(self._waiting)
         self._stopping.clear()
+        self._shown_one.clear()
         self._thread = Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
@@ -80,14 +82,20 @@ class Recorder:
             self._frames.put_nowait(frame)
         except queue.Full:
             self._dropped += 1
+        self._shown_one.set()
 
     def fail(self, _sentence: str) -> None:
         """The camera may come back; until then the last picture stands."""
 
     def stop(self) -> Recording:
-        """End the file with what was shown until now; InputError where nothing was or it could not be written."""
+        """End the file with what was shown until now; InputError where nothing was or it could not be written.
+
+        Stopped before the first picture came it waits for one, for a while.
+        """
         if self._thread is None:
             raise InputError("expected a recording under way, but none was started")
+        if self._thread.is_alive():
+            self._shown_one.wait(_FIRST_PICTURE_S)
         self._stopping.set()
         self._thread.join()
         self._thread = None
@@ -98,6 +106,7 @@ class Recorder:
 
     def close(self) -> None:
         """Stop if a recording is under way; what went wrong with it goes to the log."""
+        self._shown_one.set()  # nothing more is waited for
         try:
             if self._thread is not None:
                 self.stop()
