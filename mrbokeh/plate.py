@@ -9,22 +9,34 @@ from jaxtyping import Float32
 from mrbokeh.camera import Camera
 from mrbokeh.capture_bundle import CaptureBundle
 from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
-from mrbokeh.image_io import read_image
+from mrbokeh.image_io import read_depth, read_image
 from mrbokeh.lens import Lens
-
-_DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z", "Y")
 
 
 @dataclass(frozen=True)
 class Plate:
-    """rgb: (H, W, 3) linear, blurred by the real lens; depth_m: (H, W) or None; lens: as focused for this photograph."""
+    """rgb: (H, W, 3) linear, blurred by the real lens; depth_m: (H, W) of the sharp scene or None; lens: as focused for this photograph.
+
+    sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
+    near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
+    """
 
     rgb: Float32[np.ndarray, "height width 3"]
     depth_m: Float32[np.ndarray, "height width"] | None
     lens: Lens
     camera: Camera
+    sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None
+    near_alpha: Float32[np.ndarray, "height width"] | None = None
+
+    def __post_init__(self) -> None:
+        size = self.rgb.shape[:2]
+        for what, plane in (("depth map", self.depth_m), ("all-in-focus picture", self.sharp_rgb), ("matte", self.near_alpha)):
+            if plane is not None and plane.shape[:2] != size:
+                raise InputError(
+                    f"the {what} of the photograph is {plane.shape[1]}x{plane.shape[0]} px but the photograph is {size[1]}x{size[0]} px: "
+                    f"resize it to that size"
+                )
 
     def point_under_pixel_m(self, x_px: float, y_px: float) -> tuple[float, float, float]:
         """Where in the scene (camera axes, metres) the photograph shows at a pixel."""
@@ -53,7 +65,12 @@ def open_plate(photo: Path, slice_index: int | None, depth: Path | None, lens: L
         raise InputError(f"{photo} does not tell its lens: give --lens LENS.json (see `mrbokeh lens new`)")
     rgb = read_image(photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
-    return Plate(rgb, None if depth is None else read_depth_m(depth), focused, _pinhole(focused, rgb))
+    return plate_of(rgb, focused, None if depth is None else read_depth(depth))
+
+
+def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
+    """A picture through the pinhole of its lens, which looks at its middle."""
+    return Plate(rgb, depth_m, lens, _pinhole(lens, rgb))
 
 
 def bundle_plate(bundle: CaptureBundle, depth: Path | None, lens: Lens | None, focus_m: float | None) -> Plate:
@@ -61,17 +78,7 @@ def bundle_plate(bundle: CaptureBundle, depth: Path | None, lens: Lens | None, f
     focused = bundle.lens if lens is None else lens.focused_at(bundle.lens.focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)
     camera = replace(bundle.camera, camera_from_world=np.eye(4))
-    return Plate(bundle.plate_rgb, None if depth is None else read_depth_m(depth), focused, camera)
-
-
-def read_depth_m(path: Path) -> Float32[np.ndarray, "height width"]:
-    """A depth map in metres from the Z channel of an EXR; 0 and negative values count as background."""
-    channels = {name: pixels for part in read_exr(path) for name, pixels in part.channels.items()}
-    name = next((each for each in _DEPTH_NAMES if each in channels), None)
-    if name is None:
-        raise InputError(f"{path}: expected depth in metres in a channel {' or '.join(_DEPTH_NAMES)}, found {sorted(channels)}")
-    depth = channels[name].astype(np.float32)
-    return np.where(depth > 0, depth, np.inf).astype(np.float32)
+    return Plate(bundle.plate_rgb, None if depth is None else read_depth(depth), focused, camera)
 
 
 def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus_m: float | None) -> Plate:
@@ -85,7 +92,7 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     rgb = stack.slice_rgb(slice_index)
     camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
-    return Plate(rgb, stack.depth_m(), focused, replace(camera, camera_from_world=np.eye(4)))
+    return Plate(rgb, stack.depth_m(), focused, replace(camera, camera_from_world=np.eye(4)), stack.all_in_focus())
 
 
 def _pinhole(lens: Lens, rgb: Float32[np.ndarray, "height width 3"]) -> Camera:

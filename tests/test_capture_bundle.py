@@ -11,11 +11,12 @@ import pytest
 from mrbokeh.camera import Camera
 from mrbokeh.capture_bundle import is_bundle, read_bundle, write_bundle
 from mrbokeh.color import linear_to_srgb
-from mrbokeh.compositing import composite
+from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_image
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
+from mrbokeh.plate import bundle_plate
 from mrbokeh.renderers.polygon_differences import PolygonDifferences
 from tests.test_cli import mrbokeh
 
@@ -51,7 +52,8 @@ def test_what_was_captured_comes_back(bundle: Path) -> None:
 def test_a_bundle_composites_like_its_parts(bundle: Path, tmp_path: Path) -> None:
     done = mrbokeh("composite", bundle, "--out", tmp_path / "out.exr")
     assert done.returncode == 0, done.stderr
-    expected, _ = composite(read_bundle(bundle).plate_rgb, [sharp_square()], LENS, PolygonDifferences())
+    plate = bundle_plate(read_bundle(bundle), None, None, None)
+    expected = OverPhotograph().insert(plate, [sharp_square()], PolygonDifferences()).rgb
     np.testing.assert_allclose(read_image(tmp_path / "out.exr"), expected, atol=1e-3, rtol=1e-3)  # half precision
 
 

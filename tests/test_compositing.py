@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
 
-from mrbokeh.compositing import composite, lay_over, occlusion_matte
+from mrbokeh.compositing.base import Inserted
+from mrbokeh.compositing.occlusion import occlusion_matte
+from mrbokeh.compositing.over import OverPhotograph, behind
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
+from mrbokeh.plate import plate_of
 from mrbokeh.renderers.scatter_reference import ScatterReference
 
 LENS = Lens(50.0, 2.0, 1.0, 36.0)
@@ -17,32 +20,36 @@ def card(depth_m: float, colour: tuple[float, float, float] = (0.8, 0.1, 0.1)) -
     return Layer(alpha[..., None] * np.array(colour, np.float32), alpha, np.where(alpha > 0, depth_m, np.inf).astype(np.float32))
 
 
+def inserted(photo_rgb: np.ndarray, layer: Layer, scene_m: np.ndarray | None = None) -> Inserted:
+    return OverPhotograph().insert(plate_of(photo_rgb, LENS, scene_m), [layer], ScatterReference())
+
+
 def photo() -> np.ndarray:
     return np.random.default_rng(0).uniform(0, 1, (*SIZE, 3)).astype(np.float32)
 
 
 def test_pixels_that_the_object_does_not_touch_are_those_of_the_photograph() -> None:
-    picture, blurred = composite(photo(), [card(1.3)], LENS, ScatterReference())
-    untouched = blurred.alpha == 0
+    found = inserted(photo(), card(1.3))
+    untouched = found.virtual.alpha == 0
     assert untouched.mean() > 0.3
-    np.testing.assert_array_equal(picture[untouched], photo()[untouched])
+    np.testing.assert_array_equal(found.rgb[untouched], photo()[untouched])
 
 
 def test_a_sharp_object_replaces_the_photograph() -> None:
-    picture, _ = composite(photo(), [card(1.0)], LENS, ScatterReference())
+    picture = inserted(photo(), card(1.0)).rgb
     np.testing.assert_allclose(picture[13:35, 21:43], np.broadcast_to(np.float32([0.8, 0.1, 0.1]), (22, 22, 3)), atol=1e-6)
 
 
 def test_the_photographed_scene_hides_what_is_behind_it() -> None:
     scene_m = np.full(SIZE, 0.5, np.float32)
-    picture, _ = composite(photo(), [card(1.3)], LENS, ScatterReference(), scene_m)
+    picture = inserted(photo(), card(1.3), scene_m).rgb
     np.testing.assert_array_equal(picture, photo())
 
 
 def test_half_hidden_by_a_nearer_wall() -> None:
     scene_m = np.full(SIZE, 3.0, np.float32)
     scene_m[:, :32] = 0.5
-    _, blurred = composite(photo(), [card(1.0)], LENS, ScatterReference(), scene_m)
+    blurred = inserted(photo(), card(1.0), scene_m).virtual
     assert blurred.alpha[20, 21:32].max() == 0.0 and blurred.alpha[20, 32:43].min() == pytest.approx(1.0)
 
 
@@ -66,9 +73,10 @@ def test_background_of_a_virtual_layer_hides_nothing() -> None:
 def test_over_keeps_light_premultiplied() -> None:
     alpha = np.full(SIZE, 0.5, np.float32)
     layer = Layer(np.full((*SIZE, 3), 0.5, np.float32), alpha, np.ones(SIZE, np.float32))
-    np.testing.assert_allclose(lay_over(np.full((*SIZE, 3), 0.02, np.float32), layer), 0.51, rtol=1e-6)
+    picture = Inserted(behind(np.full((*SIZE, 3), 0.02, np.float32), layer), layer).rgb
+    np.testing.assert_allclose(picture, 0.51, rtol=1e-6)
 
 
 def test_another_size_is_refused() -> None:
     with pytest.raises(InputError, match="virtual layer is 64x48 px but the photograph is 10x10 px"):
-        composite(np.zeros((10, 10, 3), np.float32), [card(1.0)], LENS, ScatterReference())
+        inserted(np.zeros((10, 10, 3), np.float32), card(1.0))

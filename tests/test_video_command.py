@@ -13,12 +13,13 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.commands.video import app, parse_frames
-from mrbokeh.compositing import composite
+from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_layer, write_layer
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import write_lens
+from mrbokeh.plate import plate_of
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video_io import VideoWriter, read_frames
 
@@ -68,11 +69,11 @@ def test_every_frame_is_the_composite_of_the_library(clip: Path, settings: list[
     assert len(frames) == 12
     for before, after in frames:
         assert after.time_s == before.time_s
-        expected, blurred = composite(before.rgb, [layer], LENS, ScatterReference())
-        np.testing.assert_allclose(after.rgb, expected, atol=STEP)
+        inserted = OverPhotograph().insert(plate_of(before.rgb, LENS), [layer], ScatterReference())
+        np.testing.assert_allclose(after.rgb, inserted.rgb, atol=STEP)
     # 25 mm of aperture, 51.3 mm to the sensor of 16 px per mm and half a dioptre make a blur of 10.3 px, which reaches half as far.
     reach = 25 * 51.282 * 16 * 0.5 / 1000 / 2
-    rows = np.flatnonzero((blurred.alpha > 0).any(axis=1))
+    rows = np.flatnonzero((inserted.virtual.alpha > 0).any(axis=1))
     assert (21 - rows[0], rows[-1] - 31) == pytest.approx((reach, reach), abs=1.0)
     far = np.ones((64, 96), bool)
     far[rows[0] : rows[-1] + 1] = False

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.capture_bundle import read_bundle
-from mrbokeh.compositing import composite
+from mrbokeh.compositing.over import OverPhotograph
+from mrbokeh.plate import bundle_plate
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.video_color import code_from_linear
 from mrbokeh.video_io import read_display_frames
@@ -277,7 +278,8 @@ def test_a_capture_composites_to_what_the_stream_showed(clip: LiveClip, tmp_path
             sequence = bundle.facts["sequence"]
             streamed = await watch.until(lambda seen: any(each.sequence == sequence for each in seen))
         shown = next(each for each in streamed if each.sequence == sequence).bgr
-        picture, _ = composite(bundle.plate_rgb, bundle.layers, bundle.lens, make_renderer(bundle.renderer))
+        plate = bundle_plate(bundle, None, None, None)
+        picture = OverPhotograph().insert(plate, bundle.layers, make_renderer(bundle.renderer)).rgb
         codes = 255.0 * code_from_linear(np.clip(picture, 0.0, 1.0), "bt709")[..., ::-1]
         assert (bundle.lens.f_number, bundle.lens.focus_distance_m) == (2.0, 0.4)
         assert psnr_db(codes, shown) > CODEC_DB

@@ -54,7 +54,7 @@ def composite(
 
     from mrbokeh.atomic_files import refuse_existing
     from mrbokeh.capture_bundle import is_bundle, read_bundle
-    from mrbokeh.compositing import composite as put_in
+    from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
     from mrbokeh.image_io import read_layer, write_image, write_layer
     from mrbokeh.object_layers import Staging, object_layers
     from mrbokeh.plate import bundle_plate, open_plate
@@ -73,10 +73,10 @@ def composite(
         layers += object_layers(object_, staging, plate.camera)
     if not layers:
         raise InputError("nothing to put into the photograph: give --object OBJ.glb or --layer RGBAZ.exr")
-    picture, blurred = put_in(plate.rgb, layers, plate.lens, used_renderer, plate.depth_m)
-    write_image(out, picture)
+    inserted = insertion_of(DEFAULT_MODE).insert(plate, layers, used_renderer)
+    write_image(out, inserted.rgb)
     if save_layer is not None:
-        write_layer(save_layer, blurred)
+        write_layer(save_layer, inserted.virtual)
     typer.echo(f"wrote {out}")
 
 

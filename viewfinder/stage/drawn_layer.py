@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mrbokeh.camera import Camera
-from mrbokeh.compositing import covered_by
+from mrbokeh.compositing.occlusion import covered_by
 from mrbokeh.layer import Layer, flatten
 from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer

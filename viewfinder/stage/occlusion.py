@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from mrbokeh.atomic_files import read_json
 from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_from_json
-from mrbokeh.compositing import occlusion_matte
+from mrbokeh.compositing.occlusion import occlusion_matte
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_depth
 from mrbokeh.lens_file_values import read_transmission

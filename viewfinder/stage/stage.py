@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mrbokeh.camera import Camera
-from mrbokeh.compositing import covered_by
+from mrbokeh.compositing.occlusion import covered_by
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
