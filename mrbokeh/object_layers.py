@@ -10,8 +10,7 @@ from mrbokeh.image_io import read_image
 from mrbokeh.layer import Layer
 from mrbokeh.scene import Environment, Scene, shadow_catcher, split_sun, sun, world_from_scene_placing
 from mrbokeh.scene.shadow_layer import shadow_layer
-
-SUN_DIRECTION = (0.45, 1.0, 0.55)
+from mrbokeh.staging.assets import SUN_DIRECTION
 
 
 @dataclass(frozen=True)

@@ -22,17 +22,17 @@ from mrbokeh.scene import Environment, Scene
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment_filter import lighting_maps
 from mrbokeh.scene.gltf_loader import GltfAsset
+from mrbokeh.staging.assets import Assets
+from mrbokeh.staging.scene_description import PlacedObject, SceneDescription, ShadowPlane
+from mrbokeh.staging.staged_scene import StagedObject, StagedScene
+from mrbokeh.staging.upright import upright_camera
 from tests.machine import machine_line, memory_line
 from tests.stage_scenes import looking
-from viewfinder.stage.assets import Assets
 from viewfinder.stage.drawn_layer import Brushes, Drawing, DrawRequest, draw
 from viewfinder.stage.layer_depth import LayerDepth
 from viewfinder.stage.resolution import RESOLUTIONS
-from viewfinder.stage.scene_description import PlacedObject, SceneDescription, ShadowPlane
 from viewfinder.stage.stage import Stage
 from viewfinder.stage.stage_setup import live_backend, live_renderer
-from viewfinder.stage.staged_scene import StagedObject, StagedScene
-from viewfinder.stage.upright import upright_camera
 from viewfinder.tracking.base import TrackedPose
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=0.8, sensor_width_mm=36.0)

@@ -10,13 +10,13 @@ from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.staging.assets import Assets
+from mrbokeh.staging.scene_description import SceneDescription
+from mrbokeh.staging.scene_file import read_scene_file
+from mrbokeh.staging.staged_scene import StagedScene
 from tests.test_scene_gltf import GlbWriter
-from viewfinder.stage.assets import Assets
 from viewfinder.stage.drawn_layer import Brushes
 from viewfinder.stage.layer_depth import LayerDepth
-from viewfinder.stage.scene_description import SceneDescription
-from viewfinder.stage.scene_file import read_scene_file
-from viewfinder.stage.staged_scene import StagedScene
 
 WIDTH, HEIGHT = 160, 112
 FOCAL_PX = 150.0

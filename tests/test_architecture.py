@@ -15,6 +15,7 @@ ROWS = (
     ("commands.",),
     ("demo.",),
     ("object_layers", "lens_drawing", "psf_bank_drawing", "stack_pictures"),
+    ("staging.",),
     ("compositing.", "overlay", "_overlay_numba", "tilt_shift"),
     ("plate",),
     ("renderers.choose_bank",),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.camera import Camera
+from mrbokeh.staging.upright import turned
 from viewfinder.ground_plane import ground_from_picture
-from viewfinder.stage.upright import turned
 
 
 def looking_down(tilt_rad: float) -> Camera:

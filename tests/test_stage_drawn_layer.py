@@ -14,14 +14,14 @@ from mrbokeh.exr_io import ExrPart, write_exr
 from mrbokeh.layer import Layer
 from mrbokeh.overlay import Overlay
 from mrbokeh.renderers.choose import make_renderer
+from mrbokeh.staging.picture_box import box_around
+from mrbokeh.staging.scene_description import RealThings
+from mrbokeh.staging.upright import upright_camera
 from tests.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
 from viewfinder.stage.drawn_layer import Drawing, DrawRequest, draw
 from viewfinder.stage.layer_depth import LayerDepth
 from viewfinder.stage.occlusion import Mask, Occlusion, RealDepth, read_occlusion
-from viewfinder.stage.picture_box import box_around
 from viewfinder.stage.redraw import is_outdated, moved_px
-from viewfinder.stage.scene_description import RealThings
-from viewfinder.stage.upright import upright_camera
 
 BLACK = np.zeros((HEIGHT, WIDTH, 3), np.float32)
 

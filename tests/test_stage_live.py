@@ -12,13 +12,13 @@ from mrbokeh.scene import split_sun
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import Environment
 from mrbokeh.scene.rigid_motion import rigid_motion
+from mrbokeh.staging.assets import Assets
+from mrbokeh.staging.picture_box import drawn_points_m
+from mrbokeh.staging.scene_description import Lighting, Sun
+from mrbokeh.staging.upright import upright_camera
 from tests.stage_scenes import LENS, ONE_CARD, brushes, camera, scene_file, staged
-from viewfinder.stage.assets import Assets
 from viewfinder.stage.drawn_layer import DrawRequest, draw, sharp_layers
-from viewfinder.stage.picture_box import drawn_points_m
-from viewfinder.stage.scene_description import Lighting, Sun
 from viewfinder.stage.stage_setup import SetupLoader, live_backend
-from viewfinder.stage.upright import upright_camera
 
 SHADOW = ONE_CARD + "[[sun]]\ndirection = [0, -1, 1]\nirradiance = 3\n[shadow]\nstrength = 0.75\n"
 

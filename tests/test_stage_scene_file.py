@@ -9,11 +9,11 @@ import pytest
 
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, write_exr
+from mrbokeh.staging.assets import Assets
+from mrbokeh.staging.scene_file import read_scene_file
+from mrbokeh.staging.staged_scene import StagedScene
 from tests.stage_scenes import ONE_CARD, card, described, scene_file, staged
-from viewfinder.stage.assets import Assets
-from viewfinder.stage.scene_file import read_scene_file
 from viewfinder.stage.scene_watch import SceneWatch
-from viewfinder.stage.staged_scene import StagedScene
 
 ROOT = Path(__file__).resolve().parent.parent
 

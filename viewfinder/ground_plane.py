@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mrbokeh.camera import Camera
-from viewfinder.stage.upright import upright_camera
+from mrbokeh.staging.upright import upright_camera
 
 _LEAST_DETERMINANT = 1e-12
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mrbokeh.errors import InputError
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.staging.upright import turned, turned_back
 from viewfinder.captures import Captures
 from viewfinder.focus.first_known import FirstKnown
 from viewfinder.focus.manual_focus import ManualFocus
@@ -13,7 +14,6 @@ from viewfinder.ground_plane import ground_from_picture
 from viewfinder.live_compositor import LiveCompositor, Moment
 from viewfinder.server.controls import ObjectState, State
 from viewfinder.stage.stage import Stage
-from viewfinder.stage.upright import turned, turned_back
 from viewfinder.streaming.recording import Recorder, recording_path
 from viewfinder.tracking.smoothed_tracker import SmoothedTracker
 

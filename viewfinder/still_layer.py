@@ -13,9 +13,9 @@ from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.overlay import CodeTables, Overlay
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.staging.scene_description import Triple
 from viewfinder.frames import Bgr
 from viewfinder.newest import Newest
-from viewfinder.stage.scene_description import Triple
 from viewfinder.stage.stage_setup import live_renderer
 from viewfinder.stage.stage_status import StageStatus
 from viewfinder.tracking.base import TrackedPose

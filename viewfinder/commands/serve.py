@@ -94,7 +94,7 @@ async def _served(viewfinder: Viewfinder, door: Door) -> None:
 def _lens_of(scene: Path | None) -> Lens | None:
     if scene is None:
         return None
-    from viewfinder.stage.scene_file import read_scene_file
+    from mrbokeh.staging.scene_file import read_scene_file
 
     path = read_scene_file(scene).lens
     return None if path is None else read_lens(path)

@@ -14,12 +14,12 @@ from mrbokeh.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.shadow_layer import shadow_layer
+from mrbokeh.staging.picture_box import NEAREST_M, PictureBox, box_around
+from mrbokeh.staging.staged_scene import StagedScene
+from mrbokeh.staging.upright import upright_camera
 from viewfinder.stage.layer_depth import GRID_PX, LayerDepth
 from viewfinder.stage.occlusion import Occlusion
-from viewfinder.stage.picture_box import NEAREST_M, PictureBox, box_around
 from viewfinder.stage.reprojection import MovableLayer
-from viewfinder.stage.staged_scene import StagedScene
-from viewfinder.stage.upright import upright_camera
 
 _INVISIBLE = 1e-4
 """A third of the light that the darkest step of 8-bit sRGB needs."""

@@ -16,8 +16,8 @@ from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_depth
 from mrbokeh.lens_file_values import read_transmission
 from mrbokeh.other_view import layer_from_view
-from viewfinder.stage.scene_description import RealThings
-from viewfinder.stage.upright import upright_camera
+from mrbokeh.staging.scene_description import RealThings
+from mrbokeh.staging.upright import upright_camera
 
 Plane = Float32[np.ndarray, "height width"]
 _FINER = 1.25

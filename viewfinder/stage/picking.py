@@ -6,10 +6,10 @@ from jaxtyping import Float
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.scene import Scene
+from mrbokeh.staging.scene_description import Triple
+from mrbokeh.staging.upright import rays, turned_back
 from viewfinder.stage.occlusion import Occlusion
-from viewfinder.stage.scene_description import Triple
 from viewfinder.stage.seen import Seen
-from viewfinder.stage.upright import rays, turned_back
 
 _FARTHEST_M = 100.0
 _PARALLEL = 1e-12

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from viewfinder.stage.assets import modified_s
+from mrbokeh.staging.assets import modified_s
 
 
 class SceneWatch:

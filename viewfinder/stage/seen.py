@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 from mrbokeh.camera import Camera
 from mrbokeh.overlay import Overlay
+from mrbokeh.staging.staged_scene import StagedScene
 from viewfinder.stage.drawn_layer import Drawing
 from viewfinder.stage.occlusion import Occlusion
-from viewfinder.stage.staged_scene import StagedScene
 
 
 @dataclass(frozen=True, eq=False)

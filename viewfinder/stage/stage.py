@@ -13,17 +13,17 @@ from mrbokeh.lens import Lens
 from mrbokeh.overlay import CodeTables, Overlay
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.scene import SceneRenderer
+from mrbokeh.staging.scene_description import PlacedObject, Triple
+from mrbokeh.staging.upright import upright_camera
 from viewfinder.frames import Bgr
 from viewfinder.stage.drawing_thread import DrawingThread
 from viewfinder.stage.drawn_layer import DrawRequest, sharp_layers
 from viewfinder.stage.fade import Fade
 from viewfinder.stage.picking import depth_at_m
 from viewfinder.stage.redraw import is_outdated
-from viewfinder.stage.scene_description import PlacedObject, Triple
 from viewfinder.stage.seen import Seen
 from viewfinder.stage.stage_setup import SetupLoader, live_renderer
 from viewfinder.stage.stage_status import StageStatus, status_of
-from viewfinder.stage.upright import upright_camera
 from viewfinder.stage.views import VIEWS, view_picture
 from viewfinder.tracking.base import TrackedPose
 
@@ -37,7 +37,7 @@ class Stage:
     views = VIEWS
 
     def __init__(self, scene: Path, backend: SceneRenderer | None = None) -> None:
-        """scene: a scene file (viewfinder.stage.scene_file); InputError for what is wrong in it.
+        """scene: a scene file (mrbokeh.staging.scene_file); InputError for what is wrong in it.
 
         backend: None takes the graphics card where there is one, else the ray caster.
         """

@@ -9,12 +9,12 @@ from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene import SceneRenderer
-from viewfinder.stage.assets import Assets
+from mrbokeh.staging.assets import Assets
+from mrbokeh.staging.scene_file import read_scene_file
+from mrbokeh.staging.staged_scene import StagedScene
 from viewfinder.stage.drawn_layer import Brushes
 from viewfinder.stage.layer_depth import LayerDepth
 from viewfinder.stage.occlusion import read_occlusion
-from viewfinder.stage.scene_file import read_scene_file
-from viewfinder.stage.staged_scene import StagedScene
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from mrbokeh.errors import InputError
 from mrbokeh.scene import Environment, Light, Mesh, Scene, shadow_catcher, world_from_scene_placing
 from mrbokeh.scene.gltf_loader import GltfAsset
-from viewfinder.stage.assets import Assets
-from viewfinder.stage.picture_box import drawn_points_m
-from viewfinder.stage.scene_description import PlacedObject, SceneDescription
-from viewfinder.stage.upright import turned
+from mrbokeh.staging.assets import Assets
+from mrbokeh.staging.picture_box import drawn_points_m
+from mrbokeh.staging.scene_description import PlacedObject, SceneDescription
+from mrbokeh.staging.upright import turned
 
 _MOMENT_S = 1 / 120
 """Animations are posed at whole multiples of this, so that two frames of one moment share one scene."""

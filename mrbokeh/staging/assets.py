@@ -10,12 +10,12 @@ from jaxtyping import Float32
 
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_linear
-from mrbokeh.object_layers import SUN_DIRECTION
 from mrbokeh.scene import Environment, Light, split_sun, sun
 from mrbokeh.scene.gltf_loader import GltfAsset
-from viewfinder.stage.scene_description import Lighting
-from viewfinder.stage.upright import turned
+from mrbokeh.staging.scene_description import Lighting
+from mrbokeh.staging.upright import turned
 
+SUN_DIRECTION = (0.45, 1.0, 0.55)
 _GREY, _SUN = 0.45, 1.6
 """Where a scene file brings no light: as bright as `mrbokeh composite` lights an object."""
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from mrbokeh.errors import InputError
 from mrbokeh.lens_file_values import Values
-from viewfinder.stage.scene_description import Triple
+from mrbokeh.staging.scene_description import Triple
 
 
 class SceneValues(Values):

@@ -1,4 +1,4 @@
-"""The scene file of the viewfinder: TOML to SceneDescription.
+"""The scene file: TOML to SceneDescription.
 
     up = "-z"                     # what points up in the tracker's world: "-z" a board, "+z", "-y", "+y"
 
@@ -45,9 +45,9 @@ from pathlib import Path
 
 from mrbokeh.errors import InputError
 from mrbokeh.renderers.choose import DEFAULT
-from viewfinder.stage.scene_description import Lighting, PlacedObject, RealThings, SceneDescription, ShadowPlane, Sun
-from viewfinder.stage.scene_values import SceneValues
-from viewfinder.stage.upright import UPRIGHT_FROM_WORLD
+from mrbokeh.staging.scene_description import Lighting, PlacedObject, RealThings, SceneDescription, ShadowPlane, Sun
+from mrbokeh.staging.scene_values import SceneValues
+from mrbokeh.staging.upright import UPRIGHT_FROM_WORLD
 
 _TABLES = ("up", "object", "light", "sun", "shadow", "occlusion", "lens", "renderer")
 
