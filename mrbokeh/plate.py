@@ -10,8 +10,9 @@ from mrbokeh.camera import Camera
 from mrbokeh.capture_bundle import CaptureBundle
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
-from mrbokeh.image_io import read_depth, read_image
+from mrbokeh.image_io import read_depth
 from mrbokeh.lens import Lens
+from mrbokeh.photograph import read_photograph
 
 
 @dataclass(frozen=True)
@@ -55,17 +56,17 @@ class Plate:
 def open_plate(photo: Path, slice_index: int | None, depth: Path | None, lens: Lens | None, focus_m: float | None) -> Plate:
     """A photograph with a lens, or a merged focal stack with the number of a slice, which brings its own lens and depth.
 
-    lens: overrides the stack's optics but keeps the focus of its slice; needed for a lone photograph. focus_m overrides all.
+    lens: overrides what the photograph's metadata or the stack tell, but keeps the focus of a slice. focus_m overrides all.
     """
     if photo.is_dir():
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}")
+    photograph = read_photograph(photo)
     if lens is None:
-        raise InputError(f"{photo} does not tell its lens: give --lens LENS.json (see `mrbokeh lens new`)")
-    rgb = read_image(photo)
+        lens = photograph.lens(photo, focus_m)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
-    return plate_of(rgb, focused, None if depth is None else read_depth(depth))
+    return plate_of(photograph.rgb, focused, None if depth is None else read_depth(depth))
 
 
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:

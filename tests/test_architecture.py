@@ -31,7 +31,7 @@ ROWS = (
     ("video_frames", "video_audio"),
     ("video_color", "_video_frames_numba"),
     ("capture_bundle",),
-    ("lens_file", "camera_file", "charuco."),
+    ("lens_file", "camera_file", "charuco.", "photograph"),
     ("lens_file_values",),
     ("image_io", "camera_rgb"),
     ("exr_primaries",),

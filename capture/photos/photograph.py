@@ -1,0 +1,44 @@
+"""A photograph for compositing: developed to Rec.709, turned upright, with its lens and exposure from its metadata."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from capture.photos.developing import develop
+from capture.photos.metadata import read_metadata
+from capture.photos.photo_metadata import PhotoMetadata
+from mrbokeh.color import convert
+from mrbokeh.photograph import Photograph
+
+# EXIF 2.3, tag Orientation: quarter turns counter-clockwise that bring the stored picture upright, and whether it is mirrored first.
+_UPRIGHT = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False), 7: (3, True), 8: (1, False)}
+
+
+def read_photograph(path: Path) -> Photograph:
+    """White balance is the camera's own; EXR and HDR are taken as they are."""
+    decoded, metadata = develop(path, None), read_metadata(path)
+    rgb = decoded.rgb if decoded.rec709_from_camera is None else convert(decoded.rgb, np.array(decoded.rec709_from_camera))
+    turns, mirrored = _UPRIGHT.get(metadata.orientation or 1, (0, False))
+    stored_height_px, stored_width_px = rgb.shape[:2]
+    sensor_width_mm = _sensor_width_mm(metadata, decoded.photosites.width, decoded.photosites.height)
+    if sensor_width_mm is not None and turns % 2:
+        sensor_width_mm *= stored_height_px / stored_width_px
+    return Photograph(
+        upright(rgb, turns, mirrored),
+        metadata.focal_length_mm,
+        metadata.f_number,
+        metadata.focus_distance_m,
+        sensor_width_mm,
+        metadata.exposure_time_s,
+        metadata.iso,
+    )
+
+
+def upright(rgb: Float32[np.ndarray, "height width 3"], turns: int, mirrored: bool) -> Float32[np.ndarray, "new_height new_width 3"]:
+    """Mirrored left to right where asked, then turned counter-clockwise by quarters."""
+    return np.ascontiguousarray(np.rot90(rgb[:, ::-1] if mirrored else rgb, turns))
+
+
+def _sensor_width_mm(metadata: PhotoMetadata, width_px: int, height_px: int) -> float | None:
+    return None if metadata.sensor is None else metadata.sensor.width_mm(width_px, height_px)

@@ -1,0 +1,55 @@
+"""Photograph: one picture out of a camera, upright and in linear light, with what it tells of its lens and exposure.
+
+RAW files are developed by the package `capture`, which is found by its name as the command line finds its sub-commands, and needs the
+extra of that name; so does the metadata of JPEG and TIFF. Without it a picture that is no RAW is read, and tells nothing.
+"""
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.errors import InputError
+from mrbokeh.lens import Lens
+
+_READER = "capture.photos.photograph"
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """rgb: (H, W, 3) linear Rec.709, upright. None is what the file does not tell.
+
+    sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens.
+    """
+
+    rgb: Float32[np.ndarray, "height width 3"]
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    focus_distance_m: float | None = None
+    sensor_width_mm: float | None = None
+    exposure_time_s: float | None = None
+    iso: float | None = None
+
+    def lens(self, path: Path, focus_m: float | None = None) -> Lens:
+        """The lens with a round opening. focus_m takes the place of the file's own focus. Raises InputError where parts are unknown."""
+        focus = self.focus_distance_m if focus_m is None else focus_m
+        told = {
+            "focal length": self.focal_length_mm,
+            "f-number": self.f_number,
+            "sensor width": self.sensor_width_mm,
+            "focus distance": focus,
+        }
+        missing = [name for name, value in told.items() if value is None]
+        if self.focal_length_mm is None or self.f_number is None or self.sensor_width_mm is None or focus is None:
+            raise InputError(
+                f"{path} does not tell its lens (unknown: {', '.join(missing)}): give --lens LENS.json (see `mrbokeh lens new`)"
+                + (" or --focus METRES" if missing == ["focus distance"] else "")
+            )
+        return Lens(self.focal_length_mm, self.f_number, focus, self.sensor_width_mm)
+
+
+def read_photograph(path: Path | str) -> Photograph:
+    """A RAW file, JPEG, TIFF, PNG, EXR or HDR. Raises InputError where it cannot be read, MissingExtraError for RAW without the extra."""
+    return import_module(_READER).read_photograph(Path(path))
