@@ -14,7 +14,7 @@ ROWS = (
     ("cli",),
     ("commands.",),
     ("demo.",),
-    ("object_layers", "lens_drawing", "psf_bank_drawing", "stack_pictures"),
+    ("lens_drawing", "psf_bank_drawing", "stack_pictures"),
     ("staging.",),
     ("compositing.", "overlay", "_overlay_numba", "tilt_shift"),
     ("plate",),

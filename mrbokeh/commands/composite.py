@@ -1,11 +1,16 @@
 """`mrbokeh composite`: virtual objects into a photograph."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mrbokeh.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.camera import Camera
+    from mrbokeh.layer import Layer
+    from mrbokeh.staging.one_object import OneObject
 
 app = typer.Typer(add_completion=False)
 
@@ -56,9 +61,10 @@ def composite(
     from mrbokeh.capture_bundle import is_bundle, read_bundle
     from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
     from mrbokeh.image_io import read_layer, write_image, write_layer
-    from mrbokeh.object_layers import Staging, object_layers
     from mrbokeh.plate import bundle_plate, open_plate
     from mrbokeh.renderers.choose import lens_and_renderer
+    from mrbokeh.staging.one_object import OneObject
+    from mrbokeh.staging.scene_description import Lighting
 
     for path in (out, save_layer):
         if path is not None:
@@ -69,8 +75,8 @@ def composite(
     layers = [read_layer(path) for path in layer or ()] + list(bundle.layers if bundle else ())
     if object_ is not None:
         foot_m = _triple(at) if at else plate.point_under_pixel_m(*_pair(at_pixel))
-        staging = Staging(foot_m, height, math.radians(turn), math.radians(tilt), environment, exposure, shadow)
-        layers += object_layers(object_, staging, plate.camera)
+        light = Lighting(environment, exposure=exposure)
+        layers += _rendered(OneObject(object_, foot_m, height, math.radians(turn), math.radians(tilt), light, shadow), plate.camera)
     if not layers:
         raise InputError("nothing to put into the photograph: give --object OBJ.glb or --layer RGBAZ.exr")
     inserted = insertion_of(DEFAULT_MODE).insert(plate, layers, used_renderer)
@@ -78,6 +84,15 @@ def composite(
     if save_layer is not None:
         write_layer(save_layer, inserted.virtual)
     typer.echo(f"wrote {out}")
+
+
+def _rendered(one: "OneObject", camera: "Camera") -> "list[Layer]":
+    from mrbokeh.scene.choose import scene_renderer
+    from mrbokeh.staging.assets import Assets
+    from mrbokeh.staging.staged_layers import staged_layers
+    from mrbokeh.staging.staged_scene import StagedScene
+
+    return staged_layers(StagedScene.load(one.described(), Assets()), one.seen_by(camera), scene_renderer("embree"))
 
 
 def _triple(text: str) -> tuple[float, float, float]:
