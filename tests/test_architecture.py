@@ -16,6 +16,7 @@ ROWS = (
     ("demo.",),
     ("lens_drawing", "psf_bank_drawing", "stack_pictures"),
     ("staging.",),
+    ("plate_look.",),
     ("compositing.", "overlay", "_overlay_numba", "tilt_shift"),
     ("plate",),
     ("renderers.choose_bank",),
@@ -169,7 +170,7 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
     COLMAP's maps are made by capture and localised in by the viewfinder; tethered cameras shoot for one and look for the other,
     both through mrbokeh.gphoto2_library.
     """
-    asking = {"mrbokeh.commands.doctor", "datasets_scripts.dng_writer", "mrbokeh.gphoto2_library"}
+    asking = {"mrbokeh.commands.doctor", "mrbokeh.plate_look.lensfun_falloff", "datasets_scripts.dng_writer", "mrbokeh.gphoto2_library"}
     users = {
         module
         for module, path in MODULES.items()

@@ -50,15 +50,15 @@ def read_facts(path: Path | str, size_px: tuple[int, int]) -> PhotoFacts:
     DCG-001). Exif counts the subject's distance from the film plane; with T that distance, the thin lens stands s from the subject with
     s + s f / (s - f) = T.
     """
-    tags = _tags(Path(path))
-    focal_length_mm = _positive(tags.get(_FOCAL_LENGTH))
-    distance_m = _positive(tags.get(_SUBJECT_DISTANCE))
+    tags = exif_tags(Path(path))
+    focal_length_mm = positive_rational(tags.get(_FOCAL_LENGTH))
+    distance_m = positive_rational(tags.get(_SUBJECT_DISTANCE))
     if distance_m is not None and focal_length_mm is not None:
         distance_m = lens_distance_m(distance_m, focal_length_mm)
-    return PhotoFacts(focal_length_mm, _positive(tags.get(_F_NUMBER)), _sensor_width_mm(tags, focal_length_mm, size_px), distance_m)
+    return PhotoFacts(focal_length_mm, positive_rational(tags.get(_F_NUMBER)), _sensor_width_mm(tags, focal_length_mm, size_px), distance_m)
 
 
-def _tags(path: Path) -> dict[int, Any]:
+def exif_tags(path: Path) -> dict[int, Any]:
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -68,7 +68,7 @@ def _tags(path: Path) -> dict[int, Any]:
         return {}
 
 
-def _positive(value: Any) -> float | None:
+def positive_rational(value: Any) -> float | None:
     """A rational number of Exif; 0 and 0/0 mean unknown, a numerator of all ones infinitely far."""
     if getattr(value, "numerator", None) == _INFINITELY_FAR:
         return float("inf")
@@ -80,11 +80,11 @@ def _positive(value: Any) -> float | None:
 
 
 def _sensor_width_mm(tags: dict[int, Any], focal_length_mm: float | None, size_px: tuple[int, int]) -> float | None:
-    resolution, unit = _positive(tags.get(_PLANE_RESOLUTION)), _MM_PER_UNIT.get(tags.get(_PLANE_UNIT, 2))
-    pixels = _positive(tags.get(_PIXEL_WIDTH)) or float(size_px[0])
+    resolution, unit = positive_rational(tags.get(_PLANE_RESOLUTION)), _MM_PER_UNIT.get(tags.get(_PLANE_UNIT, 2))
+    pixels = positive_rational(tags.get(_PIXEL_WIDTH)) or float(size_px[0])
     if resolution is not None and unit is not None and 1.0 < pixels / resolution * unit < 100.0:
         return pixels / resolution * unit
-    film_mm = _positive(tags.get(_FOCAL_LENGTH_35MM))
+    film_mm = positive_rational(tags.get(_FOCAL_LENGTH_35MM))
     if film_mm is None or focal_length_mm is None:
         return None
     return _FULL_FRAME_DIAGONAL_MM * focal_length_mm / film_mm * size_px[0] / float(np.hypot(*size_px))
