@@ -39,6 +39,7 @@ SUB_COMMANDS = {
     "composite": SubCommand("mrbokeh.commands.composite", "Put virtual objects into a photograph."),
     "video": SubCommand("mrbokeh.commands.video", "Put virtual objects into a video."),
     "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),
+    "blender-addon": SubCommand("mrbokeh.commands.blender_addon", "Write the add-on that exports scenes from Blender."),
     "demo": SubCommand("mrbokeh.commands.demo", "The whole way on shipped photographs, with a report."),
     "doctor": SubCommand("mrbokeh.commands.doctor", "What is installed, what is missing, and what it would enable."),
 }

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blender add-on (4.2 and later): the scene's objects, its camera and its render settings as mrbokeh wants them.
+
+File > Export > mrbokeh writes into a folder:
+- scene.glb: the objects (all that render, or the selected ones);
+- camera_track.json: the camera of every frame, with focus and f-number;
+and sets the scene up to render `render/####.exr` there: multilayer EXR with RGBA, Z, motion vectors and Cryptomatte, everything
+sharp, for the lens blur comes later. Press Ctrl+F12 to render it.
+
+The world written is x right, y down, z forward of Blender's front view: a point (x, y, z) of Blender is (x, -z, y) there, just where
+mrbokeh puts the same point of the GLB file. Camera axes are x right, y down, z forward, and the centre of the first pixel is at (0.5, 0.5).
+
+Licence: this file is under the Apache License 2.0 as mrbokeh is, which the GPL 3 under which Blender is distributed permits to be
+combined with it. It uses Blender's Python interface only and nothing of mrbokeh, and what it writes is yours.
+"""
+
+import json
+import os
+from typing import Any, NamedTuple
+
+bl_info = {
+    "name": "mrbokeh export",
+    "author": "mrbokeh",
+    "version": (1, 0, 0),
+    "blender": (4, 2, 0),
+    "location": "File > Export > mrbokeh (folder)",
+    "description": "Objects, camera track and render settings for mrbokeh's lens blur",
+    "category": "Import-Export",
+}
+
+FORMAT = "mrbokeh-camera-track"
+Matrix = list[list[float]]
+# Blender's world (z up) to ours (y down); a half turn about x for cameras, which look along -z there with y up.
+OUR_FROM_BLENDER: Matrix = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+_FLIP = (1.0, -1.0, -1.0)
+
+
+class Film(NamedTuple):
+    """What Blender says of a camera's film: pixels, pixel aspect, millimetres, shift in parts of the fitted side."""
+
+    width_px: int
+    height_px: int
+    lens_mm: float
+    sensor_width_mm: float
+    sensor_height_mm: float
+    sensor_fit: str = "AUTO"
+    shift_x: float = 0.0
+    shift_y: float = 0.0
+    pixel_aspect: tuple[float, float] = (1.0, 1.0)
+
+
+def intrinsics(film: Film) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """(focal length in pixels, principal point in pixels, width of the film in mm that the picture covers).
+
+    As Blender computes its view plane: the sensor's side lies along the fitted side of the picture, counted in pixel widths.
+    """
+    tallness = film.pixel_aspect[1] / film.pixel_aspect[0]
+    is_wide = film.width_px >= tallness * film.height_px
+    horizontal = film.sensor_fit == "HORIZONTAL" or (film.sensor_fit == "AUTO" and is_wide)
+    fitted_px = film.width_px if horizontal else tallness * film.height_px
+    sensor_mm = film.sensor_height_mm if film.sensor_fit == "VERTICAL" else film.sensor_width_mm
+    focal_px = film.lens_mm * fitted_px / sensor_mm
+    across, down = film.shift_x * fitted_px, film.shift_y * fitted_px / tallness
+    principal_px = (film.width_px / 2 - across, film.height_px / 2 + down)
+    return (focal_px, focal_px / tallness), principal_px, film.width_px * sensor_mm / fitted_px
+
+
+def camera_from_world(matrix_world: Matrix) -> Matrix:
+    """(4, 4) rigid transform of our world into our camera axes, from a Blender camera's matrix_world; its scale does not count."""
+    columns = [[matrix_world[row][column] for row in range(3)] for column in range(3)]
+    lengths = [sum(each * each for each in column) ** 0.5 for column in columns]
+    axes = [_in_our_world([flip * each / length for each in column]) for column, length, flip in zip(columns, lengths, _FLIP, strict=True)]
+    place = _in_our_world([matrix_world[row][3] for row in range(3)])
+    return [[*axis, -sum(a * p for a, p in zip(axis, place, strict=True))] for axis in axes] + [[0.0, 0.0, 0.0, 1.0]]
+
+
+def _in_our_world(vector: list[float]) -> list[float]:
+    return [sum(m * v for m, v in zip(row, vector, strict=True)) for row in OUR_FROM_BLENDER]
+
+
+def track_frame(number: int, time_s: float, matrix_world: Matrix, film: Film) -> dict[str, Any]:
+    """One frame of the track, without focus."""
+    focal_px, principal_px, sensor_width_mm = intrinsics(film)
+    return {
+        "frame": number,
+        "time_s": time_s,
+        "camera": {
+            "width_px": film.width_px,
+            "height_px": film.height_px,
+            "focal_px": list(focal_px),
+            "principal_px": list(principal_px),
+            "camera_from_world": camera_from_world(matrix_world),
+        },
+        "focal_length_mm": film.lens_mm,
+        "sensor_width_mm": sensor_width_mm,
+    }
+
+
+# What follows needs Blender.
+
+
+def film_of(scene: Any, camera: Any) -> Film:
+    """The film of a camera object for a scene's render size."""
+    render, data = scene.render, camera.data
+    share = render.resolution_percentage / 100
+    return Film(
+        int(render.resolution_x * share),
+        int(render.resolution_y * share),
+        data.lens,
+        data.sensor_width,
+        data.sensor_height,
+        data.sensor_fit,
+        data.shift_x,
+        data.shift_y,
+        (render.pixel_aspect_x, render.pixel_aspect_y),
+    )
+
+
+def check_scene(scene: Any) -> None:
+    """Raises ValueError with one sentence where a scene cannot be exported truly."""
+    if scene.camera is None:
+        raise ValueError("the scene has no camera: choose one in the scene's properties")
+    if scene.camera.data.type != "PERSP":
+        raise ValueError(f"expected a perspective camera, got {scene.camera.data.type}: mrbokeh's cameras are pinholes with a lens")
+    if abs(scene.unit_settings.scale_length - 1.0) > 1e-6:
+        raise ValueError(f"expected a unit scale of 1 (Blender units are metres), got {scene.unit_settings.scale_length:g}: apply it first")
+
+
+def camera_track(scene: Any) -> dict[str, Any]:
+    """The camera of every frame of the scene's range; leaves the scene at the frame where it was."""
+    import bpy
+
+    check_scene(scene)
+    before, rate = scene.frame_current, scene.render.fps / scene.render.fps_base
+    frames = []
+    for number in range(scene.frame_start, scene.frame_end + 1):
+        scene.frame_set(number)
+        camera = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        matrix = [list(row) for row in camera.matrix_world]
+        time_s = (number - scene.frame_start) / rate
+        frames.append({**track_frame(number, time_s, matrix, film_of(scene, camera)), **_focus(camera)})
+    scene.frame_set(before)
+    return {"format": FORMAT, "version": 1, "up": "-y", "frames_per_second": rate, "frames": frames}
+
+
+def _focus(camera: Any) -> dict[str, float]:
+    """Distance along the optical axis and f-number; a focus object goes before the distance."""
+    focus = camera.data.dof
+    distance_m = focus.focus_distance
+    if focus.focus_object is not None:
+        # The camera looks along its -z.
+        to_object = focus.focus_object.matrix_world.translation - camera.matrix_world.translation
+        distance_m = -to_object.dot(camera.matrix_world.to_3x3().col[2].normalized())
+    return {"focus_distance_m": distance_m, "f_number": focus.aperture_fstop}
+
+
+def set_up_render(scene: Any, folder: str) -> None:
+    """Multilayer EXR with RGBA, Z, motion vectors and Cryptomatte of objects, unblurred: lens and shutter come later."""
+    render, image = scene.render, scene.render.image_settings
+    if hasattr(image, "media_type"):
+        # Since Blender 5.0 only formats of the medium can be chosen.
+        image.media_type = "MULTI_LAYER_IMAGE"
+    image.file_format, image.color_mode, image.color_depth, image.exr_codec = "OPEN_EXR_MULTILAYER", "RGBA", "32", "ZIP"
+    if hasattr(image, "use_exr_interleave"):
+        # All in one part: Blender 5.0.1 cannot write several where pixels are not square.
+        image.use_exr_interleave = True
+    render.filepath = os.path.join(folder, "render", "")
+    render.film_transparent = True
+    render.use_motion_blur = False
+    scene.camera.data.dof.use_dof = False
+    for layer in scene.view_layers:
+        layer.use_pass_combined = layer.use_pass_z = layer.use_pass_vector = layer.use_pass_cryptomatte_object = True
+        layer.pass_cryptomatte_depth = 6
+
+
+def export(scene: Any, folder: str, selected_only: bool = False, with_render: bool = True) -> None:
+    """Everything into `folder`, which is made."""
+    import bpy
+
+    track = camera_track(scene)
+    os.makedirs(folder, exist_ok=True)
+    bpy.ops.export_scene.gltf(
+        filepath=os.path.join(folder, "scene.glb"),
+        export_format="GLB",
+        use_selection=selected_only,
+        use_renderable=True,
+        export_yup=True,
+        export_apply=True,
+        export_cameras=False,
+        export_lights=True,
+    )
+    with open(os.path.join(folder, "camera_track.json"), "w", encoding="utf-8") as file:
+        json.dump(track, file, indent=1)
+    if with_render:
+        set_up_render(scene, folder)
+
+
+_registered: list[Any] = []
+
+
+def _operator() -> Any:
+    import bpy
+    from bpy_extras.io_utils import ExportHelper
+
+    class ExportMrbokeh(bpy.types.Operator, ExportHelper):  # type: ignore[misc]
+        """Write objects, camera track and render settings for mrbokeh"""
+
+        bl_idname = "export_scene.mrbokeh"
+        bl_label = "Export to mrbokeh"
+        filename_ext = ""
+        selected_only: bpy.props.BoolProperty(name="Selected objects only", default=False)
+        with_render: bpy.props.BoolProperty(name="Set up the render", description="EXR with Z, motion and Cryptomatte", default=True)
+
+        def execute(self, context: Any) -> set[str]:
+            try:
+                export(context.scene, self.filepath, self.selected_only, self.with_render)
+            except ValueError as error:
+                self.report({"ERROR"}, str(error))
+                return {"CANCELLED"}
+            return {"FINISHED"}
+
+    return ExportMrbokeh
+
+
+def _menu(menu: Any, _context: Any) -> None:
+    menu.layout.operator("export_scene.mrbokeh", text="mrbokeh (folder)")
+
+
+def register() -> None:
+    """Called by Blender when the add-on is switched on."""
+    import bpy
+
+    _registered.append(_operator())
+    bpy.utils.register_class(_registered[-1])
+    bpy.types.TOPBAR_MT_file_export.append(_menu)
+
+
+def unregister() -> None:
+    """Called by Blender when the add-on is switched off."""
+    import bpy
+
+    bpy.types.TOPBAR_MT_file_export.remove(_menu)
+    while _registered:
+        bpy.utils.unregister_class(_registered.pop())

@@ -1,0 +1,132 @@
+"""Colour spaces of other programs by name, through OpenColorIO 2 (extra `ocio`): plates in, pictures out.
+
+    to_ours = ColorConversion.of("aces", "ARRI LogC4", REC709_LINEAR)
+    plate_rgb = to_ours.applied(decoded_rgb)
+
+"aces" is the studio configuration of the Academy that is built into OpenColorIO: ACES spaces, camera log curves, displays.
+"""
+
+import difflib
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.errors import InputError, MissingExtraError
+
+REC709_LINEAR = "Linear Rec.709 (sRGB)"
+"""What everything here is in, as the Academy's configurations name it; many others know it by the alias lin_rec709_srgb."""
+AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+"""CIE x, y of red, green, blue and white of ACEScg (S-2014-004), to be stated in an EXR header."""
+BUILT_IN = {"aces": "studio-config-latest", "aces-cg": "cg-config-latest"}
+_OURS = (REC709_LINEAR, "lin_rec709_srgb", "lin_rec709", "lin_srgb", "Utility - Linear - sRGB", "Linear Rec.709")
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class ColorConversion:
+    """From one colour space of a configuration to another."""
+
+    source: str
+    target: str
+    processor: Any
+
+    @classmethod
+    def of(cls, config: Path | str | None, source: str, target: str, view: str = "") -> "ColorConversion":
+        """config: "aces" (studio) or "aces-cg", both built in; a file (.ocio, .ocioz); None is the file that $OCIO names.
+
+        source, target: colour spaces, aliases or roles ("scene_linear"). view: with it target is a display, such as "sRGB - Display",
+        and the view its rendering, such as "Un-tone-mapped". Raises InputError with the nearest names where one is unknown.
+        """
+        opened = open_config(config)
+        import PyOpenColorIO as ocio  # noqa: N813
+
+        _known(opened, source)
+        if view:
+            _one_of("display", target, list(opened.getDisplays()))
+            _one_of(f"view of {target}", view, list(opened.getViews(target)))
+            transform: Any = ocio.DisplayViewTransform(src=source, display=target, view=view)
+            processor = opened.getProcessor(transform)
+        else:
+            _known(opened, target)
+            processor = opened.getProcessor(source, target)
+        return cls(source, f"{target}, {view}" if view else target, processor.getDefaultCPUProcessor())
+
+    @classmethod
+    def to_rec709(cls, config: Path | str | None, source: str) -> "ColorConversion":
+        """From a space of the configuration to ours, linear Rec.709."""
+        return cls.of(config, source, rec709_name(open_config(config)))
+
+    @classmethod
+    def from_rec709(cls, config: Path | str | None, target: str, view: str = "") -> "ColorConversion":
+        """From ours, linear Rec.709, to a space of the configuration, or a view of a display."""
+        return cls.of(config, rec709_name(open_config(config)), target, view)
+
+    def applied(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        """A converted copy; the picture itself stays. Premultiplied pictures have to be divided by alpha before a curve, not a matrix."""
+        copy = np.array(rgb, np.float32, order="C")
+        self.apply(copy)
+        return copy
+
+    def apply(self, rgb: Float32[np.ndarray, "height width 3"]) -> None:
+        """In place, without a copy. Raises InputError where rows or pixels are not packed."""
+        if not rgb.flags.c_contiguous:
+            raise InputError("a picture to be converted in place must lie packed in memory: use `applied`, or make it contiguous")
+        if rgb.size:
+            self.processor.applyRGB(rgb)
+
+
+def open_config(config: Path | str | None) -> Any:
+    """An OpenColorIO configuration; opening the built-in ones takes a moment, so they are kept."""
+    if config is None:
+        config = os.environ.get("OCIO", "")
+        if not config:
+            raise InputError(
+                "expected an OpenColorIO configuration, but $OCIO is not set: set it, name a file, or take the built-in 'aces'"
+            )
+    return _opened(BUILT_IN.get(str(config), str(config)))
+
+
+def rec709_name(opened: Any) -> str:
+    """What a configuration calls linear Rec.709. Raises InputError where it has none."""
+    for name in _OURS:
+        if opened.getColorSpace(name) is not None:
+            return name
+    raise InputError(f"the colour configuration has no linear Rec.709 (looked for {', '.join(_OURS)}): state its name for it")
+
+
+@lru_cache(maxsize=4)
+def _opened(config: str) -> Any:
+    try:
+        import PyOpenColorIO as ocio  # noqa: N813
+    except ModuleNotFoundError as missing:
+        raise MissingExtraError("opencolorio", "ocio") from missing
+    try:
+        if config in BUILT_IN.values() or config.startswith("ocio://"):
+            return ocio.Config.CreateFromBuiltinConfig(config.removeprefix("ocio://"))
+        return ocio.Config.CreateFromFile(config)
+    except (ocio.Exception, ocio.ExceptionMissingFile) as error:
+        told = str(error).splitlines()[0]
+        raise InputError(f"expected an OpenColorIO configuration, {' or '.join(BUILT_IN)} or a file, at {config}: {told}") from None
+
+
+def _known(opened: Any, name: str) -> None:
+    """Colour spaces, roles and aliases are all good."""
+    if opened.getColorSpace(name) is None:
+        aliases = {alias: each.getName() for each in opened.getColorSpaces() for alias in each.getAliases()}
+        _one_of("colour space", name, list(opened.getColorSpaceNames()), aliases)
+
+
+def _one_of(what: str, name: str, names: list[str], aliases: dict[str, str] | None = None) -> None:
+    """Raises InputError with names like the one that is not there; aliases: other names of some of them."""
+    if name in names:
+        return
+    folded = {each.lower(): told for each, told in [*(aliases or {}).items(), *((each, each) for each in names)]}
+    near = [folded[each] for each in difflib.get_close_matches(name.lower(), folded, n=_NAMED, cutoff=0.4)]
+    near += [each for each in names if name and name.lower() in each.lower()][:_NAMED]
+    told = f"did you mean {', '.join(dict.fromkeys(near))}?" if near else f"there are {', '.join(names)}"
+    raise InputError(f"the colour configuration has no {what} {name!r}: {told}")
