@@ -1,0 +1,129 @@
+"""`mrbokeh refocus`: new slices of a focal stack at any focus, with its own lens or another."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FocalStack, Slice
+from mrbokeh.refocusing import Refocusing
+
+app = typer.Typer(add_completion=False)
+
+_SETTINGS = "refocus.json"
+
+
+@app.command()
+def refocus(
+    stack: Annotated[Path, typer.Argument(help="Folder of a merged focal stack.")],
+    focus: Annotated[str, typer.Option(help="Focus distances in metres, such as 0.8,1.2,inf, or NEAR:FAR:COUNT, evenly in dioptres.")],
+    out: Annotated[Path, typer.Option(help="Folder for the new focal stack.")],
+    f_number: Annotated[float | None, typer.Option(help="Another opening of the stack's lens.")] = None,
+    lens: Annotated[Path | None, typer.Option(help="LENS.json or LENS.onnx in place of the stack's lens.")] = None,
+    renderer: Annotated[
+        str | None, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
+    ] = None,
+    residuals: Annotated[
+        bool,
+        typer.Option(
+            "--residuals/--no-residuals",
+            help="Carry over what rendering misses of the slices next to the focus. Without: all rendered alike, for a focus pull.",
+        ),
+    ] = True,
+    sheet: Annotated[Path | None, typer.Option(help="Also write a contact sheet of the new slices (.png).")] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
+) -> None:
+    """Make slices between and beyond the captured ones, from the all-in-focus picture and the depth, through the lens of the stack.
+
+    A captured focus gives the captured slice, unless --no-residuals. OUT is a focal stack again; an interrupted run goes on.
+
+    Example: mrbokeh refocus SCENE/view_0 --focus 0.5:inf:12 --out refocused
+    """
+    from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.focal_stack import read_focal_stack, write_focal_stack, write_merged
+
+    if out.resolve() == stack.resolve():
+        raise InputError("--out must be another folder than the stack's own")
+    source, distances_m = read_focal_stack(stack), parse_focus(focus)
+    way = _way(source, f_number, lens, renderer, residuals)
+    _make_room(out, overwrite)
+    if sheet is not None:
+        refuse_existing(sheet, overwrite)
+    settings = {"stack": str(stack.resolve()), "f_number": f_number, "lens": str(lens), "renderer": renderer, "residuals": residuals}
+    slices = _write_slices(way, distances_m, out, settings, overwrite)
+    write_merged(out, source.all_in_focus(), source.focus_index(), source.depth_confidence(), source.depth_m())
+    made = FocalStack(
+        out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata={"refocused": settings}
+    )
+    write_focal_stack(made)
+    if sheet is not None:
+        _write_sheet(sheet, made)
+    typer.echo(f"wrote {out} ({len(slices)} slices)")
+
+
+def parse_focus(text: str) -> tuple[float, ...]:
+    """Distances in metres, commas between them, or NEAR:FAR:COUNT, evenly in dioptres."""
+    import numpy as np
+
+    try:
+        if ":" in text:
+            near, far, count = text.split(":")
+            dioptres = np.linspace(1.0 / float(near), 1.0 / float(far), int(count))
+            distances = tuple(float("inf") if each == 0 else float(1.0 / each) for each in dioptres)
+        else:
+            distances = tuple(float(each) for each in text.split(","))
+    except (ValueError, ZeroDivisionError):
+        distances = ()
+    if not distances or not all(each > 0 for each in distances) or len(set(distances)) < len(distances):
+        raise InputError(f"--focus: expected different distances in metres such as 0.8,1.2,inf, or NEAR:FAR:COUNT, got {text!r}")
+    return distances
+
+
+def _make_room(out: Path, overwrite: bool) -> None:
+    """Only what this command wrote is ever replaced; a run that was stopped has no stack.json yet and goes on."""
+    from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
+
+    if out.exists() and not (out / _SETTINGS).is_file():
+        raise InputError(f"{out} exists and was not made by refocus: give another name")
+    if not (out / FILE_NAME).is_file():
+        return
+    if not overwrite:
+        raise InputError(f"{out} exists already: give another name, or --overwrite to replace it")
+    for each in read_focal_stack(out).slices:
+        (out / each.path).unlink(missing_ok=True)
+    (out / FILE_NAME).unlink()
+
+
+def _way(source: FocalStack, f_number: float | None, lens: Path | None, renderer: str | None, residuals: bool) -> Refocusing:
+    from mrbokeh.renderers.choose import lens_and_renderer
+
+    if f_number is not None and not f_number > 0:
+        raise InputError(f"expected --f-number above 0, got {f_number:g}")
+    chosen, blurs = lens_and_renderer(lens, renderer)
+    if f_number is not None:
+        chosen = replace(chosen or source.lens_of(source.reference), f_number=f_number)
+    return Refocusing(source, blurs, chosen, residuals)
+
+
+def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, settings: dict, overwrite: bool) -> tuple[Slice, ...]:
+    """Slices that are there already, made with the same settings by a run that was stopped, are kept."""
+    from mrbokeh.atomic_files import read_json, write_json
+    from mrbokeh.image_io import write_image
+    from mrbokeh.progress import track
+
+    kept = not overwrite and (out / _SETTINGS).is_file() and read_json(out / _SETTINGS, "settings of refocus") == settings
+    write_json(out / _SETTINGS, settings)
+    slices = tuple(Slice(f"slice_{distance_m:.4f}m.exr", distance_m) for distance_m in distances_m)
+    for each, distance_m in track(list(zip(slices, distances_m, strict=True)), "refocusing"):
+        if not (kept and (out / each.path).is_file()):
+            write_image(out / each.path, way.slice_at(distance_m), half=False)
+    return slices
+
+
+def _write_sheet(path: Path, made: FocalStack) -> None:
+    from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
+
+    pictures = {f"{each.focus_distance_m:.3g} m": made.slice_rgb(index) for index, each in enumerate(made.slices)}
+    write_contact_sheet(path, [SheetRow("focus", pictures)])

@@ -1,0 +1,120 @@
+"""One virtual scene in every slice of a focal stack, so that the result is a focal stack again: with depth and an all-in-focus picture."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from mrbokeh.atomic_files import atomic_folder
+from mrbokeh.camera_rgb import Matrix3x3, write_camera_rgb
+from mrbokeh.color import convert
+from mrbokeh.compositing.base import Inserted, Insertion
+from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FocalStack, write_focal_stack, write_merged
+from mrbokeh.layer import Layer, flatten
+from mrbokeh.lens import Lens
+from mrbokeh.plate import Plate, plate_of
+from mrbokeh.progress import track
+from mrbokeh.renderers.base import Renderer
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Mask = Bool[np.ndarray, "height width"]
+
+_SURFACE = 0.5
+"""Depth has one surface per pixel: the virtual one where it covers at least this much."""
+
+
+@dataclass(frozen=True)
+class Unblurred:
+    """A renderer of pinhole pictures: what is put into the all-in-focus picture stays sharp."""
+
+    def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:  # noqa: ARG002
+        return flatten(layers)
+
+
+def composite_stack(
+    stack: FocalStack, layers: Sequence[Layer] | Callable[[Plate], Sequence[Layer]], insertion: Insertion, renderer: Renderer, out: Path
+) -> FocalStack:
+    """Write a merged focal stack to the new folder `out`, in which each slice holds the layers with the blur of its own focus.
+
+    layers: sharp, front first, of the registered size; or what gives them for a plate (a scene rendered for its camera). Pixels that
+    they do not touch keep the stored numbers of the stack, in its own camera RGB. Raises InputError where `out` exists, or the stack
+    is not merged, not registered or without focus distances.
+    """
+    if not stack.registered:
+        raise InputError(
+            f"{stack.folder} is not registered, so that one scene cannot fit all its slices: run `mrbokeh capture merge` on it"
+        )
+    depth_m, sharp_rgb = stack.depth_m(), stack.all_in_focus()
+    with atomic_folder(out) as folder:
+        for index in track(range(len(stack)), "compositing slices"):
+            plate = _plate(stack, index, depth_m, sharp_rgb)
+            inserted = insertion.insert(plate, _layers(layers, plate), renderer)
+            _write_slice(stack, index, inserted, folder)
+        plate = replace(_plate(stack, stack.reference, depth_m, sharp_rgb), rgb=sharp_rgb)
+        _write_merge(stack, insertion.insert(plate, _layers(layers, plate), Unblurred()), depth_m, folder)
+        write_focal_stack(replace(stack, folder=folder, metadata=stack.metadata | {"composited_from": stack.folder.name}))
+    return replace(stack, folder=out, metadata=stack.metadata | {"composited_from": stack.folder.name})
+
+
+def _layers(layers: Sequence[Layer] | Callable[[Plate], Sequence[Layer]], plate: Plate) -> Sequence[Layer]:
+    return layers(plate) if callable(layers) else layers
+
+
+def _plate(stack: FocalStack, index: int, depth_m: Float32[np.ndarray, "height width"], sharp_rgb: Rgb) -> Plate:
+    """All slices are seen by one camera; blur is larger by the scale of the registration."""
+    lens = stack.lens_of(index)
+    lens = replace(lens, sensor_width_mm=lens.sensor_width_mm / stack.slices[index].scale)
+    rgb = stack.slice_rgb(index)
+    camera = stack.camera or plate_of(rgb, stack.lens_of(stack.reference)).camera
+    return Plate(rgb, depth_m, lens, replace(camera, camera_from_world=np.eye(4)), sharp_rgb)
+
+
+def _write_slice(stack: FocalStack, index: int, inserted: Inserted, folder: Path) -> None:
+    stored, masks = stack.slice_camera_rgb(index), stack.slice_masks(index)
+    touched = _touched(inserted, stack.to_rec709(stored))
+    camera_rgb = _in_camera_rgb(stored, inserted.rgb, touched, stack.rec709_from_camera)
+    write_camera_rgb(
+        folder / stack.slices[index].path,
+        camera_rgb,
+        stack.rec709_from_camera,
+        saturated=masks.saturated & (inserted.virtual.alpha < 1.0),
+        valid=masks.valid,
+        half=_is_half(stored),
+    )
+
+
+def _write_merge(stack: FocalStack, inserted: Inserted, depth_m: Float32[np.ndarray, "height width"], folder: Path) -> None:
+    stored = stack.all_in_focus_camera_rgb()
+    touched = _touched(inserted, stack.to_rec709(stored))
+    surface = (inserted.virtual.alpha >= _SURFACE) & np.isfinite(inserted.virtual.depth_m)
+    new_depth_m = np.where(surface, inserted.virtual.depth_m, depth_m).astype(np.float32)
+    dioptres = np.array([1.0 / float(each) for each in stack.focus_distances_m if each is not None])
+    order = np.argsort(dioptres)
+    virtual_index = np.interp(1.0 / new_depth_m, dioptres[order], order).astype(np.float32)
+    write_merged(
+        folder,
+        _in_camera_rgb(stored, inserted.rgb, touched, stack.rec709_from_camera),
+        np.where(surface, virtual_index, stack.focus_index()).astype(np.float32),
+        np.where(surface, np.float32(1.0), stack.depth_confidence()).astype(np.float32),
+        new_depth_m,
+        stack.rec709_from_camera,
+    )
+    if stack.exclusion_path.is_file():
+        (folder / stack.exclusion_path.name).write_bytes(stack.exclusion_path.read_bytes())
+
+
+def _touched(inserted: Inserted, rgb: Rgb) -> Mask:
+    return (inserted.rgb != rgb).any(axis=2)
+
+
+def _in_camera_rgb(stored: Rgb, rgb: Rgb, touched: Mask, rec709_from_camera: Matrix3x3 | None) -> Rgb:
+    """The stored numbers, and where something was put in its light in the same primaries."""
+    own = rgb if rec709_from_camera is None else convert(rgb, np.linalg.inv(np.array(rec709_from_camera)))
+    return np.where(touched[..., None], own, stored)
+
+
+def _is_half(stored: Rgb) -> bool:
+    return bool((stored.astype(np.float16).astype(np.float32) == stored).all())
