@@ -2,7 +2,7 @@
 
 import typer
 
-from capture.commands import cameras, dataset, depth, ingest, merge, plan, poses, process, report, scale, shoot
+from capture.commands import cameras, dataset, depth, ingest, matchmove, merge, plan, poses, process, report, scale, shoot
 
 app = typer.Typer(no_args_is_help=True, help="Photographs to focal stacks: shoot, ingest, merge, poses, scale, depth, report, dataset.")
 app.command("plan", help=plan.HELP)(plan.plan_command)
@@ -11,6 +11,7 @@ app.command("shoot", help=shoot.HELP)(shoot.shoot_command)
 app.command("ingest", help=ingest.HELP)(ingest.ingest_command)
 app.command("merge", help=merge.HELP)(merge.merge_command)
 app.command("poses", help=poses.HELP)(poses.poses_command)
+app.command("matchmove", help=matchmove.HELP)(matchmove.matchmove_command)
 app.command("scale", help=scale.HELP)(scale.scale_command)
 app.command("depth", help=depth.HELP)(depth.depth_command)
 app.command("dataset", help=dataset.HELP)(dataset.dataset_command)

@@ -23,6 +23,9 @@ EXTRA_OF_MODULE = {
     "onnx": "train",
     "onnxscript": "train",
     "aiohttp": "viewfinder",
+    "mitsuba": "mitsuba",
+    "PyOpenColorIO": "ocio",
+    "distributed": "cluster",
 }
 
 
@@ -41,6 +44,7 @@ SUB_COMMANDS = {
     "refocus": SubCommand("mrbokeh.commands.refocus", "New slices of a focal stack, between and beyond the captured ones."),
     "transfer": SubCommand("mrbokeh.commands.transfer", "Put a lens on an all-in-focus photograph with a depth map."),
     "check": SubCommand("mrbokeh.commands.check", "Find what is wrong in composites: NaN, leaks, lost light, flicker."),
+    "track": SubCommand("mrbokeh.commands.track", "The camera of every frame of a clip, and its files."),
     "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),
     "blender-addon": SubCommand("mrbokeh.commands.blender_addon", "Write the add-on that exports scenes from Blender."),
     "demo": SubCommand("mrbokeh.commands.demo", "The whole way on shipped photographs, with a report."),

@@ -8,9 +8,11 @@ from jaxtyping import Float32
 
 from mrbokeh.camera import Camera
 from mrbokeh.capture_bundle import CaptureBundle
+from mrbokeh.depth_sources.depth_settings import DepthSettings
+from mrbokeh.depth_sources.open_depth import open_depth
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
-from mrbokeh.image_io import read_depth
+from mrbokeh.image_io import read_image
 from mrbokeh.lens import Lens
 from mrbokeh.photograph import read_photograph
 
@@ -53,7 +55,7 @@ class Plate:
         return float(x_m), float(y_m), float(z_m)
 
 
-def open_plate(photo: Path, slice_index: int | None, depth: Path | None, lens: Lens | None, focus_m: float | None) -> Plate:
+def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
     """A photograph with a lens, or a merged focal stack with the number of a slice, which brings its own lens and depth.
 
     lens: overrides what the photograph's metadata or the stack tell, but keeps the focus of a slice. focus_m overrides all.
@@ -66,7 +68,7 @@ def open_plate(photo: Path, slice_index: int | None, depth: Path | None, lens: L
     if lens is None:
         lens = photograph.lens(photo, focus_m)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
-    return plate_of(photograph.rgb, focused, None if depth is None else read_depth(depth))
+    return plate_of(photograph.rgb, focused)
 
 
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
@@ -74,12 +76,23 @@ def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Fl
     return Plate(rgb, depth_m, lens, _pinhole(lens, rgb))
 
 
-def bundle_plate(bundle: CaptureBundle, depth: Path | None, lens: Lens | None, focus_m: float | None) -> Plate:
+def bundle_plate(bundle: CaptureBundle, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
     """What the viewfinder captured; lens: overrides the optics but keeps the focus. Objects are placed in camera axes."""
     focused = bundle.lens if lens is None else lens.focused_at(bundle.lens.focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)
     camera = replace(bundle.camera, camera_from_world=np.eye(4))
-    return Plate(bundle.plate_rgb, None if depth is None else read_depth(depth), focused, camera)
+    return Plate(bundle.plate_rgb, None, focused, camera)
+
+
+def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
+    """The plate with depth from a file, or from a network that looks at its sharpest picture."""
+    depth = open_depth(source, plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb, settings)
+    return replace(plate, depth_m=depth.depth_m)
+
+
+def with_matte(plate: Plate, path: Path) -> Plate:
+    """The plate with a user's matte of what stands in front, whose numbers are taken as coverage."""
+    return replace(plate, near_alpha=np.ascontiguousarray(read_image(path, "linear")[..., 1]))
 
 
 def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus_m: float | None) -> Plate:

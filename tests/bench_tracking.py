@@ -17,18 +17,18 @@ import numpy as np
 
 from mrbokeh.camera import Camera
 from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.charuco.board_alignment import AlignedDetector, aligned_corners
+from mrbokeh.charuco.corner_flow import flow
 from mrbokeh.charuco.detector import CharucoDetector, Grey
+from mrbokeh.charuco.pose_from_points import pose_from_plane
 from mrbokeh.lens import Lens
 from mrbokeh.video_io import read_display_frames
 from tests.machine import machine_line, memory_line
 from tests.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.board_alignment import AlignedDetector, aligned_corners
 from viewfinder.tracking.charuco_tracker import CharucoTracker
-from viewfinder.tracking.corner_flow import flow
 from viewfinder.tracking.detection_thread import Detector, ImmediateDetections
-from viewfinder.tracking.pose_from_points import pose_from_plane
 
 FRAMES = 30
 REAL_CLIP = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "video" / "charuco_handheld.mp4"

@@ -16,7 +16,11 @@ ROWS = (
     ("demo.",),
     ("lens_drawing", "psf_bank_drawing", "stack_pictures", "stack_compositing", "transferring"),
     ("picture_checks.", "refocusing"),
+    ("shots.",),
+    ("picture_sources.",),
+    ("camera_track.",),
     ("staging.",),
+    ("moving_layers.",),
     ("plate_look.",),
     ("compositing.", "overlay", "_overlay_numba", "tilt_shift"),
     ("plate",),
@@ -35,6 +39,7 @@ ROWS = (
     ("video_color", "_video_frames_numba"),
     ("capture_bundle",),
     ("lens_file", "camera_file", "charuco.", "photograph"),
+    ("lens_distortion.",),
     ("lens_file_values",),
     ("exr_layers.",),
     ("image_io", "camera_rgb"),
@@ -173,7 +178,13 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
     COLMAP's maps are made by capture and localised in by the viewfinder; tethered cameras shoot for one and look for the other,
     both through mrbokeh.gphoto2_library.
     """
-    asking = {"mrbokeh.commands.doctor", "mrbokeh.plate_look.lensfun_falloff", "datasets_scripts.dng_writer", "mrbokeh.gphoto2_library"}
+    asking = {
+        "mrbokeh.commands.doctor",
+        "mrbokeh.plate_look.lensfun_falloff",
+        "mrbokeh.lens_distortion.lensfun_database",
+        "datasets_scripts.dng_writer",
+        "mrbokeh.gphoto2_library",
+    }
     users = {
         module
         for module, path in MODULES.items()

@@ -52,7 +52,7 @@ def test_what_was_captured_comes_back(bundle: Path) -> None:
 def test_a_bundle_composites_like_its_parts(bundle: Path, tmp_path: Path) -> None:
     done = mrbokeh("composite", bundle, "--out", tmp_path / "out.exr")
     assert done.returncode == 0, done.stderr
-    plate = bundle_plate(read_bundle(bundle), None, None, None)
+    plate = bundle_plate(read_bundle(bundle))
     expected = OverPhotograph().insert(plate, [sharp_square()], PolygonDifferences()).rgb
     np.testing.assert_allclose(read_image(tmp_path / "out.exr"), expected, atol=1e-3, rtol=1e-3)  # half precision
 

@@ -105,7 +105,7 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     plane = np.ones((HEIGHT, WIDTH), np.float32)
     write_merged(tmp_path, plate_rgb(), plane, plane, 2 * plane)
     write_focal_stack(FocalStack(tmp_path, (Slice("0.exr", 1.3),), LENS, camera, registered=True, merged=True))
-    plate = open_plate(tmp_path, 0, None, None, None)
+    plate = open_plate(tmp_path, 0)
     assert plate.point_under_pixel_m(WIDTH / 2, HEIGHT / 2) == pytest.approx((0.0, 0.0, 2.0), abs=1e-9)
 
 

@@ -124,7 +124,7 @@ def test_camera_rgb_of_a_stack_is_read_once_as_stored_and_once_converted(tmp_pat
     np.testing.assert_array_equal(read_camera_rgb(stack.all_in_focus_path), COLOURS)
     np.testing.assert_allclose(stack.all_in_focus()[0], np.array(CAMERA).T, rtol=1e-6)
     lens = Lens(50.0, 2.0, 2.0, 36.0)
-    for read in (read_linear(stack.all_in_focus_path), open_plate(stack.all_in_focus_path, None, None, lens, None).rgb):
+    for read in (read_linear(stack.all_in_focus_path), open_plate(stack.all_in_focus_path, lens=lens).rgb):
         np.testing.assert_allclose(read, stack.all_in_focus(), atol=60 * 2e-6)
 
 

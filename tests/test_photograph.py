@@ -50,11 +50,11 @@ def test_a_quarter_turn_is_counter_clockwise() -> None:
     ],
 )
 def test_a_photograph_tells_its_lens(name: str, focal_length_mm: float, f_number: float, focus_m: float, sensor_mm: float) -> None:
-    lens = open_plate(DATA / name, None, None, None, None).lens
+    lens = open_plate(DATA / name).lens
     assert (lens.focal_length_mm, lens.f_number) == (focal_length_mm, f_number)
     assert lens.focus_distance_m == pytest.approx(focus_m, rel=0.02)
     assert lens.sensor_width_mm == pytest.approx(sensor_mm, rel=0.02)
-    assert open_plate(DATA / name, None, None, None, 2.0).lens.focus_distance_m == 2.0
+    assert open_plate(DATA / name, focus_m=2.0).lens.focus_distance_m == 2.0
 
 
 @shared
@@ -67,4 +67,4 @@ def test_a_raw_file_is_developed() -> None:
 def test_without_metadata_the_lens_is_asked_for(tmp_path: Path) -> None:
     photo = saved(tmp_path / "photo.jpg", 1)
     with pytest.raises(InputError, match=r"unknown: focal length, f-number, sensor width, focus distance.*--lens"):
-        open_plate(photo, None, None, None, None)
+        open_plate(photo)

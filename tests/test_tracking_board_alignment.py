@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.board_alignment import AlignedDetector, aligned_corners
 from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
 from tests.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
-from viewfinder.tracking.board_alignment import AlignedDetector, aligned_corners
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.detection_thread import ImmediateDetections
 

@@ -13,13 +13,13 @@ import pytest
 
 from mrbokeh.camera import Camera
 from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.charuco.corner_flow import FrameHistory, flow
 from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
 from mrbokeh.video_io import read_display_frames
 from tests.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker
-from viewfinder.tracking.corner_flow import FrameHistory, flow
 from viewfinder.tracking.detection_thread import DetectionThread, ImmediateDetections
 
 

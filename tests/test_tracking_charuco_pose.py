@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.pose_from_points import pose_from_plane
 from tests.traced_board_clip import BOARD
-from viewfinder.tracking.pose_from_points import pose_from_plane
 
 CAMERA = Camera(640, 360, (590.0, 590.0), (320.0, 180.0))
 

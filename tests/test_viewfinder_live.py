@@ -278,7 +278,7 @@ def test_a_capture_composites_to_what_the_stream_showed(clip: LiveClip, tmp_path
             sequence = bundle.facts["sequence"]
             streamed = await watch.until(lambda seen: any(each.sequence == sequence for each in seen))
         shown = next(each for each in streamed if each.sequence == sequence).bgr
-        plate = bundle_plate(bundle, None, None, None)
+        plate = bundle_plate(bundle)
         picture = OverPhotograph().insert(plate, bundle.layers, make_renderer(bundle.renderer)).rgb
         codes = 255.0 * code_from_linear(np.clip(picture, 0.0, 1.0), "bt709")[..., ::-1]
         assert (bundle.lens.f_number, bundle.lens.focus_distance_m) == (2.0, 0.4)

@@ -1,117 +1,113 @@
-"""`mrbokeh composite`: virtual objects into a photograph."""
+"""`mrbokeh composite`: virtual objects into a photograph, or into all slices of a focal stack."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.commands import _composite_options as options
+from mrbokeh.commands import _look_options as look
 
 if TYPE_CHECKING:
-    from mrbokeh.camera import Camera
-    from mrbokeh.layer import Layer
-    from mrbokeh.staging.one_object import OneObject
+    from mrbokeh.commands._composite_layers import LayersFor
+    from mrbokeh.compositing.base import Insertion
+    from mrbokeh.renderers.base import Renderer
 
 app = typer.Typer(add_completion=False)
 
 
 @app.command()
 def composite(
-    photo: Annotated[
-        Path,
-        typer.Argument(help="A photograph, the folder of a merged focal stack (then give --slice), or a capture bundle of the viewfinder."),
-    ],
-    out: Annotated[Path, typer.Option(help="Where the picture goes: .exr stays linear, .png and .tif are 16-bit sRGB, .jpg is 8-bit.")],
-    layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with R, G, B, A, Z; may be given several times, front first.")] = None,
-    object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None,
-    lens: Annotated[
-        Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. A stack brings its own.")
-    ] = None,
-    renderer: Annotated[
-        str | None,
-        typer.Option(
-            "--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network, else polygon."
-        ),
-    ] = None,
-    slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.")] = None,
-    depth: Annotated[
-        Path | None, typer.Option(help="Depth of the photograph in metres (EXR with Z): real things hide virtual ones.")
-    ] = None,
-    focus: Annotated[float | None, typer.Option(help="Focus distance of the photograph in metres.")] = None,
-    at: Annotated[str | None, typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens.")] = None,
-    at_pixel: Annotated[str | None, typer.Option(help="X,Y of the pixel on which the object stands; needs depth.")] = None,
-    height: Annotated[float | None, typer.Option(help="Height of the object in metres; default: as in the file.")] = None,
-    turn: Annotated[float, typer.Option(help="Turn of the object about the vertical in degrees.")] = 0.0,
-    tilt: Annotated[float, typer.Option(help="How far the camera looks down, in degrees.")] = 0.0,
-    environment: Annotated[Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the object.")] = None,
-    exposure: Annotated[float, typer.Option(help="Factor on the object's light.")] = 1.0,
-    shadow: Annotated[float, typer.Option(help="Darkness of the object's shadow, 0 to 1.")] = 0.0,
-    save_layer: Annotated[Path | None, typer.Option(help="Also write the blurred virtual layer (EXR with alpha).")] = None,
-    overwrite: Annotated[bool, typer.Option(help="Replace files that exist.")] = False,
+    photo: options.PhotoArgument,
+    out: options.OutOption,
+    slice_: options.SliceOption = None,
+    all_slices: options.AllSlicesOption = False,
+    depth: options.DepthOption = None,
+    disparity: options.DisparityOption = None,
+    depth_scale: options.DepthScaleOption = None,
+    matte: options.MatteOption = None,
+    input_space: options.InputSpaceOption = None,
+    layer: options.LayerOption = None,
+    objects: options.ObjectsOption = None,
+    object_: options.ObjectOption = None,
+    at: options.AtOption = None,
+    at_pixel: options.AtPixelOption = None,
+    height: options.HeightOption = None,
+    turn: options.TurnOption = 0.0,
+    tilt: options.TiltOption = 0.0,
+    scene: options.SceneOption = None,
+    camera: options.CameraOption = None,
+    time: options.TimeOption = 0.0,
+    mode: options.ModeOption = None,
+    scene_renderer: options.BackendOption = "embree",
+    samples: options.SamplesOption = 64,
+    environment: options.EnvironmentOption = None,
+    exposure: options.ExposureOption = 1.0,
+    shadow: options.ShadowOption = 0.0,
+    catch: options.CatchOption = "shadow",
+    match_grey: look.MatchGreyOption = None,
+    grey_value: look.GreyValueOption = 0.18,
+    match_exposure: look.MatchExposureOption = None,
+    match_white: look.MatchWhiteOption = None,
+    match_black: look.MatchBlackOption = None,
+    vignetting: look.VignettingOption = None,
+    grain: look.GrainOption = None,
+    light_wrap: look.LightWrapOption = None,
+    seed: look.SeedOption = 0,
+    lens: options.LensOption = None,
+    focus: options.FocusOption = None,
+    renderer: options.RendererOption = None,
+    distortion: options.DistortionOption = None,
+    save_layer: options.SaveLayerOption = None,
+    output_space: options.OutputSpaceOption = None,
+    ocio: options.OcioOption = "aces",
+    overwrite: options.OverwriteOption = False,
 ) -> None:
-    """Put virtual objects into a photograph, blurred by its lens.
+    """Put virtual objects into a photograph, blurred by its lens, behind and before what is blurred in it.
 
     Example: mrbokeh composite SCENE/view_2 --slice 1 --object cake.glb --at-pixel 300,250 --height 0.1 --lens lens.onnx --out out.png
 
+    Example: mrbokeh composite IMG_2041.NEF --layer lantern.exr --depth phone.jpg --grain auto --out out.exr
+
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
-    import math
-
     from mrbokeh.atomic_files import refuse_existing
     from mrbokeh.capture_bundle import is_bundle, read_bundle
-    from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
-    from mrbokeh.image_io import read_layer, write_image, write_layer
-    from mrbokeh.plate import bundle_plate, open_plate
+    from mrbokeh.commands._composite_layers import ObjectOptions, SceneOptions, VirtualOptions, layers_by
+    from mrbokeh.commands._composite_outputs import write_picture
+    from mrbokeh.commands._composite_plate import PlateOptions, insertion_for, plate_by
+    from mrbokeh.image_io import write_layer
+    from mrbokeh.plate_look.finishing import finished
+    from mrbokeh.plate_look.look_options import LookOptions, finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
-    from mrbokeh.staging.one_object import OneObject
-    from mrbokeh.staging.scene_description import Lighting
 
     for path in (out, save_layer):
         if path is not None:
             refuse_existing(path, overwrite)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     used_lens, used_renderer = lens_and_renderer(lens, renderer or (bundle.renderer if bundle and lens is None else None))
-    plate = open_plate(photo, slice_, depth, used_lens, focus) if bundle is None else bundle_plate(bundle, depth, used_lens, focus)
-    layers = [read_layer(path) for path in layer or ()] + list(bundle.layers if bundle else ())
-    if object_ is not None:
-        foot_m = _triple(at) if at else plate.point_under_pixel_m(*_pair(at_pixel))
-        light = Lighting(environment, exposure=exposure)
-        layers += _rendered(OneObject(object_, foot_m, height, math.radians(turn), math.radians(tilt), light, shadow), plate.camera)
-    if not layers:
-        raise InputError("nothing to put into the photograph: give --object OBJ.glb or --layer RGBAZ.exr")
-    inserted = insertion_of(DEFAULT_MODE).insert(plate, layers, used_renderer)
-    write_image(out, inserted.rgb)
+    plate_options = PlateOptions(photo, 0 if all_slices else slice_, focus, depth, disparity, depth_scale, matte, input_space, ocio)
+    plate = plate_by(plate_options, used_lens, bundle)
+    standing = ObjectOptions(object_, at, at_pixel, height, turn, tilt, environment, exposure, shadow)
+    rendering = SceneOptions(scene, camera, time, scene_renderer, samples, catch, distortion)
+    layers_for = layers_by(VirtualOptions(tuple(layer or ()), objects, standing, rendering), plate, bundle)
+    insertion = insertion_for(mode, plate)
+    if all_slices:
+        _into_all_slices(photo, out, layers_for, insertion, used_renderer)
+        return
+    wanted = LookOptions(match_grey, grey_value, match_exposure, match_white, match_black, vignetting, grain, light_wrap, seed)
+    finishing = finishing_of(wanted, plate.rgb, None if photo.is_dir() else photo)
+    sharp = layers_for(plate)
+    inserted = finished(insertion.insert(plate, sharp, used_renderer), plate, finishing)
+    write_picture(out, inserted, plate, sharp, output_space, ocio)
     if save_layer is not None:
         write_layer(save_layer, inserted.virtual)
     typer.echo(f"wrote {out}")
 
 
-def _rendered(one: "OneObject", camera: "Camera") -> "list[Layer]":
-    from mrbokeh.scene.choose import scene_renderer
-    from mrbokeh.staging.assets import Assets
-    from mrbokeh.staging.staged_layers import staged_layers
-    from mrbokeh.staging.staged_scene import StagedScene
+def _into_all_slices(stack: Path, out: Path, layers_for: "LayersFor", insertion: "Insertion", renderer: "Renderer") -> None:
+    from mrbokeh.focal_stack import read_focal_stack
+    from mrbokeh.stack_compositing import composite_stack
 
-    return staged_layers(StagedScene.load(one.described(), Assets()), one.seen_by(camera), scene_renderer("embree"))
-
-
-def _triple(text: str) -> tuple[float, float, float]:
-    x_m, y_m, z_m = _numbers(text, 3, "--at")
-    return x_m, y_m, z_m
-
-
-def _pair(at_pixel: str | None) -> tuple[float, float]:
-    if at_pixel is None:
-        raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y on a photograph with depth")
-    x_px, y_px = _numbers(at_pixel, 2, "--at-pixel")
-    return x_px, y_px
-
-
-def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != count:
-        raise InputError(f"{option} expects {count} numbers with commas between, got {text!r}")
-    return numbers
+    composite_stack(read_focal_stack(stack), layers_for, insertion, renderer, out)
+    typer.echo(f"wrote the focal stack {out}")

@@ -16,8 +16,8 @@ from mrbokeh.staging.picture_box import drawn_points_m
 from mrbokeh.staging.scene_description import PlacedObject, SceneDescription
 from mrbokeh.staging.upright import turned
 
-_MOMENT_S = 1 / 120
-"""Animations are posed at whole multiples of this, so that two frames of one moment share one scene."""
+MOMENT_S = 1 / 120
+"""Live, animations are posed at whole multiples of this, so that two frames of one moment share one scene."""
 
 
 _first_scenes: WeakKeyDictionary[GltfAsset, dict[str | None, Scene]] = WeakKeyDictionary()
@@ -75,16 +75,18 @@ class StagedScene:
         description: SceneDescription,
         objects: tuple[StagedObject, ...],
         lighting: tuple[Environment | None, tuple[Light, ...]],
+        moment_s: float = MOMENT_S,
     ) -> None:
-        self.description, self.objects, self._lighting = description, objects, lighting
+        """moment_s: scenes are posed at whole multiples of this; 0 for any time, as a shutter asks for."""
+        self.description, self.objects, self._lighting, self._moment_s = description, objects, lighting, moment_s
         self._made: tuple[float, Scene, Mapping[str, Scene]] | None = None
         self._points: tuple[Scene, Float[np.ndarray, "points 3"]] | None = None
 
     @classmethod
-    def load(cls, description: SceneDescription, assets: Assets) -> "StagedScene":
+    def load(cls, description: SceneDescription, assets: Assets, moment_s: float = MOMENT_S) -> "StagedScene":
         """InputError where a file or an animation is not what the description says."""
         objects = tuple(_opened(each, assets, description) for each in description.objects)
-        staged = cls(description, objects, assets.light(description.light, description.up))
+        staged = cls(description, objects, assets.light(description.light, description.up), moment_s)
         staged.scene_at(0.0)
         return staged
 
@@ -125,10 +127,10 @@ class StagedScene:
         objects = tuple(
             each if new is each.placed else StagedObject(new, each.asset, each.up) for new, each in zip(placed, self.objects, strict=True)
         )
-        return StagedScene(replace(self.description, objects=placed), objects, self._lighting)
+        return StagedScene(replace(self.description, objects=placed), objects, self._lighting, self._moment_s)
 
     def _made_at(self, time_s: float) -> tuple[Scene, Mapping[str, Scene]]:
-        moment_s = round(time_s / _MOMENT_S) * _MOMENT_S if self.is_animated else 0.0
+        moment_s = self._moment_of(time_s) if self.is_animated else 0.0
         made = self._made
         if made is None or made[0] != moment_s:
             parts = {each.placed.name: each.scene_at(moment_s) for each in self.objects if each.placed.visible}
@@ -136,6 +138,9 @@ class StagedScene:
             whole = Scene(tuple(mesh for part in parts.values() for mesh in part.meshes), lights, environment)
             made = self._made = moment_s, whole, parts
         return made[1], made[2]
+
+    def _moment_of(self, time_s: float) -> float:
+        return round(time_s / self._moment_s) * self._moment_s if self._moment_s > 0.0 else time_s
 
 
 def _opened(placed: PlacedObject, assets: Assets, description: SceneDescription) -> StagedObject:

@@ -7,13 +7,13 @@ import numpy as np
 
 from mrbokeh.camera import Camera
 from mrbokeh.charuco.board import CharucoBoard
+from mrbokeh.charuco.board_alignment import AlignedDetector
+from mrbokeh.charuco.corner_flow import FrameHistory
 from mrbokeh.charuco.detector import NO_CORNERS, Corners
+from mrbokeh.charuco.pose_from_points import PoseFit, pose_from_plane
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.board_alignment import AlignedDetector
-from viewfinder.tracking.corner_flow import FrameHistory
 from viewfinder.tracking.detection_thread import Detections, DetectionThread
-from viewfinder.tracking.pose_from_points import PoseFit, pose_from_plane
 
 GRACE_S = 0.25
 _ENOUGH_CORNERS = 16

@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from mrbokeh.atomic_files import read_json
 from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_from_json
+from mrbokeh.camera_track.track import is_rigid
 from mrbokeh.errors import InputError
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
@@ -34,10 +33,3 @@ def read_fixed_pose(path: Path | str) -> FixedPose:
     if not is_rigid(camera.camera_from_world):
         raise InputError(f"{path}: camera_from_world must be a rigid transform (4x4: a rotation and a shift in metres), but it is not one")
     return FixedPose(camera)
-
-
-def is_rigid(pose: np.ndarray) -> bool:
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        return False
-    turn = pose[:3, :3]
-    return bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0 and np.array_equal(pose[3], (0, 0, 0, 1)))

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.corner_flow import FrameHistory
 from mrbokeh.charuco.detector import NO_CORNERS, Corners
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.corner_flow import FrameHistory
 from viewfinder.tracking.detection_thread import Detections, DetectionThread
 from viewfinder.tracking.map_localiser import MapLocaliser
 from viewfinder.tracking.map_pose import MapPose, pose_in_map, pose_refined

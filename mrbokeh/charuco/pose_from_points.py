@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from mrbokeh.camera import Camera
-from viewfinder.frames import Pose
 
 FEWEST_POINTS = 6
 """With fewer, near the limit of defocus, poses were off by degrees."""
@@ -20,6 +19,7 @@ _ALIKE = 1.1
 _ALIKE_PX = 0.03
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-10)
 
+Pose = Float64[np.ndarray, "4 4"]
 PointsM = Float64[np.ndarray, "points 3"]
 PointsPx = Float64[np.ndarray, "points 2"]
 

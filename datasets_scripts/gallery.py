@@ -1,0 +1,102 @@
+"""Build the gallery: run every example of the README and show what it made.
+
+    python -m datasets_scripts.gallery gallery_out [--demo demo_out] [--only composite,video] [--update]
+
+The README's examples are the only list: a heading, a `sh` block, a picture, and a comment that says which of the files that the block
+made the picture shows (`<!-- shows: out.png -->`), or which page to look at while its last command runs (`<!-- page: http://... -->`).
+They run in OUT, where demo_out leads to a finished demo; what is there already is kept, so that an interrupted run goes on.
+OUT/gallery.html shows all; --update puts the pictures into docs/pictures, where the README looks for them.
+"""
+
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from datasets_scripts.gallery_entries import Entry, read_entries
+from datasets_scripts.gallery_pictures import page_jpeg, result_jpeg
+from mrbokeh.atomic_files import atomic_path
+from mrbokeh.errors import InputError
+from mrbokeh.html_page import inline_figure, write_page
+from mrbokeh.progress import track
+
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
+
+
+def build(out: Path, entries: list[Entry], demo: Path) -> None:
+    """Make what is missing, in the README's order, for examples use one another's results; and the page of all."""
+    _link(out / "demo_out", demo)
+    for entry in track(entries, "building the gallery"):
+        if not (out / entry.picture.name).is_file():
+            data = _made(entry, out)
+            with atomic_path(out / entry.picture.name) as temporary:
+                temporary.write_bytes(data)
+    write_page(out / "gallery.html", "mrbokeh: every command and what it makes", [_section(entry, out) for entry in entries])
+
+
+def _made(entry: Entry, out: Path) -> bytes:
+    *first, last = entry.commands
+    for command in first:
+        _run(command, out)
+    if entry.page:
+        return page_jpeg(_words(last), entry.page, out)
+    _run(last, out)
+    return result_jpeg(out / entry.shows)
+
+
+def _run(command: str, out: Path) -> None:
+    done = subprocess.run(_words(command), cwd=out, capture_output=True, text=True)
+    if done.returncode:
+        raise InputError(
+            f"expected `{command}` to end well, but it ended with {done.returncode}: {done.stderr.strip() or done.stdout.strip()}"
+        )
+
+
+def _words(command: str) -> list[str]:
+    """`mrbokeh` and `python` are those that run this."""
+    program, *words = shlex.split(command)
+    own = {"mrbokeh": [sys.executable, "-m", "mrbokeh.cli"], "python": [sys.executable]}
+    return [*own.get(program, [program]), *words]
+
+
+def _link(link: Path, demo: Path) -> None:
+    if not (demo / "report.html").is_file():
+        raise InputError(f"expected a finished demo in {demo}: run `mrbokeh demo --out {demo}` first")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if not link.exists():
+        link.symlink_to(demo.resolve(), target_is_directory=True)
+
+
+def _section(entry: Entry, out: Path) -> str:
+    lines = "<br>".join(f"<code>{line}</code>" for line in entry.commands)
+    picture = (out / entry.picture.name).read_bytes()
+    return f"<h2>{entry.title}</h2><p>{lines}</p>" + inline_figure(picture, "jpeg", entry.caption)
+
+
+def main(
+    out: Annotated[Path, typer.Argument(help="Folder for results and gallery.html.")],
+    demo: Annotated[Path, typer.Option(help="Folder of a finished `mrbokeh demo`.")] = Path("demo_out"),
+    only: Annotated[str, typer.Option(help="Names of pictures, with commas between; empty for all.")] = "",
+    update: Annotated[bool, typer.Option("--update", help="Copy the pictures to docs/pictures.")] = False,
+) -> None:
+    """Run the examples of the README and show what they made."""
+    try:
+        entries = read_entries(README.read_text(encoding="utf-8"))
+        chosen = [entry for entry in entries if not only or entry.picture.stem in only.split(",")]
+        build(out, chosen, demo)
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from None
+    if update:
+        for entry in chosen:
+            shutil.copyfile(out / entry.picture.name, ROOT / entry.picture)
+    typer.echo(f"wrote {out / 'gallery.html'}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,135 @@
+"""The camera track of a clip in which a printed board is seen."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from mrbokeh.camera import Camera
+from mrbokeh.camera_track.board_calibration import Calibration, calibrated
+from mrbokeh.camera_track.board_corners import RollingCorners, Undistorting, read_greys
+from mrbokeh.camera_track.board_smoothing import Observation, residual_px, steadied
+from mrbokeh.camera_track.steady_poses import Pose
+from mrbokeh.camera_track.track import CameraTrack
+from mrbokeh.camera_track.tracked_frame import Distortion, TrackedFrame
+from mrbokeh.charuco.board import CharucoBoard
+from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
+from mrbokeh.charuco.pose_from_points import PoseFit, pose_from_plane
+from mrbokeh.errors import InputError
+from mrbokeh.progress import track as with_progress
+from mrbokeh.video_io import probe
+
+_CALIBRATED_FROM = 240
+"""Frames at most in which the board is read for calibration."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """longest_gap: so many frames without the board in sight are bridged.
+
+    smooth: as far as the corners' own scatter leaves poses open, see `board_smoothing`. extra_px: further, so that the picture of the
+      board may move by so much (RMS); it takes the trembling of a hand away, which is in the plate.
+    """
+
+    longest_gap: int = 10
+    smooth: bool = True
+    extra_px: float = 0.0
+
+
+@dataclass(frozen=True)
+class BoardTrack:
+    """frame_count: of the clip. seen: frames in which the pose was measured; bridged: interpolated; lost: in neither, and not in the track.
+
+    residual_px: RMS distance of all corners from where the track's poses put them; measured_residual_px: with the poses as measured.
+    """
+
+    track: CameraTrack
+    frame_count: int
+    seen: int
+    bridged: tuple[int, ...]
+    lost: tuple[int, ...]
+    residual_px: float
+    measured_residual_px: float
+
+
+def calibrate_clip(clip: Path, board: CharucoBoard) -> Calibration:
+    """Intrinsics and distortion from the frames of the clip itself."""
+    info = probe(clip)
+    step = max(1, (info.frame_count or _CALIBRATED_FROM) // _CALIBRATED_FROM)
+    detector = CharucoDetector(board)
+    greys = islice(read_greys(clip, info.width_px, info.height_px), 0, None, step)
+    seen = [detector.detect(grey) for grey, _ in with_progress(greys, "calibrating", (info.frame_count or 0) // step)]
+    return calibrated(board, seen, info.width_px, info.height_px)
+
+
+def track_board(
+    clip: Path, board: CharucoBoard, camera: Camera, distortion: Distortion | None = None, settings: TrackSettings | None = None
+) -> BoardTrack:
+    """camera: intrinsics; its size is made that of the clip. Raises InputError where the board is never seen."""
+    settings, info = settings or TrackSettings(), probe(clip)
+    camera = replace(camera.resized(info.width_px, info.height_px), camera_from_world=np.eye(4))
+    undistorted, times_s = Undistorting(camera, distortion), []
+
+    def greys() -> Iterator[Grey]:
+        frames = read_greys(clip, info.width_px, info.height_px)
+        for grey, time_s in with_progress(frames, "tracking the board", info.frame_count or 0):
+            times_s.append(time_s)
+            yield undistorted(grey)
+
+    corners = RollingCorners(board).all(greys())
+    fits = poses_of(corners, board, camera)
+    if len(fits) < 2:
+        raise InputError(
+            f"the board ({board.squares_text} squares, {board.dictionary}) was found in {len(fits)} of {len(corners)} frames of {clip}: "
+            f"check that --board is the one in the picture, and that it is lit and sharp"
+        )
+    return _judged(corners, fits, _Shot(board, camera, distortion, tuple(times_s)), settings)
+
+
+def poses_of(corners: Sequence[Corners], board: CharucoBoard, camera: Camera) -> dict[int, PoseFit]:
+    """By frame; of two poses that explain a frame alike the one nearer to the frame before is taken."""
+    fits: dict[int, PoseFit] = {}
+    before: Pose | None = None
+    for number, each in enumerate(corners):
+        fit = pose_from_plane(board.corners_m[each.ids], each.xy_px, camera, before)
+        if fit is not None:
+            fits[number] = fit
+            before = fit.camera_from_world
+    return fits
+
+
+@dataclass(frozen=True)
+class _Shot:
+    board: CharucoBoard
+    camera: Camera
+    distortion: Distortion | None
+    times_s: tuple[float, ...]
+
+
+def _judged(corners: Sequence[Corners], fits: dict[int, PoseFit], shot: _Shot, settings: TrackSettings) -> BoardTrack:
+    observed = {number: Observation(fit.camera_from_world, corners[number].only(fit.inliers)) for number, fit in fits.items()}
+    steady = steadied(observed, shot.board, shot.camera, settings.extra_px)
+    measured = {number: each.pose for number, each in observed.items()}
+    bridged = [number for number in steady if number not in fits and _gap(number, fits) <= settings.longest_gap]
+    poses = {number: steady[number] if settings.smooth else measured[number] for number in fits} | {n: steady[n] for n in bridged}
+    frames = {
+        number: TrackedFrame(
+            replace(shot.camera, camera_from_world=poses[number]), time_s=shot.times_s[number], distortion=shot.distortion or None
+        )
+        for number in sorted(poses)
+    }
+    lost = tuple(number for number in range(len(corners)) if number not in poses)
+    after_px, before_px = (residual_px(observed, each, shot.board, shot.camera) for each in (poses, measured))
+    return BoardTrack(CameraTrack(frames, "-z"), len(corners), len(fits), tuple(sorted(bridged)), lost, after_px, before_px)
+
+
+def _gap(number: int, fits: dict[int, PoseFit]) -> int:
+    """How many frames around this one are missing."""
+    before, after = number, number
+    while before not in fits:
+        before -= 1
+    while after not in fits:
+        after += 1
+    return after - before - 1

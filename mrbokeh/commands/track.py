@@ -1,0 +1,165 @@
+"""`mrbokeh track`: the camera of a clip from a printed board, and camera tracks from one kind of file to another."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from mrbokeh.atomic_files import refuse_existing
+from mrbokeh.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.camera import Camera
+    from mrbokeh.camera_track.board_track import BoardTrack
+    from mrbokeh.camera_track.options import TrackOptions
+    from mrbokeh.camera_track.track import CameraTrack
+    from mrbokeh.camera_track.tracked_frame import Distortion
+
+_CLIP = "clip"
+
+
+class ClipByDefault(TyperGroup):
+    """`mrbokeh track CLIP` is `mrbokeh track clip CLIP`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
+            args = [_CLIP, *args]
+        return list(super().parse_args(ctx, args))
+
+
+app = typer.Typer(cls=ClipByDefault, add_completion=False, no_args_is_help=True, help="The camera of every frame of a clip, and its files.")
+
+OutOption = Annotated[Path, typer.Option(metavar="TRACK", help="Where the track goes; the suffix says in which format.")]
+FormatOption = Annotated[
+    str | None,
+    typer.Option("--format", help="json, chan, nerfstudio, opentrackio, colmap or colmap-binary; by default what the name says."),
+]
+UpOption = Annotated[str | None, typer.Option(metavar="AXIS", help="Which axis is up in the file's world: -z, +z, -y or +y.")]
+RotationOption = Annotated[str, typer.Option(metavar="ORDER", help="Of a .chan: which rotation comes first.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the track where it exists.")]
+
+
+@app.command(_CLIP)
+def track(
+    clip: Annotated[Path, typer.Argument(metavar="CLIP", help="Video in which the board lies still.")],
+    board: Annotated[Path, typer.Option(metavar="BOARD.json", help="The board, as `mrbokeh viewfinder board` writes it, or a .toml.")],
+    out: OutOption,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="CAMERA.json", help="Intrinsics: a camera or a track with its distortion. Else give --calibrate.")
+    ] = None,
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the intrinsics from the clip itself.")] = False,
+    longest_gap: Annotated[int, typer.Option(min=0, metavar="FRAMES", help="Bridge so many frames in which the board is not seen.")] = 10,
+    smooth: Annotated[bool, typer.Option(help="Smooth poses as far as the scatter of the corners leaves them open.")] = True,
+    steadier: Annotated[float, typer.Option(min=0.0, metavar="PX", help="Smooth further, by so many pixels in the picture.")] = 0.0,
+    format_: FormatOption = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Track a clip by the printed board in it; the world of the track is the board's, in metres.
+
+    Example: mrbokeh track clip.mp4 --board board.json --calibrate --out track.json
+    """
+    from mrbokeh.camera_track.board_track import TrackSettings, calibrate_clip, track_board
+    from mrbokeh.charuco.board_file import read_board
+
+    refuse_existing(out, overwrite)
+    if calibrate == (camera is not None):
+        raise InputError("expected either --camera CAMERA.json or --calibrate, which finds the camera from the clip: give one of them")
+    printed = read_board(board)
+    if camera is not None:
+        intrinsics, distortion = _intrinsics(camera)
+    else:
+        found = calibrate_clip(clip, printed)
+        intrinsics, distortion = found.camera, found.distortion
+        typer.echo(
+            f"calibrated from {found.views} frames: focal length {intrinsics.focal_px[0]:.1f} px +- {100 * found.focal_sigma:.1f} %, "
+            f"{_named(found.distortion)}, {found.residual_px:.2f} px"
+        )
+    settings = TrackSettings(longest_gap, smooth, steadier)
+    tracked = track_board(clip, printed, intrinsics, distortion, settings)
+    _write(out, tracked.track, None, format_)
+    typer.echo(_told(tracked, out))
+
+
+@app.command("convert")
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A track: .json, .chan, .jsonl, transforms.json or a folder of COLMAP.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; the suffix says in which format.")],
+    from_: Annotated[str | None, typer.Option("--from", metavar="FORMAT", help="Format of IN; by default what the file shows.")] = None,
+    format_: FormatOption = None,
+    size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the pictures; needed for a .chan.")] = None,
+    up: UpOption = None,
+    out_up: Annotated[str | None, typer.Option(metavar="AXIS", help="Which axis is to be up in OUT.")] = None,
+    rotation_order: RotationOption = "ZXY",
+    sensor_width: Annotated[float | None, typer.Option(min=0.1, metavar="MM", help="Of OpenTrackIO samples that do not tell it.")] = None,
+    frame_rate: Annotated[float | None, typer.Option(min=0.001, help="Gives frames the times of their numbers.")] = None,
+    frame_offset: Annotated[int, typer.Option(help="Added to every frame number.")] = 0,
+    metric: Annotated[
+        bool | None, typer.Option("--metric/--no-metric", help="Whether lengths are metres, where the file leaves it open.")
+    ] = None,
+    distortion: Annotated[bool, typer.Option(help="Leave the lens distortion of IN out with --no-distortion.")] = True,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Turn a camera track into another format.
+
+    Example: mrbokeh track convert track.json track.chan
+    """
+    from mrbokeh.camera_track.formats import read_track
+    from mrbokeh.camera_track.options import TrackOptions
+
+    refuse_existing(out, overwrite)
+    options = TrackOptions(up, _size_px(size), rotation_order, sensor_width, metric, distortion)
+    read = read_track(source, options, from_).shifted(frame_offset)
+    read = read.timed(frame_rate) if frame_rate is not None else read
+    _write(out, read, TrackOptions(out_up, None, rotation_order, sensor_width), format_)
+    unit = "" if read.metric else ", the scale of its lengths is arbitrary"
+    typer.echo(f"{out}: {len(read.frames)} frames, {read.numbers[0]} to {read.numbers[-1]}, {read.size_px[0]}x{read.size_px[1]} px{unit}")
+
+
+def _intrinsics(path: Path) -> "tuple[Camera, Distortion | None]":
+    from mrbokeh.camera_track.formats import read_track
+
+    known = read_track(path)
+    first = known.at(known.numbers[0])
+    return first.camera, first.distortion
+
+
+def _write(out: Path, made: "CameraTrack", options: "TrackOptions | None", format_: str | None) -> None:
+    from mrbokeh.camera_track.formats import write_track
+
+    missing = write_track(out, made, options, format_)
+    if missing:
+        typer.echo(f"{out} cannot hold and lacks: {', '.join(missing)}", err=True)
+
+
+def _told(tracked: "BoardTrack", out: Path) -> str:
+    lost = f", {len(tracked.lost)} lost ({_ranges(tracked.lost)})" if tracked.lost else ""
+    bridged = f", {len(tracked.bridged)} bridged ({_ranges(tracked.bridged)})" if tracked.bridged else ""
+    return (
+        f"{out}: board seen in {tracked.seen} of {tracked.frame_count} frames "
+        f"({100 * tracked.seen / tracked.frame_count:.1f} %){bridged}{lost}; reprojection {tracked.residual_px:.2f} px RMS"
+    )
+
+
+def _ranges(numbers: tuple[int, ...]) -> str:
+    """3-5, 9: at most six of them."""
+    starts = [number for number in numbers if number - 1 not in numbers]
+    ends = [number for number in numbers if number + 1 not in numbers]
+    texts = [str(start) if start == end else f"{start}-{end}" for start, end in zip(starts, ends, strict=True)]
+    return ", ".join(texts[:6]) + (", ..." if len(texts) > 6 else "")
+
+
+def _named(distortion: "Distortion") -> str:
+    return ", ".join(f"{name} {value:.3f}" for name, value in distortion.items()) or "no distortion"
+
+
+def _size_px(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    try:
+        width, height = (int(each) for each in text.lower().split("x"))
+    except ValueError:
+        width, height = 0, 0
+    if width < 1 or height < 1:
+        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1920x1080, got {text!r}")
+    return width, height

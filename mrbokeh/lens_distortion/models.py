@@ -1,0 +1,90 @@
+"""Distortion models: where a point of the undistorted picture lands, and how the picture is stretched there.
+
+All bend a point q = (x, y), counted from the principal point in the model's unit, to q' along the radius, r' = g(r):
+
+    opencv   g = r (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), and tangentially by p1 and p2 (Brown 1966)
+    fisheye  g = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) with a = atan r (Kannala and Brandt 2006)
+    ptlens   g = r (a r^3 + b r^2 + c r + 1 - a - b - c)
+    poly3    g = r (1 - k1 + k1 r^2)
+    poly5    g = r (1 + k1 r^2 + k2 r^4)
+
+The unit of the first two is the focal length; that of the others, which are lensfun's and Hugin's, is a length in the picture.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+PARAMETERS: dict[str, tuple[str, ...]] = {
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+    "ptlens": ("a", "b", "c"),
+    "poly3": ("k1",),
+    "poly5": ("k1", "k2"),
+}
+"""Names of the models and of their parameters; all are 0 where nothing is bent, but for the fisheye."""
+IN_LENGTHS = ("ptlens", "poly3", "poly5")
+
+Values = tuple[float, ...]
+Radii = Float[np.ndarray, "*batch"]
+Points = Float[np.ndarray, "*batch 2"]
+
+
+def radial(model: str, values: Values, radius: Radii) -> tuple[Radii, Radii]:
+    """(g, dg/dr) at radii from 0 on; what is tangential is left out."""
+    if model == "opencv":
+        return _rational(values, radius)
+    if model == "fisheye":
+        angle, (k1, k2, k3, k4) = np.arctan(radius), values
+        bent, slope = _odd((1.0, k1, k2, k3, k4), angle)
+        return bent, slope / (1.0 + radius**2)
+    if model == "ptlens":
+        a, b, c = values
+        bent = radius * (1.0 - a - b - c + radius * (c + radius * (b + radius * a)))
+        return bent, 1.0 - a - b - c + radius * (2.0 * c + radius * (3.0 * b + radius * 4.0 * a))
+    return _odd((1.0 - values[0], values[0]) if model == "poly3" else (1.0, *values), radius)
+
+
+def _odd(terms: Values, radius: Radii) -> tuple[Radii, Radii]:
+    """r (t0 + t1 r^2 + t2 r^4 ...) and its derivative."""
+    r2, value, slope = radius**2, np.zeros_like(radius), np.zeros_like(radius)
+    for power, term in reversed(list(enumerate(terms))):
+        value, slope = value * r2 + term, slope * r2 + (2 * power + 1) * term
+    return radius * value, slope
+
+
+def _rational(values: Values, radius: Radii) -> tuple[Radii, Radii]:
+    k1, k2, _, _, k3, k4, k5, k6 = values
+    above, above_slope = _odd((1.0, k1, k2, k3), radius)
+    r2 = radius**2
+    below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    below_slope = radius * (2.0 * k4 + r2 * (4.0 * k5 + r2 * 6.0 * k6))
+    return above / below, (above_slope * below - above * below_slope) / below**2
+
+
+def is_tangential(model: str, values: Values) -> bool:
+    return model == "opencv" and (values[2] != 0.0 or values[3] != 0.0)
+
+
+def bent(model: str, values: Values, points: Points) -> tuple[Points, Float[np.ndarray, "*batch 2 2"]]:
+    """Bent points and the derivatives of their (x, y) by that of the points."""
+    radius = np.linalg.norm(points, axis=-1)
+    value, slope = radial(model, values, radius)
+    at_centre = radius < 1e-12
+    safe = np.where(at_centre, 1.0, radius)
+    stretch = np.where(at_centre, slope, value / safe)
+    along = points / safe[..., None]
+    derivative = (slope - stretch)[..., None, None] * along[..., :, None] * along[..., None, :] + stretch[..., None, None] * np.eye(2)
+    result = points * stretch[..., None]
+    if is_tangential(model, values):
+        shift, by = _tangential(values[2], values[3], points)
+        return result + shift, derivative + by
+    return result, derivative
+
+
+def _tangential(p1: float, p2: float, points: Points) -> tuple[Points, Float[np.ndarray, "*batch 2 2"]]:
+    x, y = points[..., 0], points[..., 1]
+    r2 = x * x + y * y
+    shift = np.stack([2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y], axis=-1)
+    across = 2.0 * (p1 * x + p2 * y)
+    rows = [[2.0 * p1 * y + 6.0 * p2 * x, across], [across, 6.0 * p1 * y + 2.0 * p2 * x]]
+    return shift, np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -1,0 +1,287 @@
+"""Distortion models: closed forms, OpenCV, COLMAP and lensfun as judges, the inverse, and files."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
+from mrbokeh.exr_io import ExrPart, write_exr
+from mrbokeh.lens_distortion import LensDistortion
+from mrbokeh.lens_distortion.colmap import colmap_distortion
+from mrbokeh.lens_distortion.distortion_json import distortion_from_json, distortion_to_json
+from mrbokeh.lens_distortion.st_map import StMap, read_st_map
+
+CAMERA = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
+OPENCV = {"k1": -0.21, "k2": 0.06, "p1": 1.5e-3, "p2": -0.8e-3, "k3": 0.01, "k4": 0.03, "k5": -0.01, "k6": 0.002}
+MODELS = {
+    "barrel": LensDistortion.of("opencv", k1=-0.25, k2=0.08),
+    "pincushion": LensDistortion.of("opencv", k1=0.15, k2=0.02),
+    "rational": LensDistortion.of("opencv", **OPENCV),
+    "fisheye": LensDistortion.of("fisheye", k1=0.02, k2=-0.004, k3=0.001),
+    "ptlens": LensDistortion.of("ptlens", a=0.012, b=-0.035, c=0.01),
+    "poly3": LensDistortion.of("poly3", k1=-0.03),
+    "poly5": LensDistortion.of("poly5", k1=-0.04, k2=0.01),
+}
+
+
+def some_px(camera: Camera = CAMERA, count: int = 400) -> np.ndarray:
+    return np.random.default_rng(1).uniform(0.0, 1.0, (count, 2)) * (camera.width_px, camera.height_px)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "factor"),
+    [
+        (LensDistortion.of("opencv", k1=-0.1, k2=0.04), 1 - 0.1 * 0.25 + 0.04 * 0.0625),
+        (LensDistortion.of("opencv", k4=0.2), 1 / 1.05),
+        (LensDistortion.of("fisheye"), np.arctan(0.5) / 0.5),
+    ],
+)
+def test_radial_values_in_focal_lengths(distortion: LensDistortion, factor: float) -> None:
+    """A point half a focal length right of the principal point, by the formulas of models.py."""
+    camera = Camera(200, 100, (100.0, 80.0), (100.0, 50.0))
+    np.testing.assert_allclose(distortion.distorted_px(np.array([[150.0, 50.0]]), camera), [[100.0 + 50.0 * factor, 50.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "at_half"),
+    [
+        (LensDistortion.of("ptlens", a=0.1, b=-0.2, c=0.04), 0.5 * (0.1 / 8 - 0.2 / 4 + 0.04 / 2 + 1.06)),
+        (LensDistortion.of("poly3", k1=0.08), 0.5 * (0.92 + 0.02)),
+        (LensDistortion.of("poly5", k1=0.08, k2=0.16), 0.5 * (1 + 0.02 + 0.01)),
+    ],
+)
+def test_values_in_half_the_shorter_side(distortion: LensDistortion, at_half: float) -> None:
+    """Hugin's unit: half of 200 px in a 3:2 frame, whatever the focal lengths are."""
+    camera = Camera(300, 200, (500.0, 400.0), (150.0, 100.0))
+    np.testing.assert_allclose(distortion.distorted_px(np.array([[150.0, 150.0]]), camera), [[150.0, 100.0 + 100.0 * at_half]], atol=1e-12)
+
+
+def test_tangential_values() -> None:
+    """x' = x + 2 p1 x y + p2 (r^2 + 2 x^2), y' = y + p1 (r^2 + 2 y^2) + 2 p2 x y, at (0.3, 0.4): r^2 = 0.25."""
+    camera = Camera(100, 100, (1.0, 1.0), (0.0, 0.0))
+    bent = LensDistortion.of("opencv", p1=0.01, p2=0.02).distorted_px(np.array([[0.3, 0.4]]), camera)[0]
+    expected = [0.3 + 0.02 * 0.12 + 0.02 * (0.25 + 0.18), 0.4 + 0.01 * (0.25 + 0.32) + 0.04 * 0.12]
+    np.testing.assert_allclose(bent, expected, atol=1e-15)
+
+
+def opencv_matrix(camera: Camera) -> np.ndarray:
+    """OpenCV counts from the centre of the first pixel, which is (0.5, 0.5) here."""
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
+    return np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
+
+
+def test_opencv_projects_alike() -> None:
+    xy_px, zero = some_px(), np.zeros(3)
+    points_m = CAMERA.unproject(xy_px, np.full(len(xy_px), 2.0))
+    projected, _ = cv2.projectPoints(points_m, zero, zero, opencv_matrix(CAMERA), np.array(list(OPENCV.values())))
+    np.testing.assert_allclose(MODELS["rational"].distorted_px(xy_px, CAMERA), projected[:, 0] + 0.5, atol=1e-9)
+
+
+def test_opencv_projects_a_fisheye_alike() -> None:
+    xy_px, zero = some_px(), np.zeros(3)
+    points_m = CAMERA.unproject(xy_px, np.full(len(xy_px), 2.0))
+    values = np.array(MODELS["fisheye"].values)
+    projected, _ = cv2.fisheye.projectPoints(points_m[:, None], zero[:, None], zero[:, None], opencv_matrix(CAMERA), values)
+    np.testing.assert_allclose(MODELS["fisheye"].distorted_px(xy_px, CAMERA), projected[:, 0] + 0.5, atol=1e-9)
+
+
+def test_opencv_undistorts_alike() -> None:
+    """Its map holds, for every undistorted pixel, where in the plate it is read. float32: 320 px to 3e-5."""
+    matrix, size = opencv_matrix(CAMERA), (CAMERA.width_px, CAMERA.height_px)
+    x, y = cv2.initUndistortRectifyMap(matrix, np.array(list(OPENCV.values())), None, matrix, size, cv2.CV_32FC1)
+    np.testing.assert_allclose(
+        MODELS["rational"].distorted_px(CAMERA.pixel_centres_px(), CAMERA), np.stack([x, y], axis=-1) + 0.5, atol=5e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "values"),
+    [
+        ("SIMPLE_PINHOLE", (270.0, 158.3, 109.6)),
+        ("PINHOLE", (270.0, 265.0, 158.3, 109.6)),
+        ("SIMPLE_RADIAL", (270.0, 158.3, 109.6, -0.1)),
+        ("RADIAL", (270.0, 158.3, 109.6, -0.1, 0.03)),
+        ("OPENCV", (270.0, 265.0, 158.3, 109.6, -0.1, 0.03, 1e-3, -2e-3)),
+        ("FULL_OPENCV", (270.0, 265.0, 158.3, 109.6, *OPENCV.values())),
+        ("OPENCV_FISHEYE", (270.0, 265.0, 158.3, 109.6, 0.02, -0.004, 0.001, 2e-4)),
+        ("SIMPLE_RADIAL_FISHEYE", (270.0, 158.3, 109.6, 0.02)),
+        ("RADIAL_FISHEYE", (270.0, 158.3, 109.6, 0.02, -0.004)),
+    ],
+)
+def test_colmap_projects_alike(model: str, values: tuple[float, ...]) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Camera(model=model, width=320, height=214, params=list(values))
+    focal_px, principal_px, distortion = colmap_distortion(model, values)
+    camera = Camera(320, 214, focal_px, principal_px)
+    xy_px = some_px()
+    points_m = camera.unproject(xy_px, np.full(len(xy_px), 3.0))
+    np.testing.assert_allclose(distortion.distorted_px(xy_px, camera), theirs.img_from_cam(points_m), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("camera_model", "lens_model", "focal_mm"),
+    [
+        ("NIKON D3S", "Nikkor 28mm f/2.8D AF", 28.0),
+        ("Canon EOS 5D Mark III", "Canon EF 24-105mm f/4L IS USM", 24.0),
+        ("Canon EOS 7D", "Canon EF 24-105mm f/4L IS USM", 35.0),
+        ("E-M1", "Olympus M.Zuiko Digital ED 12-40mm f/2.8 Pro", 12.0),
+    ],
+)
+@pytest.mark.parametrize("size_px", [(300, 200), (200, 300), (320, 180)])
+def test_lensfun_undistorts_alike(camera_model: str, lens_model: str, focal_mm: float, size_px: tuple[int, int]) -> None:
+    """lensfun spans a frame from the centre of its first pixel to that of its last: one pixel more makes its numbers our edges.
+
+    Calibrated at 3:2 and 4:3, on frames of the same and of other crop factors. It is asked for one column at a time, because
+    of four pixels of a row that it takes at once, three are off by up to 0.2 px (0.3.4). It counts in float32.
+    """
+    lensfunpy = pytest.importorskip("lensfunpy")
+    from mrbokeh.lens_distortion.lensfun_database import _found, lensfun_distortion
+
+    width, height = size_px
+    found, lens = _found(None, camera_model, lens_model)
+    modifier = lensfunpy.Modifier(lens, found.crop_factor, width + 1, height + 1)
+    modifier.initialize(focal_mm, 4.0, 1000.0, 1.0, flags=lensfunpy.ModifyFlags.DISTORTION)
+    camera = Camera(width, height, (300.0, 300.0), (width / 2, height / 2))
+    distortion, farthest_px = lensfun_distortion(camera_model, lens_model, focal_mm), 0.0
+    for x in range(0, width + 1, 10):
+        edges_px = np.stack([np.full(height + 1, float(x)), np.arange(height + 1.0)], axis=-1)
+        theirs_px = np.asarray(modifier.apply_geometry_distortion(x, 0, 1, height + 1)).reshape(-1, 2)
+        farthest_px = max(farthest_px, float(np.abs(theirs_px - edges_px).max()))
+        np.testing.assert_allclose(distortion.distorted_px(edges_px, camera), theirs_px, atol=4e-4)
+    assert farthest_px > 0.05
+
+
+def test_lensfun_says_what_it_does_not_know() -> None:
+    pytest.importorskip("lensfunpy")
+    from mrbokeh.lens_distortion.lensfun_database import lensfun_distortion
+
+    with pytest.raises(InputError, match="knows no camera"):
+        lensfun_distortion("Zorki 99", "any", 50.0)
+    with pytest.raises(InputError, match="fisheye"):
+        lensfun_distortion("Canon EOS 5D Mark III", "Canon EF 8-15mm f/4L Fisheye USM", 15.0)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_inverse_is_exact(name: str) -> None:
+    """Residual of the solved equation, in pixels, also 10 % beyond the frame."""
+    xy_px = (some_px() - 150.0) * 1.1 + 150.0
+    undistorted = MODELS[name].undistorted_px(xy_px, CAMERA)
+    assert np.isfinite(undistorted).all()
+    np.testing.assert_allclose(MODELS[name].distorted_px(undistorted, CAMERA), xy_px, atol=3e-8)
+    assert np.abs(undistorted - xy_px).max() > 1.0
+
+
+def test_nothing_is_seen_beyond_the_fold() -> None:
+    """r (1 - r^2 / 3) grows up to r = 1, where it is 2/3: points beyond come from nowhere and go nowhere."""
+    camera, distortion = Camera(100, 100, (1.0, 1.0), (0.0, 0.0)), LensDistortion.of("opencv", k1=-1.0 / 3.0)
+    seen = np.array([[0.66, 0.0], [0.0, -0.66]])
+    np.testing.assert_allclose(distortion.distorted_px(distortion.undistorted_px(seen, camera), camera), seen, atol=1e-9)
+    assert np.isnan(distortion.undistorted_px(np.array([[0.67, 0.0]]), camera)).all()
+    assert np.isnan(distortion.distorted_px(np.array([[1.01, 0.0]]), camera)).all()
+
+
+def test_nothing_bends_nothing() -> None:
+    xy_px = some_px()
+    for none in (LensDistortion(), LensDistortion.of("opencv"), LensDistortion.of("poly3")):
+        assert none.is_none
+        np.testing.assert_array_equal(none.distorted_px(xy_px, CAMERA), xy_px)
+        np.testing.assert_array_equal(none.undistorted_px(xy_px, CAMERA), xy_px)
+    assert not LensDistortion.of("fisheye").is_none
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_resized_plate_is_bent_alike(name: str) -> None:
+    half = MODELS[name].distorted_px(some_px() / 2, CAMERA.resized(160, 107))
+    np.testing.assert_allclose(2 * half, MODELS[name].distorted_px(some_px(), CAMERA), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_json_keeps_a_model(name: str) -> None:
+    assert distortion_from_json(json.loads(json.dumps(distortion_to_json(MODELS[name])))) == MODELS[name]
+
+
+def test_json_takes_names_of_colmap() -> None:
+    assert distortion_from_json({"model": "RADIAL", "values": [-0.1, 0.02]}) == LensDistortion.of("opencv", k1=-0.1, k2=0.02)
+    assert distortion_from_json({"model": "OPENCV_FISHEYE", "values": [0.1, 0.0, 0.0, 0.0]}) == LensDistortion.of("fisheye", k1=0.1)
+    assert distortion_from_json({"model": "none"}).is_none
+
+
+def test_json_without_a_model_is_opencvs() -> None:
+    assert distortion_from_json({"k1": -0.1, "p1": 0.01}) == LensDistortion.of("opencv", k1=-0.1, p1=0.01)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [{}, {"model": "opencv", "k9": 1.0}, {"model": "spline"}, {"model": "opencv", "k1": "x"}, {"model": "RADIAL", "values": [1.0]}],
+)
+def test_json_that_is_no_distortion(document: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=r"camera\.json"):
+        distortion_from_json(document, "camera.json")
+
+
+def st_map_of(distortion: LensDistortion, kind: str) -> np.ndarray:
+    """(h, w, 2) as Nuke writes it: u to the right, v from the bottom up, at pixel centres."""
+    centres = CAMERA.pixel_centres_px()
+    read_px = distortion.undistorted_px(centres, CAMERA) if kind == "distort" else distortion.distorted_px(centres, CAMERA)
+    return np.stack([read_px[..., 0] / CAMERA.width_px, 1.0 - read_px[..., 1] / CAMERA.height_px], axis=-1).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["distort", "undistort"])
+@pytest.mark.parametrize("name", ["barrel", "pincushion", "rational"])
+def test_an_st_map_does_what_its_model_does(kind: str, name: str, tmp_path: Path) -> None:
+    """Bilinear between samples: a map bent by f'' = 4e-3 px per px^2 (6 k1 r / f) misses by f''/8 an axis."""
+    uv = st_map_of(MODELS[name], kind)
+    write_exr(tmp_path / "st.exr", ExrPart({"R": uv[..., 0], "G": uv[..., 1], "B": np.zeros_like(uv[..., 0])}))
+    distortion = LensDistortion.from_st_map(read_st_map(tmp_path / "st.exr", kind))
+    expected = MODELS[name].undistorted_px(some_px(), CAMERA)
+    undistorted = distortion.undistorted_px(some_px(), CAMERA)
+    known = np.isfinite(undistorted).all(axis=-1)
+    assert known.mean() > (0.999 if kind == "distort" or name == "pincushion" else 0.85)
+    np.testing.assert_allclose(undistorted[known], expected[known], atol=6e-3)
+    np.testing.assert_allclose(distortion.distorted_px(undistorted[known], CAMERA), some_px()[known], atol=1e-5)
+
+
+def test_v_of_an_st_map_runs_upwards() -> None:
+    """The identity, written by the convention: the lower left pixel's centre reads (0.5 / w, 0.5 / h)."""
+    u, v = np.meshgrid((np.arange(320) + 0.5) / 320, 1.0 - (np.arange(214) + 0.5) / 214)
+    assert (u[-1, 0], v[-1, 0]) == pytest.approx((0.5 / 320, 0.5 / 214))
+    distortion = LensDistortion.from_st_map(StMap(np.stack([u, v], axis=-1)))
+    np.testing.assert_allclose(distortion.undistorted_px(some_px(), CAMERA), some_px(), atol=1e-9)
+    lower = LensDistortion.from_st_map(StMap(np.stack([u, v - 10.0 / 214], axis=-1)))
+    np.testing.assert_allclose(lower.undistorted_px(some_px(), CAMERA), some_px() + np.array([0.0, 10.0]), atol=1e-9)
+
+
+def test_st_maps_that_cannot_serve(tmp_path: Path) -> None:
+    uv = np.zeros((4, 1024), np.float16)
+    write_exr(tmp_path / "half.exr", ExrPart({"R": uv, "G": uv, "B": uv}))
+    with pytest.raises(InputError, match="half floats"):
+        read_st_map(tmp_path / "half.exr")
+    write_exr(tmp_path / "grey.exr", ExrPart({"Y": np.zeros((4, 4), np.float32)}))
+    with pytest.raises(InputError, match="u in red"):
+        read_st_map(tmp_path / "grey.exr")
+    with pytest.raises(InputError, match="distort or undistort"):
+        StMap(np.zeros((4, 4, 2)), "redistort")
+
+
+def test_json_names_an_st_map_by_its_file(tmp_path: Path) -> None:
+    uv = st_map_of(MODELS["barrel"], "distort")
+    write_exr(tmp_path / "st.exr", ExrPart({"u": uv[..., 0], "v": uv[..., 1]}))
+    read = distortion_from_json({"model": "st_map", "path": "st.exr"}, folder=tmp_path)
+    assert distortion_to_json(read) == {"model": "st_map", "path": str(tmp_path / "st.exr"), "kind": "distort"}
+    with pytest.raises(InputError, match="made in memory"):
+        distortion_to_json(LensDistortion.from_st_map(StMap(uv)))
+
+
+def test_values_that_are_no_distortion() -> None:
+    with pytest.raises(InputError, match="needs 8 finite values"):
+        LensDistortion("opencv", (0.1,))
+    with pytest.raises(InputError, match="out of none, opencv"):
+        LensDistortion("division")
+    with pytest.raises(InputError, match="COLMAP's camera models"):
+        colmap_distortion("FOV", (1.0,))
+    with pytest.raises(InputError, match="has 5 parameters, got 4"):
+        colmap_distortion("RADIAL", (1.0, 2.0, 3.0, 4.0))
