@@ -23,9 +23,6 @@ EXTRA_OF_MODULE = {
     "onnx": "train",
     "onnxscript": "train",
     "aiohttp": "viewfinder",
-    "mitsuba": "mitsuba",
-    "PyOpenColorIO": "ocio",
-    "distributed": "cluster",
 }
 
 
