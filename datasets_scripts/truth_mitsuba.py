@@ -2,22 +2,16 @@
 
 import importlib
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int
 
 from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.scene.mitsuba_variant import find_llvm
 
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
 VARIANTS = (LLVM, SCALAR)
-
-_PLACES = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib")
-_PATTERNS = ("libLLVM*", "*/libLLVM*", "llvm-*/lib/libLLVM*")
-_TESTED = "19"
-# Debian's LLVM 15 crashes on processors with AVX-512.
-_CRASHES = ("LLVM-15", "LLVM.so.15")
 
 
 def best_variant() -> str:
@@ -56,14 +50,3 @@ def scene_of(variant: str, vertices_m: Float32[np.ndarray, "vertices 3"], triang
     parameters["faces"] = renumbered.ravel().astype(np.uint32)
     parameters.update()
     return mitsuba.load_dict({"type": "scene", "triangles": mesh})
-
-
-def find_llvm() -> Path | None:
-    """LLVM's shared library: where DRJIT_LIBLLVM_PATH says, else version 19 or, without it, the last by name."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if named:
-        return Path(named)
-    found = [path for place in _PLACES for pattern in _PATTERNS for path in Path(place).glob(pattern)]
-    libraries = [path for path in found if path.is_file() and (".so" in path.name or path.suffix == ".dylib")]
-    usable = [path for path in libraries if not any(name in path.name for name in _CRASHES)]
-    return max(usable, key=lambda path: (_TESTED in path.name, path.name), default=None)

@@ -2,18 +2,22 @@
 
 from mrbokeh.errors import InputError
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
 from mrbokeh.scene.wgpu_device import gpu
 from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
 
 
-def scene_renderer(name: str = "auto", threads: int = 0) -> EmbreeRaycaster | WgpuRasterizer:
-    """A renderer by name; threads: of the ray caster, 0 takes all.
+def scene_renderer(name: str = "auto", threads: int = 0) -> EmbreeRaycaster | WgpuRasterizer | MitsubaTracer:
+    """A renderer by name; threads: of the ray caster and the path tracer, 0 takes all.
 
     "auto" takes the graphics card where there is one, and the ray caster otherwise. Mesa's device in software
-    is taken only when asked for by "wgpu". Raises InputError where the device asked for is missing.
+    is taken only when asked for by "wgpu", path tracing only by "mitsuba". Raises InputError where the device or
+    the package asked for is missing.
     """
-    if name not in ("auto", "wgpu", "embree"):
-        raise InputError(f"expected the scene renderer auto, wgpu or embree, got {name!r}")
+    if name not in ("auto", "wgpu", "embree", "mitsuba"):
+        raise InputError(f"expected the scene renderer mitsuba, auto, wgpu or embree, got {name!r}")
+    if name == "mitsuba":
+        return MitsubaTracer(threads=threads)
     if name == "embree" or (name == "auto" and not has_graphics_card()):
         return EmbreeRaycaster(threads=threads)
     return WgpuRasterizer()

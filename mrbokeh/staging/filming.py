@@ -1,7 +1,7 @@
 """Filming: how a staged scene becomes the layers of a plate: by which backend, through which distortion, with which shutter and shadow."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float32
@@ -14,7 +14,7 @@ from mrbokeh.moving_layers import FilmedScene, ShutterTiming, moving_layer, movi
 from mrbokeh.moving_layers.moving_shadow import ShadowCatcher
 from mrbokeh.scene import Scene, SceneRenderer
 from mrbokeh.scene.choose import scene_renderer
-from mrbokeh.scene.light_change import light_change
+from mrbokeh.scene.light_change import GREY, light_change
 from mrbokeh.scene.shadow_layer import shadow_layer
 from mrbokeh.staging.assets import Assets
 from mrbokeh.staging.scene_description import SceneDescription
@@ -92,7 +92,14 @@ class FilmedLayers:
 
     def _still(self, camera: Camera, time_s: float, sharp_rgb: Float32[np.ndarray, "height width 3"] | None) -> list[Layer]:
         scene = self._staged.scene_at(time_s)
-        return [self._renderer.render(scene, camera), *self._caught(scene, camera, sharp_rgb)]
+        return [self._objects(scene, camera), *self._caught(scene, camera, sharp_rgb)]
+
+    def _objects(self, scene: Scene, camera: Camera) -> Layer:
+        """The objects alone; with light on the ground they also see the ground, where the backend follows light so far."""
+        catcher = self._staged.catcher
+        if self._filming.backend == "mitsuba" and self._filming.catches == "light" and catcher is not None:
+            return self._renderer.render_beside(scene, camera, [replace(catcher, material=GREY, catches_shadow=False)])  # type: ignore[attr-defined]
+        return self._renderer.render(scene, camera)
 
     def _caught(self, scene: Scene, camera: Camera, sharp_rgb: Float32[np.ndarray, "height width 3"] | None) -> list[Layer]:
         shadow, catcher = self._staged.description.shadow, self._staged.catcher
