@@ -4,14 +4,12 @@ FFmpeg scales chroma and bit depth; the step between luma-chroma and RGB is ours
 through truncated 8 bit whatever the depth, and is half an 8-bit step too dark in the mean.
 """
 
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from mrbokeh.color import convert
-from mrbokeh.errors import InputError
 from mrbokeh.video_color import (
     DECODE_TOP,
     ENCODE_TOP,
@@ -22,39 +20,9 @@ from mrbokeh.video_color import (
     linear_from_code,
     rec709_from_primaries,
 )
-
-
-class Encoding(NamedTuple):
-    codec: str
-    pixel_format: str
-    bits: int
-    suffixes: tuple[str, ...]
-    options: dict[str, str]
-
-
-ENCODINGS = {
-    "h264": Encoding("libx264", "yuv420p", 8, (".mp4", ".mov", ".mkv"), {"crf": "14", "preset": "medium"}),
-    "h264-10bit": Encoding("libx264", "yuv420p10le", 10, (".mp4", ".mov", ".mkv"), {"crf": "12", "preset": "medium"}),
-    "prores4444": Encoding("prores_ks", "yuv444p10le", 10, (".mov",), {"profile": "4444", "vendor": "apl0"}),
-    "prores422": Encoding("prores_ks", "yuv422p10le", 10, (".mov",), {"profile": "hq", "vendor": "apl0"}),
-    "ffv1": Encoding("ffv1", "gbrp16le", 16, (".mkv",), {"level": "3", "slices": "16", "slicecrc": "1"}),
-}
-_BY_SUFFIX = {".mp4": "h264", ".mov": "prores4444", ".mkv": "ffv1"}
-
-
-def encoding_for(path: Path, name: str | None = None) -> Encoding:
-    """The encoding of that name, or the usual one of the file's suffix: .mp4 h264, .mov prores4444, .mkv ffv1 (lossless, 16 bit)."""
-    suffix = Path(path).suffix.lower()
-    name = name or _BY_SUFFIX.get(suffix)
-    if name is None:
-        raise InputError(f"cannot write {path}: expected .mp4, .mov or .mkv, not {suffix or 'a file without suffix'}")
-    if name not in ENCODINGS:
-        raise InputError(f"expected an encoding ({', '.join(ENCODINGS)}), got {name!r}")
-    if suffix not in ENCODINGS[name].suffixes:
-        raise InputError(
-            f"{path}: {name} is written to {' or '.join(ENCODINGS[name].suffixes)}, not to {suffix or 'a file without suffix'}"
-        )
-    return ENCODINGS[name]
+from mrbokeh.video_encodings import ENCODINGS as ENCODINGS
+from mrbokeh.video_encodings import Encoding
+from mrbokeh.video_encodings import encoding_for as encoding_for
 
 
 def _planes(frame: Any, count: int = 3) -> list[np.ndarray]:
@@ -155,16 +123,38 @@ def display_bgr(frame: Any, color: VideoColor, size: tuple[int, int]) -> UInt8[n
     return bgr8_from_planes(y, cb, cr, zeros, gains, matrix)
 
 
-def encoded_frame(rgb: Float32[np.ndarray, "height width 3"], encoding: Encoding, color: VideoColor) -> Any:
-    """A PyAV frame of linear light, tagged."""
+def encoded_frame(picture: Float32[np.ndarray, "height width channels"], encoding: Encoding, color: VideoColor) -> Any:
+    """A PyAV frame of linear light (H, W, 3), tagged; of an encoding with alpha also (H, W, 4), premultiplied.
+
+    What is stored beside alpha is the straight colour (not multiplied), as editing programs expect of ProRes 4444.
+    """
     import av
 
-    frame = av.VideoFrame(rgb.shape[1], rgb.shape[0], encoding.pixel_format)
-    for target, plane in zip(_planes(frame), _stored_planes(np.asarray(rgb, np.float32), encoding, color), strict=True):
+    picture = np.asarray(picture, np.float32)
+    frame = av.VideoFrame(picture.shape[1], picture.shape[0], encoding.pixel_format)
+    planes = _stored_planes(_straight(picture), encoding, color)
+    if encoding.alpha:
+        planes.append(_alpha_codes(picture, encoding.bits))
+    for target, plane in zip(_planes(frame, len(planes)), planes, strict=True):
         target[:] = plane
     frame.colorspace, frame.color_range = color.matrix, color.code_range
     frame.color_trc, frame.color_primaries = color.transfer, color.primaries
     return frame
+
+
+def _straight(picture: Float32[np.ndarray, "height width channels"]) -> Float32[np.ndarray, "height width 3"]:
+    if picture.shape[2] == 3:
+        return picture
+    alpha = picture[..., 3:]
+    return np.divide(picture[..., :3], alpha, out=np.zeros_like(picture[..., :3]), where=alpha > 0)
+
+
+def _alpha_codes(picture: Float32[np.ndarray, "height width channels"], bits: int) -> np.ndarray:
+    """Coverage uses the full range of codes, whatever colour does."""
+    largest = (1 << bits) - 1
+    if picture.shape[2] == 3:
+        return np.full(picture.shape[:2], largest, np.uint16)
+    return np.rint(np.clip(picture[..., 3], 0.0, 1.0) * largest)
 
 
 def _stored_planes(rgb: Float32[np.ndarray, "height width 3"], encoding: Encoding, color: VideoColor) -> list[np.ndarray]:

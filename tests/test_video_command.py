@@ -12,16 +12,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from mrbokeh.atomic_files import write_json
+from mrbokeh.camera_file import camera_to_json
+from mrbokeh.camera_track.focus_pull import parse_focus_keys
 from mrbokeh.commands.video import app, parse_frames
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_layer, write_layer
+from mrbokeh.exr_io import ExrPart, write_exr
+from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import write_lens
 from mrbokeh.plate import plate_of
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video_io import VideoWriter, read_frames
+from tests.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=6.0)
 # One 16-bit step of BT.709 codes, in linear light at white, where the curve is steepest: 1 / 65535 * 1 / 0.495.
@@ -55,8 +60,9 @@ def settings(tmp_path: Path) -> list[str]:
 
 
 def run(*arguments: object) -> str:
-    """What the command prints; its errors are raised here."""
-    result = CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
+    """What the command prints; its errors are raised here. One process, unless told otherwise."""
+    alone = () if "--workers" in arguments or "--help" in arguments else ("--workers", "1")
+    result = CliRunner().invoke(app, [*map(str, arguments), *alone], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -96,7 +102,7 @@ def test_frames_are_parsed() -> None:
 
 def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: Path) -> None:
     write_layer(tmp_path / "small.exr", square(48, 32))
-    with pytest.raises(InputError, match=r"small\.exr is 48x32 px but .*clip\.mkv is 96x64 px"):
+    with pytest.raises(InputError, match=r"small\.exr is 48x32 px but the clip is 96x64 px"):
         run(clip, "--layer", tmp_path / "small.exr", "--lens", tmp_path / "lens.json", "--out", tmp_path / "out.mov")
     with pytest.raises(InputError, match="leaves nothing of"):
         run(clip, *settings, "--out", tmp_path / "out.mov", "--frames", "40:50")
@@ -104,7 +110,9 @@ def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: P
         run(clip, *settings, "--out", clip)
     with pytest.raises(InputError, match="expected a renderer"):
         run(clip, *settings, "--out", tmp_path / "out.mov", "--renderer", "magic")
-    assert not (tmp_path / "out.mov").exists()
+    with pytest.raises(InputError, match="nothing to put into the clip"):
+        run(clip, "--lens", tmp_path / "lens.json", "--out", tmp_path / "out.mov")
+    assert not list(tmp_path.glob("out.mov*"))
 
 
 def test_help_shows_an_example() -> None:
@@ -112,26 +120,123 @@ def test_help_shows_an_example() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
-def test_ctrl_c_leaves_no_half_file(tmp_path: Path, shared_data: Path) -> None:
-    write_layer(tmp_path / "layer.exr", square(1280, 720))
+def test_ctrl_c_keeps_finished_segments_and_the_same_command_goes_on(tmp_path: Path) -> None:
+    clip, out = tmp_path / "long.mkv", tmp_path / "results" / "out.mp4"
+    ramp = np.linspace(0, 0.8, 160, dtype=np.float32)[None, :, None].repeat(96, 0).repeat(3, 2)
+    with VideoWriter(clip, 160, 96, Fraction(25)) as writer:
+        for i in range(50):
+            writer.write(np.roll(ramp, i, axis=1), i / 25)
+    write_layer(tmp_path / "layer.exr", square(160, 96))
     write_lens(tmp_path / "lens.json", LENS)
-    out = tmp_path / "results" / "out.mov"
-    clip = shared_data / "video" / "ducks_720p.mp4"
-    command = [sys.executable, "-m", "mrbokeh.cli", "video", clip, "--layer", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json"]
-    process = subprocess.Popen(
-        [*map(str, command), "--out", str(out)],
-        cwd=Path(__file__).parent.parent,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline_s = time.monotonic() + 40
-    # A few frames are in the file under its temporary name: the command is in the middle of its work.
-    while not any(file.stat().st_size > 500_000 for file in out.parent.glob(".*")):
-        assert process.poll() is None
+    options = ["--layer", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json", "--segment", "0.2"]
+    command = [sys.executable, "-m", "mrbokeh.cli", "video", clip, *options, "--workers", "2", "--out", out]
+    process = subprocess.Popen([*map(str, command)], cwd=Path(__file__).parent.parent, stderr=subprocess.PIPE, text=True)
+    parts = out.with_name("out.mp4.parts")
+    deadline_s = time.monotonic() + 60
+    while not any(parts.glob("0*.nut")):
+        assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline_s
-        time.sleep(0.02)
+        time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=20)
-    assert process.returncode != 0, errors
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130, errors
     assert "Traceback" not in errors
-    assert list(out.parent.iterdir()) == []
+    assert "the same command goes on from there" in " ".join(errors.split())
+    assert [file.name for file in out.parent.iterdir()] == ["out.mp4.parts"]
+    assert 1 <= len(list(parts.glob("0*.nut"))) < 10
+    assert not list(parts.glob(".*")), "no half files"
+    assert "50 frames, no audio" in run(clip, *options, "--workers", "1", "--out", out)
+    assert [file.name for file in out.parent.iterdir()] == ["out.mp4"]
+    assert len(list(read_frames(out))) == 50
+
+
+def test_the_focus_is_pulled(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    """Each frame is blurred as by the lens at its own focus; between keys focus goes smoothly in dioptres (mrbokeh.camera_track)."""
+    out = tmp_path / "out.mkv"
+    run(clip, *settings, "--focus-pull", "0:2.0,11:1.0", "--renderer", "scatter", "--out", out)
+    pull, layer = parse_focus_keys("0:2.0,11:1.0", "smooth"), read_layer(tmp_path / "layer.exr")
+    for index, (before, after) in enumerate(zip(read_frames(clip), read_frames(out), strict=True)):
+        plate = plate_of(before.rgb, LENS.focused_at(pull.at(index)))
+        np.testing.assert_allclose(after.rgb, OverPhotograph().insert(plate, [layer], ScatterReference()).rgb, atol=STEP)
+    (tmp_path / "pull.csv").write_text("frame,focus_distance_m\n" + "".join(f"{i},{2 - i / 11}\n" for i in range(12)))
+    run(clip, *settings, "--focus-pull", tmp_path / "pull.csv", "--out", tmp_path / "of_csv.mkv")
+    first, *_, last = read_frames(tmp_path / "of_csv.mkv")
+    # At 1 m the square of 1 m is in focus: its rim is sharp, and the frame beside it untouched; at 2 m it spreads by 5 px.
+    assert (last.rgb[21:32, 30] == list(read_frames(clip))[11].rgb[21:32, 30]).all()
+    assert (first.rgb[21:32, 30] != next(read_frames(clip)).rgb[21:32, 30]).any()
+
+
+@pytest.mark.usefixtures("settings")
+def test_layers_and_depth_of_each_frame(clip: Path, tmp_path: Path) -> None:
+    """A square that moves by 4 px a frame; from frame 6 on the filmed scene stands before it and hides all of it."""
+    for i in range(12):
+        layer = square(96, 64)
+        moved = Layer(*(np.roll(plane, 4 * i, axis=1) for plane in (layer.rgb, layer.alpha, layer.depth_m)))
+        write_layer(tmp_path / f"moving.{1001 + i}.exr", moved, half=False)
+        depth_m = np.full((64, 96), 5.0 if i < 6 else 0.5, np.float32)
+        write_exr(tmp_path / f"depth.{1001 + i}.exr", ExrPart({"Z": depth_m}))
+    options = ["--lens", tmp_path / "lens.json", "--layer", tmp_path / "moving.%04d.exr", "--first-number", "1001"]
+    out = tmp_path / "out.mkv"
+    run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--renderer", "scatter", "--out", out)
+    for index, (before, after) in enumerate(zip(read_frames(clip), read_frames(out), strict=True)):
+        layers = [read_layer(tmp_path / f"moving.{1001 + index}.exr")] if index < 6 else []
+        np.testing.assert_allclose(
+            after.rgb, OverPhotograph().insert(plate_of(before.rgb, LENS), layers, ScatterReference()).rgb, atol=STEP
+        )
+    run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--mode", "front", "--out", tmp_path / "front.mkv", "--frames", "6:8")
+    assert (next(read_frames(tmp_path / "front.mkv")).rgb != list(read_frames(clip))[6].rgb).any()
+    with pytest.raises(InputError, match="1001 to 1012"):
+        run(clip, "--lens", tmp_path / "lens.json", "--layer", tmp_path / "moving.%04d.exr", "--out", tmp_path / "no.mkv")
+
+
+def test_a_scene_is_rendered_per_frame(tmp_path: Path) -> None:
+    """A card of light 0.2 m high stands 1 m before a fixed camera: it covers 0.2 * 150 = 30 px; of a shut lens, exactly."""
+    clip = tmp_path / "grey.mkv"
+    with VideoWriter(clip, WIDTH, HEIGHT, Fraction(25)) as writer:
+        for i in range(3):
+            writer.write(np.full((HEIGHT, WIDTH, 3), 0.25, np.float32), i / 25)
+    scene = scene_file(tmp_path, ONE_CARD)
+    write_json(tmp_path / "camera.json", camera_to_json(camera()))
+    write_lens(tmp_path / "pinhole.json", Lens(50.0, 5000.0, 1.0, 36.0))
+    options = ["--scene", scene, "--scene-renderer", "embree", "--lens", tmp_path / "pinhole.json", "--out", tmp_path / "out.mkv"]
+    run(clip, *options, "--camera", tmp_path / "camera.json")
+    for frame in read_frames(tmp_path / "out.mkv"):
+        lit = (np.abs(frame.rgb - [1.0, 0.5, 0.25]) < 0.01).all(axis=2)
+        rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+        assert (len(rows), len(columns)) == pytest.approx((30, 30), abs=1)
+        np.testing.assert_array_equal(frame.rgb[0], next(read_frames(clip)).rgb[0])
+    with pytest.raises(InputError, match="give --camera"):
+        run(clip, *options, "--overwrite")
+
+
+def test_the_virtual_layer_alone_and_pictures_out(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.%03d.exr", "--frames", "2:5")
+    run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.mov", "--frames", "2:5")
+    run(clip, *settings, "--out", tmp_path / "whole.%03d.png", "--frames", "2:5")
+    assert sorted(file.name for file in tmp_path.glob("virtual.*")) == [*(f"virtual.{i:03d}.exr" for i in (2, 3, 4)), "virtual.mov"]
+    virtual, frame = read_layer(tmp_path / "virtual.002.exr"), list(read_frames(clip))[2]
+    whole = read_image(tmp_path / "whole.002.png")
+    # Half has 11 bits; 16-bit sRGB has 1/65535.
+    np.testing.assert_allclose(whole, np.clip((1 - virtual.alpha[..., None]) * frame.rgb + virtual.rgb, 0, 1), atol=2**-10)
+    assert 0.5 < virtual.alpha.max() < 0.76
+    # And numbered pictures in: the same composite of the same light.
+    for i, picture in enumerate(read_frames(clip)):
+        write_image(tmp_path / f"in.{i:03d}.exr", picture.rgb, half=False)
+    run(tmp_path / "in.%03d.exr", "--rate", "24", *settings, "--out", tmp_path / "again.%03d.png", "--frames", "2:5")
+    np.testing.assert_allclose(read_image(tmp_path / "again.004.png"), read_image(tmp_path / "whole.004.png"), atol=2.5 / 65535)
+    with pytest.raises(InputError, match="give --rate"):
+        run(tmp_path / "in.%03d.exr", *settings, "--out", tmp_path / "no.mov")
+    with pytest.raises(InputError, match="is for videos"):
+        run(clip, *settings, "--encoding", "h264", "--out", tmp_path / "no.%03d.exr")
+
+
+def test_parts_of_another_lens_are_refused(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "out.mkv"
+    (tmp_path / "out.mkv.parts").mkdir()
+    run(clip, *settings, "--out", out, "--segment", "0.1")
+    out.unlink()
+    write_json(tmp_path / "out.mkv.parts" / "manifest.json", {"settings": {"lens": "another"}, "segments": []})
+    with pytest.raises(InputError, match=r"other settings \(.*lens.*\): run with the same to go on, or --overwrite"):
+        run(clip, *settings, "--out", out)
+    run(clip, *settings, "--out", out, "--overwrite")
+    assert not (tmp_path / "out.mkv.parts").exists()

@@ -61,6 +61,11 @@ def rgb_by_h273(planes: Sequence[np.ndarray], matrix: str, *, full: bool) -> np.
         # 8 bit: a luma step is 1/219 and rounding errs by a quarter of it in the mean; 10 bit has a quarter of the steps' size.
         ("h264", ".mp4", 0.002, 0.008),
         ("h264-10bit", ".mp4", 0.001, 0.004),
+        ("h265-10bit", ".mp4", 0.001, 0.004),
+        ("h265-10bit", ".mkv", 0.001, 0.004),
+        ("dnxhr-hqx", ".mov", 0.0005, 0.002),
+        ("dnxhr-hqx", ".mxf", 0.0005, 0.002),
+        ("prores4444-alpha", ".mov", 0.0005, 0.002),
         ("prores422", ".mov", 0.0005, 0.002),
         ("prores4444", ".mov", 0.0005, 0.002),
         ("ffv1", ".mkv", 0.6 / 65535, 1.2 / 65535),
@@ -81,6 +86,34 @@ def test_colour_bars_survive(tmp_path: Path, encoding: str, suffix: str, mean_er
     tags = probe(path).color
     assert (tags.transfer, tags.primaries) == (1, 1)
     assert (tags.matrix, tags.code_range) == ((0, 2) if encoding == "ffv1" else (1, 1))
+
+
+def test_players_find_the_tags_that_they_know(tmp_path: Path) -> None:
+    """QuickTime plays H.265 in MP4 and MOV as hvc1 only; ffprobe's names of the others."""
+    tags = {"h265-10bit": "hvc1", "h264": "avc1", "prores4444-alpha": "ap4h", "prores422": "apch", "dnxhr-hqx": "AVdh"}
+    for encoding, tag in tags.items():
+        path = tmp_path / f"{encoding}.mov"
+        with VideoWriter(path, 320, 256, encoding=encoding) as writer:
+            writer.write(np.full((256, 320, 3), 0.18, np.float32), 0.0)
+        with av.open(str(path)) as container:
+            assert container.streams.video[0].codec_context.codec_tag == tag
+
+
+def test_alpha_is_stored_beside_straight_colour(tmp_path: Path) -> None:
+    """A ramp of coverage over one colour: 10 bit of alpha, and the colour is the same wherever it is seen."""
+    alpha = np.linspace(0, 1, 320, dtype=np.float32)[None].repeat(256, 0)
+    picture = np.dstack([alpha * light for light in (0.5, 0.3, 0.2)] + [alpha]).astype(np.float32)
+    with VideoWriter(tmp_path / "ramp.mov", 320, 256, encoding="prores4444-alpha") as writer:
+        writer.write(picture, 0.0)
+    with av.open(str(tmp_path / "ramp.mov")) as container:
+        stored = next(container.decode(video=0))
+    assert stored.format.name == "yuva444p12le"
+    plane = stored.planes[3]
+    found = np.frombuffer(plane, "<u2").reshape(256, plane.line_size // 2)[:, :320] / 4095
+    # Half a step of 10 bit, in which it is written, and a step of the 12 bit in which FFmpeg gives it back.
+    np.testing.assert_allclose(found, alpha, atol=0.5 / 1023 + 1 / 4095)
+    rgb = next(read_frames(tmp_path / "ramp.mov")).rgb
+    np.testing.assert_allclose(rgb[:, 8:], np.broadcast_to(np.float32([0.5, 0.3, 0.2]), (256, 312, 3)), atol=0.004)
 
 
 @pytest.mark.parametrize(

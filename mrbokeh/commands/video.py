@@ -1,76 +1,91 @@
-"""`mrbokeh video`: a virtual layer, blurred by the lens, in every frame of a clip from a fixed camera."""
+"""`mrbokeh video`: virtual objects in every frame of a clip, blurred by its lens."""
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from mrbokeh.atomic_files import refuse_existing
+from mrbokeh.commands import _video_options as options
+from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens_file import read_lens
-from mrbokeh.overlay import Overlay
-from mrbokeh.progress import track
-from mrbokeh.renderers.choose import DEFAULT, make_renderer
-from mrbokeh.video_frames import encoding_for
-from mrbokeh.video_io import Frame, VideoInfo, VideoWriter, probe, read_frames
+from mrbokeh.picture_sources.base import PictureSource
+from mrbokeh.picture_sources.choose import open_source
+from mrbokeh.picture_sources.numbered_files import is_pattern
+from mrbokeh.progress import progress_bars
+from mrbokeh.renderers.choose import BY_NAME, DEFAULT
+from mrbokeh.shots.composite_recipe import CompositeRecipe
+from mrbokeh.shots.crew import Crew, OneProcess
+from mrbokeh.shots.dask_crew import DaskCrew
+from mrbokeh.shots.frame_sources import CameraFile, DepthFiles, FocusPulled
+from mrbokeh.shots.layer_sources import LayerFiles, SceneLayers
+from mrbokeh.shots.making import make_shot
+from mrbokeh.shots.process_crew import ProcessCrew
+from mrbokeh.shots.segment import SEGMENT_S
+from mrbokeh.shots.sequence_target import SequenceTarget
+from mrbokeh.shots.shot import Shot, Target
+from mrbokeh.shots.video_target import VideoTarget
+from mrbokeh.workers import cores
 
 app = typer.Typer(add_completion=False)
 
-ClipArgument = Annotated[Path, typer.Argument(metavar="CLIP", help="Video from a camera that does not move.")]
-LayerOption = Annotated[Path, typer.Option(metavar="RGBAZ.exr", help="All-in-focus virtual layer: linear, premultiplied, Z in metres.")]
-LensOption = Annotated[Path, typer.Option(metavar="LENS.json", help="The lens, focused as it was when the clip was shot.")]
-OutOption = Annotated[Path, typer.Option(metavar="VIDEO", help=".mov (ProRes 4444), .mp4 (H.264) or .mkv (FFV1, lossless).")]
-RendererOption = Annotated[str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).")]
-FramesOption = Annotated[str, typer.Option(metavar="START:STOP", help="Frames to take, counted from 0; STOP is left out.")]
-EncodingOption = Annotated[
-    str | None, typer.Option(help="h264, h264-10bit, prores4444, prores422 or ffv1; by default the usual one of OUT.")
-]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace OUT where it exists.")]
+INTERRUPTED = 130
 
 
 @app.command()
 def video(
-    clip: ClipArgument,
-    layer: LayerOption,
-    lens: LensOption,
-    out: OutOption,
-    renderer: RendererOption = DEFAULT,
-    frames: FramesOption = ":",
-    encoding: EncodingOption = None,
-    overwrite: OverwriteOption = False,
+    clip: options.ClipArgument,
+    lens: options.LensOption,
+    out: options.OutOption,
+    layer: options.LayerOption = None,
+    scene: options.SceneOption = None,
+    camera: options.CameraOption = None,
+    scene_renderer: options.BackendOption = "auto",
+    scene_begin: options.BeginOption = 0.0,
+    focus_pull: options.FocusOption = None,
+    depth: options.DepthOption = None,
+    steady_depth: options.SteadyOption = False,
+    mode: options.ModeOption = DEFAULT_MODE,
+    renderer: options.RendererOption = DEFAULT,
+    frames: options.FramesOption = ":",
+    rate: options.RateOption = None,
+    first_number: options.NumberOption = None,
+    encoding: options.EncodingOption = None,
+    virtual_only: options.VirtualOption = False,
+    overwrite: options.OverwriteOption = False,
+    workers: options.WorkersOption = 0,
+    cluster: options.ClusterOption = None,
+    segment: options.SegmentOption = SEGMENT_S,
 ) -> None:
-    """Blur a virtual layer once with the lens and lay it over each frame in linear light; sound and times are kept.
+    """Blur virtual layers with the lens and put them into each frame in linear light; sound and times are kept.
+
+    Finished segments wait in OUT.parts: the same command goes on where it was interrupted.
 
     Example: mrbokeh video clip.mp4 --layer lantern.exr --lens lens.json --out lantern_in_clip.mov --frames 0:50
+
+    Example: mrbokeh video clip.mov --scene scene.toml --camera track.json --focus-pull 0:1.2,48:3.5 --lens lens.json --out out.mp4
     """
-    refuse_existing(out, overwrite)
-    encoding_for(out, encoding)
-    start, stop = parse_frames(frames)
-    info = probe(clip)
-    virtual = _layer_of_size(layer, info, clip)
-    blurred = Overlay.of(make_renderer(renderer).render([virtual], read_lens(lens)))
-    total = None if info.frame_count is None else max(0, min(info.frame_count, stop or info.frame_count) - start)
-    pictures = read_frames(clip, start, stop)
-    first = next(pictures, None)
-    if first is None:
-        raise InputError(f"--frames {frames} leaves nothing of {clip}: expected a range within its {info.frame_count or ''} frames")
-    begin_s = first.time_s if start else 0.0
-    with VideoWriter(
-        out,
-        info.width_px,
-        info.height_px,
-        info.frame_rate,
-        info.time_base,
-        encoding=encoding,
-        audio_from=clip,
-        audio_start_s=begin_s,
-    ) as writer:
-        for picture in track(_chain(first, pictures), "compositing", total or 0):
-            writer.write(blurred.over(picture.rgb), picture.time_s - begin_s)
-    typer.echo(f"wrote {out} ({info.width_px}x{info.height_px} px, {writer.frame_count} frames, {writer.audio_note})")
+    source = open_source(clip, rate)
+    start, stop = _range(frames, source)
+    number = source.first_number if first_number is None else first_number
+    if not layer and scene is None:
+        raise InputError("nothing to put into the clip: give --layer RGBAZ.exr or --scene SCENE.toml")
+    in_scene = () if scene is None else (SceneLayers(scene.resolve(), scene_renderer, scene_begin),)
+    recipe = CompositeRecipe(
+        lens=lens.resolve(),
+        layers=(*(LayerFiles(path.resolve()) for path in layer or ()), *in_scene),
+        renderer=renderer if renderer in BY_NAME else str(Path(renderer).resolve()) if renderer.endswith(".onnx") else renderer,
+        mode=mode,
+        camera=None if camera is None else CameraFile(camera.resolve(), (source.info.width_px, source.info.height_px)),
+        focus=None if focus_pull is None else FocusPulled.of(focus_pull),
+        depth=None if depth is None else DepthFiles(depth.resolve(), steady_depth),
+        first_number=number,
+        virtual_only=virtual_only,
+    )
+    target = _target(out.resolve(), encoding, source, number, virtual_only)
+    shot = Shot(source, recipe, target, start, stop, max(1, round(segment * source.info.frame_rate)))
+    target.require_new(shot, overwrite or shot.was_begun)
+    _try_first_frame(shot)
+    note = _made(shot, _crew(cluster, workers, len(shot.segments)), overwrite)
+    typer.echo(f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {stop - start} frames, {note})")
 
 
 def parse_frames(text: str) -> tuple[int, int | None]:
@@ -85,14 +100,41 @@ def parse_frames(text: str) -> tuple[int, int | None]:
     return parsed
 
 
-def _layer_of_size(path: Path, info: VideoInfo, clip: Path) -> Layer:
-    layer = read_layer(path)
-    if (layer.width_px, layer.height_px) != (info.width_px, info.height_px):
-        sizes = f"{path} is {layer.width_px}x{layer.height_px} px but {clip} is {info.width_px}x{info.height_px} px"
-        raise InputError(f"{sizes}: render the layer in the size of the clip")
-    return layer
+def _range(frames: str, source: PictureSource) -> tuple[int, int]:
+    (start, stop), count = parse_frames(frames), len(source.times_s)
+    if start >= count:
+        raise InputError(f"--frames {frames} leaves nothing of {source.path}: expected a range within its {count} frames")
+    return start, min(count, count if stop is None else stop)
 
 
-def _chain(first: Frame, rest: Iterator[Frame]) -> Iterator[Frame]:
-    yield first
-    yield from rest
+def _target(out: Path, encoding: str | None, source: PictureSource, number: int, virtual_only: bool) -> Target:
+    if is_pattern(out):
+        if encoding is not None:
+            raise InputError(f"--encoding {encoding} is for videos, but {out} are pictures: leave it out")
+        return SequenceTarget(out, number, virtual_only)
+    if virtual_only:
+        encoding = encoding or "prores4444-alpha"
+    return VideoTarget(out, encoding, None if is_pattern(source.path) else source.path)
+
+
+def _crew(cluster: str | None, workers: int, segments: int) -> Crew:
+    if cluster is not None:
+        return DaskCrew(cluster)
+    count = min(workers or cores(), segments)
+    return OneProcess() if count == 1 else ProcessCrew(count)
+
+
+def _try_first_frame(shot: Shot) -> None:
+    """Mistakes in files and options are told at once, and not by a worker."""
+    frame = next(shot.source.frames(shot.start, shot.start + 1))
+    shot.recipe.build(1).make(shot.start, frame.rgb, frame.time_s)
+
+
+def _made(shot: Shot, crew: Crew, overwrite: bool) -> str:
+    with progress_bars() as bars:
+        task = bars.add_task("compositing", total=shot.stop - shot.start)
+        try:
+            return make_shot(shot, crew, overwrite=overwrite, progress=lambda count: bars.advance(task, count))
+        except KeyboardInterrupt:
+            typer.echo(f"interrupted: finished segments wait in {shot.parts_path}; the same command goes on from there", err=True)
+            raise typer.Exit(INTERRUPTED) from None

@@ -1,0 +1,91 @@
+"""CompositeRecipe: virtual layers put into each frame of a clip, blurred by its lens as it is focused in that frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.camera import Camera
+from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import read_lens
+from mrbokeh.plate import Plate, plate_of
+from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
+from mrbokeh.shots.boxed_insertion import BoxedInsertion
+from mrbokeh.shots.frame_maker import Picture
+from mrbokeh.shots.hooks import CameraSource, DepthSource, Description, Finisher, FocusSource, LayerSource, Moment
+
+_LOCAL = ("polygon", "scatter")
+"""Renderers that light leaves no farther than its circle of confusion."""
+
+
+@dataclass(frozen=True)
+class CompositeRecipe:
+    """A MakerRecipe. first_number: what frame 0 of the clip is called by in sequences, tracks and focus pulls.
+
+    focus: None leaves the lens as its file has it. virtual_only: the blurred virtual layer alone, in place of the picture.
+    """
+
+    lens: Path
+    layers: tuple[Description[LayerSource], ...]
+    renderer: str = DEFAULT
+    mode: str = DEFAULT_MODE
+    camera: Description[CameraSource] | None = None
+    focus: Description[FocusSource] | None = None
+    depth: Description[DepthSource] | None = None
+    finisher: Finisher | None = None
+    first_number: int = 0
+    virtual_only: bool = False
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        described = (*self.layers, self.camera, self.focus, self.depth)
+        network = () if self.renderer in BY_NAME else (Path(self.renderer),)
+        return (self.lens, *network, *(path for each in described if each is not None for path in each.files))
+
+    def build(self, threads: int) -> "CompositeMaker":
+        return CompositeMaker(self, threads)
+
+
+class CompositeMaker:
+    """A FrameMaker. What did not change since the last frame is not made again: reading, rendering, cutting, blur."""
+
+    def __init__(self, recipe: CompositeRecipe, threads: int) -> None:
+        self._recipe, self._lens = recipe, read_lens(recipe.lens)
+        self._sources = [each.opened(threads) for each in recipe.layers]
+        self._camera = None if recipe.camera is None else recipe.camera.opened(threads)
+        self._focus = None if recipe.focus is None else recipe.focus.opened(threads)
+        self._depth = None if recipe.depth is None else recipe.depth.opened(threads)
+        renderer = make_renderer(recipe.renderer, threads=threads)
+        self._boxed = BoxedInsertion(insertion_of(recipe.mode), renderer, local=recipe.renderer in _LOCAL)
+
+    def make(self, index: int, rgb: Float32[np.ndarray, "height width 3"], time_s: float) -> Picture:
+        height, width = rgb.shape[:2]
+        moment = Moment(self._recipe.first_number + index, time_s, (width, height))
+        camera = None if self._camera is None else self._camera.camera_at(moment)
+        plate = self._plate(moment, rgb, camera)
+        part = self._boxed.insert(plate, self._layers(moment, camera))
+        if self._recipe.finisher is None and not self._recipe.virtual_only:
+            return part.over(rgb)
+        inserted = part.whole(rgb)
+        if self._recipe.finisher is not None:
+            inserted = self._recipe.finisher.finished(inserted, plate, moment.number)
+        return inserted.virtual if self._recipe.virtual_only else inserted.rgb
+
+    def _layers(self, moment: Moment, camera: Camera | None) -> Sequence[Layer]:
+        return [layer for source in self._sources for layer in source.layers_at(moment, camera)]
+
+    def _plate(self, moment: Moment, rgb: Float32[np.ndarray, "height width 3"], camera: Camera | None) -> Plate:
+        depth_m = None if self._depth is None else self._depth.depth_m_at(moment)
+        lens = self._lens_at(moment.number)
+        return plate_of(rgb, lens, depth_m) if camera is None else Plate(rgb, depth_m, lens, camera)
+
+    def _lens_at(self, number: int) -> Lens:
+        """The very same lens as long as the focus stays."""
+        focus_m = self._lens.focus_distance_m if self._focus is None else self._focus.at(number)
+        if focus_m != self._lens.focus_distance_m:
+            self._lens = self._lens.focused_at(focus_m)
+        return self._lens

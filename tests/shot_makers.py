@@ -1,0 +1,92 @@
+"""Small recipes and layers for tests of the engine, in a module that worker processes can import."""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mrbokeh.camera import Camera
+from mrbokeh.layer import Layer
+from mrbokeh.shots.hooks import LayerSource, Moment
+
+
+@dataclass(frozen=True)
+class Brighter:
+    """Adds `amount` to every frame, more for later ones, so that a frame in the wrong place is seen.
+
+    pause_s: how long each frame takes. killing: a file that, while it exists, costs the worker its life after it deleted it;
+    pids: a folder in which every worker leaves its number.
+    """
+
+    amount: float = 0.1
+    pause_s: float = 0.0
+    killing: Path | None = None
+    pids: Path | None = None
+    as_layer: bool = False
+    reads: tuple[Path, ...] = ()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return self.reads
+
+    def build(self, threads: int) -> "Brightening":  # noqa: ARG002
+        if self.pids is not None:
+            (self.pids / str(os.getpid())).touch()
+        return Brightening(self)
+
+
+class Brightening:
+    def __init__(self, recipe: Brighter) -> None:
+        self._recipe = recipe
+
+    def make(self, index: int, rgb: np.ndarray, time_s: float) -> np.ndarray | Layer:  # noqa: ARG002
+        recipe = self._recipe
+        time.sleep(recipe.pause_s)
+        if recipe.killing is not None and recipe.killing.exists() and index % 7 == 3:
+            recipe.killing.unlink()
+            os.kill(os.getpid(), 9)
+        result = (0.5 * rgb + np.float32(recipe.amount * (index % 5 + 1) / 5)).astype(np.float32)
+        if recipe.as_layer:
+            alpha = np.full(rgb.shape[:2], 0.5, np.float32)
+            return Layer(result * alpha[..., None], alpha, np.full_like(alpha, 2.0))
+        return result
+
+
+@dataclass(frozen=True)
+class MovingDisc:
+    """Description of a textured disc that wanders across the frame, step_px to the right a frame, at depths around depth_m."""
+
+    radius_px: int = 240
+    step_px: int = 3
+    depth_m: float = 1.2
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return ()
+
+    def opened(self, threads: int) -> LayerSource:  # noqa: ARG002
+        return _Moving(self)
+
+
+class _Moving:
+    def __init__(self, described: MovingDisc) -> None:
+        radius, rng = described.radius_px, np.random.default_rng(5)
+        y, x = np.mgrid[-radius:radius, -radius:radius] + 0.5
+        self._alpha = np.clip(radius - np.hypot(x, y), 0.0, 1.0).astype(np.float32)
+        self._rgb = (self._alpha[..., None] * rng.random((2 * radius, 2 * radius, 3))).astype(np.float32)
+        depth_m = described.depth_m * (1.0 + 0.1 * x / radius)
+        self._depth_m = np.where(self._alpha > 0, depth_m, np.inf).astype(np.float32)
+        self._described = described
+
+    def layers_at(self, moment: Moment, camera: Camera | None) -> Sequence[Layer]:  # noqa: ARG002
+        width, height = moment.size_px
+        size = 2 * self._described.radius_px
+        left, top = moment.number * self._described.step_px % (width - size), (height - size) // 2
+        box = np.s_[top : top + size, left : left + size]
+        rgb, alpha = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
+        depth_m = np.full((height, width), np.inf, np.float32)
+        rgb[box], alpha[box], depth_m[box] = self._rgb, self._alpha, self._depth_m
+        return [Layer(rgb, alpha, depth_m)]

@@ -1,0 +1,135 @@
+"""Shots on a Dask cluster of real processes: a scheduler and workers of their own."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mrbokeh import __version__
+from mrbokeh.errors import InputError
+from mrbokeh.shots.crew import Crew, OneProcess
+from mrbokeh.shots.dask_crew import DaskCrew, require_same_files
+from mrbokeh.shots.making import make_shot
+from mrbokeh.shots.video_target import VideoTarget
+from tests.shot_makers import Brighter
+from tests.test_shots import COUNT, clip_of_blobs, shot_of
+
+distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A scheduler and two workers of one thread, each watched by a nanny that starts it again when it dies."""
+    told = tmp_path_factory.mktemp("dask") / "scheduler.json"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__DAEMON": "True"}
+    module, plain = "distributed.cli.dask_", {"cwd": told.parent, "env": environment, "stderr": subprocess.DEVNULL}
+    scheduler = [sys.executable, "-m", f"{module}scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    worker = [sys.executable, "-m", f"{module}worker", "--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
+    processes = [subprocess.Popen([*each, "--scheduler-file", str(told)], **plain) for each in (scheduler, worker)]  # type: ignore[call-overload]
+    try:
+        yield address_in(told)
+    finally:
+        for process in reversed(processes):
+            process.send_signal(signal.SIGTERM)
+        for process in processes:
+            process.wait(timeout=30)
+
+
+def address_in(told: Path) -> str:
+    import json
+
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s:
+        try:
+            address = str(json.loads(told.read_text(encoding="utf-8"))["address"])
+        except (OSError, ValueError):
+            time.sleep(0.1)
+            continue
+        with distributed.Client(address, timeout=60, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+        return address
+    raise AssertionError("the scheduler did not start")
+
+
+def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
+    clip, crew = clip_of_blobs(tmp_path), DaskCrew(address)
+    assert isinstance(crew, Crew)
+    make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), OneProcess())
+    (tmp_path / "pids").mkdir()
+    told: list[int] = []
+    make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), Brighter(pause_s=0.05, pids=tmp_path / "pids")), crew, progress=told.append)
+    assert len(list((tmp_path / "pids").iterdir())) == 2, "both workers took part"
+    assert str(os.getpid()) not in {file.name for file in (tmp_path / "pids").iterdir()}
+    assert sum(told) == COUNT
+    assert (tmp_path / "two.mp4").read_bytes() == (tmp_path / "one.mp4").read_bytes()
+    assert not (tmp_path / "two.mp4.parts").exists()
+
+
+def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: str) -> None:
+    """One of the two is killed by signal 9 from outside in the middle of its segment; its nanny starts another."""
+    clip, pids = clip_of_blobs(tmp_path), tmp_path / "pids"
+    make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mkv")), OneProcess())
+    pids.mkdir()
+    killed: list[int] = []
+
+    def kill_one() -> None:
+        while not (started := list(pids.iterdir())):
+            time.sleep(0.01)
+        time.sleep(0.2)
+        killed.append(int(started[0].name))
+        os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_one, daemon=True)
+    killer.start()
+    make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mkv"), Brighter(pause_s=0.1, pids=pids)), DaskCrew(address))
+    killer.join()
+    assert killed
+    assert (tmp_path / "two.mkv").read_bytes() == (tmp_path / "one.mkv").read_bytes()
+
+
+def test_a_mistake_on_a_worker_is_the_users_sentence(tmp_path: Path, address: str) -> None:
+    shot = shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True))
+    with pytest.raises(InputError, match="pictures with alpha need"):
+        make_shot(shot, DaskCrew(address))
+
+
+def test_nobody_answers() -> None:
+    crew = DaskCrew("tcp://127.0.0.1:9", patience_s=0.5)
+    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"), crew._client():
+        pass
+
+
+class Elsewhere:
+    """A client whose workers see other disks, or run other versions."""
+
+    def __init__(self, *reports: tuple[bool, bool, str]) -> None:
+        self._reports = reports
+
+    def run(self, function: Any, token: str, clip: str) -> dict[str, tuple[str, bool, str]]:
+        read, there, version = function(token, clip)
+        return {
+            f"tcp://there:{i}": (read if sees_token else "", there and sees_clip, other or version)
+            for i, (sees_token, sees_clip, other) in enumerate(self._reports)
+        }
+
+
+def test_workers_must_see_the_same_files(tmp_path: Path) -> None:
+    clip = clip_of_blobs(tmp_path)
+    require_same_files(Elsewhere((True, True, "")), tmp_path, clip)
+    for reports, words in (
+        ([(True, True, ""), (False, True, "")], "there:1 does not see"),
+        ([(True, False, "")], r"does not see .*clip\.mkv: a cluster needs a file system that all machines share"),
+        ([(True, True, "0.0.1")], rf"runs mrbokeh 0\.0\.1, but this is {__version__}"),
+        ([], "has no workers"),
+    ):
+        with pytest.raises(InputError, match=words):
+            require_same_files(Elsewhere(*reports), tmp_path, clip)
+    assert [file.name for file in tmp_path.iterdir()] == ["clip.mkv"]
