@@ -1,11 +1,23 @@
 """Ways of putting layers into a photograph, by name."""
 
 from mrbokeh.compositing.base import Insertion
+from mrbokeh.compositing.between import Between
+from mrbokeh.compositing.matte import SmoothedMatte
 from mrbokeh.compositing.over import OverPhotograph
+from mrbokeh.compositing.rerender import Rerendered
+from mrbokeh.compositing.touched_box import InTouchedBox
 from mrbokeh.errors import InputError
 
-MODES: dict[str, Insertion] = {"front": OverPhotograph(by_depth=False), "over": OverPhotograph()}
-"""front: over everything. over: the sharp layers lose what the depth of the photograph hides, then they are blurred."""
+MODES: dict[str, Insertion] = {
+    "front": InTouchedBox(OverPhotograph(by_depth=False)),
+    "over": InTouchedBox(OverPhotograph()),
+    "matte": InTouchedBox(SmoothedMatte()),
+    "between": InTouchedBox(Between()),
+    "rerender": InTouchedBox(Rerendered()),
+}
+"""front: over everything. over: the sharp layers lose what the depth of the photograph hides, then they are blurred. matte: the same
+with the paper's smoothed matte. between: behind the blurred near things of the photograph, before the rest. rerender: all-in-focus
+picture and layers blurred together."""
 
 DEFAULT_MODE = "over"
 

@@ -1,0 +1,121 @@
+"""Virtual layers between the blurred layers of a photograph: behind what is near in it, before the rest.
+
+What is near in the photograph is blurred there, so its coverage is soft and its colour mixed with what is behind. The sharp scene
+is cut in two at the depth of the virtual surface (mrbokeh.compositing.near_and_far), and the near part is blurred anew by the lens,
+focused as it was for the photograph. That tells how much of every pixel of the photograph is near light (a F) and how much far light
+((1 - a) B). The far light alone is dimmed, by the share of it that the virtual surface hides; near light stays; the virtual light
+that gets past the near things is added. So the photograph's own pixels are used, errors of blurring anew matter only at the rims of
+what is hidden, and pixels that no virtual light reaches stay as they are, bit for bit.
+
+Which part of the pupil each of the three takes is found by rays (mrbokeh.compositing.pupil_shares): coverages multiplied would be
+right only if near and virtual rims crossed the pupil independently, which those of one pixel do not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from mrbokeh.compositing.base import Inserted, same_size
+from mrbokeh.compositing.clean_colours import clean_colours
+from mrbokeh.compositing.near_and_far import NO_LIGHTS, NearAndFar, continued, cut_in_two, nearer_than
+from mrbokeh.compositing.pupil_shares import Rays
+from mrbokeh.compositing.three_parts import put_together
+from mrbokeh.compositing.virtual_surface import shows, virtual_depth_m
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer, clear, flatten
+from mrbokeh.lens import Lens
+from mrbokeh.plate import Plate
+from mrbokeh.renderers.base import Renderer
+
+Plane = Float32[np.ndarray, "height width"]
+Picture = Float32[np.ndarray, "height width 3"]
+
+_HALF = 0.5
+
+
+@dataclass(frozen=True)
+class Between:
+    """tolerance: by what share of its depth a photographed surface must be nearer to hide the virtual one (see occlusion_matte).
+
+    pupil_points: rays per pixel where near and virtual rims meet. near_depth_m: distance of what a user's matte (Plate.near_alpha)
+    holds, for photographs without depth.
+    Any Renderer will do; only its kernels' shares of the pupil are taken from the opening of the plate's lens.
+    """
+
+    tolerance: float = 0.03
+    pupil_points: int = 64
+    near_depth_m: float | None = None
+
+    def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
+        same_size(plate, layers)
+        if not any(shows(layer).any() for layer in layers):
+            return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
+        sharp = flatten([replace(layer, extra={}) for layer in layers])
+        depth_m = virtual_depth_m(sharp)
+        blurred = renderer.render(layers, plate.lens)
+        scene, near = self._scene(plate, depth_m, renderer)
+        return put_together(plate, near, blurred, Rays.of(scene, sharp, depth_m, plate.lens, self.pupil_points))
+
+    def cut(self, plate: Plate, layers: Sequence[Layer]) -> NearAndFar:
+        """The sharp scene of a plate cut in two by the layers, one of which shows something."""
+        depth_m = virtual_depth_m(flatten([replace(layer, extra={}) for layer in layers]))
+        matte = self._matte(plate, depth_m)
+        if plate.sharp_rgb is None:
+            raise InputError("to cut the scene in two its all-in-focus picture is needed: give a focal stack")
+        return self._cut(plate, plate.sharp_rgb, matte, self._near_depth_m(plate, matte))
+
+    def _scene(self, plate: Plate, depth_m: Plane, renderer: Renderer) -> tuple[NearAndFar, Layer]:
+        """The scene cut in two, and its near part as the lens sees it."""
+        matte = self._matte(plate, depth_m)
+        near_m = self._near_depth_m(plate, matte)
+        if plate.sharp_rgb is None:
+            return _without_sharp_picture(plate, Layer(np.repeat(matte[..., None], 3, axis=2), matte, near_m), renderer)
+        scene = self._cut(plate, plate.sharp_rgb, matte, near_m)
+        return scene, renderer.render([scene.near], plate.lens) if scene.near.alpha.any() else clear(*matte.shape)
+
+    def _matte(self, plate: Plate, depth_m: Plane) -> Plane:
+        """What is near, sharp: the user's matte, else by depth."""
+        if plate.near_alpha is not None:
+            return plate.near_alpha
+        if plate.depth_m is None:
+            raise InputError(
+                "to put objects between the layers of a photograph it needs depth (a focal stack or --depth) or a matte of what "
+                "is near: give one, or use the mode front"
+            )
+        return nearer_than(plate.depth_m, depth_m, self.tolerance).astype(np.float32)
+
+    def _near_depth_m(self, plate: Plate, matte: Plane) -> Plane:
+        """Depth of the near things, continued to all places."""
+        if self.near_depth_m is not None:
+            return np.full_like(matte, self.near_depth_m)
+        if plate.depth_m is None:
+            raise InputError("a matte of what is near needs its distance: give depth, or the distance in metres (near_depth_m)")
+        return continued(plate.depth_m, matte > _HALF)
+
+    def _cut(self, plate: Plate, sharp_rgb: Picture, matte: Plane, near_m: Plane) -> NearAndFar:
+        if plate.near_alpha is None and plate.depth_m is not None:
+            is_near = matte > _HALF
+            return cut_in_two(sharp_rgb, plate.depth_m, is_near, _reach_px(plate.lens, plate.depth_m, is_near), self.tolerance)
+        front, behind = clean_colours(sharp_rgb, matte)
+        far_m = None if plate.depth_m is None else continued(plate.depth_m, matte <= _HALF)
+        return NearAndFar(Layer(front * matte[..., None], matte, near_m), behind, far_m, NO_LIGHTS)
+
+
+def _reach_px(lens: Lens, depth_m: Plane, is_near: Bool[np.ndarray, "height width"]) -> float:
+    """How far the lens looks past the edges of what is near: half of the difference of the circles of confusion, at most."""
+    coc_px = np.asarray(lens.coc_px(depth_m, depth_m.shape[1]))
+    if not is_near.any() or is_near.all():
+        return 0.0
+    near_px, far_px = coc_px[is_near], coc_px[~is_near]
+    return 0.5 * lens.aperture.unit_radius * float(max(far_px.max() - near_px.min(), 0.0))
+
+
+def _without_sharp_picture(plate: Plate, white: Layer, renderer: Renderer) -> tuple[NearAndFar, Layer]:
+    """From the photograph and a matte alone: the lens blurs the matte, and the photograph is solved for both colours under it."""
+    if not white.alpha.any():
+        return NearAndFar(white, plate.rgb, None, NO_LIGHTS), clear(*white.alpha.shape)
+    alpha = np.clip(renderer.render([white], plate.lens).alpha, 0.0, 1.0)
+    front, behind = clean_colours(plate.rgb, alpha)
+    return NearAndFar(white, behind, None, NO_LIGHTS), Layer(front * alpha[..., None], alpha, white.depth_m)

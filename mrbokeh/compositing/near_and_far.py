@@ -1,0 +1,128 @@
+"""The sharp photographed scene cut in two by a virtual surface: what is nearer, with soft rims, and the rest, continued behind it.
+
+A pixel on the rim of a near thing holds both colours; they are taken apart as mrbokeh.hidden_background does, but at depth edges
+alone: where the virtual surface cuts through a smooth surface (a table that an object stands on), the cut is hard. Lights are kept
+apart from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from mrbokeh.hidden_background import apart
+from mrbokeh.layer import Layer
+from mrbokeh.lit_pixels import lights, without_lights
+from mrbokeh.sheets import Sheet
+from mrbokeh.workers import workers
+
+_TWO_DEEP = 2.0
+_EDGE_PX = 5
+_NEIGHBOURS = [(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)]
+
+Plane = Float32[np.ndarray, "height width"]
+Picture = Float32[np.ndarray, "height width 3"]
+Mask = Bool[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Single pixels far brighter than what is around them: places (row times width plus column), colour and depth."""
+
+    places: Int64[np.ndarray, " lights"]
+    rgb: Float32[np.ndarray, "lights 3"]
+    depth_m: Float32[np.ndarray, " lights"]
+
+
+NO_LIGHTS = Lights(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+
+
+@dataclass(frozen=True)
+class NearAndFar:
+    """near: premultiplied, sharp, alpha 0 where nothing is near, its depth continued to all places.
+
+    far_rgb, far_depth_m: opaque, without its lights; depth None: blurred already. lights: those of what is far.
+    """
+
+    near: Layer
+    far_rgb: Picture
+    far_depth_m: Plane | None
+    lights: Lights
+
+
+def nearer_than(depth_m: Plane, virtual_depth_m: Plane, tolerance: float) -> Mask:
+    """Where the photographed surface lies before the virtual one by more than a share `tolerance` of its depth."""
+    return np.isfinite(virtual_depth_m) & (depth_m * np.float32(1.0 + tolerance) < virtual_depth_m)
+
+
+def continued(values: np.ndarray, known: Mask) -> np.ndarray:
+    """Values (H, W) or (H, W, C) of the nearest pixel where they are known; as they are where none is."""
+    if known.all() or not known.any():
+        return values
+    return values.reshape(-1, *values.shape[2:])[nearest_places(known)]
+
+
+def nearest_places(known: Mask) -> Int64[np.ndarray, "height width"]:
+    """Per pixel the place (row times width plus column) of the nearest known one; some pixel must be known."""
+    from cv2 import DIST_L2, DIST_LABEL_PIXEL, DIST_MASK_5, distanceTransformWithLabels
+
+    _, labels = distanceTransformWithLabels((~known).astype(np.uint8), DIST_L2, DIST_MASK_5, labelType=DIST_LABEL_PIXEL)
+    place_of = np.zeros(int(labels.max()) + 1, np.int64)
+    places = np.flatnonzero(known)
+    place_of[labels.reshape(-1)[places]] = places
+    return place_of[labels]
+
+
+def cut_in_two(sharp_rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance: float) -> NearAndFar:
+    """reach_px: how far the lens looks past an edge; nothing is made up farther behind the near things."""
+    rgb = np.ascontiguousarray(sharp_rgb)
+    without, places = without_lights(rgb), np.flatnonzero(lights(rgb))
+    places = places[~_brightest_is_near(rgb, near, places)]
+    dark = rgb.copy()
+    dark.reshape(-1, 3)[places] = without.reshape(-1, 3)[places]
+    near_values, far_rgb = _parted(dark, depth_m, near, reach_px, tolerance)
+    near_depth_m, far_depth_m = continued(depth_m, near), continued(depth_m, ~near)
+    far_lights = Lights(places, (rgb - dark).reshape(-1, 3)[places], far_depth_m.reshape(-1)[places])
+    alpha = np.ascontiguousarray(near_values[..., 3])
+    return NearAndFar(Layer(np.ascontiguousarray(near_values[..., :3]), alpha, near_depth_m), far_rgb, far_depth_m, far_lights)
+
+
+def _parted(rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance: float) -> tuple[np.ndarray, Picture]:
+    """(near (H, W, 4) premultiplied, far (H, W, 3) with what lies behind the near as far as the lens sees it)."""
+    height, width = near.shape
+    values = np.ones((height, width, 4), np.float32)
+    values[..., :3] = rgb
+    step_px = np.float32(_TWO_DEEP * reach_px + _TWO_DEEP)
+    with workers(near.size) as pool:
+        front, behind = apart(Sheet(values, np.where(near, -step_px, np.float32(0.0)), True), pool)
+    in_front = front.coc_px.reshape(height, width) < -0.5 * step_px
+    near_values = np.where(in_front[..., None], front.values.reshape(height, width, 4), np.float32(0.0))
+    far = np.where(in_front[..., None], continued(rgb, ~near), rgb)
+    is_far = behind.coc_px > -0.5 * step_px
+    far.reshape(-1, 3)[behind.places[is_far]] = behind.values[is_far, :3]
+    smooth = _without_edge(depth_m, tolerance)
+    near_values[smooth] = np.dstack([rgb, np.ones_like(depth_m)])[smooth] * near[smooth, None]
+    far[smooth & ~near] = rgb[smooth & ~near]
+    return near_values, far
+
+
+def _without_edge(depth_m: Plane, tolerance: float) -> Mask:
+    """Where depth changes by no more than twice the tolerance (a share of it) among the pixels around."""
+    from cv2 import dilate, erode
+
+    kernel = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
+    dioptres = np.ascontiguousarray(1.0 / depth_m, np.float32)
+    return dilate(dioptres, kernel) <= np.float32(1.0 + 2.0 * tolerance) * erode(dioptres, kernel)
+
+
+def _brightest_is_near(rgb: Picture, near: Mask, places: Int64[np.ndarray, " lights"]) -> Bool[np.ndarray, " lights"]:
+    """Whether the brightest of the 5x5 pixels around each place, the lamp whose light it holds, is near."""
+    height, width = near.shape
+    rows, columns = places // width, places % width
+    brightest, is_near = np.full(len(places), -1.0, np.float32), np.zeros(len(places), bool)
+    for dy, dx in _NEIGHBOURS:
+        y, x = np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)
+        brightness = rgb[y, x].sum(axis=1)
+        brighter = brightness > brightest
+        brightest, is_near = np.where(brighter, brightness, brightest), np.where(brighter, near[y, x], is_near)
+    return is_near

@@ -1,0 +1,106 @@
+"""How near things, a virtual surface and the rest share the pupil, place by place of the blurred picture.
+
+Blurred coverages alone do not say it: a wire and the rim of an object behind it may hide the same part of the pupil or two parts
+of it. So rays are followed through some points of the pupil. Only what two coverages have in common (their covariance) and ratios
+are taken from so few rays; coverages and light by themselves come from the renderer.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.compositing.near_and_far import NearAndFar
+from mrbokeh.compositing.pupil_points import pupil_points
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.lit_pixels import without_lights
+from mrbokeh.spreading import FIELD_CELLS, Frame
+from mrbokeh.workers import in_bands, workers
+
+_BAND_PLACES = 2048
+
+Plane = Float32[np.ndarray, "height width"]
+Places = Int64[np.ndarray, " places"]
+
+
+@dataclass(frozen=True)
+class PupilMeans:
+    """Means over the pupil at some places: f is 1 where a ray gets past the near things, a the coverage of the virtual surface.
+
+    virtual, far: light of the virtual surface (premultiplied) and of the rest; past: beyond near and virtual, 1 where f (1 - a) is.
+    """
+
+    f: Float64[np.ndarray, " places"]
+    a: Float64[np.ndarray, " places"]
+    f_a: Float64[np.ndarray, " places"]
+    virtual: Float64[np.ndarray, "places 3"]
+    f_virtual: Float64[np.ndarray, "places 3"]
+    f_far: Float64[np.ndarray, "places 3"]
+    past_far: Float64[np.ndarray, "places 3"]
+    past: Float64[np.ndarray, " places"]
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Sharp near, virtual and far surfaces with their circles of confusion, continued, and the lens that looks at them."""
+
+    scene: NearAndFar
+    virtual: Layer
+    lens: Lens
+    coc_px: Float32[np.ndarray, "3 height width"]
+    points: int
+
+    @classmethod
+    def of(cls, scene: NearAndFar, virtual: Layer, virtual_depth_m: Plane, lens: Lens, points: int) -> "Rays":
+        width = virtual.width_px
+        far_coc_px = np.zeros_like(virtual_depth_m) if scene.far_depth_m is None else lens.coc_px(scene.far_depth_m, width)
+        coc_px = [lens.coc_px(scene.near.depth_m, width), lens.coc_px(virtual_depth_m, width), far_coc_px]
+        return cls(scene, virtual, lens, np.stack(coc_px).astype(np.float32), points)
+
+    def means(self, places: Places) -> PupilMeans:
+        """At places (row times width plus column) of the picture."""
+        from mrbokeh.compositing._between_numba import gather
+
+        sums, near, far = np.zeros((len(places), 16)), self.scene.near.alpha, self.scene.far_rgb
+        in_reach = self._near_in_reach()
+        sharp = np.dstack([self.virtual.rgb, self.virtual.alpha])
+        dark = np.ascontiguousarray(without_lights(np.ascontiguousarray(sharp)))
+        for which, aperture in self.cells(places):
+            pupil, found = pupil_points(aperture, self.points).astype(np.float32), np.zeros((len(which), 16), np.float32)
+            here = places[which]
+            with workers(len(here) * self.points) as pool:
+                work = lambda first, end: gather(found, here, near, in_reach, dark, far, self.coc_px, pupil, first, end)  # noqa: B023, E731
+                in_bands(pool, len(here), _BAND_PLACES, work)
+            sums[which] = found
+        f, a, f_a, past = (sums[:, c] for c in (0, 1, 2, 15))
+        return PupilMeans(f, a, f_a, sums[:, 3:6], sums[:, 6:9], sums[:, 9:12], sums[:, 12:15], past)
+
+    def _near_in_reach(self) -> Bool[np.ndarray, "height width"]:
+        """Where rays may meet something near: within its blur and a pixel."""
+        from cv2 import MORPH_RECT, dilate, getStructuringElement
+
+        there = self.scene.near.alpha > 0
+        if not there.any():
+            return there
+        half_px = 0.5 * float(np.abs(self.coc_px[0][there]).max()) * self.lens.aperture.unit_radius
+        size = 2 * int(np.ceil(half_px + 2.0)) + 1
+        return np.asarray(dilate(there.astype(np.uint8), getStructuringElement(MORPH_RECT, (size, size))) > 0)
+
+    def cells(self, places: Places) -> Iterator[tuple[Places, Aperture]]:
+        """Indices of the places that see one opening, and that opening."""
+        aperture, (height, width) = self.lens.aperture, self.virtual.alpha.shape
+        if len(places) == 0:
+            return
+        if not aperture.varies_over_field:
+            yield np.arange(len(places)), aperture.seen(1)
+            return
+        columns, rows = FIELD_CELLS
+        cell = (places // width * rows // height) * columns + places % width * columns // width
+        frame = Frame(width, height)
+        for number in np.unique(cell):
+            row, column = divmod(int(number), columns)
+            field_xy = frame.field_at((column + 0.5) * width / columns, (row + 0.5) * height / rows)
+            yield np.flatnonzero(cell == number), aperture.seen(1, field_xy)

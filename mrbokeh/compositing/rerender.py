@@ -1,0 +1,46 @@
+"""All blurred anew: the all-in-focus picture with its depth and the virtual layers, through the photograph's lens in one go."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrbokeh.compositing.base import Inserted, same_size
+from mrbokeh.compositing.between import Between
+from mrbokeh.compositing.three_parts import LEAST_LIGHT
+from mrbokeh.compositing.virtual_surface import shows
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer, clear, flatten
+from mrbokeh.plate import Plate
+from mrbokeh.renderers.base import Renderer
+
+
+@dataclass(frozen=True)
+class Rerendered:
+    """What virtual light reaches is taken from the new picture, the rest from the photograph. tolerance: see `Between`.
+
+    Simpler than `Between` and the same for any lens, but touched pixels show how well the picture is blurred anew, and coverages of
+    near and virtual rims are multiplied.
+    """
+
+    tolerance: float = 0.03
+
+    def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
+        same_size(plate, layers)
+        if plate.sharp_rgb is None or plate.depth_m is None:
+            raise InputError(
+                "to blur a photograph anew its all-in-focus picture and depth are needed: give a focal stack, or use the mode over"
+            )
+        if not any(shows(layer).any() for layer in layers):
+            return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
+        scene = Between(self.tolerance).cut(plate, layers)
+        near = [scene.near] if scene.near.alpha.any() else []
+        far = Layer(scene.far_rgb, np.ones_like(plate.depth_m), plate.depth_m if scene.far_depth_m is None else scene.far_depth_m)
+        far.rgb.reshape(-1, 3)[scene.lights.places] += scene.lights.rgb
+        picture = renderer.render([*near, *layers, far], plate.lens)
+        virtual = renderer.render(layers, plate.lens)
+        free = 1.0 - renderer.render(near, plate.lens).alpha if near else np.ones_like(virtual.alpha)
+        seen = Layer(virtual.rgb * free[..., None], virtual.alpha * free, virtual.depth_m)
+        touched = (seen.alpha > LEAST_LIGHT) | (np.abs(seen.rgb).max(axis=2) > LEAST_LIGHT)
+        left = np.where(touched[..., None], np.maximum(picture.rgb - seen.rgb, 0.0), plate.rgb)
+        return Inserted(left, Layer(seen.rgb * touched[..., None], seen.alpha * touched, seen.depth_m))

@@ -1,0 +1,258 @@
+"""Layers between the blurred layers of a photograph: half planes and lights whose shares of the pupil are known in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from mrbokeh.aperture import Aperture
+from mrbokeh.compositing.between import Between
+from mrbokeh.compositing.clean_colours import clean_colours
+from mrbokeh.compositing.light_points import virtual_lights
+from mrbokeh.compositing.near_and_far import NO_LIGHTS, NearAndFar, cut_in_two, nearer_than
+from mrbokeh.compositing.pupil_points import pupil_points, transmission
+from mrbokeh.compositing.pupil_shares import Rays
+from mrbokeh.errors import InputError
+from mrbokeh.layer import Layer, opaque
+from mrbokeh.lens import Lens
+from mrbokeh.plate import Plate, plate_of
+from mrbokeh.renderers.scatter_reference import ScatterReference
+
+LENS = Lens(100.0, 1.0, 4.0, 36.0)  # 28 px of blur for near things, 13 px for virtual ones
+HEIGHT, WIDTH, EDGE = 40, 96, 48
+NEAR_M, VIRTUAL_M, FAR_M = 0.8, 1.4, 4.0
+GREEN, RED, BLUE = np.float32([0.1, 0.5, 0.1]), np.float32([0.8, 0.1, 0.1]), np.float32([0.1, 0.2, 0.9])
+
+
+def disc_share(t: np.ndarray) -> np.ndarray:
+    """Area of the unit disc left of x = t, over its whole: the circular segment in closed form."""
+    inside = np.clip(t, -1.0, 1.0)
+    return 0.5 + (inside * np.sqrt(1.0 - inside**2) + np.arcsin(inside)) / np.pi
+
+
+def half_plane(left: bool, depth_m: float, colour: np.ndarray) -> Layer:
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[:, slice(None, EDGE) if left else slice(EDGE, None)] = 1.0
+    return Layer(alpha[..., None] * colour, alpha, np.where(alpha > 0, depth_m, np.inf).astype(np.float32))
+
+
+def photograph(lens: Lens = LENS) -> Plate:
+    """Green and near on the left, blue and in focus behind it."""
+    near = half_plane(True, NEAR_M, GREEN)
+    depth_m = np.where(near.alpha > 0, NEAR_M, FAR_M).astype(np.float32)
+    sharp = np.where(near.alpha[..., None] > 0, GREEN, BLUE).astype(np.float32)
+    near_share = half_share(lens, NEAR_M)
+    row = near_share[:, None] * GREEN + (1.0 - near_share[:, None]) * BLUE
+    blurred = np.broadcast_to(row, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    return replace(plate_of(blurred, lens, depth_m), sharp_rgb=sharp)
+
+
+def columns() -> np.ndarray:
+    return np.arange(WIDTH) + 0.5
+
+
+def middle_row(plate: Plate, virtual: Layer, between: Between | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """(rgb, share of the pupil) along the middle row, away from the borders, and their columns cut alike."""
+    found = (between or Between()).insert(plate, [virtual], ScatterReference())
+    return found.rgb[HEIGHT // 2, 24:-24], found.virtual.alpha[HEIGHT // 2, 24:-24]
+
+
+def half_share(lens: Lens, depth_m: float) -> np.ndarray:
+    """What a half plane on the left of the edge covers of the pupil, by column; in focus an edge between pixels is sharp."""
+    coc_px = max(abs(float(lens.coc_px(depth_m, WIDTH))), 0.5)
+    return 1.0 - disc_share(2.0 * (columns() - EDGE) / coc_px)
+
+
+def shares(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Of near and virtual half planes on the left, along the columns of `middle_row`."""
+    return half_share(lens, NEAR_M)[24:-24], half_share(lens, VIRTUAL_M)[24:-24]
+
+
+def test_an_object_that_fills_the_picture_shows_where_the_near_thing_does_not() -> None:
+    whole = Layer(
+        np.broadcast_to(RED, (HEIGHT, WIDTH, 3)).copy(),
+        np.ones((HEIGHT, WIDTH), np.float32),
+        np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32),
+    )
+    rgb, share = middle_row(photograph(), whole)
+    near, _ = shares(LENS)
+    np.testing.assert_allclose(rgb, near[:, None] * GREEN + (1.0 - near)[:, None] * RED, atol=0.012)
+    np.testing.assert_allclose(share, 1.0 - near, atol=0.012)
+
+
+def test_an_object_hidden_by_the_same_half_of_the_pupil_does_not_show() -> None:
+    """Both edges lie in one line: at the edge near and virtual take the same half, so none of the virtual is seen.
+
+    Coverages multiplied would show a quarter of it. Beside the edge the virtual shows by what its share exceeds the near one's.
+    """
+    rgb, share = middle_row(photograph(), half_plane(True, VIRTUAL_M, RED))
+    near, virtual = shares(LENS)
+    seen = np.maximum(virtual - near, 0.0)
+    np.testing.assert_allclose(share, seen, atol=0.025)
+    np.testing.assert_allclose(rgb, near[:, None] * GREEN + seen[:, None] * RED + (1.0 - near - seen)[:, None] * BLUE, atol=0.03)
+    assert abs(share[EDGE - 24]) < 0.04 < 0.2 < near[EDGE - 24] * (1.0 - virtual[EDGE - 24])
+
+
+def test_an_object_in_the_other_half_of_the_pupil_shows_whole() -> None:
+    """At the edge each takes its half and nothing is left for what is far; multiplied, a quarter would be left."""
+    rgb, share = middle_row(photograph(), half_plane(False, VIRTUAL_M, RED))
+    near, left_part = shares(LENS)
+    seen = np.minimum(1.0 - left_part, 1.0 - near)
+    np.testing.assert_allclose(share, seen, atol=0.025)
+    np.testing.assert_allclose(rgb, near[:, None] * GREEN + seen[:, None] * RED + (1.0 - near - seen)[:, None] * BLUE, atol=0.03)
+
+
+@pytest.mark.parametrize("focus_m", [0.8, 1.4])
+def test_the_same_on_both_sides_of_the_focus(focus_m: float) -> None:
+    lens = LENS.focused_at(focus_m)
+    _, share = middle_row(photograph(lens), half_plane(False, VIRTUAL_M, RED))
+    near, left_part = shares(lens)
+    np.testing.assert_allclose(share, np.minimum(1.0 - left_part, 1.0 - near), atol=0.04)
+
+
+def test_a_matte_of_the_user_stands_in_for_sharp_picture_and_depth() -> None:
+    """Near green over blue is solved from the photograph alone."""
+    plate = replace(photograph(), depth_m=None, sharp_rgb=None, near_alpha=half_plane(True, NEAR_M, GREEN).alpha)
+    whole = Layer(
+        np.broadcast_to(RED, (HEIGHT, WIDTH, 3)).copy(),
+        np.ones((HEIGHT, WIDTH), np.float32),
+        np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32),
+    )
+    rgb, _ = middle_row(plate, whole, Between(near_depth_m=NEAR_M))
+    near, _ = shares(LENS)
+    np.testing.assert_allclose(rgb, near[:, None] * GREEN + (1.0 - near)[:, None] * RED, atol=0.06)
+
+
+def test_what_is_missing_is_asked_for() -> None:
+    virtual, bare = half_plane(True, VIRTUAL_M, RED), replace(photograph(), depth_m=None, sharp_rgb=None)
+    with pytest.raises(InputError, match=r"needs depth .* or a matte"):
+        Between().insert(bare, [virtual], ScatterReference())
+    with pytest.raises(InputError, match="needs its distance"):
+        Between().insert(replace(bare, near_alpha=virtual.alpha), [virtual], ScatterReference())
+
+
+def test_each_setting_matters() -> None:
+    plate, virtual = photograph(), half_plane(False, VIRTUAL_M, RED)
+    usual = Between().insert(plate, [virtual], ScatterReference()).rgb
+    assert np.abs(Between(tolerance=0.9).insert(plate, [virtual], ScatterReference()).rgb - usual).max() > 0.1
+    assert 1e-5 < np.abs(Between(pupil_points=8).insert(plate, [virtual], ScatterReference()).rgb - usual).max() < 0.2
+    matted = replace(plate, near_alpha=1.0 - virtual.alpha)
+    nearer, farther = (Between(near_depth_m=d).insert(matted, [virtual], ScatterReference()).rgb for d in (0.8, 1.2))
+    assert np.abs(nearer - farther).max() > 0.05
+
+
+def test_the_edge_of_an_object_cuts_the_disc_of_a_light_behind_it() -> None:
+    """A far light at the edge of an object half way to it: one half of its disc stays, the other goes."""
+    lens = LENS.focused_at(0.9)
+    sharp, row, column = np.full((HEIGHT, WIDTH, 3), 0.1, np.float32), HEIGHT // 2, EDGE
+    sharp[row, column] = 400.0
+    depth_m = np.full((HEIGHT, WIDTH), FAR_M, np.float32)
+    plate = replace(plate_of(ScatterReference().render([opaque(sharp, depth_m)], lens).rgb, lens, depth_m), sharp_rgb=sharp)
+    left = Between().insert(plate, [half_plane(True, 2.0, 0.1 * np.ones(3, np.float32))], ScatterReference()).photo_rgb[row, :, 0]
+    half_px = 0.5 * float(lens.coc_px(FAR_M, WIDTH))
+    soft_px = 1 + int(half_px / (half_px - 0.5 * float(lens.coc_px(2.0, WIDTH))))  # how wide a pixel of the edge lies on the disc
+    kept, gone = np.s_[column + soft_px : column + int(half_px) - 2], np.s_[column - int(half_px) + 3 : column - soft_px]
+    assert half_px > 12 and plate.rgb[row, kept, 0].min() > 0.3
+    np.testing.assert_allclose(left[kept], plate.rgb[row, kept, 0], rtol=0.03)
+    assert left[gone].max() < 0.15
+
+
+def test_lights_of_the_object_are_hidden_by_near_edges_alone() -> None:
+    """A light on the virtual surface behind a near half plane: where its disc lies past the edge, it is not dimmed."""
+    lens = LENS.focused_at(0.8)
+    virtual = half_plane(False, VIRTUAL_M, np.float32([0.1, 0.1, 0.1]))
+    virtual.rgb[HEIGHT // 2, EDGE + 4] = 300.0
+    found = Between().insert(photograph(lens), [virtual], ScatterReference()).virtual.rgb[HEIGHT // 2, :, 0]
+    alone = ScatterReference().render([virtual], lens).rgb[HEIGHT // 2, :, 0]
+    np.testing.assert_allclose(found[EDGE + 2 : EDGE + 8], alone[EDGE + 2 : EDGE + 8], rtol=0.05)
+    assert found[: EDGE - 1].max() < 0.1 < alone[EDGE - 3]
+
+
+# The steps.
+
+
+def test_points_of_the_pupil_are_evenly_spread_over_the_opening() -> None:
+    points = pupil_points(Aperture.disc(), 4096)
+    np.testing.assert_allclose(points[:, :2].mean(axis=0), 0.0, atol=5e-3)
+    np.testing.assert_allclose((points[:, :2] ** 2).mean(axis=0), 0.25, atol=5e-3)  # of a disc: r^2 / 4
+    ring = pupil_points(Aperture.ring(0.5), 4096)
+    assert np.hypot(*ring[:, :2].T).min() > 0.49 and np.all(ring[:, 2] == 1.0)
+
+
+def test_transmission_is_the_sum_of_the_outlines_around_a_point() -> None:
+    ring = Aperture.ring(0.5)
+    np.testing.assert_allclose(transmission(ring, np.array([[0.0, 0.0], [0.75, 0.0], [0.0, -0.75], [1.2, 0.0]])), [0, 1, 1, 0], atol=1e-9)
+
+
+def rays_through_flat_layers() -> Rays:
+    rng = np.random.default_rng(1)
+    near = half_plane(True, NEAR_M, GREEN)
+    scene = NearAndFar(
+        replace(near, depth_m=np.full_like(near.alpha, NEAR_M)),
+        rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32),
+        np.full((HEIGHT, WIDTH), FAR_M, np.float32),
+        NO_LIGHTS,
+    )
+    alpha = rng.uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32)
+    virtual = Layer(alpha[..., None] * RED, alpha, np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32))
+    return Rays.of(scene, virtual, virtual.depth_m, LENS.focused_at(1.0), 32)
+
+
+def test_compiled_rays_are_those_of_a_plain_loop() -> None:
+    rays = rays_through_flat_layers()
+    places = np.array([20 * WIDTH + 30, 20 * WIDTH + EDGE, 3 * WIDTH + EDGE + 5])
+    found, pupil = rays.means(places), pupil_points(rays.lens.aperture, 32)
+    near_px, virtual_px, far_px = (float(plane[0, 0]) for plane in rays.coc_px)
+    for index, place in enumerate(places):
+        y, x = place // WIDTH + 0.5, place % WIDTH + 0.5
+
+        def met(plane: np.ndarray, coc_px: float, y: float = y, x: float = x) -> np.ndarray:
+            at = [y - pupil[:, 1] * coc_px / 2 - 0.5, x - pupil[:, 0] * coc_px / 2 - 0.5]
+            return map_coordinates(plane.astype(np.float64), at, order=1, mode="nearest")
+
+        free, covered = 1.0 - met(rays.scene.near.alpha, near_px), met(rays.virtual.alpha, virtual_px)
+        red = met(rays.scene.far_rgb[..., 0], far_px)
+        plain = [free.mean(), covered.mean(), (free * covered).mean(), (free * red).mean(), (free * (1 - covered) * red).mean()]
+        compiled = [found.f[index], found.a[index], found.f_a[index], found.f_far[index, 0], found.past_far[index, 0]]
+        np.testing.assert_allclose(compiled, plain, atol=2e-4)
+
+
+def test_all_light_of_a_light_arrives_where_nothing_hides_it() -> None:
+    rays = rays_through_flat_layers()
+    rays.virtual.rgb[:] = 0.1 * rays.virtual.alpha[..., None]
+    rays.virtual.rgb[20, 70] = 100.0
+    through = virtual_lights(rays)
+    assert through.one.sum() == pytest.approx(300.0, rel=0.02) and through.both.sum() == pytest.approx(through.one.sum(), rel=1e-5)
+
+
+def test_a_smooth_surface_is_cut_without_taking_its_colours_apart() -> None:
+    """A table that recedes: what is near and what is far of it add up to it, hard at the cut."""
+    sharp = np.random.default_rng(2).uniform(0, 1, (40, 60, 3)).astype(np.float32)
+    depth_m = np.repeat(np.linspace(2.4, 1.6, 40, dtype=np.float32)[:, None], 60, axis=1)
+    near = nearer_than(depth_m, np.full_like(depth_m, 2.0), 0.03)
+    scene = cut_in_two(sharp, depth_m, near, 8.0, 0.03)
+    assert set(np.unique(scene.near.alpha)) == {0.0, 1.0} and 0.3 < near.mean() < 0.6
+    np.testing.assert_array_equal(scene.near.rgb[near], sharp[near])
+    np.testing.assert_array_equal(scene.far_rgb[~near], sharp[~near])
+
+
+def test_mixed_pixels_of_a_rim_are_taken_apart() -> None:
+    """A dark bar over grey whose border pixels are 40 % bar: its coverage there is found again."""
+    alpha = np.zeros((30, 40), np.float32)
+    alpha[:, 10:16], alpha[:, [9, 16]] = 1.0, 0.4
+    sharp = (alpha[..., None] * 0.1 + (1.0 - alpha[..., None]) * 0.6).repeat(3, axis=2).astype(np.float32)
+    depth_m = np.where(alpha > 0.5, 0.8, 3.0).astype(np.float32)
+    scene = cut_in_two(sharp, depth_m, alpha > 0.5, 8.0, 0.03)
+    np.testing.assert_allclose(scene.near.alpha, alpha, atol=0.02)
+    np.testing.assert_allclose(scene.far_rgb, 0.6, atol=0.02)
+
+
+def test_clean_colours_of_two_flat_ones() -> None:
+    alpha = np.repeat(np.clip((np.arange(120, dtype=np.float32) - 50) / 20, 0, 1)[None], 40, axis=0)
+    picture = (alpha[..., None] * GREEN + (1.0 - alpha[..., None]) * BLUE).astype(np.float32)
+    front, behind = clean_colours(picture, alpha)
+    np.testing.assert_allclose(alpha[..., None] * front + (1.0 - alpha[..., None]) * behind, picture, atol=0.02)
+    mixed = (alpha > 0.2) & (alpha < 0.8)
+    for found, true in ((front, GREEN), (behind, BLUE)):
+        assert np.abs(found[mixed] - true).mean() < 0.2 * np.abs(picture[mixed] - true).mean()
