@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.camera import Camera
 from mrbokeh.layer import Layer
-from mrbokeh.shots.hooks import LayerSource, Moment
+from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class _Moving:
         self._depth_m = np.where(self._alpha > 0, depth_m, np.inf).astype(np.float32)
         self._described = described
 
-    def layers_at(self, moment: Moment, camera: Camera | None) -> Sequence[Layer]:  # noqa: ARG002
+    def layers_at(self, moment: Moment, cameras: CameraSource | None) -> Sequence[Layer]:  # noqa: ARG002
         width, height = moment.size_px
         size = 2 * self._described.radius_px
         left, top = moment.number * self._described.step_px % (width - size), (height - size) // 2

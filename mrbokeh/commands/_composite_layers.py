@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from mrbokeh.camera import Camera
@@ -104,13 +104,10 @@ def _scene_layers(path: Path, options: SceneOptions) -> LayersFor:
 
 
 def _filmed(description: SceneDescription, options: SceneOptions, seen_by: Callable[[Plate], Camera]) -> LayersFor:
-    from mrbokeh.atomic_files import read_json
-    from mrbokeh.lens_distortion.distortion_json import distortion_from_json
+    from mrbokeh.lens_distortion.distortion_json import read_distortion
     from mrbokeh.staging.filming import FilmedLayers, Filming
 
-    filming = Filming(options.backend, options.samples, catches=options.catches)
-    if (path := options.distortion) is not None:
-        filming = replace(filming, distortion=distortion_from_json(read_json(path, "a lens distortion"), str(path), path.parent))
+    filming = Filming(options.backend, options.samples, catches=options.catches, distortion=read_distortion(options.distortion))
     filmed = FilmedLayers(filming, description)
 
     def layers(plate: Plate) -> list[Layer]:

@@ -36,6 +36,9 @@ MatteOption = Annotated[
     Path | None,
     typer.Option(metavar="MATTE.png", help="White where something real stands in front, sharp; for --mode between.", rich_help_panel=PLATE),
 ]
+NearDistanceOption = Annotated[
+    float | None, typer.Option(metavar="METRES", help="How far what --matte shows is, where there is no depth.", rich_help_panel=PLATE)
+]
 InputSpaceOption = Annotated[
     str | None, typer.Option(help="OpenColorIO space of the photograph's numbers, such as ACEScg.", rich_help_panel=PLATE)
 ]

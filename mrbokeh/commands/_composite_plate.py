@@ -43,13 +43,15 @@ def plate_by(options: PlateOptions, lens: Lens | None, bundle: CaptureBundle | N
     return plate if options.matte is None else with_matte(plate, options.matte)
 
 
-def insertion_for(mode: str | None, plate: Plate) -> Insertion:
-    """By name; else the best that what is known of the plate allows."""
-    if mode is not None:
-        return insertion_of(mode)
+def insertion_for(mode: str | None, plate: Plate, near_m: float | None = None) -> Insertion:
+    """By name; else the best that what is known of the plate allows. near_m: how far what the plate's matte holds is."""
+    return insertion_of(mode or _best_mode(plate), near_m)
+
+
+def _best_mode(plate: Plate) -> str:
     if plate.near_alpha is not None or (plate.depth_m is not None and plate.sharp_rgb is not None):
-        return insertion_of("between")
-    return insertion_of("over" if plate.depth_m is not None else "front")
+        return "between"
+    return "over" if plate.depth_m is not None else "front"
 
 
 def _from_space(plate: Plate, options: PlateOptions) -> Plate:

@@ -25,6 +25,15 @@ DepthOption = Annotated[
     Path | None,
     typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.", rich_help_panel=CLIP),
 ]
+MatteOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="MATTE.png", help="White where something real stands in front, sharp; one file or matte.%04d.png.", rich_help_panel=CLIP
+    ),
+]
+NearDistanceOption = Annotated[
+    float | None, typer.Option(metavar="METRES", help="How far what --matte shows is, where there is no depth.", rich_help_panel=CLIP)
+]
 SteadyOption = Annotated[bool, typer.Option("--steady-depth", help="Filter numbered depth in time, against flicker.", rich_help_panel=CLIP)]
 
 LayerOption = Annotated[
@@ -46,9 +55,30 @@ CameraOption = Annotated[
         rich_help_panel=VIRTUAL,
     ),
 ]
-BackendOption = Annotated[str, typer.Option(help="Who renders --scene: auto, embree or wgpu.", rich_help_panel=VIRTUAL)]
+BackendOption = Annotated[str, typer.Option(help="Who renders --scene: auto, embree, wgpu or mitsuba.", rich_help_panel=VIRTUAL)]
+SamplesOption = Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.", rich_help_panel=VIRTUAL)]
+CatchOption = Annotated[
+    str,
+    typer.Option(help="What the ground of --scene catches: shadow or light (with mitsuba also reflections).", rich_help_panel=VIRTUAL),
+]
+ShutterOption = Annotated[
+    float | None,
+    typer.Option(min=0.0, max=360.0, metavar="DEGREES", help="Shutter angle: --scene is blurred by its motion.", rich_help_panel=LENS),
+]
+ReadoutOption = Annotated[
+    float, typer.Option(help="Seconds from the first to the last row of a rolling shutter, with --shutter.", rich_help_panel=LENS)
+]
+DistortionOption = Annotated[
+    Path | None,
+    typer.Option(metavar="DISTORTION.json", help="How the lens bends straight lines: --scene is bent alike.", rich_help_panel=LENS),
+]
 BeginOption = Annotated[float, typer.Option(help="Second of the clip at which the animations of --scene begin.", rich_help_panel=VIRTUAL)]
-ModeOption = Annotated[str, typer.Option(help="How layers go in: front of everything, or over by depth.", rich_help_panel=VIRTUAL)]
+ModeOption = Annotated[
+    str | None,
+    typer.Option(
+        help="How layers go in: front, over (by depth), matte, between (behind blurred near things) or rerender.", rich_help_panel=VIRTUAL
+    ),
+]
 
 LensOption = Annotated[
     Path, typer.Option(metavar="LENS.json", help="The lens, focused as it was when the clip was shot.", rich_help_panel=LENS)

@@ -26,6 +26,7 @@ def composite(
     disparity: options.DisparityOption = None,
     depth_scale: options.DepthScaleOption = None,
     matte: options.MatteOption = None,
+    near_distance: options.NearDistanceOption = None,
     input_space: options.InputSpaceOption = None,
     layer: options.LayerOption = None,
     objects: options.ObjectsOption = None,
@@ -91,7 +92,7 @@ def composite(
     standing = ObjectOptions(object_, at, at_pixel, height, turn, tilt, environment, exposure, shadow)
     rendering = SceneOptions(scene, camera, time, scene_renderer, samples, catch, distortion)
     layers_for = layers_by(VirtualOptions(tuple(layer or ()), objects, standing, rendering), plate, bundle)
-    insertion = insertion_for(mode, plate)
+    insertion = insertion_for(mode, plate, near_distance)
     if all_slices:
         _into_all_slices(photo, out, layers_for, insertion, used_renderer)
         return

@@ -4,18 +4,23 @@ from pathlib import Path
 
 import typer
 
+from mrbokeh.commands import _look_options as look
 from mrbokeh.commands import _video_options as options
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.errors import InputError
+from mrbokeh.lens_distortion.distortion_json import read_distortion
+from mrbokeh.moving_layers import ShutterTiming
 from mrbokeh.picture_sources.base import PictureSource
 from mrbokeh.picture_sources.choose import open_source
 from mrbokeh.picture_sources.numbered_files import is_pattern
+from mrbokeh.plate_look.look_options import LookOptions
 from mrbokeh.progress import progress_bars
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT
+from mrbokeh.shots.clip_look import ClipLook
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.crew import Crew, OneProcess
 from mrbokeh.shots.dask_crew import DaskCrew
-from mrbokeh.shots.frame_sources import CameraFile, DepthFiles, FocusPulled
+from mrbokeh.shots.frame_sources import CameraFile, DepthFiles, FocusPulled, MatteFiles
 from mrbokeh.shots.layer_sources import LayerFiles, SceneLayers
 from mrbokeh.shots.making import make_shot
 from mrbokeh.shots.process_crew import ProcessCrew
@@ -23,6 +28,7 @@ from mrbokeh.shots.segment import SEGMENT_S
 from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.video_target import VideoTarget
+from mrbokeh.staging.filming import Filming
 from mrbokeh.workers import cores
 
 app = typer.Typer(add_completion=False)
@@ -39,11 +45,26 @@ def video(
     scene: options.SceneOption = None,
     camera: options.CameraOption = None,
     scene_renderer: options.BackendOption = "auto",
+    samples: options.SamplesOption = 64,
     scene_begin: options.BeginOption = 0.0,
+    catch: options.CatchOption = "shadow",
+    shutter: options.ShutterOption = None,
+    readout: options.ReadoutOption = 0.0,
+    distortion: options.DistortionOption = None,
     focus_pull: options.FocusOption = None,
     depth: options.DepthOption = None,
     steady_depth: options.SteadyOption = False,
-    mode: options.ModeOption = DEFAULT_MODE,
+    matte: options.MatteOption = None,
+    near_distance: options.NearDistanceOption = None,
+    mode: options.ModeOption = None,
+    match_grey: look.MatchGreyOption = None,
+    grey_value: look.GreyValueOption = 0.18,
+    match_white: look.MatchWhiteOption = None,
+    match_black: look.MatchBlackOption = None,
+    vignetting: look.VignettingOption = None,
+    grain: look.GrainOption = None,
+    light_wrap: look.LightWrapOption = None,
+    seed: look.SeedOption = 0,
     renderer: options.RendererOption = DEFAULT,
     frames: options.FramesOption = ":",
     rate: options.RateOption = None,
@@ -68,15 +89,23 @@ def video(
     number = source.first_number if first_number is None else first_number
     if not layer and scene is None:
         raise InputError("nothing to put into the clip: give --layer RGBAZ.exr or --scene SCENE.toml")
-    in_scene = () if scene is None else (SceneLayers(scene.resolve(), scene_renderer, scene_begin),)
+    if scene is None and (shutter is not None or distortion is not None or camera is not None):
+        raise InputError("--camera, --shutter and --distortion are for what --scene renders: layers in files have theirs in them")
+    timing = None if shutter is None else ShutterTiming(float(source.info.frame_rate), shutter, readout_s=readout)
+    filming = Filming(scene_renderer, samples, catches=catch, distortion=read_distortion(distortion), shutter=timing)
+    in_scene = () if scene is None else (SceneLayers(scene.resolve(), filming, scene_begin),)
+    wanted = LookOptions(match_grey, grey_value, None, match_white, match_black, vignetting, grain, light_wrap, seed)
     recipe = CompositeRecipe(
         lens=lens.resolve(),
         layers=(*(LayerFiles(path.resolve()) for path in layer or ()), *in_scene),
         renderer=renderer if renderer in BY_NAME else str(Path(renderer).resolve()) if renderer.endswith(".onnx") else renderer,
-        mode=mode,
-        camera=None if camera is None else CameraFile(camera.resolve(), (source.info.width_px, source.info.height_px)),
+        mode=mode or (DEFAULT_MODE if matte is None else "between"),
+        camera=None if camera is None else CameraFile.of_clip(camera.resolve(), source.info),
         focus=None if focus_pull is None else FocusPulled.of(focus_pull),
         depth=None if depth is None else DepthFiles(depth.resolve(), steady_depth),
+        matte=None if matte is None else MatteFiles(matte.resolve()),
+        near_m=near_distance,
+        look=None if wanted == LookOptions(seed=seed) else ClipLook(wanted, clip.resolve(), rate, start),
         first_number=number,
         virtual_only=virtual_only,
     )

@@ -22,8 +22,12 @@ picture and layers blurred together."""
 DEFAULT_MODE = "over"
 
 
-def insertion_of(mode: str) -> Insertion:
-    """Raises InputError where there is no mode of that name."""
+def insertion_of(mode: str, near_m: float | None = None) -> Insertion:
+    """near_m: how far what a user's matte shows is, for the mode between. Raises InputError where there is no mode of that name."""
     if mode not in MODES:
         raise InputError(f"expected a mode out of {', '.join(MODES)}, got {mode!r}")
-    return MODES[mode]
+    if near_m is None:
+        return MODES[mode]
+    if mode != "between":
+        raise InputError(f"the distance of what the matte shows is for the mode between, got the mode {mode}: leave it out")
+    return InTouchedBox(Between(near_depth_m=near_m))

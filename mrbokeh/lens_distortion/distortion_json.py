@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from mrbokeh.atomic_files import read_json
 from mrbokeh.errors import InputError
 from mrbokeh.lens_distortion.colmap import colmap_distortion
 from mrbokeh.lens_distortion.distortion import HUGIN_UNIT, LensDistortion
@@ -42,6 +43,13 @@ def distortion_from_json(document: dict[str, Any], where: str = "distortion", fo
         raise InputError(f"{where}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{where}: expected the name of a model and its values as numbers ({error!r})") from None
+
+
+def read_distortion(path: Path | None) -> LensDistortion:
+    """From a JSON file; None bends nothing."""
+    if path is None:
+        return LensDistortion()
+    return distortion_from_json(read_json(path, "a lens distortion (JSON)"), str(path), path.parent)
 
 
 def _of_colmap(model: str, values: list[float]) -> LensDistortion:

@@ -1,7 +1,7 @@
 """CompositeRecipe: virtual layers put into each frame of a clip, blurred by its lens as it is focused in that frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from mrbokeh.plate import Plate, plate_of
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
 from mrbokeh.shots.boxed_insertion import BoxedInsertion
 from mrbokeh.shots.frame_maker import Picture
-from mrbokeh.shots.hooks import CameraSource, DepthSource, Description, Finisher, FocusSource, LayerSource, Moment
+from mrbokeh.shots.hooks import CameraSource, DepthSource, Description, Finisher, FocusSource, LayerSource, MatteSource, Moment
 
 _LOCAL = ("polygon", "scatter")
 """Renderers that light leaves no farther than its circle of confusion."""
@@ -26,7 +26,8 @@ _LOCAL = ("polygon", "scatter")
 class CompositeRecipe:
     """A MakerRecipe. first_number: what frame 0 of the clip is called by in sequences, tracks and focus pulls.
 
-    focus: None leaves the lens as its file has it. virtual_only: the blurred virtual layer alone, in place of the picture.
+    focus: None leaves the lens as its file has it. near_m: how far what the matte shows is, where there is no depth.
+    virtual_only: the blurred virtual layer alone, in place of the picture.
     """
 
     lens: Path
@@ -36,13 +37,15 @@ class CompositeRecipe:
     camera: Description[CameraSource] | None = None
     focus: Description[FocusSource] | None = None
     depth: Description[DepthSource] | None = None
-    finisher: Finisher | None = None
+    matte: Description[MatteSource] | None = None
+    near_m: float | None = None
+    look: Description[Finisher] | None = None
     first_number: int = 0
     virtual_only: bool = False
 
     @property
     def files(self) -> tuple[Path, ...]:
-        described = (*self.layers, self.camera, self.focus, self.depth)
+        described = (*self.layers, self.camera, self.focus, self.depth, self.matte, self.look)
         network = () if self.renderer in BY_NAME else (Path(self.renderer),)
         return (self.lens, *network, *(path for each in described if each is not None for path in each.files))
 
@@ -59,29 +62,32 @@ class CompositeMaker:
         self._camera = None if recipe.camera is None else recipe.camera.opened(threads)
         self._focus = None if recipe.focus is None else recipe.focus.opened(threads)
         self._depth = None if recipe.depth is None else recipe.depth.opened(threads)
+        self._matte = None if recipe.matte is None else recipe.matte.opened(threads)
+        self._finisher = None if recipe.look is None else recipe.look.opened(threads)
         renderer = make_renderer(recipe.renderer, threads=threads)
-        self._boxed = BoxedInsertion(insertion_of(recipe.mode), renderer, local=recipe.renderer in _LOCAL)
+        self._boxed = BoxedInsertion(insertion_of(recipe.mode, recipe.near_m), renderer, local=recipe.renderer in _LOCAL)
 
     def make(self, index: int, rgb: Float32[np.ndarray, "height width 3"], time_s: float) -> Picture:
         height, width = rgb.shape[:2]
         moment = Moment(self._recipe.first_number + index, time_s, (width, height))
         camera = None if self._camera is None else self._camera.camera_at(moment)
         plate = self._plate(moment, rgb, camera)
-        part = self._boxed.insert(plate, self._layers(moment, camera))
-        if self._recipe.finisher is None and not self._recipe.virtual_only:
+        part = self._boxed.insert(plate, self._layers(moment))
+        if self._finisher is None and not self._recipe.virtual_only:
             return part.over(rgb)
         inserted = part.whole(rgb)
-        if self._recipe.finisher is not None:
-            inserted = self._recipe.finisher.finished(inserted, plate, moment.number)
+        if self._finisher is not None:
+            inserted = self._finisher.finished(inserted, plate, moment.number)
         return inserted.virtual if self._recipe.virtual_only else inserted.rgb
 
-    def _layers(self, moment: Moment, camera: Camera | None) -> Sequence[Layer]:
-        return [layer for source in self._sources for layer in source.layers_at(moment, camera)]
+    def _layers(self, moment: Moment) -> Sequence[Layer]:
+        return [layer for source in self._sources for layer in source.layers_at(moment, self._camera)]
 
     def _plate(self, moment: Moment, rgb: Float32[np.ndarray, "height width 3"], camera: Camera | None) -> Plate:
         depth_m = None if self._depth is None else self._depth.depth_m_at(moment)
         lens = self._lens_at(moment.number)
-        return plate_of(rgb, lens, depth_m) if camera is None else Plate(rgb, depth_m, lens, camera)
+        plate = plate_of(rgb, lens, depth_m) if camera is None else Plate(rgb, depth_m, lens, camera)
+        return plate if self._matte is None else replace(plate, near_alpha=self._matte.near_alpha_at(moment))
 
     def _lens_at(self, number: int) -> Lens:
         """The very same lens as long as the focus stays."""

@@ -1,6 +1,7 @@
 """Camera, focus and depth of each frame, from files."""
 
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -12,38 +13,53 @@ from mrbokeh.camera_track.focus_pull import parse_focus_keys
 from mrbokeh.camera_track.formats import read_track
 from mrbokeh.camera_track.options import TrackOptions
 from mrbokeh.camera_track.track import CameraTrack
+from mrbokeh.camera_track.tracked_frame import TrackedFrame
 from mrbokeh.depth_sources.temporal_filter import TemporalDepthFilter
 from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_depth
+from mrbokeh.image_io import read_depth, read_image
 from mrbokeh.picture_sources.numbered_files import is_pattern, numbered
-from mrbokeh.shots.hooks import CameraSource, DepthSource, FocusSource, Moment
+from mrbokeh.shots.hooks import CameraSource, DepthSource, FocusSource, MatteSource, Moment
 from mrbokeh.shots.kept import Kept
+from mrbokeh.video_io import VideoInfo
 
 Plane = Float32[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Description of a fixed camera (JSON) or a track, in any form that mrbokeh.camera_track reads; size_px: of the clip."""
+    """Description of a fixed camera (JSON) or a track, in any form that mrbokeh.camera_track reads.
+
+    size_px, frame_rate: of the clip.
+    """
 
     path: Path
     size_px: tuple[int, int]
+    frame_rate: Fraction = Fraction(25)
+
+    @classmethod
+    def of_clip(cls, path: Path, clip: VideoInfo) -> "CameraFile":
+        return cls(path, (clip.width_px, clip.height_px), clip.frame_rate)
 
     @property
     def files(self) -> tuple[Path, ...]:
         return (self.path,)
 
     def opened(self, threads: int) -> CameraSource:  # noqa: ARG002
-        return _OpenedTrack(read_track(self.path, TrackOptions(size_px=self.size_px)))
+        return _OpenedTrack(read_track(self.path, TrackOptions(size_px=self.size_px)), float(self.frame_rate))
 
 
 class _OpenedTrack:
-    def __init__(self, track: CameraTrack) -> None:
-        self._track = track
+    def __init__(self, track: CameraTrack, frame_rate: float) -> None:
+        self._track, self._timed, self._frame_rate = track, track.timed(frame_rate), frame_rate
 
-    def camera_at(self, moment: Moment) -> Camera:
-        camera = self._track.at(moment.number).camera
+    def camera_at(self, moment: Moment, after_s: float = 0.0) -> Camera:
+        """Beyond the ends of the track the camera stays where it was."""
+        camera = (self._track.at(moment.number) if after_s == 0.0 else self._around(moment, after_s)).camera
         return camera if (camera.width_px, camera.height_px) == moment.size_px else camera.resized(*moment.size_px)
+
+    def _around(self, moment: Moment, after_s: float) -> TrackedFrame:
+        first, last = self._track.numbers[0], self._track.numbers[-1]
+        return self._timed.at_time(min(max(moment.number + after_s * self._frame_rate, first), last) / self._frame_rate)
 
 
 @dataclass(frozen=True)
@@ -94,6 +110,28 @@ class _Depth:
         return _of_size(self._read(str(numbered(self._path, moment.number))), moment, self._path)
 
 
+@dataclass(frozen=True)
+class MatteFiles:
+    """Description of mattes of what is near, whose numbers are coverage: one picture for all frames, or numbered ones (matte.%04d.png)."""
+
+    path: Path
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return (self.path,)
+
+    def opened(self, threads: int) -> MatteSource:  # noqa: ARG002
+        return _Mattes(self.path)
+
+
+class _Mattes:
+    def __init__(self, path: Path) -> None:
+        self._path, self._read = path, Kept(lambda name: np.ascontiguousarray(read_image(Path(name), "linear")[..., 1]))
+
+    def near_alpha_at(self, moment: Moment) -> Plane:
+        return _of_size(self._read(str(numbered(self._path, moment.number))), moment, self._path)
+
+
 class _SteadyDepth:
     def __init__(self, described: DepthFiles) -> None:
         self._described, self._filter = described, TemporalDepthFilter()
@@ -119,10 +157,8 @@ class _SteadyDepth:
         return range(begin, number + 1)
 
 
-def _of_size(depth_m: Plane, moment: Moment, path: Path) -> Plane:
+def _of_size(plane: Plane, moment: Moment, path: Path) -> Plane:
     width, height = moment.size_px
-    if depth_m.shape != (height, width):
-        raise InputError(
-            f"{path} is {depth_m.shape[1]}x{depth_m.shape[0]} px but the clip is {width}x{height} px: resize the depth to that size"
-        )
-    return depth_m
+    if plane.shape != (height, width):
+        raise InputError(f"{path} is {plane.shape[1]}x{plane.shape[0]} px but the clip is {width}x{height} px: resize it to that size")
+    return plane

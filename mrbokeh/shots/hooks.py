@@ -40,15 +40,15 @@ class Description(Protocol[Opened]):
 
 @runtime_checkable
 class LayerSource(Protocol):
-    def layers_at(self, moment: Moment, camera: Camera | None) -> Sequence[Layer]:
-        """Sharp layers of the plate's size, front first. camera: of that frame, where one is given."""
+    def layers_at(self, moment: Moment, cameras: "CameraSource | None") -> Sequence[Layer]:
+        """Sharp layers of the plate's size, front first. cameras: of the clip, where they are given."""
         ...
 
 
 @runtime_checkable
 class CameraSource(Protocol):
-    def camera_at(self, moment: Moment) -> Camera:
-        """With its pose in the world of the scene."""
+    def camera_at(self, moment: Moment, after_s: float = 0.0) -> Camera:
+        """With its pose in the world of the scene; after_s: so much later, or earlier, while the shutter is open."""
         ...
 
 
@@ -67,22 +67,16 @@ class DepthSource(Protocol):
 
 
 @runtime_checkable
+class MatteSource(Protocol):
+    def near_alpha_at(self, moment: Moment) -> Float32[np.ndarray, "height width"]:
+        """What of the photographed scene stands in front of the virtual objects: its coverage, sharp, 0 to 1."""
+        ...
+
+
+@runtime_checkable
 class Finisher(Protocol):
     """What makes virtual light look photographed (mrbokeh.plate_look)."""
 
     def finished(self, inserted: Inserted, plate: Plate, number: int) -> Inserted:
         """Whole frames; the photograph's own pixels stay as they are."""
-        ...
-
-
-@runtime_checkable
-class Distorter(Protocol):
-    """Renders as the plate's lens bends them (mrbokeh.lens_distortion)."""
-
-    def overscan_camera(self, camera: Camera) -> Camera:
-        """The pinhole that sees all that the plate sees."""
-        ...
-
-    def distorted(self, layer: Layer, overscan: Camera, plate: Camera) -> Layer:
-        """Its picture as the plate's."""
         ...

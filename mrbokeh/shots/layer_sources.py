@@ -1,7 +1,7 @@
 """Layers of a frame: EXR files of other renderers, or a staged scene rendered here."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +10,10 @@ from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.exr_layers.sequence import ExrSequence
 from mrbokeh.layer import Layer
-from mrbokeh.scene import Scene
-from mrbokeh.scene.base import SceneRenderer
-from mrbokeh.scene.choose import scene_renderer
-from mrbokeh.shots.hooks import Distorter, LayerSource, Moment
+from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
 from mrbokeh.shots.kept import Kept
-from mrbokeh.staging.assets import Assets
-from mrbokeh.staging.scene_description import SceneDescription
+from mrbokeh.staging.filming import FilmedLayers, Filming
 from mrbokeh.staging.scene_file import read_scene_file
-from mrbokeh.staging.staged_layers import staged_layers
-from mrbokeh.staging.staged_scene import StagedScene
 
 
 @dataclass(frozen=True)
@@ -41,7 +35,7 @@ class _OpenedFiles:
         self._sequence = sequence
         self._read = Kept(lambda name: sequence.reader.layers(Path(name)))
 
-    def layers_at(self, moment: Moment, camera: Camera | None) -> Sequence[Layer]:  # noqa: ARG002
+    def layers_at(self, moment: Moment, cameras: CameraSource | None) -> Sequence[Layer]:  # noqa: ARG002
         path = self._sequence.path_of(moment.number)
         layers = self._read(str(path))
         for layer in layers:
@@ -53,48 +47,38 @@ class _OpenedFiles:
 
 @dataclass(frozen=True)
 class SceneLayers:
-    """Description of a scene file (mrbokeh.staging) and the backend that renders it; begin_s: when in the clip its animations start.
-
-    distorter: of the plate's lens, or None for a pinhole.
-    """
+    """Description of a scene file (mrbokeh.staging) and how it is filmed; begin_s: when in the clip its animations start."""
 
     path: Path
-    backend: str = "auto"
+    filming: Filming = field(default_factory=Filming)
     begin_s: float = 0.0
-    distorter: Distorter | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:
         return read_scene_file(self.path).files
 
     def opened(self, threads: int) -> LayerSource:
-        return _OpenedScene(self, read_scene_file(self.path), scene_renderer(self.backend, threads))
+        return _OpenedScene(self, FilmedLayers(self.filming, read_scene_file(self.path), threads))
 
 
 class _OpenedScene:
-    """Rendered anew only where the camera or the scene moved."""
+    """Filmed anew only where the camera or the scene moved."""
 
-    def __init__(self, described: SceneLayers, description: SceneDescription, backend: SceneRenderer) -> None:
-        self._described, self._backend = described, backend
-        self._staged = StagedScene.load(description, Assets())
-        self._last: tuple[Scene, Camera, Sequence[Layer]] | None = None
+    def __init__(self, described: SceneLayers, filmed: FilmedLayers) -> None:
+        self._described, self._filmed = described, filmed
+        self._last: tuple[Camera, Sequence[Layer]] | None = None
 
-    def layers_at(self, moment: Moment, camera: Camera | None) -> Sequence[Layer]:
-        if camera is None:
+    def layers_at(self, moment: Moment, cameras: CameraSource | None) -> Sequence[Layer]:
+        if cameras is None:
             raise InputError(f"to render {self._described.path} a camera is needed: give --camera with a fixed camera or a track")
-        time_s = moment.time_s - self._described.begin_s
-        scene, last = self._staged.scene_at(time_s), self._last
-        if last is None or last[0] is not scene or not same_view(last[1], camera):
-            last = self._last = scene, camera, self._render(camera, time_s)
-        return last[2]
+        camera, last = cameras.camera_at(moment), self._last
+        if last is None or self._filmed.changes_by_itself or not same_view(last[0], camera):
+            last = self._last = camera, self._film(moment, cameras)
+        return last[1]
 
-    def _render(self, camera: Camera, time_s: float) -> Sequence[Layer]:
-        distorter = self._described.distorter
-        if distorter is None:
-            return staged_layers(self._staged, camera, self._backend, time_s)
-        overscan = distorter.overscan_camera(camera)
-        layers = staged_layers(self._staged, overscan, self._backend, time_s)
-        return [distorter.distorted(layer, overscan, camera) for layer in layers]
+    def _film(self, moment: Moment, cameras: CameraSource) -> Sequence[Layer]:
+        begin_s = moment.time_s - self._described.begin_s
+        return self._filmed.at(lambda time_s: cameras.camera_at(moment, time_s - begin_s), begin_s)
 
 
 def same_view(one: Camera, other: Camera) -> bool:

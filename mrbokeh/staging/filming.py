@@ -62,6 +62,11 @@ class FilmedLayers:
         self._filming, self._renderer = filming, filming.renderer(threads)
         self._staged = StagedScene.load(description, Assets(), moment_s=0.0)
 
+    @property
+    def changes_by_itself(self) -> bool:
+        """Whether the layers can differ between two moments that show the same camera: by animation, or by what the shutter sees."""
+        return self._staged.is_animated or self._filming.shutter is not None
+
     def at(self, camera_at: CameraAt, time_s: float = 0.0, sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None) -> list[Layer]:
         """Sharp layers of the plate's size, front first: the objects, and behind them what they change on the ground.
 

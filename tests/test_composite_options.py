@@ -1,0 +1,187 @@
+"""What each option of `mrbokeh composite` changes in the picture, and what stays bit for bit."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mrbokeh.camera import Camera
+from mrbokeh.commands.composite import app
+from mrbokeh.demo.plan import DATA
+from mrbokeh.errors import InputError
+from mrbokeh.exr_layers.composite_exr import read_composite_exr
+from mrbokeh.exr_layers.deep_out import write_deep_exr
+from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.image_io import read_image, write_image, write_layer
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import write_lens
+
+HEIGHT, WIDTH = 96, 144
+LENS = Lens(35.0, 2.0, 2.0, 23.5)
+CAKE = DATA / "objects" / "cakeBirthday.glb"
+GREY = 0.3
+
+
+def plate_rgb() -> np.ndarray:
+    return np.random.default_rng(0).normal(GREY, 0.02, (HEIGHT, WIDTH, 3)).astype(np.float32)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A grey wall at 2 m in focus, a post at 0.8 m in its left third, and a white card at 1.3 m."""
+    write_image(tmp_path / "photo.exr", plate_rgb(), half=False)
+    depth_m = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    depth_m[:, : WIDTH // 3] = 0.8
+    write_layer(tmp_path / "depth.exr", Layer(plate_rgb(), np.ones_like(depth_m), depth_m))
+    write_image(tmp_path / "near.png", np.repeat((depth_m < 1.0)[..., None], 3, axis=2).astype(np.float32), "linear")
+    write_image(tmp_path / "disparity.png", np.repeat((0.8 / depth_m)[..., None], 3, axis=2), "linear")
+    write_lens(tmp_path / "lens.json", LENS)
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[30:70, 30:90] = 1.0
+    card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, 1.3, np.inf).astype(np.float32))
+    write_layer(tmp_path / "card.exr", card, half=False)
+    write_deep_exr(tmp_path / "deep.exr", [card])
+    return tmp_path
+
+
+def put_in(files: Path, *words: object, photo: str = "photo.exr", card: str | None = "card.exr") -> np.ndarray:
+    """The picture in linear light. Errors are raised here."""
+    out = files / f"out{len(list(files.iterdir()))}.exr"
+    virtual = () if card is None else ("--layer", files / card)
+    arguments = (files / photo, "--lens", files / "lens.json", *virtual, *words, "--out", out)
+    result = CliRunner().invoke(app, [str(word) for word in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return read_image(out)
+
+
+def changed(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.abs(one - other).max(axis=2) > 2e-3
+
+
+def test_without_depth_it_stands_before_everything_and_with_it_the_post_hides_a_part(files: Path) -> None:
+    before, behind = put_in(files), put_in(files, "--depth", files / "depth.exr")
+    assert before[50, 35].min() > 0.9 and behind[50, 35].max() < 0.5
+    np.testing.assert_array_equal(before[50, 60:80], behind[50, 60:80])
+
+
+def test_depth_may_come_as_disparity(files: Path) -> None:
+    """0.8 / depth is even in dioptres: 1 (white) at 0.8 m, 0 at infinity."""
+    words = ("--depth", files / "disparity.png", "--disparity", "0.8:inf", "--mode", "over")
+    stated = put_in(files, "--depth", files / "depth.exr", "--mode", "over")
+    assert changed(put_in(files, *words), stated).mean() < 0.01
+
+
+def test_a_matte_with_its_distance_does_without_depth(files: Path) -> None:
+    """The post is 1.0 / 0.8 - 1 / 2 = 0.75 dioptres out of focus: its edge at column 48 is soft, and the card shines through it."""
+    picture = put_in(files, "--matte", files / "near.png", "--near-distance", "0.8")
+    sharp = put_in(files, "--depth", files / "depth.exr", "--mode", "over")
+    row = picture[50].mean(axis=1)
+    assert row[35] < 0.5 and row[60] > 0.9
+    # Two neighbours of the noise, meaned over three colours, differ by 0.016 (one sigma).
+    assert (np.diff(row[44:54]) > -0.07).all() and changed(picture, sharp)[50, 44:54].any()
+    with pytest.raises(InputError, match="for the mode between"):
+        put_in(files, "--matte", files / "near.png", "--near-distance", "0.8", "--mode", "over")
+
+
+@pytest.mark.parametrize("mode", ["front", "over", "matte", "between"])
+def test_every_mode_leaves_what_it_does_not_touch(files: Path, mode: str) -> None:
+    picture = put_in(files, "--depth", files / "depth.exr", "--mode", mode)
+    stored = plate_rgb().astype(np.float16).astype(np.float32)
+    np.testing.assert_array_equal(picture[:20], stored[:20])
+    assert changed(picture, stored)[50, 70]
+
+
+def test_a_deep_picture_is_what_it_flattens_to(files: Path) -> None:
+    np.testing.assert_allclose(put_in(files, card="deep.exr"), put_in(files), atol=2e-3)
+
+
+def test_an_exr_holds_all_that_it_was_put_together_from(files: Path) -> None:
+    put_in(files, "--depth", files / "depth.exr", "--mode", "over")
+    found = read_composite_exr(next(files.glob("out*.exr")))
+    assert set(found.layers) == {"virtual", "sharp"} and found.matte is not None and found.coc_px is not None and found.depth_m is not None
+    rest = found.rgb - found.layers["virtual"].rgb
+    np.testing.assert_allclose(rest[50, 100], plate_rgb()[50, 100], atol=1e-3)
+    assert found.depth_m[50, 70] == pytest.approx(1.3) and found.depth_m[50, 10] == pytest.approx(0.8)
+    assert found.coc_px[50, 70] == pytest.approx(float(LENS.coc_px(1.3, WIDTH)), rel=1e-3)
+    np.testing.assert_array_equal(found.matte, found.layers["virtual"].alpha)
+
+
+def test_grain_and_a_grey_card_change_virtual_light_alone(files: Path) -> None:
+    """A card of 18 % that reads 0.3 in the plate makes the white card 1 / 0.18 * 0.3 = 1.67."""
+    plain = put_in(files)
+    grey = put_in(files, "--match-grey", "120,20,8")
+    grainy = put_in(files, "--grain", "auto", "--seed", "3")
+    other_grain = put_in(files, "--grain", "auto", "--seed", "4")
+    assert grey[50, 70] == pytest.approx(np.full(3, GREY / 0.18), rel=0.02)
+    inside = np.s_[40:60, 45:80]
+    assert grainy[inside].std() > 0.01 > plain[inside].std() and changed(grainy, other_grain)[inside].any()
+    for picture in (grey, grainy):
+        np.testing.assert_array_equal(picture[:20], plain[:20])
+
+
+def test_distortion_bends_what_is_rendered(files: Path) -> None:
+    """A barrel of -0.3 at the unit of the focal length, 216 px, pulls what stands 50 px aside to the middle by 0.3 * (50/216)^2 = 1.6 %."""
+    (files / "barrel.json").write_text(json.dumps({"model": "opencv", "k1": -0.3}))
+    standing = ("--object", CAKE, "--at", "0.5,0.1,2", "--height", "0.2")
+    columns = []
+    for words in ((), ("--distortion", files / "barrel.json")):
+        picture = put_in(files, *standing, *words, card=None)
+        columns.append(float(np.average(np.arange(WIDTH), weights=changed(picture, plate_rgb()).sum(axis=0))))
+    assert 0.2 < columns[0] - columns[1] < 2.0
+
+
+def test_the_ground_catches_a_shadow_or_all_that_changes(files: Path) -> None:
+    standing = ("--object", CAKE, "--at", "0,0.2,2", "--height", "0.2", "--tilt", "25", "--shadow", "0.7")
+    plain, shadow, light = (put_in(files, *standing[: 8 if n == 0 else 10], *("--catch", "light") * (n == 2), card=None) for n in range(3))
+    darker = [float((plain - each).clip(0).sum()) for each in (shadow, light)]
+    assert min(darker) > 1.0, "both darken the ground"
+    assert changed(shadow, light).any()
+
+
+def test_a_scene_file_with_its_camera(files: Path) -> None:
+    """Seen from 5 cm to the right the cake stands 0.05 / 2 * 216 px = 5.4 px farther left."""
+    (files / "scene.toml").write_text(
+        f'up = "-y"\n[[object]]\nname = "cake"\nglb = "{CAKE}"\nposition_m = [0.0, 0.1, 2.0]\nheight_m = 0.2\n'
+    )
+    focal_px = LENS.focal_px(WIDTH)
+    camera = {"width_px": WIDTH, "height_px": HEIGHT, "focal_px": [focal_px, focal_px], "principal_px": [WIDTH / 2, HEIGHT / 2]}
+    pose = np.eye(4)
+    pose[0, 3] = -0.05
+    (files / "camera.json").write_text(json.dumps(camera | {"camera_from_world": pose.tolist()}))
+    columns = []
+    for words in ((), ("--camera", files / "camera.json")):
+        picture = put_in(files, "--scene", files / "scene.toml", *words, card=None)
+        columns.append(float(np.average(np.arange(WIDTH), weights=changed(picture, plate_rgb()).sum(axis=0))))
+    assert columns[0] - columns[1] == pytest.approx(0.05 / 2 * focal_px, abs=0.6)
+
+
+def test_all_slices_get_one_scene(files: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    stack = tmp_path_factory.mktemp("stack")
+    for index in range(2):
+        write_image(stack / f"{index}.exr", plate_rgb())
+    camera = Camera(WIDTH, HEIGHT, (LENS.focal_px(WIDTH),) * 2, (WIDTH / 2, HEIGHT / 2))
+    plane = np.ones((HEIGHT, WIDTH), np.float32)
+    write_merged(stack, plate_rgb(), plane, plane, 2 * plane)
+    slices = tuple(Slice(f"{index}.exr", distance_m) for index, distance_m in enumerate((1.3, 3.0)))
+    write_focal_stack(replace(FocalStack(stack, slices, LENS, camera, registered=True), merged=True))
+    out = files / "stack_with_card"
+    words = (stack, "--all-slices", "--layer", files / "card.exr", "--out", out)
+    assert CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False).exit_code == 0
+    made = read_focal_stack(out)
+    sharp, blurred = (made.slice_rgb(index)[50].mean(axis=1) for index in range(2))
+    assert np.abs(np.diff(sharp)).max() > 0.5 > np.abs(np.diff(blurred)).max(), "sharp where it is in focus"
+    assert made.depth_m()[50, 70] == pytest.approx(1.3, rel=1e-3) and made.depth_m()[5, 5] == pytest.approx(2.0, rel=1e-3)
+
+
+def test_spaces_of_opencolorio_come_in_and_go_out(files: Path) -> None:
+    """Grey is grey in ACEScg too; red of Rec.709 is 0.6131 of red there (AP1 from Rec.709, ACES documents)."""
+    pytest.importorskip("PyOpenColorIO")
+    write_image(files / "red.exr", np.full((HEIGHT, WIDTH, 3), [1.0, 0.0, 0.0], np.float32), half=False)
+    out = put_in(files, "--output-space", "ACEScg", photo="red.exr")
+    assert out[5, 5, 0] == pytest.approx(0.6131, abs=2e-3)
+    back = put_in(files, "--input-space", "ACEScg", photo="red.exr")
+    assert back[5, 5, 0] == pytest.approx(1.705, abs=5e-3) and back[5, 5, 1] < -0.1
