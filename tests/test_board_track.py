@@ -242,13 +242,13 @@ def run(*arguments: object) -> tuple[int, str]:
 
 
 def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) -> None:
-    """`mrbokeh track CLIP`, then into a .chan and back: the same centre of projection."""
+    """`mrbokeh track clip`, then into a .chan and back: the same centre of projection."""
     write_board(tmp_path / "board.json", BOARD)
     (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(true_camera(0))))
     known = ("--board", tmp_path / "board.json", "--camera", tmp_path / "camera.json", "--out", tmp_path / "track.json")
-    code, told = run(clip, *known)
+    code, told = run("clip", clip, *known)
     assert code == 0 and "seen in 13 of 16 frames (81.2 %), 3 bridged (6-8); reprojection 0.0" in told
-    code, told = run(clip, *known)
+    code, told = run("clip", clip, *known)
     assert code == 1 and "--overwrite" in told
     code, told = run("convert", tmp_path / "track.json", tmp_path / "track.chan", "--frame-offset", 1001)
     assert code == 0 and "lacks: times" in told and "16 frames, 1001 to 1016" in told
@@ -269,7 +269,7 @@ def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) ->
 )
 def test_mistakes_end_in_a_sentence(clip: Path, tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
     write_board(tmp_path / "board.json", BOARD)
-    code, told = run(clip, "--board", tmp_path / "board.json", "--out", tmp_path / "track.json", *arguments)
+    code, told = run("clip", clip, "--board", tmp_path / "board.json", "--out", tmp_path / "track.json", *arguments)
     assert code == 1 and says in told and not (tmp_path / "track.json").exists()
 
 
@@ -280,7 +280,7 @@ def test_a_traced_clip_calibrates_itself(tmp_path: Path) -> None:
         for number, rgb in enumerate(clip_of(640, 360, 40).pictures()):
             video.write(rgb, number / 30.0)
     write_board(tmp_path / "board.json", BOARD)
-    code, told = run(tmp_path / "clip.mkv", "--board", tmp_path / "board.json", "--calibrate", "--out", tmp_path / "track.json")
+    code, told = run("clip", tmp_path / "clip.mkv", "--board", tmp_path / "board.json", "--calibrate", "--out", tmp_path / "track.json")
     track = read_track(tmp_path / "track.json")
     assert code == 0 and "calibrated from" in told and "40 of 40 frames" in told
     assert track.at(0).camera.focal_px[0] == pytest.approx(clip_of(640, 360, 1).camera(0).focal_px[0], rel=0.005)
@@ -294,7 +294,7 @@ def test_a_real_dark_clip_is_tracked_in_most_frames(shared_data: Path, tmp_path:
         pytest.skip("video/charuco_handheld.mp4 is not in the shared test data")
     board = CharucoBoard((CharucoGrid((5, 5), 28.8, 21.6),))
     write_board(tmp_path / "board.json", board)
-    code, _ = run(path, "--board", tmp_path / "board.json", "--calibrate", "--out", tmp_path / "track.json")
+    code, _ = run("clip", path, "--board", tmp_path / "board.json", "--calibrate", "--out", tmp_path / "track.json")
     track = read_track(tmp_path / "track.json")
     assert code == 0 and 280.0 < track.at(track.numbers[0]).camera.focal_px[0] < 310.0
     tracked = track_board(path, board, track.at(track.numbers[0]).camera)

@@ -1,10 +1,9 @@
 """`mrbokeh track`: the camera of a clip from a printed board, and camera tracks from one kind of file to another."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from mrbokeh.atomic_files import refuse_existing
 from mrbokeh.errors import InputError
@@ -16,19 +15,7 @@ if TYPE_CHECKING:
     from mrbokeh.camera_track.track import CameraTrack
     from mrbokeh.camera_track.tracked_frame import Distortion
 
-_CLIP = "clip"
-
-
-class ClipByDefault(TyperGroup):
-    """`mrbokeh track CLIP` is `mrbokeh track clip CLIP`."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
-            args = [_CLIP, *args]
-        return list(super().parse_args(ctx, args))
-
-
-app = typer.Typer(cls=ClipByDefault, add_completion=False, no_args_is_help=True, help="The camera of every frame of a clip, and its files.")
+app = typer.Typer(add_completion=False, no_args_is_help=True, help="The camera of every frame of a clip, and its files.")
 
 OutOption = Annotated[Path, typer.Option(metavar="TRACK", help="Where the track goes; the suffix says in which format.")]
 FormatOption = Annotated[
@@ -40,7 +27,7 @@ RotationOption = Annotated[str, typer.Option(metavar="ORDER", help="Of a .chan: 
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the track where it exists.")]
 
 
-@app.command(_CLIP)
+@app.command("clip")
 def track(
     clip: Annotated[Path, typer.Argument(metavar="CLIP", help="Video in which the board lies still.")],
     board: Annotated[Path, typer.Option(metavar="BOARD.json", help="The board, as `mrbokeh viewfinder board` writes it, or a .toml.")],
@@ -57,7 +44,7 @@ def track(
 ) -> None:
     """Track a clip by the printed board in it; the world of the track is the board's, in metres.
 
-    Example: mrbokeh track clip.mp4 --board board.json --calibrate --out track.json
+    Example: mrbokeh track clip clip.mp4 --board board.json --calibrate --out track.json
     """
     from mrbokeh.camera_track.board_track import TrackSettings, calibrate_clip, track_board
     from mrbokeh.charuco.board_file import read_board
