@@ -37,7 +37,7 @@ LENS = Lens(focal_length_mm=50.0, f_number=1.8, focus_distance_m=2.5, sensor_wid
 
 
 class Memory:
-    """The largest sum of the resident memory of this process and its children; pages that they share count for each."""
+    """The largest sum of the memory of this process and its children; pages that they share count once (proportional set size)."""
 
     def __init__(self) -> None:
         self.largest_mb, self._done = 0.0, threading.Event()
@@ -53,13 +53,14 @@ class Memory:
 
     def _watch(self) -> None:
         while not self._done.wait(0.2):
-            self.largest_mb = max(self.largest_mb, sum(map(_resident_mb, [os.getpid(), *_children(os.getpid())])))
+            self.largest_mb = max(self.largest_mb, sum(map(_own_mb, [os.getpid(), *_children(os.getpid())])))
 
 
-def _resident_mb(pid: int) -> float:
+def _own_mb(pid: int) -> float:
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except (OSError, IndexError):
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1e3
+    except (OSError, StopIteration):
         return 0.0
 
 

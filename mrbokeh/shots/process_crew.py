@@ -11,7 +11,6 @@ from typing import Any
 
 from mrbokeh.errors import InputError
 from mrbokeh.shots.crew import Progress
-from mrbokeh.shots.lean_memory import give_back_large_blocks
 from mrbokeh.shots.segment_task import SegmentTask, make_segment
 from mrbokeh.workers import cores
 
@@ -110,7 +109,6 @@ def _begin(board: _Board) -> None:
     global _board
     _board = board
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    give_back_large_blocks()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
