@@ -24,6 +24,7 @@ from mrbokeh.workers import cores
 _RAYS_AT_ONCE = 1 << 14
 """So few that the shading points of one part stay in the processor's cache, and that Python's lock is free again after 2 ms."""
 _EDGES_AT_ONCE = 1 << 15
+_ROWS_AT_ONCE = 512
 _ROOM_PX = 2
 _Result = TypeVar("_Result")
 
@@ -114,7 +115,7 @@ class EmbreeRaycaster:
             parts = self._in_threads(lambda part: placed.ready.lit_share(ground, lights, world_from_ready, eye_m, part), directions)
             return np.concatenate(parts)
 
-        mask = lit_share(camera.pixel_centres_px().reshape(-1, 2))
+        mask = np.concatenate([lit_share(_row_centres_px(camera, first)) for first in range(0, height, _ROWS_AT_ONCE)])
         edges = np.flatnonzero(_steps(mask.reshape(height, width)))
         if len(edges):
             mask[edges] = lit_share(self._within(edges, width)).reshape(-1, len(self._offsets)).mean(1)
@@ -173,6 +174,13 @@ def _cut(camera: Camera, rows: slice, columns: slice) -> Camera:
     """The camera that sees only these pixels."""
     principal = (camera.principal_px[0] - columns.start, camera.principal_px[1] - rows.start)
     return Camera(columns.stop - columns.start, rows.stop - rows.start, camera.focal_px, principal, camera.camera_from_world)
+
+
+def _row_centres_px(camera: Camera, first: int) -> Float64[np.ndarray, "points 2"]:
+    """Centres of the pixels of some rows: those of a whole large picture, as rays, would take gigabytes."""
+    rows = np.arange(first, min(first + _ROWS_AT_ONCE, camera.height_px)) + 0.5
+    x, y = np.meshgrid(np.arange(camera.width_px) + 0.5, rows)
+    return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
 def _directions(camera: Camera, xy_px: Float[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points 3"]:
