@@ -1,5 +1,6 @@
 """Camera, focus and depth of each frame, from files."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -86,8 +87,8 @@ class FocusPulled:
 class DepthFiles:
     """Description of the depth of the photographed scene: one file for all frames, or numbered ones (depth.%04d.exr).
 
-    steady: numbered depth goes through a temporal filter. It looks back `warm_up` frames before the first one asked for, so that
-    a segment begins as if the one before had gone through it too.
+    steady: numbered depth goes through a temporal filter. It looks at `warm_up` frames before the first one asked for, so that
+    a segment begins as if the one before had gone through it too; the clip itself begins with a filter that has settled.
     """
 
     path: Path
@@ -146,15 +147,20 @@ class _SteadyDepth:
         assert self._plane is not None
         return _of_size(self._plane, moment, self._described.path)
 
-    def _still_to_go(self, number: int) -> range:
-        """From the next one, or from those before where the filter starts anew."""
+    def _still_to_go(self, number: int) -> Sequence[int]:
+        """The next one; where the filter starts anew those before, and at the clip's beginning first those behind it, backwards."""
         if self._next == number:
-            return range(number, number + 1)
+            return [number]
         self._filter = TemporalDepthFilter()
-        begin = max(number - self._described.warm_up, 0)
-        while not numbered(self._described.path, begin).exists() and begin < number:
-            begin += 1
-        return range(begin, number + 1)
+        warm_up = self._described.warm_up
+        first = next(each for each in range(max(number - warm_up, 0), number + 1) if each == number or self._is_there(each))
+        if first > 0 and self._is_there(first - 1):
+            return range(first, number + 1)
+        ahead = [each for each in range(first + 1, first + warm_up + 1) if self._is_there(each)]
+        return [*reversed(ahead), *range(first, number + 1)]
+
+    def _is_there(self, number: int) -> bool:
+        return numbered(self._described.path, number).exists()
 
 
 def _of_size(plane: Plane, moment: Moment, path: Path) -> Plane:
