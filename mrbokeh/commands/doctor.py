@@ -38,6 +38,10 @@ PACKAGES = (
     ("av", "reading and writing videos", "pip install mrbokeh"),
     ("aiohttp", "the viewfinder in a browser", "pip install 'mrbokeh[viewfinder]'"),
     ("aiortc", "the viewfinder's video stream", "pip install 'mrbokeh[viewfinder]'"),
+    ("mitsuba", "path-traced objects, with reflections on the ground", "pip install 'mrbokeh[mitsuba]'"),
+    ("pyoidn", "denoising of path-traced objects", "pip install 'mrbokeh[denoise]'"),
+    ("opencolorio", "ACES and other colour spaces", "pip install 'mrbokeh[ocio]'"),
+    ("distributed", "videos composited by several machines", "pip install 'mrbokeh[cluster]'"),
 )
 PROGRAMS = (
     ("exiftool", "metadata of more cameras (49 of 54 files are read without it)", "install exiftool with your system's package manager"),
@@ -63,7 +67,7 @@ def findings() -> list[Finding]:
     """Every optional thing with its version or path, None where it is missing."""
     packages = [Finding(name, _version(name), enables, remedy) for name, enables, remedy in PACKAGES]
     programs = [Finding(name, shutil.which(name), enables, remedy) for name, enables, remedy in PROGRAMS]
-    return [*packages, _cuda(), _graphics_device(), *programs]
+    return [*packages, _cuda(), _graphics_device(), _llvm(), *programs]
 
 
 def _version(package: str) -> str | None:
@@ -81,6 +85,13 @@ def _cuda() -> Finding:
 def _graphics_device() -> Finding:
     remedy = "pip install 'mrbokeh[viewfinder]' and a Vulkan, Metal or Direct3D 12 driver; the ray caster draws without one"
     return Finding("graphics device", _quietly(_described_device), "rendering 3D objects on a graphics card", remedy)
+
+
+def _llvm() -> Finding:
+    from mrbokeh.scene.mitsuba_variant import find_llvm
+
+    found = find_llvm()
+    return Finding("LLVM library", None if found is None else str(found), "Mitsuba's compiler", "Debian: apt install libllvm19")
 
 
 def _described_device() -> str | None:
