@@ -5,10 +5,14 @@ RUN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= demo_out
 
-.PHONY: demo test test-slow test-browser check bench clean
+.PHONY: demo gallery test test-slow test-browser check bench clean
 
 demo: $(READY)
 	$(RUN)/mrbokeh demo --out $(OUT)
+
+gallery: $(READY)
+	$(RUN)/mrbokeh demo --out $(OUT)
+	$(RUN)/python -m datasets_scripts.gallery gallery_out --demo $(OUT)
 
 test: $(READY)
 	$(RUN)/python -m pytest -n 2 -m "not slow and not browser"

@@ -4,8 +4,9 @@
 
 The README's examples are the only list: a heading, a `sh` block, a picture, and a comment that says which of the files that the block
 made the picture shows (`<!-- shows: out.png -->`), or which page to look at while its last command runs (`<!-- page: http://... -->`).
-They run in OUT, where demo_out leads to a finished demo; what is there already is kept, so that an interrupted run goes on.
-OUT/gallery.html shows all; --update puts the pictures into docs/pictures, where the README looks for them.
+They run in OUT, where demo_out leads to a finished demo and repository to this repository. Finished commands and pictures are kept,
+so that an interrupted run goes on; after a command has changed, begin with an empty folder. OUT/gallery.html shows all; --update puts the
+pictures into docs/pictures, where the README looks for them.
 """
 
 import shlex
@@ -26,11 +27,17 @@ from mrbokeh.progress import track
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
+FINISHED = ".finished"
+FINDS = 1
+"""`mrbokeh check` ends with it where it found something, which is what its example shows."""
 
 
 def build(out: Path, entries: list[Entry], demo: Path) -> None:
     """Make what is missing, in the README's order, for examples use one another's results; and the page of all."""
+    if not (demo / "report.html").is_file():
+        raise InputError(f"expected a finished demo in {demo}: run `mrbokeh demo --out {demo}` first")
     _link(out / "demo_out", demo)
+    _link(out / "repository", ROOT)
     for entry in track(entries, "building the gallery"):
         if not (out / entry.picture.name).is_file():
             data = _made(entry, out)
@@ -46,15 +53,22 @@ def _made(entry: Entry, out: Path) -> bytes:
     if entry.page:
         return page_jpeg(_words(last), entry.page, out)
     _run(last, out)
-    return result_jpeg(out / entry.shows)
+    return result_jpeg(*(out / name for name in entry.shows.split()))
 
 
 def _run(command: str, out: Path) -> None:
+    """Unless it ran before. The demo was finished before all this, in the folder that the link leads to."""
+    finished = out / FINISHED
+    before = finished.read_text(encoding="utf-8").splitlines() if finished.is_file() else []
+    if command in before or command.startswith("mrbokeh demo "):
+        return
     done = subprocess.run(_words(command), cwd=out, capture_output=True, text=True)
-    if done.returncode:
+    if done.returncode not in ((0, FINDS) if command.startswith("mrbokeh check ") else (0,)):
         raise InputError(
             f"expected `{command}` to end well, but it ended with {done.returncode}: {done.stderr.strip() or done.stdout.strip()}"
         )
+    with atomic_path(finished) as temporary:
+        temporary.write_text("\n".join([*before, command]), encoding="utf-8")
 
 
 def _words(command: str) -> list[str]:
@@ -64,12 +78,10 @@ def _words(command: str) -> list[str]:
     return [*own.get(program, [program]), *words]
 
 
-def _link(link: Path, demo: Path) -> None:
-    if not (demo / "report.html").is_file():
-        raise InputError(f"expected a finished demo in {demo}: run `mrbokeh demo --out {demo}` first")
+def _link(link: Path, folder: Path) -> None:
     link.parent.mkdir(parents=True, exist_ok=True)
     if not link.exists():
-        link.symlink_to(demo.resolve(), target_is_directory=True)
+        link.symlink_to(folder.resolve(), target_is_directory=True)
 
 
 def _section(entry: Entry, out: Path) -> str:

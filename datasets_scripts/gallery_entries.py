@@ -15,7 +15,7 @@ _ENTRY = re.compile(
 
 @dataclass(frozen=True)
 class Entry:
-    """picture: where the README looks for it. Either `shows`, a file that the commands make, or `page`, an address, is given."""
+    """picture: where the README looks for it. Either `shows`, files that the commands make (side by side), or `page`, an address."""
 
     title: str
     commands: tuple[str, ...]

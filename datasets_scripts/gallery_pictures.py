@@ -1,7 +1,7 @@
 """Results as JPEG for people to look at: pictures, frames of a video side by side, or a page in a browser without a screen."""
 
+import asyncio
 import os
-import shutil
 import signal
 import subprocess
 import tempfile
@@ -14,33 +14,52 @@ from jaxtyping import Float32, UInt8
 from mrbokeh.color import display_rgb8
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import LINEAR_SUFFIXES, read_image
+from tests.chromium import CHROMIUM, chromium_page
 
 WIDEST_PX = 960
 _QUALITY = 82
+_TALLEST = 0.9
+"""Of the width: sheets go on below."""
 _FRAMES = 3
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv")
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-_STARTS_S, _SETTLES_MS = 60.0, 8000
+_WINDOW_PX = (960, 640)
+_STARTS_S, _SETTLES_S = 60.0, 8.0
+_STEADY = r"(text => !text.includes('tracking') || /tracking (8\d|9\d|100) %/.test(text))(document.body.innerText)"
+"""A clip that is played in a loop is tracked anew where it begins, and things fade in."""
 
 
-def result_jpeg(path: Path) -> bytes:
-    """An EXR is tone-mapped, of a video three frames stand side by side, anything else is shown as it is."""
+def result_jpeg(*paths: Path) -> bytes:
+    """Pictures side by side. An EXR is tone-mapped, of a video three frames are shown, of a long sheet its upper part."""
+    pictures = [_shown(path) for path in paths]
+    height_px = min(picture.shape[0] for picture in pictures)
+    return _jpeg(np.concatenate([_resized(picture, height_px) for picture in pictures], axis=1))
+
+
+def _shown(path: Path) -> UInt8[np.ndarray, "height width 3"]:
     if path.suffix.lower() in _VIDEO_SUFFIXES:
-        return _jpeg(_frames(path))
+        return _frames(path)
     if path.suffix.lower() in LINEAR_SUFFIXES:
-        return _jpeg(display_rgb8(read_image(path)))
-    return _jpeg(display_rgb8(read_image(path), 0.0) if path.suffix.lower() in (".tif", ".tiff") else _as_stored(path))
+        return display_rgb8(read_image(path))
+    stored = display_rgb8(read_image(path), 0.0) if path.suffix.lower() in (".tif", ".tiff") else _as_stored(path)
+    return stored[: round(_TALLEST * stored.shape[1])]
+
+
+def _resized(rgb: UInt8[np.ndarray, "height width 3"], height_px: int) -> UInt8[np.ndarray, "height_px new_width 3"]:
+    import cv2
+
+    share = height_px / rgb.shape[0]
+    return rgb if share == 1.0 else cv2.resize(rgb, (round(rgb.shape[1] * share), height_px), interpolation=cv2.INTER_AREA)
 
 
 def page_jpeg(command: list[str], address: str, folder: Path) -> bytes:
     """A page that a command serves, as a browser shows it a few seconds after it was opened."""
-    browser = next((found for found in map(shutil.which, _BROWSERS) if found), None)
-    if browser is None:
-        raise InputError(f"a picture of {address} needs a browser: install one of {', '.join(_BROWSERS)}")
+    if CHROMIUM is None:
+        raise InputError(f"a picture of {address} needs a browser: install Chromium (`apt-get install chromium`)")
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True, start_new_session=True) as server:
         try:
             _wait_for_address(server)
-            return _jpeg(_screenshot(browser, address))
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+                return _jpeg(asyncio.run(_screenshot(address, Path(profile))))
         finally:
             os.killpg(server.pid, signal.SIGTERM)
 
@@ -57,14 +76,11 @@ def _wait_for_address(server: "subprocess.Popen[str]") -> None:
     raise InputError(f"expected `{' '.join(map(str, server.args))}` to print its address within {_STARTS_S:g} s, but it did not")  # type: ignore[arg-type]
 
 
-def _screenshot(browser: str, address: str) -> UInt8[np.ndarray, "height width 3"]:
-    with tempfile.TemporaryDirectory() as folder:
-        picture = Path(folder) / "page.png"
-        words = ("--headless=new", "--no-sandbox", "--hide-scrollbars", "--window-size=960,600", f"--timeout={_SETTLES_MS}")
-        subprocess.run([browser, *words, f"--user-data-dir={folder}", f"--screenshot={picture}", address], capture_output=True, timeout=120)
-        if not picture.is_file():
-            raise InputError(f"expected {browser} to take a picture of {address}, but it did not")
-        return _as_stored(picture)
+async def _screenshot(address: str, profile: Path) -> UInt8[np.ndarray, "height width 3"]:
+    async with chromium_page(address, profile, size_px=_WINDOW_PX) as page:
+        await asyncio.sleep(_SETTLES_S)
+        await page.comes_true(_STEADY)
+        return await page.screenshot()
 
 
 def _frames(path: Path) -> UInt8[np.ndarray, "height width 3"]:
@@ -77,7 +93,10 @@ def _frames(path: Path) -> UInt8[np.ndarray, "height width 3"]:
 def _as_stored(path: Path) -> UInt8[np.ndarray, "height width 3"]:
     import cv2
 
-    return cv2.cvtColor(cv2.imread(str(path), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    stored = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if stored is None:
+        raise InputError(f"expected a picture in {path}, but there is none: see `shows` of its example in the README")
+    return cv2.cvtColor(stored, cv2.COLOR_BGR2RGB)
 
 
 def _smaller(rgb: Float32[np.ndarray, "height width 3"], width_px: int) -> Float32[np.ndarray, "new_height new_width 3"]:

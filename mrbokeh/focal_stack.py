@@ -154,6 +154,11 @@ class FocalStack:
         found = metadata["px_per_dioptre"] / lens.coc_px_per_dioptre(metadata["px_per_dioptre_width_px"])
         return replace(lens, f_number=lens.f_number / found)
 
+    def registered_lens_of(self, index: int) -> Lens:
+        """The lens that blurs as a registered slice is blurred: what registration enlarged is a larger picture of less of the sensor."""
+        lens = self.lens_of(index)
+        return replace(lens, sensor_width_mm=lens.sensor_width_mm / self.slices[index].scale)
+
     def coc_px_per_dioptre(self, index: int, width_px: int) -> float:
         """How fast blur grows in a registered slice, width_px wide: what registration enlarged grew with it."""
         return self.lens_of(index).coc_px_per_dioptre(width_px) * self.slices[index].scale

@@ -101,7 +101,7 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
         raise InputError(
             f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, got {slice_index}"
         )
-    focused = stack.lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
+    focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)
     rgb = stack.slice_rgb(slice_index)
     camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)

@@ -35,12 +35,17 @@ class Unblurred:
 
 
 def composite_stack(
-    stack: FocalStack, layers: Sequence[Layer] | Callable[[Plate], Sequence[Layer]], insertion: Insertion, renderer: Renderer, out: Path
+    stack: FocalStack,
+    layers: Sequence[Layer] | Callable[[Plate], Sequence[Layer]],
+    insertion: Insertion,
+    renderer: Renderer,
+    out: Path,
+    lens: Lens | None = None,
 ) -> FocalStack:
     """Write a merged focal stack to the new folder `out`, in which each slice holds the layers with the blur of its own focus.
 
     layers: sharp, front first, of the registered size; or what gives them for a plate (a scene rendered for its camera). Pixels that
-    they do not touch keep the stored numbers of the stack, in its own camera RGB. Raises InputError where `out` exists, or the stack
+    they do not touch keep the stored numbers of the stack, in its own camera RGB. lens: in place of the stack's. Raises InputError where `out` exists, or the stack
     is not merged, not registered or without focus distances.
     """
     if not stack.registered:
@@ -50,10 +55,10 @@ def composite_stack(
     depth_m, sharp_rgb = stack.depth_m(), stack.all_in_focus()
     with atomic_folder(out) as folder:
         for index in track(range(len(stack)), "compositing slices"):
-            plate = _plate(stack, index, depth_m, sharp_rgb)
+            plate = _plate(stack, index, depth_m, sharp_rgb, lens)
             inserted = insertion.insert(plate, _layers(layers, plate), renderer)
             _write_slice(stack, index, inserted, folder)
-        plate = replace(_plate(stack, stack.reference, depth_m, sharp_rgb), rgb=sharp_rgb)
+        plate = replace(_plate(stack, stack.reference, depth_m, sharp_rgb, lens), rgb=sharp_rgb)
         _write_merge(stack, insertion.insert(plate, _layers(layers, plate), Unblurred()), depth_m, folder)
         write_focal_stack(replace(stack, folder=folder, metadata=stack.metadata | {"composited_from": stack.folder.name}))
     return replace(stack, folder=out, metadata=stack.metadata | {"composited_from": stack.folder.name})
@@ -63,10 +68,9 @@ def _layers(layers: Sequence[Layer] | Callable[[Plate], Sequence[Layer]], plate:
     return layers(plate) if callable(layers) else layers
 
 
-def _plate(stack: FocalStack, index: int, depth_m: Float32[np.ndarray, "height width"], sharp_rgb: Rgb) -> Plate:
-    """All slices are seen by one camera; blur is larger by the scale of the registration."""
-    lens = stack.lens_of(index)
-    lens = replace(lens, sensor_width_mm=lens.sensor_width_mm / stack.slices[index].scale)
+def _plate(stack: FocalStack, index: int, depth_m: Float32[np.ndarray, "height width"], sharp_rgb: Rgb, other: Lens | None) -> Plate:
+    """All slices are seen by one camera; another lens takes the slice's focus and nothing else."""
+    lens = stack.registered_lens_of(index) if other is None else other.focused_at(stack.lens_of(index).focus_distance_m)
     rgb = stack.slice_rgb(index)
     camera = stack.camera or plate_of(rgb, stack.lens_of(stack.reference)).camera
     return Plate(rgb, depth_m, lens, replace(camera, camera_from_world=np.eye(4)), sharp_rgb)

@@ -18,7 +18,8 @@ COMMANDS = [
     ["capture", "dataset"], ["capture", "process"], ["train"], ["train", "fit"], ["train", "evaluate"], ["train", "export"],
     ["train", "ablate"],
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
-    ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"], ["check"], ["blender-addon"], ["track"], ["track", "clip"], ["track", "convert"],
+    ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"],
+    ["check"], ["blender-addon"], ["track"], ["track", "clip"], ["track", "convert"],
     ["capture", "matchmove"],
     ["viewfinder"], ["viewfinder", "board"], ["viewfinder", "calibrate-phone"], ["demo"], ["doctor"],
 ]  # fmt: skip

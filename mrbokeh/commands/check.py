@@ -103,4 +103,6 @@ def _print(report: CheckReport) -> None:
         console.print(f"{name}: {value:.6g}")
     for name, needs in sorted(report.skipped.items()):
         console.print(f"not checked: {name}: {needs}")
-    console.print(f"{report.pictures} pictures checked, {len(report.findings) or 'no'} findings")
+    pictures, findings = report.pictures, len(report.findings)
+    told = f"{findings or 'no'} finding{'' if findings == 1 else 's'}"
+    console.print(f"{pictures} picture{'' if pictures == 1 else 's'} checked, {told}")

@@ -11,6 +11,7 @@ from mrbokeh.commands import _look_options as look
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_layers import LayersFor
     from mrbokeh.compositing.base import Insertion
+    from mrbokeh.lens import Lens
     from mrbokeh.renderers.base import Renderer
 
 app = typer.Typer(add_completion=False)
@@ -94,7 +95,7 @@ def composite(
     layers_for = layers_by(VirtualOptions(tuple(layer or ()), objects, standing, rendering), plate, bundle)
     insertion = insertion_for(mode, plate, near_distance)
     if all_slices:
-        _into_all_slices(photo, out, layers_for, insertion, used_renderer)
+        _into_all_slices(photo, out, layers_for, insertion, used_renderer, used_lens)
         return
     wanted = LookOptions(match_grey, grey_value, match_exposure, match_white, match_black, vignetting, grain, light_wrap, seed)
     finishing = finishing_of(wanted, plate.rgb, None if photo.is_dir() else photo)
@@ -106,9 +107,11 @@ def composite(
     typer.echo(f"wrote {out}")
 
 
-def _into_all_slices(stack: Path, out: Path, layers_for: "LayersFor", insertion: "Insertion", renderer: "Renderer") -> None:
+def _into_all_slices(
+    stack: Path, out: Path, layers_for: "LayersFor", insertion: "Insertion", renderer: "Renderer", lens: "Lens | None"
+) -> None:
     from mrbokeh.focal_stack import read_focal_stack
     from mrbokeh.stack_compositing import composite_stack
 
-    composite_stack(read_focal_stack(stack), layers_for, insertion, renderer, out)
+    composite_stack(read_focal_stack(stack), layers_for, insertion, renderer, out, lens)
     typer.echo(f"wrote the focal stack {out}")

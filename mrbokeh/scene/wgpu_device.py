@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from os import environ
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -93,6 +95,8 @@ def sampled(kind: str, dimension: str = "2d", multisampled: bool = False) -> dic
 @cache
 def gpu() -> Gpu:
     """The fastest device of this machine. Raises InputError where there is none, MissingExtraError without wgpu."""
+    # Without a place for sockets its library complains of an error on every start, though it needs none here.
+    environ.setdefault("XDG_RUNTIME_DIR", gettempdir())
     try:
         import wgpu
     except ImportError as missing:
