@@ -45,8 +45,8 @@ def composite_stack(
     """Write a merged focal stack to the new folder `out`, in which each slice holds the layers with the blur of its own focus.
 
     layers: sharp, front first, of the registered size; or what gives them for a plate (a scene rendered for its camera). Pixels that
-    they do not touch keep the stored numbers of the stack, in its own camera RGB. lens: in place of the stack's. Raises InputError where `out` exists, or the stack
-    is not merged, not registered or without focus distances.
+    they do not touch keep the stored numbers of the stack, in its own camera RGB. lens: in place of the stack's. Raises InputError
+    where `out` exists, or the stack is not merged, not registered or without focus distances.
     """
     if not stack.registered:
         raise InputError(
