@@ -119,10 +119,11 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
         return pixels.astype(np.float32)
     if pixels.dtype not in _INTEGER_RANGE:
         raise InputError(f"{path} stores {pixels.dtype}: expected 8 or 16 bit integers or float")
-    scaled = (pixels / np.float32(_INTEGER_RANGE[pixels.dtype])).astype(np.float32)
-    if encoding == "srgb":
-        scaled[..., :3] = srgb_to_linear(scaled[..., :3])
-    return scaled
+    top = np.float32(_INTEGER_RANGE[pixels.dtype])
+    if encoding != "srgb":
+        return pixels / top
+    linear = srgb_to_linear(np.arange(int(top) + 1) / top)[pixels[..., :3]]
+    return linear if pixels.shape[2] == 3 else np.dstack([linear, pixels[..., 3] / top])
 
 
 def _decode(path: Path) -> np.ndarray:

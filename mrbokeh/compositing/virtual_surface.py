@@ -16,4 +16,5 @@ def virtual_depth_m(sharp: Layer) -> Plane:
 
 def shows(sharp: Layer) -> Bool[np.ndarray, "height width"]:
     """Where a layer covers anything or gives light."""
-    return (sharp.alpha > 0) | (sharp.rgb > 0).any(axis=2)
+    red, green, blue = (sharp.rgb[..., channel] > 0 for channel in range(3))
+    return (sharp.alpha > 0) | red | green | blue
