@@ -9,6 +9,7 @@ so that an interrupted run goes on; after a command has changed, begin with an e
 pictures into docs/pictures, where the README looks for them.
 """
 
+import os
 import shlex
 import shutil
 import subprocess
@@ -62,13 +63,18 @@ def _run(command: str, out: Path) -> None:
     before = finished.read_text(encoding="utf-8").splitlines() if finished.is_file() else []
     if command in before or command.startswith("mrbokeh demo "):
         return
-    done = subprocess.run(_words(command), cwd=out, capture_output=True, text=True)
+    done = subprocess.run(_words(command), cwd=out, env=_with_scripts(), capture_output=True, text=True)
     if done.returncode not in ((0, FINDS) if command.startswith("mrbokeh check ") else (0,)):
         raise InputError(
             f"expected `{command}` to end well, but it ended with {done.returncode}: {done.stderr.strip() or done.stdout.strip()}"
         )
     with atomic_path(finished) as temporary:
         temporary.write_text("\n".join([*before, command]), encoding="utf-8")
+
+
+def _with_scripts() -> dict[str, str]:
+    """`python -m datasets_scripts...` is found from any folder."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
 
 
 def _words(command: str) -> list[str]:
