@@ -51,7 +51,7 @@ def calibrated(board: CharucoBoard, seen: Sequence[Corners], width_px: int, heig
     if len(views) < _FEWEST_VIEWS:
         raise InputError(
             f"only {len(views)} frames show {_FEWEST_CORNERS} corners of the board, too few to calibrate by: give --camera, "
-            f"or film the board nearer and from several sides"
+            f"or film the board nearer and from several sides, or print one of more squares (this one has {len(board.corners_m)} corners)"
         )
     solutions = [_solved(board, views, (width_px, height_px), index) for index in range(len(_FREED))]
     best = min((each for each in solutions if each is not None), key=lambda each: each[0], default=None)

@@ -60,7 +60,7 @@ def track(
         intrinsics, distortion = found.camera, found.distortion
         typer.echo(
             f"calibrated from {found.views} frames: focal length {intrinsics.focal_px[0]:.1f} px +- {100 * found.focal_sigma:.1f} %, "
-            f"{_named(found.distortion)}, {found.residual_px:.2f} px"
+            f"{_named(found.distortion)}; corners as first read scatter by {found.residual_px:.2f} px"
         )
     settings = TrackSettings(longest_gap, smooth, steadier)
     tracked = track_board(clip, printed, intrinsics, distortion, settings)
