@@ -256,3 +256,17 @@ def test_clean_colours_of_two_flat_ones() -> None:
     mixed = (alpha > 0.2) & (alpha < 0.8)
     for found, true in ((front, GREEN), (behind, BLUE)):
         assert np.abs(found[mixed] - true).mean() < 0.2 * np.abs(picture[mixed] - true).mean()
+
+
+def test_specks_of_wrong_depth_leave_no_holes_in_a_near_surface() -> None:
+    """A grey card in focus hides what is behind it; depth that is off at single pixels and at pairs must not let that through."""
+    lens = Lens(100.0, 1.0, 2.0, 36.0)
+    depth_m = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    depth_m[10, 20] = depth_m[20, 30:32] = depth_m[30:32, 40:42] = 2.3
+    depth_m[:, 80:] = 4.0
+    grey = np.full((HEIGHT, WIDTH, 3), 0.4, np.float32)
+    behind = opaque(np.ones_like(grey), np.full((HEIGHT, WIDTH), 2.6, np.float32))
+    plate = replace(plate_of(grey, lens, depth_m), sharp_rgb=grey)
+    found = Between().insert(plate, [behind], ScatterReference()).rgb
+    np.testing.assert_allclose(found[:, :60], grey[:, :60], atol=0.01)
+    assert found[:, 90:].min() > 0.9

@@ -17,6 +17,7 @@ from mrbokeh.sheets import Sheet
 from mrbokeh.workers import workers
 
 _TWO_DEEP = 2.0
+_SPECK_PX = 5
 _EDGE_PX = 5
 _NEIGHBOURS = [(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)]
 
@@ -81,10 +82,17 @@ def cut_in_two(sharp_rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, 
     dark = rgb.copy()
     dark.reshape(-1, 3)[places] = without.reshape(-1, 3)[places]
     near_values, far_rgb = _parted(dark, depth_m, near, reach_px, tolerance)
-    near_depth_m, far_depth_m = continued(depth_m, near), continued(depth_m, ~near)
+    near_depth_m, far_depth_m = _without_specks(continued(depth_m, near)), continued(depth_m, ~near)
     far_lights = Lights(places, (rgb - dark).reshape(-1, 3)[places], far_depth_m.reshape(-1)[places])
     alpha = np.ascontiguousarray(near_values[..., 3])
     return NearAndFar(Layer(np.ascontiguousarray(near_values[..., :3]), alpha, near_depth_m), far_rgb, far_depth_m, far_lights)
+
+
+def _without_specks(depth_m: Plane) -> Plane:
+    """A few pixels of another depth than all around are errors of the depth; blurred apart from their surface they leave holes in it."""
+    from cv2 import medianBlur
+
+    return np.asarray(1.0 / medianBlur(np.ascontiguousarray(1.0 / depth_m, np.float32), _SPECK_PX), np.float32)
 
 
 def _parted(rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance: float) -> tuple[np.ndarray, Picture]:
