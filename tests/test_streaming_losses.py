@@ -60,6 +60,7 @@ def test_lost_packets_are_sent_again() -> None:
                     async with aiohttp.ClientSession() as session:
                         await viewer.connect(url, session)
                     shown = [await viewer.next() for _ in range(25)]
+                    await asyncio.sleep(0.5)  # what is told of the last picture may come after it
                 finally:
                     await viewer.peer.close()
                 assert len(lost) >= 10
