@@ -20,8 +20,8 @@ from datasets_scripts.bokeh_stacks_manifest import LICENCE, dataset_of
 from datasets_scripts.bokeh_stacks_plan import SIZES, StacksPlan
 from datasets_scripts.bokeh_stacks_shapes import SHAPES
 from datasets_scripts.bokeh_stacks_view import StackView
+from datasets_scripts.file_job import claim_folder
 from datasets_scripts.truth_mitsuba import SCALAR, best_variant, load
-from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack_dataset import FILE_NAME, FocalStackDataset, write_focal_stack_dataset
 from mrbokeh.lens_file import write_lens
@@ -66,17 +66,13 @@ def make_pull(out: Path, plan: StacksPlan, frames: int, *, overwrite: bool = Fal
 
 def claim(out: Path, plan: StacksPlan, views: list[StackView], overwrite: bool, more: dict[str, int] | None = None) -> None:
     """Go on only in a folder that is empty or was begun with the same plan: plan.json, written first, says which."""
-    path, document = out / PLAN_NAME, _plan_document(plan) | (more or {})
-    made = [each for view in views for job in view.jobs() for each in job.paths if each.exists()]
-    if overwrite:
-        for each in (*made, path, out / FILE_NAME):
-            each.unlink(missing_ok=True)
-    elif path.exists():
-        if read_json(path, "the plan of a set") != document:
-            raise InputError(f"{out} was begun with other settings: choose another folder, or --overwrite to replace its files")
-    elif out.exists() and any(out.iterdir()):
+    path = out / PLAN_NAME
+    if not overwrite and not path.exists() and out.exists() and any(out.iterdir()):
         raise InputError(f"{out} holds something else than a set of bokeh stacks: give the name of a new folder")
-    write_json(path, document)
+    files = [each for view in views for job in view.jobs() for each in job.paths]
+    claim_folder(path, _plan_document(plan) | (more or {}), files, overwrite)
+    if overwrite:
+        (out / FILE_NAME).unlink(missing_ok=True)
 
 
 def _make_missing(views: list[StackView], description: str) -> None:

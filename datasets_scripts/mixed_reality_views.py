@@ -7,13 +7,13 @@ from typing import Literal
 
 from datasets_scripts.file_job import Job
 from datasets_scripts.mixed_reality_objects import OBJECT_DISTANCES_M, scene_around, virtual_object, with_object, without_shadows
-from datasets_scripts.truth_plan import TruthPlan, truth_name, view_document
+from datasets_scripts.mixed_reality_sheet import write_sheet
+from datasets_scripts.truth_plan import truth_name, view_document
 from datasets_scripts.truth_scene import TruthScene, pack
+from datasets_scripts.truth_set import ViewFiles
 from datasets_scripts.truth_sharp import sharp_layer
 from datasets_scripts.truth_tracer import TruthTracer
 from datasets_scripts.truth_tracer_choice import make_tracer
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, write_exr
 from mrbokeh.image_io import write_image, write_layer
 
@@ -28,15 +28,8 @@ OBJECT_CONVENTIONS = {
 }
 
 
-class MixedView:
-    """One camera's look at one scene with and without its object, in OUT/SCENE_SEED/view_NN.
-
-    variant: of Mitsuba, None for the best that runs here.
-    """
-
-    def __init__(self, out: Path, plan: TruthPlan, name: str, number: int, variant: str | None = None) -> None:
-        self.folder = out / f"{name}_{plan.seed}" / f"view_{number:02d}"
-        self._plan, self._name, self._number, self._variant = plan, name, number, variant
+class MixedView(ViewFiles):
+    """One camera's look at one scene with and without its object."""
 
     @cached_property
     def scene(self) -> TruthScene:
@@ -67,20 +60,6 @@ class MixedView:
             "conventions": conventions | OBJECT_CONVENTIONS,
         }
 
-    def claim(self, overwrite: bool) -> None:
-        """Go on only in a folder that is empty or was made with the same settings: meta.json, written first, says which."""
-        meta, document = self.folder / "meta.json", self.document()
-        made = [path for job in self.jobs() for path in job.paths if path.exists()]
-        if overwrite:
-            for path in (*made, meta):
-                path.unlink(missing_ok=True)
-        elif meta.exists():
-            if read_json(meta, "the description of a view (meta.json)") != document:
-                raise InputError(f"{self.folder} was made with other settings: choose another folder, or --overwrite to replace its files")
-        elif made:
-            raise InputError(f"{self.folder} holds pictures without a meta.json: choose another folder, or --overwrite to replace them")
-        write_json(meta, document)
-
     def jobs(self) -> Iterator[Job]:
         folder = self.folder
         yield Job((folder / "scene" / "all_in_focus.exr", folder / "scene" / "depth.exr"), self._make_sharp)
@@ -91,6 +70,9 @@ class MixedView:
                 for what in both:
                     path = folder / what / truth_name(shape, index)
                     yield Job((path,), partial(self._make_defocused, what, shape, distance_m, path))
+
+    def write_sheet(self) -> None:
+        write_sheet(self.folder)
 
     def _make_sharp(self) -> None:
         layer = self._sharp(self._tracers["scene"])

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from datasets_scripts.file_job import claim_folder
 from datasets_scripts.samples_scene import MovingScene
 from datasets_scripts.samples_scenes import LENS, SCENES, make_scene
 from datasets_scripts.samples_tracer import WIDEST_PX, Advance, SampleArrays, SampleTracer
-from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.atomic_files import write_json
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_image, write_image, write_layer
 from mrbokeh.image_metrics import psnr
@@ -104,18 +105,8 @@ class SamplesSet:
         return make_scene(self._plan.scene, self._plan.seed, self._plan.lens, self._plan.height_px / self._plan.width_px)
 
     def claim(self, overwrite: bool) -> None:
-        """Go on only in a folder that is empty or was made with the same plan: meta.json, written first, says which."""
-        meta, document = self.folder / "meta.json", self._plan.document(self.scene)
-        made = [job.path for job in self.jobs(measure=True) if job.path.exists()]
-        if overwrite:
-            for path in (*made, meta):
-                path.unlink(missing_ok=True)
-        elif meta.exists():
-            if read_json(meta, "the description of a set of samples (meta.json)") != document:
-                raise InputError(f"{self.folder} was made with other settings: choose another folder, or --overwrite to replace its files")
-        elif made:
-            raise InputError(f"{self.folder} holds files without a meta.json: choose another folder, or --overwrite to replace them")
-        write_json(meta, document)
+        files = (job.path for job in self.jobs(measure=True))
+        claim_folder(self.folder / "meta.json", self._plan.document(self.scene), files, overwrite)
 
     def jobs(self, measure: bool) -> Iterator[Job]:
         """measure: the noise of the reference too, which is made once more for that."""

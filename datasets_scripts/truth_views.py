@@ -7,27 +7,20 @@ from pathlib import Path
 import numpy as np
 
 from datasets_scripts.file_job import Job
-from datasets_scripts.truth_plan import TruthPlan, truth_name, view_document
+from datasets_scripts.truth_plan import truth_name, view_document
 from datasets_scripts.truth_scene import PackedScene, TruthScene, pack
 from datasets_scripts.truth_scenes import make_scene
+from datasets_scripts.truth_set import ViewFiles
 from datasets_scripts.truth_sharp import sharp_layer
+from datasets_scripts.truth_sheet import write_sheet
 from datasets_scripts.truth_tracer import Part, Picture, TruthTracer
 from datasets_scripts.truth_tracer_choice import make_tracer
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, write_exr
 from mrbokeh.image_io import write_image, write_layer
 
 
-class View:
-    """One camera's look at one scene, in OUT/SCENE_SEED/view_NN; what is costly is made when it is first needed.
-
-    variant: of Mitsuba, None for the best that runs here.
-    """
-
-    def __init__(self, out: Path, plan: TruthPlan, name: str, number: int, variant: str | None = None) -> None:
-        self.folder = out / f"{name}_{plan.seed}" / f"view_{number:02d}"
-        self._plan, self._name, self._number, self._variant = plan, name, number, variant
+class View(ViewFiles):
+    """One camera's look at one scene; what is costly is made when it is first needed."""
 
     @cached_property
     def scene(self) -> TruthScene:
@@ -44,19 +37,11 @@ class View:
     def _tracer(self, part: Part) -> TruthTracer:
         return make_tracer(self._packed, self._plan.camera(self._number), part, self._plan.seed, self._variant)
 
-    def claim(self, overwrite: bool) -> None:
-        """Go on only in a folder that is empty or was made with the same settings: meta.json, written first, says which."""
-        meta, document = self.folder / "meta.json", view_document(self._plan, self._name, self.scene, self._number)
-        made = [path for job in self.jobs() for path in job.paths if path.exists()]
-        if overwrite:
-            for path in (*made, meta):
-                path.unlink(missing_ok=True)
-        elif meta.exists():
-            if read_json(meta, "the description of a view (meta.json)") != document:
-                raise InputError(f"{self.folder} was made with other settings: choose another folder, or --overwrite to replace its files")
-        elif made:
-            raise InputError(f"{self.folder} holds pictures without a meta.json: choose another folder, or --overwrite to replace them")
-        write_json(meta, document)
+    def document(self) -> dict[str, object]:
+        return view_document(self._plan, self._name, self.scene, self._number)
+
+    def write_sheet(self) -> None:
+        write_sheet(self.folder)
 
     def jobs(self) -> Iterator[Job]:
         folder = self.folder

@@ -1,6 +1,7 @@
 """Match-move: drawn rooms with true cameras; a camera on a tripod must be refused. COLMAP itself runs in the slow tests only."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from capture.cli import app
-from capture.matchmove.clip_matchmove import matchmove_clip
+from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
 from capture.matchmove.frame_poses import poses_between
+from capture.matchmove.ground import GroundPicks, Ruler, on_ground, ruler_scale
 from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip
 from capture.matchmove.only_turning import model_residual_px, turning_residual_px
+from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
 from capture.views.sparse_model import SparseModel, SparseView
 from mrbokeh.camera import Camera
 from mrbokeh.camera_track.formats import read_track
@@ -127,6 +130,80 @@ def test_turning_is_told_from_walking() -> None:
     assert turning_residual_px(moved) > 5.0 * model_residual_px(moved)
 
 
+FLOOR_POINTS = np.array([[-0.6, 0.8, 2.0], [0.9, 0.8, 2.1], [0.8, 0.8, 3.3], [-0.7, 0.8, 3.2]])
+
+
+def elsewhere(model: SparseModel) -> SparseModel:
+    """As COLMAP leaves it: turned, shifted and in a unit of its own (0.37 of a metre)."""
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = Rotation.from_euler("xyz", (0.5, -0.8, 0.3)).as_matrix(), (2.0, -1.0, 0.7)
+    return replace(model.moved(turn).times(1.0 / 0.37), metres_per_unit=None)
+
+
+def test_the_world_stands_on_picked_ground_and_is_as_long_as_the_ruler() -> None:
+    """Pixels of four known points of the floor, read to 0.1 px: the first is the origin, the second lies 1.503 m along x, y is down."""
+    cameras = walking(6)
+    view_px = np.round(cameras[2].project(FLOOR_POINTS)[0], 1)
+    picks, true_m = GroundPicks(2, view_px), float(np.linalg.norm(FLOOR_POINTS[1] - FLOOR_POINTS[0]))
+    model = elsewhere(model_of(cameras, 0.1))
+    standing = on_ground(model, model.views[2], picks)
+    metric = standing.times(ruler_scale(standing.views[2], Ruler(2, view_px[:2], true_m)))
+    # 0.1 px at 2 m and 380 px of focal length are 0.5 mm across and, at 22 degrees to the floor, 1.4 mm along.
+    on_floor = metric.points[len(metric.points) // 2 :]
+    assert np.abs(on_floor[:, 1]).max() < 0.003
+    seen_px, _ = metric.views[5].project(np.array([[0.0, 0.0, 0.0], [true_m, 0.0, 0.0]]))
+    assert np.abs(seen_px - cameras[5].project(FLOOR_POINTS[:2])[0]).max() < 0.5
+    heights_m = [0.8 - camera.world_from_camera[1, 3] for camera in cameras]
+    assert [-view.centre[1] for view in metric.views] == pytest.approx(heights_m, abs=0.003)
+
+
+def test_ground_finds_the_floor_among_things_that_stand_on_it() -> None:
+    """A third of the points between the picks is lifted by 5 to 40 cm."""
+    cameras = walking(6)
+    model = model_of(cameras)
+    lifted = np.random.default_rng(4).random(len(model.points)) < 0.33
+    points = model.points - np.where(lifted, np.random.default_rng(5).uniform(0.05, 0.4, len(lifted)), 0.0)[:, None] * (0.0, 1.0, 0.0)
+    standing = on_ground(replace(model, points=points), model.views[2], GroundPicks(2, cameras[2].project(FLOOR_POINTS)[0]))
+    assert standing.views[2].centre[1] == pytest.approx(cameras[2].world_from_camera[1, 3] - 0.8, abs=1e-6)
+
+
+def test_bad_picks_are_refused() -> None:
+    cameras = walking(6)
+    model = model_of(cameras)
+    floor_px = cameras[2].project(FLOOR_POINTS)[0]
+    with pytest.raises(InputError, match="0 points of the model lie between"):
+        on_ground(model, model.views[2], GroundPicks(2, floor_px[0] + [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    scattered = replace(model, points=model.points + np.random.default_rng(0).normal(0.0, 0.3, model.points.shape))
+    with pytest.raises(InputError, match="lie on one plane"):
+        on_ground(scattered, model.views[2], GroundPicks(2, floor_px))
+    standing = on_ground(model, model.views[2], GroundPicks(2, floor_px))
+    with pytest.raises(InputError, match="above the horizon"):
+        ruler_scale(standing.views[2], Ruler(2, np.array([[200.0, 5.0], [220.0, 250.0]]), 1.0))
+    with pytest.raises(InputError, match="positive number of metres"):
+        ruler_scale(standing.views[2], Ruler(2, floor_px[:2], -1.0))
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        *((parse_ground, each) for each in ("", "0", "0:1,2/3,4", "x:1,2/3,4/5,6", "-1:1,2/3,4/5,6", "0:1,2/3,4/5")),
+        *((parse_ruler, each) for each in ("0:1,2/3,4", "0:1,2/3,4/x", "1,2/3,4/5")),
+        *((parse_frame_distance, each) for each in ("0,1", "a,b,1", "0,1,2,3")),
+    ],
+)
+def test_picks_that_cannot_be_read(parse: Callable[[str], object], text: str) -> None:
+    with pytest.raises(InputError, match="must be FRAME"):
+        parse(text)
+
+
+def test_a_ruler_needs_a_ground_and_frames_that_are_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="say with --ground"):
+        MatchmoveSettings(ruler=parse_ruler("0:1,2/3,4/1"))
+    clip = write_clip(tmp_path / "clip.mkv", walking(5))
+    with pytest.raises(InputError, match="frames 0 to 4"):
+        matchmove_clip(clip, tmp_path / "work", MatchmoveSettings(distance=(0, 5, 1.0)))
+
+
 def test_a_resting_camera_is_refused(tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "clip.mkv", walking(9)[:1] * 4)
     with pytest.raises(InputError, match="take a single camera"):
@@ -147,6 +224,16 @@ def test_a_walk_is_matchmoved(tmp_path: Path) -> None:
     assert off_m < 0.005 and off_deg < 0.5 and not track.metric
     assert track.at(0).camera.focal_px[0] == pytest.approx(380.0, rel=0.01) and track.at_time(0.52).camera.width_px == 400
     assert (tmp_path / "track_matchmove" / "poses.json").exists()
+    pixels = ["/".join(f"{x:.1f},{y:.1f}" for x, y in cameras[0].project(each)[0]) for each in (FLOOR_POINTS[:3], FLOOR_POINTS[:2])]
+    true_m = float(np.linalg.norm(FLOOR_POINTS[1] - FLOOR_POINTS[0]))
+    told = ["--ground", f"0:{pixels[0]}", "--ruler", f"0:{pixels[1]}/{true_m}", "--work", str(tmp_path / "track_matchmove")]
+    again = CliRunner().invoke(app, ["matchmove", str(clip), "--out", str(tmp_path / "stands.json"), "--keyframes", "8", *told])
+    assert again.exit_code == 0 and "in metres, by the ruler" in again.output
+    stands = read_track(tmp_path / "stands.json")
+    # Picks of 0.1 px on a floor seen from 0.8 m above: 2 mm, and what the model itself is off.
+    heights_m = np.array([0.8 - camera.world_from_camera[1, 3] for camera in cameras])
+    assert stands.metric and stands.up == "-y"
+    assert [-stands.at(n).camera.world_from_camera[1, 3] for n in range(25)] == pytest.approx(heights_m, abs=0.01)
 
 
 @pytest.mark.slow

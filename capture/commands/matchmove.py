@@ -10,9 +10,12 @@ from mrbokeh.atomic_files import refuse_existing
 HELP = "\n\n".join(
     (
         "Find the camera of every frame of a clip with COLMAP: keyframes are chosen by motion and placed, then all frames against them.",
-        "The scale is arbitrary unless a printed board of known size is in the clip (--board). A camera that only turns, or a scene "
-        "that moves by itself, is refused. Keyframes and COLMAP's files stay in --work, with which an interrupted run goes on.",
-        "Example:  mrbokeh capture matchmove clip.mp4 --out track.json",
+        "The scale is arbitrary unless something of known size is told: a printed board in the clip (--board), two pixels on the ground "
+        "and their distance (--ruler), or how far the camera went between two frames (--distance). --ground puts the world's floor under "
+        "three pixels or more, its origin under the first, x towards the second: what stands at 0,0,0 in a scene file stands there.",
+        "A camera that only turns, or a scene that moves by itself, is refused. Keyframes and COLMAP's files stay in --work, with which "
+        "an interrupted run goes on, and other --ground or --board are tried at once.",
+        "Example:  mrbokeh capture matchmove clip.mp4 --out track.json --ground 0:300,900/1500,900/900,700 --ruler 0:300,900/1500,900/2.4",
     )
 )
 
@@ -25,19 +28,34 @@ def matchmove_command(
     mapper: Annotated[str, typer.Option(help="incremental, or global (GLOMAP)")] = "incremental",
     max_image_size: Annotated[int, typer.Option(min=200, metavar="PX", help="features are sought in pictures no wider or higher")] = 1600,
     board: Annotated[Path | None, typer.Option(metavar="BOARD.json", help="a printed board in the clip: gives metres")] = None,
+    ground: Annotated[str | None, typer.Option(metavar="FRAME:X,Y/X,Y/X,Y", help="pixels with flat ground between them")] = None,
+    ruler: Annotated[str | None, typer.Option(metavar="FRAME:X,Y/X,Y/METRES", help="between two pixels on the ground")] = None,
+    distance: Annotated[str | None, typer.Option(metavar="FRAME,FRAME,METRES", help="between the cameras of two frames")] = None,
     work: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for COLMAP; default: beside OUT")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the track, and find poses again from the start")] = False,
 ) -> None:
     from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
+    from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
     from mrbokeh.camera_track.formats import write_track
     from mrbokeh.charuco.board_file import read_board
 
     refuse_existing(out, overwrite)
     printed = None if board is None else read_board(board)
-    settings = MatchmoveSettings(keyframes, camera_model, mapper, max_image_size, printed, overwrite)
+    settings = MatchmoveSettings(
+        keyframes,
+        camera_model,
+        mapper,
+        max_image_size,
+        printed,
+        overwrite,
+        None if ground is None else parse_ground(ground),
+        None if ruler is None else parse_ruler(ruler),
+        None if distance is None else parse_frame_distance(distance),
+    )
     made = matchmove_clip(clip, work or out.with_name(f"{out.stem}_matchmove"), settings)
     missing = write_track(out, made.track)
-    scale = "in metres, by the board" if made.track.metric else "scale arbitrary"
+    told_by = next((name for name, told in (("board", board), ("ruler", ruler), ("distance", distance)) if told), None)
+    scale = "scale arbitrary" if told_by is None else f"in metres, by the {told_by}"
     lost = f", {len(made.lost)} lost ({', '.join(map(str, made.lost[:8]))}{', ...' if len(made.lost) > 8 else ''})" if made.lost else ""
     typer.echo(
         f"{out}: {len(made.track.frames)} of {made.frame_count} frames from {len(made.model.views)} keyframes{lost}; {scale}; "

@@ -7,12 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from capture.matchmove.doubts import doubts, require_walking
 from capture.matchmove.frame_poses import FramePose, poses_between
-from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip, write_keyframes
-from capture.matchmove.only_turning import model_residual_px, turning_residual_px
+from capture.matchmove.ground import GroundPicks, Ruler, on_ground, ruler_scale
+from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip, view_name, write_keyframes
 from capture.views.colmap import PoseSettings, find_picture_poses
 from capture.views.colmap_matches import median_parallax_deg
 from capture.views.scale_board import board_scale
+from capture.views.scale_distance import distance_scale
 from capture.views.sparse_model import SparseModel, SparseView
 from mrbokeh.camera import Camera
 from mrbokeh.camera_track.track import CameraTrack
@@ -24,20 +26,15 @@ from mrbokeh.progress import track as with_progress
 from mrbokeh.video_io import VideoInfo, probe, read_display_frames
 
 _STILL_SHARE = 0.02
-_TURNS_AS_WELL = 3.0
-"""Times the model's residual up to which a camera that only turns explains the clip: 1.2 for one that does, 22 for one that walks."""
-
-_TURNS_PX = 0.25
-"""Below which it does in any case: features are not placed better than that."""
-
-_TOO_FEW_POINTS, _FEW_POINTS = 30, 150
-_SMALL_PARALLAX_DEG = 4.0
-_FEW_INLIERS = 0.8
 
 
 @dataclass(frozen=True)
 class MatchmoveSettings:
-    """keyframes: at most so many. board: seen in the clip, gives metres. overwrite: start COLMAP from nothing."""
+    """keyframes: at most so many, and those of the picks. overwrite: start COLMAP from nothing.
+
+    Metres come from a board that is seen in the clip, a ruler on the ground, or the distance of the cameras of two frames, the first of
+    them that is given. ground: where the world stands; without it as COLMAP has it.
+    """
 
     keyframes: int = 40
     camera_model: str = "SIMPLE_RADIAL"
@@ -45,6 +42,19 @@ class MatchmoveSettings:
     max_image_size_px: int = 1600
     board: CharucoBoard | None = None
     overwrite: bool = False
+    ground: GroundPicks | None = None
+    ruler: Ruler | None = None
+    distance: tuple[int, int, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.ruler is not None and self.ground is None:
+            raise InputError("--ruler lies on the ground: say with --ground where that is, or give --distance or --board")
+
+    @property
+    def picked_frames(self) -> set[int]:
+        """That must be keyframes."""
+        picks = {each.frame for each in (self.ground, self.ruler) if each is not None}
+        return picks | set(() if self.distance is None else self.distance[:2])
 
 
 @dataclass(frozen=True)
@@ -75,13 +85,28 @@ def matchmove_clip(clip: Path, work: Path, settings: MatchmoveSettings | None = 
             f"{clip}: the picture moves by {100 * motion[-1]:.1f} % of its width in all, from which no motion of the camera follows: "
             f"take a single camera for all frames"
         )
-    write_keyframes(clip, info, chosen_keyframes(motion, settings.keyframes), work / "images")
+    if settings.picked_frames and not 0 <= min(settings.picked_frames) <= max(settings.picked_frames) < len(motion):
+        raise InputError(f"{clip} has frames 0 to {len(motion) - 1}, but pixels or places were given of {sorted(settings.picked_frames)}")
+    keyframes = sorted({*chosen_keyframes(motion, settings.keyframes), *settings.picked_frames})
+    write_keyframes(clip, info, keyframes, work / "images")
     poses = PoseSettings(settings.mapper, settings.camera_model, "shared", settings.max_image_size_px, overwrite=settings.overwrite)
     model = _of_clip(clip, work, poses)
-    _require_walking(clip, model)
+    require_walking(clip, model)
+    return _with_all_frames(clip, info, _standing(model, settings, work / "images"))
+
+
+def _standing(model: SparseModel, settings: MatchmoveSettings, pictures: Path) -> SparseModel:
+    """On the ground and in metres, as far as the settings tell."""
+    if settings.ground is not None:
+        model = on_ground(model, model.view(view_name(settings.ground.frame)), settings.ground)
     if settings.board is not None:
-        model = model.times(board_scale(model, settings.board, _pictures(model, work / "images")).metres_per_unit)
-    return _with_all_frames(clip, info, model)
+        return model.times(board_scale(model, settings.board, _pictures(model, pictures)).metres_per_unit)
+    if settings.ruler is not None:
+        return model.times(ruler_scale(model.view(view_name(settings.ruler.frame)), settings.ruler))
+    if settings.distance is not None:
+        one, other, metres = settings.distance
+        return model.times(distance_scale(model, view_name(one), view_name(other), metres).metres_per_unit)
+    return model
 
 
 def _of_clip(clip: Path, work: Path, poses: PoseSettings) -> SparseModel:
@@ -120,40 +145,7 @@ def _with_all_frames(clip: Path, info: VideoInfo, model: SparseModel) -> Matchmo
     residuals = [pose.residual_px for pose in found.values()] or [float(model.errors_px.mean())]
     made = CameraTrack(frames, "-y", model.metres_per_unit is not None)
     parallax_deg, residual_px = median_parallax_deg(model), float(np.sqrt(np.mean(np.square(residuals))))
-    return Matchmove(made, model, len(times_s), lost, residual_px, parallax_deg, _doubts(model, list(found.values()), parallax_deg))
-
-
-def _points_of_keyframe(model: SparseModel) -> float:
-    """Median number that one sees."""
-    return float(np.median(np.bincount(model.observations[:, 0], minlength=len(model.views))))
-
-
-def _require_walking(clip: Path, model: SparseModel) -> None:
-    if (points := _points_of_keyframe(model)) < _TOO_FEW_POINTS:
-        raise InputError(
-            f"{clip}: COLMAP placed {len(model.views)} keyframes by {points:.0f} points each, too few to trust: film more texture with the "
-            f"camera moving sideways (one that only turns gives no points), or track a printed board"
-        )
-    turning_px, model_px = turning_residual_px(model), model_residual_px(model)
-    if turning_px < max(_TURNS_AS_WELL * model_px, _TURNS_PX):
-        raise InputError(
-            f"{clip}: the camera seems only to turn (turning alone explains what it sees to {turning_px:.2f} px, a way through space to "
-            f"{model_px:.2f} px), so that nothing tells where it was: film with the camera moving sideways, or track a printed board"
-        )
-
-
-def _doubts(model: SparseModel, found: list[FramePose], parallax_deg: float) -> tuple[str, ...]:
-    """What a scene at rest and a moving camera do not show."""
-    points = _points_of_keyframe(model)
-    fitting = float(np.median([pose.fitting for pose in found])) if found else 1.0
-    left_out = len(model.left_out)
-    told = (
-        (points < _FEW_POINTS, f"a keyframe sees only {points:.0f} points of the model"),
-        (parallax_deg < _SMALL_PARALLAX_DEG, f"points are seen under {parallax_deg:.1f} degrees only, so that depth is uncertain"),
-        (fitting < _FEW_INLIERS, f"of the points carried into a frame only {100 * fitting:.0f} % move with the scene"),
-        (left_out > 0, f"{left_out} of {left_out + len(model.views)} keyframes could not be placed"),
-    )
-    return tuple(text for doubtful, text in told if doubtful)
+    return Matchmove(made, model, len(times_s), lost, residual_px, parallax_deg, doubts(model, list(found.values()), parallax_deg))
 
 
 def _stretch(model: SparseModel, greys: list[Grey], first: int, views: Mapping[int, SparseView]) -> dict[int, FramePose]:

@@ -92,6 +92,14 @@ class SparseModel:
             views.append(replace(each, camera=replace(each.camera, camera_from_world=pose)))
         return replace(self, views=tuple(views), points=self.points * metres_per_unit, metres_per_unit=1.0)
 
+    def moved(self, there_from_world: Float[np.ndarray, "4 4"]) -> "SparseModel":
+        """The same in another world: a rotation and a shift in the model's unit."""
+        back = np.linalg.inv(there_from_world)
+        views = tuple(
+            replace(each, camera=replace(each.camera, camera_from_world=each.camera.camera_from_world @ back)) for each in self.views
+        )
+        return replace(self, views=views, points=self.points @ there_from_world[:3, :3].T + there_from_world[:3, 3])
+
     def points_of(self, view: SparseView | str) -> Int[np.ndarray, " seen"]:
         """Indices of the points that a view observes, in the order of `depths_in`."""
         return self.observations[self._of_view(view), 1]

@@ -1,0 +1,103 @@
+"""The world of a match-move on the ground: a plane through points of the model around picked pixels, the first pick as its origin."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+
+from capture.views.sparse_model import SparseModel, SparseView
+from mrbokeh.errors import InputError
+
+_FEWEST_POINTS = 12
+_TRIALS = 500
+_ON_PLANE = 0.01
+"""Of the distance to the camera: points nearer than that to a plane lie on it."""
+
+_FEWEST_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class GroundPicks:
+    """Three pixels or more of one frame with the ground between them; x runs from the first to the second."""
+
+    frame: int
+    xy_px: Float64[np.ndarray, "picks 2"]
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """Two pixels of one frame on the ground, and how far apart they are there."""
+
+    frame: int
+    xy_px: Float64[np.ndarray, "2 2"]
+    metres: float
+
+
+def on_ground(model: SparseModel, view: SparseView, picks: GroundPicks) -> SparseModel:
+    """The model in another world: y down and 0 on the ground, the origin at the first pick, x towards the second; lengths stay.
+
+    Raises InputError where too few points of the model lie between the picks, or no plane holds half of them.
+    """
+    points = _points_between(model, view, picks)
+    normal, offset = _plane(points, view.centre, picks)
+    origin, along = (_on_plane(view, xy_px, normal, offset) for xy_px in picks.xy_px[:2])
+    x = along - origin
+    if np.linalg.norm(x) == 0.0:
+        raise InputError("--ground: the first two pixels must differ, they say where x points")
+    x /= np.linalg.norm(x)
+    turn = np.stack([x, -normal, np.cross(x, -normal)])
+    moved = np.eye(4)
+    moved[:3, :3], moved[:3, 3] = turn, -turn @ origin
+    return model.moved(moved)
+
+
+def ruler_scale(view: SparseView, ruler: Ruler) -> float:
+    """Metres per unit of a model whose ground is y = 0; view: of the ruler's frame."""
+    if not 0.0 < ruler.metres < float("inf"):
+        raise InputError(f"--ruler: expected a positive number of metres, got {ruler.metres:g}")
+    one, other = (_on_plane(view, xy_px, np.array([0.0, -1.0, 0.0]), 0.0) for xy_px in ruler.xy_px)
+    units = float(np.linalg.norm(one - other))
+    if units == 0.0:
+        raise InputError("--ruler: its two pixels must differ")
+    return ruler.metres / units
+
+
+def _points_between(model: SparseModel, view: SparseView, picks: GroundPicks) -> Float64[np.ndarray, "points 3"]:
+    xy_px, depth = view.project(model.points.astype(np.float64))
+    outline = cv2.convexHull(picks.xy_px.astype(np.float32))
+    inside = [d > 0 and cv2.pointPolygonTest(outline, (float(x), float(y)), False) >= 0 for (x, y), d in zip(xy_px, depth, strict=True)]
+    if np.count_nonzero(inside) < _FEWEST_POINTS:
+        raise InputError(
+            f"--ground: {np.count_nonzero(inside)} points of the model lie between the pixels of frame {picks.frame}, "
+            f"at least {_FEWEST_POINTS} are needed: pick a larger part of the ground with more texture"
+        )
+    return model.points[inside].astype(np.float64)
+
+
+def _plane(points: Float64[np.ndarray, "points 3"], centre: np.ndarray, picks: GroundPicks) -> tuple[Float64[np.ndarray, "3"], float]:
+    """(normal towards the camera, offset) of normal . x = offset: RANSAC, then least squares over what lies on the best plane."""
+    rng, near = np.random.default_rng(0), _ON_PLANE * np.median(np.linalg.norm(points - centre, axis=1))
+    corners = points[np.argsort(rng.random((_TRIALS, len(points))), axis=1)[:, :3]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    normals, corners = normals[lengths > 0] / lengths[lengths > 0, None], corners[lengths > 0]
+    off = np.abs(points @ normals.T - np.sum(normals * corners[:, 0], axis=1))
+    kept = (off < near)[:, np.argmax((off < near).sum(axis=0))]
+    if kept.mean() < _FEWEST_SHARE:
+        raise InputError(
+            f"--ground: only {100 * kept.mean():.0f} % of the model's points between the pixels of frame {picks.frame} lie on one plane: "
+            f"pick pixels with nothing but flat ground between them"
+        )
+    middle = points[kept].mean(axis=0)
+    normal = np.linalg.svd(points[kept] - middle)[2][2]
+    normal = normal if normal @ (centre - middle) > 0 else -normal
+    return normal, float(normal @ middle)
+
+
+def _on_plane(view: SparseView, xy_px: np.ndarray, normal: np.ndarray, offset: float) -> Float64[np.ndarray, "3"]:
+    ray = view.unproject(xy_px[None].astype(np.float64), np.ones(1))[0] - view.centre
+    along = (offset - normal @ view.centre) / (normal @ ray)
+    if not 0.0 < along < float("inf"):
+        raise InputError(f"the pixel {xy_px[0]:g},{xy_px[1]:g} looks above the horizon of the ground: pick one on the ground")
+    return view.centre + along * ray
