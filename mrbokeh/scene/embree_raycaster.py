@@ -12,7 +12,10 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer, clear
-from mrbokeh.scene.embree_scene import PreparedScene, RaySamples
+from mrbokeh.scene.embree_scene import PreparedScene
+from mrbokeh.scene.embree_shading import RaySamples, shaded
+from mrbokeh.scene.embree_shadows import lit_share
+from mrbokeh.scene.embree_views import ROWS_AT_ONCE, cut, ray_directions, row_centres_px, window
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.pixel_edges import SAMPLE_COUNTS, edge_pixels, sample_offsets_px
@@ -24,8 +27,6 @@ from mrbokeh.workers import cores
 _RAYS_AT_ONCE = 1 << 14
 """So few that the shading points of one part stay in the processor's cache, and that Python's lock is free again after 2 ms."""
 _EDGES_AT_ONCE = 1 << 15
-_ROWS_AT_ONCE = 512
-_ROOM_PX = 2
 _Result = TypeVar("_Result")
 
 
@@ -66,23 +67,23 @@ class EmbreeRaycaster:
         layer = clear(camera.height_px, camera.width_px)
         if placed is None:
             return layer
-        rows, columns = _window(placed.ready, placed.camera(camera))
+        rows, columns = window(placed.ready, placed.camera(camera))
         if rows.start >= rows.stop or columns.start >= columns.stop:
             return layer
-        part = self._rendered(placed, scene, _cut(placed.camera(camera), rows, columns))
+        part = self._rendered(placed, scene, cut(placed.camera(camera), rows, columns))
         layer.rgb[rows, columns], layer.alpha[rows, columns], layer.depth_m[rows, columns] = part.rgb, part.alpha, part.depth_m
         return layer
 
     def _rendered(self, placed: PlacedScene, scene: Scene, camera: Camera) -> Layer:
         """The whole picture of a camera in the prepared scene's axes."""
         height, width = camera.height_px, camera.width_px
-        directions = _directions(camera, camera.pixel_centres_px().reshape(-1, 2))
+        directions = ray_directions(camera, camera.pixel_centres_px().reshape(-1, 2))
         centres = self._traced(placed, scene, camera, directions, pixel_share=1.0)
         rgb, alpha, depth_m = centres.rgb.copy(), centres.alpha.copy(), centres.depth_m.copy()
 
         edges, count = np.flatnonzero(_edges(placed.ready, camera, directions, centres)), len(self._offsets)
         for some in np.array_split(edges, max(1, len(edges) // _EDGES_AT_ONCE)):
-            samples = self._traced(placed, scene, camera, _directions(camera, self._within(some, width)), pixel_share=count**-0.5)
+            samples = self._traced(placed, scene, camera, ray_directions(camera, self._within(some, width)), pixel_share=count**-0.5)
             rgb[some] = samples.rgb.reshape(-1, count, 3).mean(1)
             alpha[some] = samples.alpha.reshape(-1, count).mean(1)
             nearest_m = samples.depth_m.reshape(-1, count).min(1)
@@ -110,15 +111,15 @@ class EmbreeRaycaster:
         ground, world_from_ready = self._kept.ground(catcher), placed.world_from_ready
         height, width, eye_m = camera.height_px, camera.width_px, camera.world_from_camera[:3, 3]
 
-        def lit_share(xy_px: Float[np.ndarray, "points 2"]) -> Float32[np.ndarray, " points"]:
-            directions = _directions(camera, xy_px)
-            parts = self._in_threads(lambda part: placed.ready.lit_share(ground, lights, world_from_ready, eye_m, part), directions)
+        def lit(xy_px: Float[np.ndarray, "points 2"]) -> Float32[np.ndarray, " points"]:
+            directions = ray_directions(camera, xy_px)
+            parts = self._in_threads(lambda part: lit_share(placed.ready, ground, lights, world_from_ready, eye_m, part), directions)
             return np.concatenate(parts)
 
-        mask = np.concatenate([lit_share(_row_centres_px(camera, first)) for first in range(0, height, _ROWS_AT_ONCE)])
+        mask = np.concatenate([lit(row_centres_px(camera, first)) for first in range(0, height, ROWS_AT_ONCE)])
         edges = np.flatnonzero(_steps(mask.reshape(height, width)))
         if len(edges):
-            mask[edges] = lit_share(self._within(edges, width)).reshape(-1, len(self._offsets)).mean(1)
+            mask[edges] = lit(self._within(edges, width)).reshape(-1, len(self._offsets)).mean(1)
         return mask.reshape(height, width)
 
     def _within(self, pixels: Int64[np.ndarray, " pixels"], width_px: int) -> Float64[np.ndarray, "samples 2"]:
@@ -134,7 +135,7 @@ class EmbreeRaycaster:
         footprint = pixel_share / float(np.sqrt(camera.focal_px[0] * camera.focal_px[1]))
         eye_m = camera.world_from_camera[:3, 3]
         return RaySamples.joined(
-            self._in_threads(lambda part: placed.ready.shaded(eye_m, part, footprint, placed.lights, maps, self._most_layers), directions)
+            self._in_threads(lambda part: shaded(placed.ready, eye_m, part, footprint, placed.lights, maps, self._most_layers), directions)
         )
 
     def _in_threads(self, work: Callable[[Float[np.ndarray, "some 3"]], _Result], directions: Float[np.ndarray, "rays 3"]) -> list[_Result]:
@@ -152,42 +153,6 @@ def _checked(edge_samples: int, shadow_step_px: int) -> tuple[Float[np.ndarray, 
             f"expected 4 or 16 rays in a pixel at an edge and a step of whole pixels from 1 on, got {edge_samples} and {shadow_step_px}"
         )
     return sample_offsets_px(edge_samples), shadow_step_px
-
-
-def _window(ready: PreparedScene, camera: Camera) -> tuple[slice, slice]:
-    """Rows and columns outside which nothing of the scene is; the whole picture where the camera is within or before its box."""
-    signs = np.array(np.meshgrid((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0))).reshape(3, -1).T
-    low, high, size = np.zeros(2), np.zeros(2), np.array([camera.width_px, camera.height_px])
-    corners_m = ready.centre_m + signs * ready.half_size_m
-    ahead_m = corners_m @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-    if ahead_m.max() <= 0:
-        return slice(0, 0), slice(0, 0)
-    if ahead_m.min() <= 1e-3 * ready.reach_m:
-        return slice(0, camera.height_px), slice(0, camera.width_px)
-    xy_px, _ = camera.project(corners_m)
-    low, high = (np.clip(each, -_ROOM_PX, size + _ROOM_PX) for each in (np.floor(xy_px.min(0)), np.ceil(xy_px.max(0))))
-    (left, top), (right, bottom) = (np.clip(each, 0, size).astype(int).tolist() for each in (low - _ROOM_PX, high + _ROOM_PX))
-    return slice(top, bottom), slice(left, right)
-
-
-def _cut(camera: Camera, rows: slice, columns: slice) -> Camera:
-    """The camera that sees only these pixels."""
-    principal = (camera.principal_px[0] - columns.start, camera.principal_px[1] - rows.start)
-    return Camera(columns.stop - columns.start, rows.stop - rows.start, camera.focal_px, principal, camera.camera_from_world)
-
-
-def _row_centres_px(camera: Camera, first: int) -> Float64[np.ndarray, "points 2"]:
-    """Centres of the pixels of some rows: those of a whole large picture, as rays, would take gigabytes."""
-    rows = np.arange(first, min(first + _ROWS_AT_ONCE, camera.height_px)) + 0.5
-    x, y = np.meshgrid(np.arange(camera.width_px) + 0.5, rows)
-    return np.stack([x, y], axis=-1).reshape(-1, 2)
-
-
-def _directions(camera: Camera, xy_px: Float[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points 3"]:
-    """Rays through points of the picture in world space, 1 long along the optical axis."""
-    right, down, forward = camera.world_from_camera[:3, :3].T
-    x, y = ((xy_px - np.asarray(camera.principal_px)) / np.asarray(camera.focal_px)).T
-    return np.stack([x * right[axis] + y * down[axis] + forward[axis] for axis in range(3)], axis=-1)
 
 
 def _edges(

@@ -17,6 +17,7 @@ from mrbokeh.scene._surface_numba import Surfaces, empty_surfaces, fill_surfaces
 from mrbokeh.scene.base import SceneRenderer
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.embree_scene import prepared
+from mrbokeh.scene.embree_shadows import visible
 from mrbokeh.scene.environment import Environment
 from mrbokeh.scene.environment_filter import lighting_maps, reflected_share_table
 from mrbokeh.scene.light import Light
@@ -93,7 +94,7 @@ class _Objects:
     def hidden(self, points_m: Float[np.ndarray, "points 3"], towards: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, " points"]:
         """How much of the light from infinitely far the objects keep from points."""
         far_m = np.full(len(points_m), np.inf)
-        return 1.0 - self._rays._visible(points_m - self._rays.centre_m, towards, far_m)
+        return 1.0 - visible(self._rays, points_m - self._rays.centre_m, towards, far_m)
 
 
 def _hidden_sky(
