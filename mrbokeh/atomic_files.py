@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,3 +59,22 @@ def refuse_existing(path: Path | str, overwrite: bool) -> None:
     """Existing results are kept unless the user asked to overwrite them."""
     if Path(path).exists() and not overwrite:
         raise InputError(f"{path} exists already: give another name, or --overwrite to replace it")
+
+
+def require_safe_outputs(outputs: Iterable[Path | str | None], inputs: Iterable[Path | str | None], overwrite: bool) -> None:
+    """Every file that will be written is one of its own: no two are the same, none is read (also through links), none is there already.
+
+    None stands for what was not asked for. Raises InputError; `overwrite` allows replacing what exists, but never what is read.
+    """
+    read, written = {_real(path) for path in inputs if path is not None}, set[Path]()
+    for path in (Path(each) for each in outputs if each is not None):
+        if _real(path) in read:
+            raise InputError(f"{path} is read and would be written over: give the result another name")
+        if _real(path) in written:
+            raise InputError(f"{path} is named for two results, of which the second would replace the first: give each its own name")
+        written.add(_real(path))
+        refuse_existing(path, overwrite)
+
+
+def _real(path: Path | str) -> Path:
+    return Path(path).resolve()

@@ -1,7 +1,11 @@
 """`mrbokeh`: one typer app; the package behind a sub-command is imported when it is called, not before."""
 
+import os
+import signal
 import sys
 from importlib import import_module
+from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple
 
 import typer
@@ -24,6 +28,10 @@ EXTRA_OF_MODULE = {
     "onnxscript": "train",
     "aiohttp": "viewfinder",
 }
+
+
+INTERRUPTED = 130
+"""Exit code of what was stopped by Ctrl-C, as shells have it."""
 
 
 class SubCommand(NamedTuple):
@@ -96,6 +104,7 @@ def _root(
 
 def main() -> None:
     """The console script: mistakes of the user end in one sentence and exit code 2, without a traceback."""
+    interrupted = _noted_interrupts()
     try:
         app()
     except InputError as error:
@@ -105,6 +114,34 @@ def main() -> None:
         if extra is None:
             raise
         _fail(str(MissingExtraError(str(error.name), extra)))
+    except OSError as error:
+        if error.filename is None or isinstance(error.filename, int):
+            raise
+        _fail(_refused(error))
+    except Exception:
+        if interrupted:
+            sys.exit(INTERRUPTED)
+        raise
+
+
+def _noted_interrupts() -> list[int]:
+    """Ctrl-C raises KeyboardInterrupt as ever, which compilers may turn into another error: whoever handles that one asks here."""
+    noted: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        signal.default_int_handler(number, frame)
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, note)
+    return noted
+
+
+def _refused(error: OSError) -> str:
+    """What the system would not do with a file or folder; of a file that is being written under a temporary name, its folder."""
+    path = Path(os.fsdecode(error.filename))
+    shown = path.parent if path.name.startswith(".") and ".part" in path.name else path
+    return f"{shown}: {(error.strerror or 'the system refused it').lower()}; check the name, the space left and who may write there"
 
 
 def _fail(message: str) -> None:

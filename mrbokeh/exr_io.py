@@ -45,12 +45,15 @@ def read_exr(path: Path | str) -> list[ExrPart]:
         raise InputError(f"expected an EXR file at {path}, but there is none")
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
+            is_deep = any(part.type() in (OpenEXR.deepscanline, OpenEXR.deeptile) for part in file.parts)
             flat = [part for part in file.parts if part.type() in (OpenEXR.scanlineimage, OpenEXR.tiledimage)]
             parts = [_part_from_openexr(part) for part in flat]
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as EXR: {error}") from None
-    if not parts:
+    if not parts and is_deep:
         raise InputError(f"{path} holds no flat picture (deep EXR): flatten it first")
+    if not parts:
+        raise InputError(f"{path} cannot be read as EXR: its pixels are missing or damaged, copy or render it again")
     return parts
 
 

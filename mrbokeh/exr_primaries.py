@@ -14,6 +14,9 @@ ATTRIBUTE = "chromaticities"
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """CIE x, y of red, green, blue and white (D65), ITU-R BT.709; what EXR takes where a file states nothing."""
 
+BT2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+"""The same of ITU-R BT.2020, which holds nearly all colours of real things."""
+
 # Cone responses that the Bradford transform scales (Lam 1985; CIE 160:2004).
 _CONES_FROM_XYZ = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 # Programs write D65 with four to six digits.
@@ -75,3 +78,11 @@ def _xyz_matrix(xy: Float[np.ndarray, "4 2"]) -> Float64[np.ndarray, "3 3"] | No
         return None
     XYZ_from_rgb = columns * np.linalg.solve(columns, white)
     return XYZ_from_rgb if np.linalg.cond(XYZ_from_rgb) < _LARGEST_CONDITION else None
+
+
+def _known(matrix: Float64[np.ndarray, "3 3"] | None) -> Float64[np.ndarray, "3 3"]:
+    assert matrix is not None
+    return matrix
+
+
+BT2020_from_rec709 = np.linalg.inv(_known(rec709_from_chromaticities(BT2020)))

@@ -16,6 +16,7 @@ from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.exr_primaries import in_rec709, stated_primaries
 from mrbokeh.layer import Layer
+from mrbokeh.sound_values import require_depth_ahead
 
 Encoding = Literal["srgb", "linear"]
 
@@ -35,6 +36,12 @@ def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndar
     return _read_rgba(Path(path), encoding)[..., :3]
 
 
+def require_suffix(path: Path | str, suffixes: tuple[str, ...], what: str) -> None:
+    """Said before the work, not after it. what: what would be written, such as "--sheet"."""
+    if Path(path).suffix.lower() not in suffixes:
+        raise InputError(f"{what}: expected a name that ends in {' or '.join(suffixes)}, got {path}")
+
+
 def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
     """Write scene-linear RGB. EXR keeps it (half or float); PNG and TIFF store 16 bit, JPEG 8 bit, clipped to [0, 1]."""
     path = Path(path)
@@ -45,13 +52,16 @@ def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], enco
         _write_integer_image(path, np.asarray(rgb, np.float32), encoding)
 
 
-def read_linear(path: Path | str) -> Float32[np.ndarray, "height width 3"]:
-    """A picture that is scene-linear as stored (EXR, HDR, float TIFF); a file of integers is refused, for it is encoded for display."""
+def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR first") -> Float32[np.ndarray, "height width 3"]:
+    """A picture that is scene-linear as stored (EXR, HDR, float TIFF); a file of integers is refused, for it is encoded for display.
+
+    instead: what the error advises then.
+    """
     path = Path(path)
     if path.is_file() and path.suffix.lower() in INTEGER_SUFFIXES and _decode(path).dtype.kind != "f":
         raise InputError(
             f"{path}: expected scene-linear values (EXR, HDR or float TIFF), but it stores {_decode(path).dtype} made for display, without "
-            f"highlights: develop the RAW file to EXR, or say that it is sRGB if that is all there is"
+            f"highlights: {instead}"
         )
     rgb = read_image(path)
     if not np.isfinite(rgb).all():
@@ -84,7 +94,9 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
     rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
-    depth = next((channels[name] for name in _DEPTH_NAMES if name in channels), np.zeros(rgb.shape[:2])).astype(np.float32)
+    depth_name = next((name for name in _DEPTH_NAMES if name in channels), None)
+    depth = (np.zeros(rgb.shape[:2]) if depth_name is None else channels[depth_name]).astype(np.float32)
+    require_depth_ahead(path, str(depth_name), depth[alpha > 0])
     others = sorted(channels.keys() - set("RGBA") - set(_DEPTH_NAMES)) if extra else []
     depth_m = np.where((depth > 0) & (alpha > 0), depth, np.inf).astype(np.float32)
     return Layer(rgb, alpha, depth_m, {name: channels[name].astype(np.float32)[..., None] for name in others})
@@ -126,13 +138,25 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
     return linear if pixels.shape[2] == 3 else np.dstack([linear, pixels[..., 3] / top])
 
 
-def _decode(path: Path) -> np.ndarray:
-    """The stored numbers as (H, W, 3 or 4), RGB order."""
+def stored_pixels(path: Path) -> np.ndarray:
+    """The numbers of a PNG, TIFF, JPEG or HDR file as they are stored: (H, W) or (H, W, 3 or 4) with blue first.
+
+    Raises InputError where the file is empty or damaged.
+    """
     import cv2
 
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    data = np.fromfile(path, np.uint8)
+    if not data.size:
+        raise InputError(f"{path} is empty: copy or render it again")
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f"{path} cannot be read as a picture: it is damaged or not what its suffix says")
+    return np.asarray(pixels)
+
+
+def _decode(path: Path) -> np.ndarray:
+    """The stored numbers as (H, W, 3 or 4), RGB order."""
+    pixels = stored_pixels(path)
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
     order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]

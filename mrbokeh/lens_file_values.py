@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from mrbokeh.errors import InputError
+from mrbokeh.image_io import stored_pixels
 
 
 class _Missing:
@@ -105,13 +106,9 @@ def read_transmission(path: Path) -> Float32[np.ndarray, "height width"]:
 
     A drawing of an opening is a matte: its numbers mean shares of light, without a display curve.
     """
-    import cv2
-
     if not path.is_file():
         raise InputError(f"expected a picture of the opening at {path}, but there is no such file")
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise InputError(f"{path} cannot be read as a picture (PNG, TIFF, JPEG): it is damaged or not what its suffix says")
+    pixels = stored_pixels(path)
     scaled = pixels.astype(np.float32)
     if pixels.dtype.kind != "f":
         scaled /= np.float32(np.iinfo(pixels.dtype.name).max)

@@ -143,10 +143,21 @@ def test_depth_means_what_the_setting_says(tmp_path: Path) -> None:
         FlatRender(depth_is="distance", camera=camera.resized(8, 6)).layers(path)
 
 
-@pytest.mark.parametrize(("meaning", "far"), [("axis", 1e10), ("axis", np.inf), ("axis", 0.0), ("axis", -1.0), ("inverse", 0.0)])
+@pytest.mark.parametrize(("meaning", "far"), [("axis", 1e10), ("axis", np.inf), ("axis", 0.0), ("inverse", 0.0)])
 def test_background_is_infinite(tmp_path: Path, meaning: str, far: float) -> None:
     path = written(tmp_path / "a.exr", colours("", 1, 1, 1) | {"Z": plane(far)})
     assert np.isinf(FlatRender(depth_is=meaning).layers(path)[0].depth_m).all()  # type: ignore[arg-type]
+
+
+def test_negative_depth_is_background_beside_others_and_where_nothing_is_seen(tmp_path: Path) -> None:
+    """-1 as some programs mark the sky. Where all that is seen is negative, it is distance along -z, and refused."""
+    channels = colours("", 1, 1, 1) | {"Z": plane(-1.0)}
+    with pytest.raises(InputError, match="turn the sign"):
+        FlatRender().layers(written(tmp_path / "a.exr", channels))
+    channels["Z"][0, 0] = 2.0
+    assert np.isinf(FlatRender().layers(written(tmp_path / "b.exr", channels))[0].depth_m).sum() == channels["Z"].size - 1
+    unseen = colours("", 0, 0, 0, 0) | {"Z": plane(-1.0)}
+    assert np.isinf(FlatRender().layers(written(tmp_path / "c.exr", unseen))[0].depth_m).all()
 
 
 def test_edges_take_the_depth_of_what_covers_them(tmp_path: Path) -> None:
@@ -167,7 +178,7 @@ def test_nan_is_refused(tmp_path: Path) -> None:
     for name, what in (("R", "colour"), ("Z", "Z")):
         bad = {**broken, name: broken[name].copy()}
         bad[name][3, 4] = np.nan
-        with pytest.raises(InputError, match=f"1 values of {what} are NaN"):
+        with pytest.raises(InputError, match=f"{what} is NaN in 1 place"):
             FlatRender().layers(written(tmp_path / "a.exr", bad))
 
 

@@ -33,17 +33,15 @@ def read_sharp(sources: Sources) -> dict[str, Layer]:
 
 
 def _read(sources: Sources) -> dict[str, Layer]:
-    from mrbokeh.image_io import read_layer
-
     rgb, depth = sources.rgb, sources.depth
-    sharp = {str(path): read_layer(path, extra=True) for path in sources.layers}
+    sharp = {str(path): _whole_layer(path) for path in sources.layers}
     if (rgb is None) != (depth is None):
         raise InputError("--rgb and --depth belong together: give both, or only --layer")
     if rgb is not None and depth is not None:
         sharp[str(rgb)] = _picture(rgb, depth, sources.srgb)
     if sources.behind and rgb is None:
         raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
-    sharp |= {str(path): read_layer(path, extra=True) for path in sources.behind}
+    sharp |= {str(path): _whole_layer(path) for path in sources.behind}
     if not sharp:
         raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
     if len({each.alpha.shape for each in sharp.values()}) > 1:
@@ -51,11 +49,21 @@ def _read(sources: Sources) -> dict[str, Layer]:
     return sharp
 
 
+def _whole_layer(path: Path) -> Layer:
+    from mrbokeh.image_io import read_layer
+    from mrbokeh.sound_values import require_numbers
+
+    layer = read_layer(path, extra=True)
+    require_numbers(path, {"colour": layer.rgb, "alpha": layer.alpha})
+    return layer
+
+
 def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
     from mrbokeh.image_io import read_depth, read_image, read_linear
     from mrbokeh.layer import opaque
 
-    colour, depth_m = read_image(rgb) if srgb else read_linear(rgb), read_depth(depth)
+    linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
+    colour, depth_m = read_image(rgb) if srgb else read_linear(rgb, linear_or), read_depth(depth)
     if colour.shape[:2] != depth_m.shape:
         sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
         raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")

@@ -54,10 +54,13 @@ def check(
 
     Example: mrbokeh check out.exr --against plate.exr --virtual blurred_layer.exr --json check.json --map leaks.png
     """
-    from mrbokeh.atomic_files import write_json
+    from mrbokeh.atomic_files import require_safe_outputs, write_json
+    from mrbokeh.image_io import require_suffix
 
-    if map_out is not None and map_out.suffix.lower() != ".png":
-        raise InputError(f"--map: expected a .png to write to, got {map_out}")
+    for name, path, suffix in (("--map", map_out, ".png"), ("--json", json_out, ".json")):
+        if path is not None:
+            require_suffix(path, (suffix,), name)
+    require_safe_outputs((json_out, map_out), (out, against, virtual, sharp, lens), overwrite=True)
     if lens is not None and sharp is None:
         raise InputError("--lens tells how far light of the sharp layer reaches: give --sharp LAYER.exr too")
     plate = None if against is None else open_shot(against)

@@ -33,7 +33,10 @@ def new(
     focal_length: Annotated[float, typer.Option(help="Focal length in mm.")],
     f_number: Annotated[float, typer.Option(help="f-number.")],
     focus: Annotated[float, typer.Option(help="Focus distance from the lens in metres; inf is allowed.")],
-    sensor_width: Annotated[float, typer.Option(help="Sensor width in mm (36 for full frame, 23.5 for APS-C).")] = 36.0,
+    sensor_width: Annotated[
+        float,
+        typer.Option(help="Width in mm of the sensor as the picture lies: 36 for full frame (24 held upright), 23.5 for APS-C (15.6)."),
+    ] = 36.0,
     shape: Annotated[
         str, typer.Option(help=f"Shape of the opening: {', '.join(SHAPES)}. (disc where none is given, polygon where --blades is.)")
     ] = "",
@@ -58,8 +61,10 @@ def new(
     Example: mrbokeh lens new lens.json --focal-length 50 --f-number 1.8 --focus 0.8 --blades 7 --curvature 0.3
     """
     from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.image_io import require_suffix
     from mrbokeh.lens_file import lens_from_json, write_lens
 
+    require_suffix(out, (".json",), "LENS")
     refuse_existing(out, overwrite)
     parts = {"blades": blades or None, "curvature": curvature or None, "inner": inner, "path": path}
     parts |= {"image": None if image is None else str(image), "levels": None if levels == 1 else levels}

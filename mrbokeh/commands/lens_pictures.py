@@ -11,7 +11,7 @@ from mrbokeh.errors import InputError
 def show(
     lens: Annotated[Path, typer.Argument(help="Lens file, or the folder of a bank of PSFs.")],
     out: Annotated[Path, typer.Option(help="The picture to write (.png, .pdf or .svg).")],
-    width: Annotated[int, typer.Option(help="Image width in pixels (of a lens file).")] = 1920,
+    width: Annotated[int, typer.Option(min=16, help="Image width in pixels (of a lens file).")] = 1920,
     overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
 ) -> None:
     """Draw the blur of a lens: its kernels over diameter and field, its outlines and low-rank error, and blur over depth.
@@ -21,11 +21,15 @@ def show(
     Example: mrbokeh lens show lens.json --out lens.png
     """
     from mrbokeh.atomic_files import atomic_path, refuse_existing
+    from mrbokeh.progress import working
 
+    if lens.suffix.lower() == ".onnx":
+        raise InputError(f"expected a lens file or a bank of PSFs to draw, got the network {lens}: `mrbokeh train evaluate` shows it")
     if out.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise InputError(f"cannot draw {out}: expected .png, .pdf or .svg")
     refuse_existing(out, overwrite)
-    figure = _drawn_bank(lens) if lens.is_dir() else _drawn_lens(lens, width)
+    with working("drawing (the first time on a machine it takes a minute to compile)"):
+        figure = _drawn_bank(lens) if lens.is_dir() else _drawn_lens(lens, width)
     with atomic_path(out) as temporary:
         figure.savefig(temporary, dpi=150)
     typer.echo(f"wrote {out}")

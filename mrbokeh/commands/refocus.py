@@ -41,16 +41,18 @@ def refocus(
 
     Example: mrbokeh refocus SCENE/view_0 --focus 0.5:inf:12 --out refocused
     """
-    from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.atomic_files import require_safe_outputs
     from mrbokeh.focal_stack import read_focal_stack, write_focal_stack, write_merged
+    from mrbokeh.image_io import require_suffix
 
     if out.resolve() == stack.resolve():
         raise InputError("--out must be another folder than the stack's own")
+    if sheet is not None:
+        require_suffix(sheet, (".png",), "--sheet")
+        require_safe_outputs((sheet,), (lens, out), overwrite)
     source, distances_m = read_focal_stack(stack), parse_focus(focus)
     way = _way(source, f_number, lens, renderer, residuals)
     _make_room(out, overwrite)
-    if sheet is not None:
-        refuse_existing(sheet, overwrite)
     settings = {"stack": str(stack.resolve()), "f_number": f_number, "lens": str(lens), "renderer": renderer, "residuals": residuals}
     slices = _write_slices(way, distances_m, out, settings, overwrite)
     write_merged(out, source.all_in_focus(), source.focus_index(), source.depth_confidence(), source.depth_m())

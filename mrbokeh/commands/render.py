@@ -52,15 +52,17 @@ def render(
 
     Example: mrbokeh render --rgb aif.exr --depth z.exr --lens lens.json --focus-at 640,360 --out blurred.exr
     """
-    from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.atomic_files import require_safe_outputs
     from mrbokeh.commands._render_method import focused, reconstructed
     from mrbokeh.commands._render_sharp import Sources, read_sharp
+    from mrbokeh.image_io import INTEGER_SUFFIXES, require_suffix
     from mrbokeh.layering import Layering
     from mrbokeh.lens_file import read_lens
     from mrbokeh.progress import working
     from mrbokeh.renderers.choose_bank import chosen_renderer
 
-    refuse_existing(out, overwrite)
+    require_suffix(out, (".exr", *INTEGER_SUFFIXES), "--out")
+    require_safe_outputs((out,), (lens, rgb, depth, motion, samples, *(layer or ()), *(behind or ())), overwrite)
     if alpha_out and out.suffix.lower() != ".exr":
         raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
     sources = Sources(rgb, depth, tuple(layer or ()), tuple(behind or ()), motion, shutter, srgb)

@@ -61,7 +61,7 @@ def transfer(
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.transferring import open_sharp, seen_like, with_recovered_highlights
 
-    _refuse(out, overwrite, sheet, save_depth)
+    _require_outputs(out, sheet, save_depth, (photo, lens, depth), overwrite)
     settings = DepthSettings(
         None if disparity is None else parse_near_far(disparity),
         depth_scale,
@@ -92,13 +92,20 @@ def transfer(
     typer.echo(f"wrote {out} (depth: {sharp.depth.note}; largest circle of confusion {coc_px:.1f} px)")
 
 
-def _refuse(out: Path, overwrite: bool, sheet: Path | None, save_depth: Path | None) -> None:
-    from mrbokeh.atomic_files import refuse_existing
-    from mrbokeh.commands._transfer_outputs import is_transferred
+def _require_outputs(out: Path, sheet: Path | None, save_depth: Path | None, inputs: tuple[Path | None, ...], overwrite: bool) -> None:
+    from mrbokeh.atomic_files import require_safe_outputs
+    from mrbokeh.commands._transfer_outputs import FILMS, is_transferred
+    from mrbokeh.image_io import INTEGER_SUFFIXES, require_suffix
 
-    for path in (out, sheet, save_depth):
+    named = (
+        (out, ("", ".exr", *INTEGER_SUFFIXES, *FILMS), "--out"),
+        (sheet, (".png",), "--sheet"),
+        (save_depth, (".exr",), "--save-depth"),
+    )
+    for path, suffixes, name in named:
         if path is not None:
-            refuse_existing(path, overwrite)
+            require_suffix(path, suffixes, name)
+    require_safe_outputs((out, sheet, save_depth), inputs, overwrite)
     if out.is_dir() and not is_transferred(out):
         raise InputError(f"{out} is a folder that was not made by transfer: give another name")
 

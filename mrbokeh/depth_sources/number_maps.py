@@ -8,6 +8,7 @@ from jaxtyping import Float32
 from mrbokeh.depth_sources.depth_map import DepthMap
 from mrbokeh.depth_sources.depth_settings import DepthSettings
 from mrbokeh.errors import InputError
+from mrbokeh.image_io import stored_pixels
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -17,12 +18,8 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
 
     For near_far_m the whole range of an integer format counts (0 is FAR, 65535 is NEAR), of floats the range that occurs.
     """
-    import cv2
-
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise InputError(f"{path} cannot be read as a depth map: expected EXR, PNG or TIFF")
-    numbers = np.asarray(pixels) if pixels.ndim == 2 else np.asarray(pixels)[..., 0]
+    pixels = stored_pixels(path)
+    numbers = pixels if pixels.ndim == 2 else pixels[..., 0]
     known = np.isfinite(numbers)
     if settings.metres_per_unit is not None:
         known &= numbers > 0

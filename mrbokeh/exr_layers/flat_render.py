@@ -15,6 +15,7 @@ from mrbokeh.exr_layers.render_channels import RenderChannels
 from mrbokeh.exr_primaries import in_rec709
 from mrbokeh.layer import Layer
 from mrbokeh.motion import with_motion
+from mrbokeh.sound_values import require_depth_ahead, require_numbers
 
 DepthMeaning = Literal["axis", "inverse", "distance"]
 
@@ -59,18 +60,19 @@ class FlatRender:
         rgb = np.stack([render.plane(joined(name, each)) for each in "RGB"], axis=2).astype(np.float32)
         alpha_name = joined(name, "A")
         alpha = render.plane(alpha_name).astype(np.float32) if alpha_name in render.channels else np.ones(rgb.shape[:2], np.float32)
-        _refuse_nan(render, {"colour": rgb, "alpha": alpha})
+        require_numbers(render.path, {"colour": rgb, "alpha": alpha})
         rgb = in_rec709(rgb, render.primaries, render.path)
         rgb = rgb if self.premultiplied else rgb * alpha[..., None]
-        depth_m = self._depth_m(render, render.depth_name(name, self.depth))
-        is_seen = (alpha > 0) | (rgb != 0).any(axis=2)
+        depth_name, is_seen = render.depth_name(name, self.depth), (alpha > 0) | (rgb != 0).any(axis=2)
+        require_depth_ahead(render.path, depth_name, render.plane(depth_name)[is_seen])
+        depth_m = self._depth_m(render, depth_name)
         layer = Layer(rgb, alpha, np.where(is_seen, depth_m, np.float32(np.inf)))
         return self._moving(layer, render, name) if self.shutter > 0 else layer
 
     def _depth_m(self, render: RenderChannels, name: str) -> Float32[np.ndarray, "height width"]:
         """Metres along the axis; what is not above 0 or farther than any scene is background."""
         stored = render.plane(name).astype(np.float32)
-        _refuse_nan(render, {name: stored})
+        require_numbers(render.path, {name: stored})
         if self.depth_is == "inverse":
             stored = np.divide(1.0, stored, out=np.full_like(stored, np.inf), where=stored > 0)
         is_there = (stored > 0) & (stored < BACKGROUND_FROM)
@@ -81,7 +83,7 @@ class FlatRender:
         names = render.motion_names(name)
         right, up = (names.factor * render.plane(each).astype(np.float32) for each in (names.right, names.up))
         motion_px = np.stack([right, -up], axis=2).astype(np.float32)
-        _refuse_nan(render, {names.right: motion_px[layer.alpha > 0]})
+        require_numbers(render.path, {names.right: motion_px[layer.alpha > 0]})
         return with_motion(layer, motion_px, self.shutter)
 
 
@@ -93,10 +95,3 @@ def _axis_share(camera: Camera, size: tuple[int, ...]) -> Float32[np.ndarray, "h
         )
     plane = (camera.pixel_centres_px() - camera.principal_px) / np.asarray(camera.focal_px)
     return (1.0 / np.sqrt(1.0 + (plane**2).sum(axis=2))).astype(np.float32)
-
-
-def _refuse_nan(render: RenderChannels, planes: dict[str, np.ndarray]) -> None:
-    for what, values in planes.items():
-        broken = int(np.isnan(values).sum())
-        if broken:
-            raise InputError(f"{render.path}: {broken} values of {what} are NaN: mend the render first")

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32
 from mrbokeh.color import linear_to_srgb
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr
-from mrbokeh.image_io import INTEGER_SUFFIXES, read_image, read_layer
+from mrbokeh.image_io import INTEGER_SUFFIXES, read_image, read_layer, stored_pixels
 from mrbokeh.layer import Layer
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -30,6 +30,13 @@ class Storage:
 
     is_linear: bool
     step: float
+
+    @property
+    def dark_step(self) -> float:
+        """How far below 0 storing can bring light: an EXR holds what was written; colours of lossy films ring over the dark beside them."""
+        if self.is_linear:
+            return 0.0
+        return float("inf") if self.step >= _LOSSY_STEP else self.step / _STEEPEST
 
     def changed(self, rgb: Rgb, plate_rgb: Rgb) -> Bool[np.ndarray, "height width"]:
         """Where two pictures differ by more than storing them explains. Not a number differs from everything."""
@@ -88,9 +95,7 @@ def _integer_storage(path: Path) -> Storage:
         return Storage(True, 2.0**-7)
     if suffix in (".jpg", ".jpeg"):
         return LOSSY_FILM
-    import cv2
-
-    pixels = np.asarray(cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED))
+    pixels = stored_pixels(path)
     if pixels.dtype.kind == "f":
         return Storage(True, 0.0)
     return Storage(False, _CODE_STEP_16 if pixels.dtype == np.uint16 else _CODE_STEP_8)

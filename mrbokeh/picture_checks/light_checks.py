@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from mrbokeh.color import convert
+from mrbokeh.exr_primaries import BT2020_from_rec709
 from mrbokeh.layer import Layer
 from mrbokeh.picture_checks.checked_picture import SHARP, VIRTUAL, CheckedPicture
 from mrbokeh.picture_checks.findings import CheckReport, Finding
@@ -17,25 +19,34 @@ _BORDER_PX = 2
 
 
 def check_numbers(report: CheckReport, picture: CheckedPicture, plate_rgb: Rgb | None) -> None:
-    """The picture and its layers. plate_rgb: a strong colour of a camera may be negative in Rec.709; only what is below it counts."""
-    floor = np.float32(0.0) if plate_rgb is None else np.minimum(plate_rgb, 0.0)
-    _check(report, picture.name, picture.rgb, picture.alpha, floor)
+    """The picture and its layers, which are rendered in Rec.709 and have nothing below 0.
+
+    Strong colours of a camera are negative in Rec.709: in the picture only what is below the plate counts, or, without one, what no
+    colour of BT.2020 has. What storing does is allowed; of lossy films nothing can be said.
+    """
+    light = _in_bt2020(picture.rgb) if plate_rgb is None else picture.rgb - np.minimum(plate_rgb, np.float32(0.0))
+    _check(report, picture.name, picture.rgb, picture.alpha, light, DARK_SLACK + picture.storage.dark_step)
     for name, layer in picture.layers.items():
-        _check(report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, np.float32(0.0))
+        _check(report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, layer.rgb, DARK_SLACK)
 
 
-def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, floor: Rgb | np.float32) -> None:
+def _in_bt2020(rgb: Rgb) -> Rgb:
+    return np.where(np.isfinite(rgb), convert(np.nan_to_num(rgb, posinf=0.0, neginf=0.0), BT2020_from_rec709), np.float32(np.nan))
+
+
+def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, light: Rgb, slack: float) -> None:
+    """light: the picture as far as it must not be negative."""
     lost = ~np.isfinite(rgb).all(axis=2)
     if alpha is not None:
         lost |= ~np.isfinite(alpha)
-    _note(report, "nan", where, lost, "pixels are NaN or infinite", float(lost.sum()), 0.0)
-    dark = np.where(np.isfinite(rgb), rgb - floor, np.float32(0.0)).min(axis=2)
-    _note(report, "negative", where, dark < -DARK_SLACK, "pixels have negative light", float(dark.min()), -DARK_SLACK)
+    _note(report, "nan", where, lost, "NaN or infinity", float(lost.sum()), 0.0)
+    dark = np.where(np.isfinite(light), light, np.float32(0.0)).min(axis=2)
+    _note(report, "negative", where, dark < -slack, "negative light", float(dark.min()), -slack)
     if alpha is not None:
         known = np.where(np.isfinite(alpha), alpha, np.float32(0.0))
         above, below = known > 1.0 + ALPHA_SLACK, known < -ALPHA_SLACK
-        _note(report, "alpha", where, above, "pixels have alpha above 1", float(known.max()), 1.0 + ALPHA_SLACK)
-        _note(report, "alpha", where, below, "pixels have alpha below 0", float(known.min()), -ALPHA_SLACK)
+        _note(report, "alpha", where, above, "alpha above 1", float(known.max()), 1.0 + ALPHA_SLACK)
+        _note(report, "alpha", where, below, "alpha below 0", float(known.min()), -ALPHA_SLACK)
 
 
 def _note(
@@ -43,7 +54,7 @@ def _note(
 ) -> None:
     if bad.any():
         y, x = np.argwhere(bad)[0]
-        report.findings.append(Finding(check, where, f"{int(bad.sum())} {what}, the first at {x},{y}", value, limit))
+        report.findings.append(Finding(check, where, f"{what} in {int(bad.sum())} px, the first at {x},{y}", value, limit))
 
 
 def check_energy(report: CheckReport, picture: CheckedPicture, tolerance: float) -> None:
