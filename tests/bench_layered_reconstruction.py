@@ -34,6 +34,8 @@ REPEATS = 5
 ALL = Settings()
 VARIANTS = {
     "all improvements": ALL,
+    "pupil and shutter in one part": replace(ALL, pupil_parts=1, shutter_parts=1),
+    "pupil and shutter in 2 parts along each axis": replace(ALL, pupil_parts=2, shutter_parts=2),
     "one cell of motion": replace(ALL, motion_step_px=np.inf),
     "neither merging nor sparse statistics": replace(ALL, merge=False, sparse_statistics=False),
     "merging alone": replace(ALL, sparse_statistics=False),
@@ -112,7 +114,7 @@ def _set(folder: Path) -> None:
         f"{folder.name}, {samples.per_pixel:.0f} spp (dB linear / displayed): raw {linear_db[0]:.1f} / {shown_db[0]:.1f}, "
         f"best non-local means {linear_db[1]:.1f} / {shown_db[1]:.1f}"
     )
-    for variant in ("all improvements", "neither merging nor sparse statistics", "one cell of motion"):
+    for variant in ("all improvements", "neither merging nor sparse statistics", "pupil and shutter in one part"):
         method = LayeredReconstruction(VARIANTS[variant])
         rgb, counts = method.reconstruct_counted(samples, lens)
         displayed = linear_to_srgb(np.clip(rgb, 0, 1))

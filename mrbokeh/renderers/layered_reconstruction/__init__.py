@@ -6,8 +6,8 @@ Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/layer
 2. Mean and variance of the blur and of the motion of a partition give its sheared filter.
 3. The samples around the tile are reprojected to the middle of pupil and shutter along the partition's slopes. Those of the
    partition add colour and opacity, those behind it lower the opacity, for they were seen through it.
-4. A Gaussian over the screen spreads what the reprojection took together.
-5. Partitions are composited front to back.
+4. A filter over the screen spreads what the reprojection took together, part by part of pupil and shutter.
+5. Partitions are composited front to back, for each part on its own; the picture is the mean of the parts.
 """
 
 from collections.abc import Callable, Sequence
@@ -118,13 +118,14 @@ class LayeredReconstruction:
         from mrbokeh.renderers.layered_reconstruction._tiles_numba import reconstruct_tiles
 
         light = prepared(samples, values, coc_px, self.settings)
-        choice, pupil = self._choice(samples.per_pixel, shared_out), Pupil(*packed_pupil(aperture))
+        choice = self._choice(samples.per_pixel, shared_out)
+        pupil, cells = (Pupil(*packed_pupil(aperture, across)) for across in (1, self.settings.parts[0]))
         tiles = (len(light.starts) - 1) // BLOCKS
         counts = np.zeros((tiles, 2), np.int32)
         out = np.zeros((samples.height_px, samples.width_px, values.shape[1]), np.float32)
 
         def run(part: np.ndarray) -> None:
-            reconstruct_tiles(out, part, counts, light, choice, pupil, light.depths * light.cells)
+            reconstruct_tiles(out, part, counts, light, choice, pupil, cells, light.depths * light.cells)
 
         self._each(run, tiles)
         before, after = counts[counts[:, 0] > 0].mean(axis=0)
@@ -137,6 +138,7 @@ class LayeredReconstruction:
         return Choice(
             every, self.seed, chosen.merge, chosen.merge_tolerance, chosen.sigma_x_px, chosen.bandwidth, _KINDS[chosen.screen_filter],
             chosen.support, chosen.recursive_passes, alpha, chosen.tap_distance, chosen.enough, shared_out,
+            chosen.parts[1],
         )  # fmt: skip
 
     def _each(self, run: Callable[[np.ndarray], None], tiles: int) -> None:

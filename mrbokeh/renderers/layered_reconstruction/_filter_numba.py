@@ -11,6 +11,9 @@ SUMS = 8
 WINDOW = 4
 """Second moments of the pupil (uu, uv, vv) and of the shutter (tt)."""
 
+PIXEL_VARIANCE = 1.0 / 12.0
+"""What a pixel as a bin adds to the spread of the samples in it: the variance of a box of 1 px."""
+
 
 @njit(cache=True, nogil=True)
 def sheared_slopes(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: float) -> tuple[float, float, float, float, float]:

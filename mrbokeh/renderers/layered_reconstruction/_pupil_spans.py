@@ -11,6 +11,7 @@ STRIPS = (8, 16, 32, 64)
 """How many strips a diameter has in the coarse to fine drawings of a pupil."""
 
 _LEAST_WIDTH = 1e-9
+_LEAST_SHARE = 1e-4
 
 
 def pupil_spans(aperture: Aperture, strips: int) -> Float64[np.ndarray, "spans 5"]:
@@ -26,10 +27,40 @@ def pupil_spans(aperture: Aperture, strips: int) -> Float64[np.ndarray, "spans 5
     return table
 
 
-def packed_pupil(aperture: Aperture) -> tuple[Float64[np.ndarray, "spans 5"], Int64[np.ndarray, " starts"]]:
-    """All drawings of what is seen in front of the focus, then of what is seen behind it, and where each begins."""
-    tables = [pupil_spans(aperture.seen(side), strips) for side in (-1, 1) for strips in STRIPS]
-    return np.concatenate(tables), np.cumsum([0, *(len(table) for table in tables)])
+def packed_pupil(
+    aperture: Aperture, across: int = 1
+) -> tuple[Float64[np.ndarray, "spans 5"], Int64[np.ndarray, " starts"], Float64[np.ndarray, " cells"]]:
+    """All drawings of what is seen in front of the focus, then of what is seen behind it, each in its cells; where each begins; the
+    share of the light that comes through each cell.
+
+    across: cells along either side of the box around the opening; those that nothing comes through are left out. Weights of a
+    cell sum to 1.
+    """
+    corners = np.concatenate(aperture.outlines)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    drawings = [_in_cells(pupil_spans(aperture.seen(side), strips), low, high, across) for side in (-1, 1) for strips in STRIPS]
+    light = np.array([[cell[:, 3].sum() for cell in drawing] for drawing in drawings])
+    is_open = np.all(light > _LEAST_SHARE, axis=0)
+    tables = [cell * (1, 1, 1, 1 / share, 1) for drawing, row in zip(drawings, light, strict=True)
+              for cell, share, kept in zip(drawing, row, is_open, strict=True) if kept]  # fmt: skip
+    shares = light[:, is_open][[len(STRIPS) - 1, -1]].mean(axis=0)
+    return np.concatenate(tables), np.cumsum([0, *(len(table) for table in tables)]), shares / shares.sum()
+
+
+def _in_cells(
+    spans: Float64[np.ndarray, "spans 5"], low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"], across: int
+) -> list[Float64[np.ndarray, "_ 5"]]:
+    """What of the strips lies in each of across x across cells of the box from low to high, u first; weights by area."""
+    u, v = (np.linspace(low[axis], high[axis], across + 1) for axis in (0, 1))
+    middle, from_u, to_u, weight, height = spans.T
+    cells = []
+    for j, i in np.ndindex(across, across):
+        left, right = np.maximum(from_u, u[i]), np.minimum(to_u, u[i + 1])
+        top, bottom = np.maximum(middle - height / 2, v[j]), np.minimum(middle + height / 2, v[j + 1])
+        area = (right - left) / (to_u - from_u) * (bottom - top) / height
+        inside = (right - left > _LEAST_WIDTH) & (bottom - top > _LEAST_WIDTH)
+        cells.append(np.column_stack([(top + bottom) / 2, left, right, weight * area, bottom - top])[inside])
+    return cells
 
 
 def _open_stretches(aperture: Aperture, v: float) -> list[tuple[float, float, float]]:

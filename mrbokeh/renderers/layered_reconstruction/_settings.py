@@ -10,6 +10,7 @@ from mrbokeh.errors import InputError
 ScreenFilter = Literal["windows", "sheared", "texture", "texture_one_tap", "direct"]
 SCREEN_FILTERS: tuple[ScreenFilter, ...] = ("windows", "sheared", "texture", "texture_one_tap", "direct")
 _LEAST_SIGMA_PX = float(np.sqrt(1.0 / 12.0))
+_MOST_PARTS = 16
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class Settings:
     enough: a reprojected place weighs at most as much as this many samples; inf lets all count, as in the paper.
     support: how many standard deviations the guard band of a tile holds.
     motion: False leaves motion out (defocus only).
+    pupil_parts, shutter_parts: cells across the pupil (their square in all) and stretches of the shutter. Layers hide one another
+      by their opacities within each part alone ("windows" only); 1 and 1 are the paper's.
     """
 
     tile_px: int = 32
@@ -51,6 +54,8 @@ class Settings:
     enough: float = 0.5
     support: float = 3.0
     motion: bool = True
+    pupil_parts: int = 3
+    shutter_parts: int = 3
 
     def __post_init__(self) -> None:
         if self.tile_px not in (4, 8, 16, 32, 64, 128, 256):
@@ -76,6 +81,17 @@ class Settings:
                 f"bandwidth must be at least 0, support and recursive_passes at least 1, "
                 f"got {self.bandwidth}, {self.support}, {self.recursive_passes}"
             )
+        if not (1 <= self.pupil_parts <= _MOST_PARTS and 1 <= self.shutter_parts <= _MOST_PARTS):
+            raise InputError(
+                f"pupil_parts and shutter_parts must be whole numbers from 1 to {_MOST_PARTS}, got {self.pupil_parts}, {self.shutter_parts}"
+            )
+
+    @property
+    def parts(self) -> tuple[int, int]:
+        """pupil_parts and shutter_parts as far as they mean anything: a Gaussian has no parts, and without motion time has none."""
+        if self.screen_filter != "windows":
+            return 1, 1
+        return self.pupil_parts, self.shutter_parts if self.motion else 1
 
 
 def footprint_sigmas(energy: float) -> float:

@@ -33,7 +33,10 @@ class Light(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Numbers of Settings. every: one sample of so many makes the statistics. kind: of the screen filter. alpha: of Eq. 3."""
+    """Numbers of Settings. every: one sample of so many makes the statistics. kind: of the screen filter. alpha: of Eq. 3.
+
+    times: stretches of the shutter that are composited on their own.
+    """
 
     every: int
     seed: int
@@ -48,6 +51,7 @@ class Choice(NamedTuple):
     tap_distance: float
     enough: float
     shared_out: bool
+    times: int
 
 
 class Slope(NamedTuple):
@@ -59,10 +63,14 @@ class Slope(NamedTuple):
 
 
 class Pupil(NamedTuple):
-    """Drawings of the opening, coarse to fine, first as seen in front of the focus; see `packed_pupil`."""
+    """Drawings of the opening, coarse to fine, first as seen in front of the focus, each in its cells; see `packed_pupil`.
+
+    shares: (cells,) of the light.
+    """
 
     spans: np.ndarray
     starts: np.ndarray
+    shares: np.ndarray
 
 
 class Partitions(NamedTuple):

@@ -1,9 +1,15 @@
-"""The true shapes of pupil and shutter over the screen, in place of the Gaussians that stand for them."""
+"""The true shape of the pupil over the screen, in place of the Gaussian that stands for it."""
 
 import math
 
 import numpy as np
 from numba import njit
+
+STRIPS_FOR_PX = 2.0
+"""Up to this radius the coarsest drawing of the pupil does, up to twice of it the next."""
+
+LEAST_SCALE_PX = 0.1
+"""A pupil of a smaller radius is a point."""
 
 
 @njit(cache=True, nogil=True)
@@ -30,10 +36,10 @@ def add_spans(out: np.ndarray, prefix: np.ndarray, spans: np.ndarray, scale: flo
 def add_strip(out: np.ndarray, prefix: np.ndarray, one: float, other: float, weight: float, row: int, guard_x: int, guard_y: int) -> None:
     """Add weight times the mean between x + one and x + other, so many rows below."""
     height, width, channels = out.shape
-    gain = np.float32(weight / abs(other - one))
+    gain = weight / abs(other - one)
     start, end = guard_x + 0.5 + min(one, other), guard_x + 0.5 + max(one, other)
     start_px, end_px = int(math.floor(start)), int(math.floor(end))
-    s, e = np.float32(start - start_px), np.float32(end - end_px)
+    s, e = start - start_px, end - end_px
     length = width * channels
     for y in range(height):
         # Rows as one run of numbers, pixel by pixel: all channels of a row in one loop that the compiler makes vectors of.
@@ -48,7 +54,7 @@ def add_strip(out: np.ndarray, prefix: np.ndarray, one: float, other: float, wei
 def sums_along_x(planes: np.ndarray) -> np.ndarray:
     """prefix[y, x]: the sum of planes[y, :x], one longer than the row and once more repeated for reading beyond."""
     height, width, channels = planes.shape
-    prefix = np.zeros((height, width + 2, channels), np.float32)
+    prefix = np.zeros((height, width + 2, channels))
     carried = np.zeros(channels)
     for y in range(height):
         carried[:] = 0.0
@@ -59,48 +65,6 @@ def sums_along_x(planes: np.ndarray) -> np.ndarray:
         for c in range(channels):
             prefix[y, width + 1, c] = carried[c]
     return prefix
-
-
-@njit(cache=True, nogil=True)
-def line_taps(length_x: float, length_y: float) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (T, 2) and weights of the pixels that a segment centred on a pixel crosses, by the length within each."""
-    reach_x, reach_y = int(math.ceil(0.5 * abs(length_x))), int(math.ceil(0.5 * abs(length_y)))
-    kernel = np.zeros((2 * reach_y + 1, 2 * reach_x + 1))
-    cuts = np.empty(2 * (reach_x + reach_y) + 2)
-    cuts[0], cuts[1] = -0.5, 0.5
-    count = 2
-    for length, reach in ((length_x, reach_x), (length_y, reach_y)):
-        for k in range(reach):
-            at = (k + 0.5) / abs(length)
-            if at < 0.5:
-                cuts[count], cuts[count + 1] = -at, at
-                count += 2
-    cuts = np.sort(cuts[:count])
-    for k in range(count - 1):
-        middle = 0.5 * (cuts[k] + cuts[k + 1])
-        x, y = int(math.floor(middle * length_x + 0.5)), int(math.floor(middle * length_y + 0.5))
-        kernel[y + reach_y, x + reach_x] += cuts[k + 1] - cuts[k]
-    rows, columns = np.nonzero(kernel > 0.0)
-    weights = np.empty(len(rows), np.float32)
-    offsets = np.empty((len(rows), 2), np.int64)
-    for k in range(len(rows)):
-        weights[k] = kernel[rows[k], columns[k]]
-        offsets[k, 0], offsets[k, 1] = columns[k] - reach_x, rows[k] - reach_y
-    return offsets, weights
-
-
-@njit(cache=True, nogil=True)
-def along_line(out: np.ndarray, planes: np.ndarray, offsets: np.ndarray, weights: np.ndarray, guard_x: int, guard_y: int) -> None:
-    """Fill out (h, w, C) with the mean of planes (h + 2 guard_y, w + 2 guard_x, C) along a segment."""
-    height, width, channels = out.shape
-    out[:] = 0.0
-    for k in range(len(weights)):
-        weight = weights[k]
-        first = (guard_x + offsets[k, 0]) * channels
-        for y in range(height):
-            line, to = planes[y + guard_y + offsets[k, 1]].ravel()[first:], out[y].ravel()
-            for n in range(width * channels):
-                to[n] += weight * line[n]
 
 
 @njit(cache=True, nogil=True)
@@ -135,25 +99,10 @@ def window_guards(scale: float, pupil_radius: float, length_x: float, length_y: 
 
 
 @njit(cache=True, nogil=True)
-def window_filter(
-    out: np.ndarray,
-    planes: np.ndarray,
-    spans: np.ndarray,
-    scale: float,
-    length_x: float,
-    length_y: float,
-    variance_px2: float,
-    guards: tuple,
-) -> None:
-    """Pupil, then shutter: planes have guards[0..1] + guards[2] + guards[3] around out (h, w, C). Uses planes up."""
-    line_x, line_y, pupil, around = guards
-    smooth(planes, variance_px2)
-    height, width, channels = out.shape
-    inner = np.ascontiguousarray(planes[around : planes.shape[0] - around, around : planes.shape[1] - around])
-    offsets, weights = line_taps(length_x, length_y)
-    if abs(scale) < 0.1:
-        along_line(out, inner, offsets, weights, line_x + pupil, line_y + pupil)
-        return
-    blurred = np.empty((height + 2 * line_y, width + 2 * line_x, channels), np.float32)
-    add_spans(blurred, sums_along_x(inner), spans, scale, pupil, pupil)
-    along_line(out, blurred, offsets, weights, line_x, line_y)
+def pupil_filter(out: np.ndarray, planes: np.ndarray, prefix: np.ndarray, spans: np.ndarray, scale: float, guard: int) -> None:
+    """Fill out (h, w, C) with the mean of planes (h + 2 guard, w + 2 guard, C), whose sums along x are prefix, over the pupil's picture
+    or a cell of it."""
+    if abs(scale) < LEAST_SCALE_PX:
+        out[:] = planes[guard : planes.shape[0] - guard, guard : planes.shape[1] - guard]
+    else:
+        add_spans(out, prefix, spans, scale, guard, guard)

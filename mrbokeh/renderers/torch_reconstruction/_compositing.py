@@ -13,9 +13,12 @@ _LEAST_TAKEN = 1e-3
 Tiles = Float32[Tensor, "tiles channels side side"]
 
 
-def composited(layers: Float32[Tensor, "jobs planes side side"], counts: Int64[np.ndarray, " tiles"]) -> tuple[Tiles, Tensor]:
+def composited(
+    layers: Float32[Tensor, "jobs planes parts side side"], counts: Int64[np.ndarray, " tiles"], shares: list[float]
+) -> tuple[Tiles, Tensor]:
     """e(x) = e_0(x) + sum_j e_j(x) prod_{k<j} (1 - alpha_k(x)), and the product over all that is left, (T, side, side).
 
+    Both are the mean over parts of pupil and shutter, by their shares, each of which is composited on its own.
     layers: colour, opacity and weight, both of which the weight divides, of jobs tile by tile; a layer of no weight is not there.
     counts: of jobs, of each tile. Tiles with most jobs go first, so that a step takes only those that still have one.
     """
@@ -30,6 +33,8 @@ def composited(layers: Float32[Tensor, "jobs planes side side"], counts: Int64[n
         is_there = weight > _LEAST_WEIGHT
         out[:active] += torch.where(is_there, left[:active] / weight, 0.0)[:, None] * layer[:, :-2]
         left[:active] *= torch.where(is_there, (1.0 - layer[:, -2] / weight).clamp(min=0.0), 1.0)
+    weights = torch.tensor(shares, dtype=out.dtype, device=out.device)[:, None, None]
+    out, left = (out * weights).sum(dim=2), (left * weights).sum(dim=1)
     # Behind the last layer is nothing that was sampled: what no layer claims belongs to those that were seen.
     taken = 1.0 - left
     return torch.where((taken > _LEAST_TAKEN)[:, None], out / taken[:, None], out)[back], left[back]

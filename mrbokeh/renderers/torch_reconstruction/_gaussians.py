@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from mrbokeh.renderers.layered_reconstruction._tiles_numba import PIXEL_VARIANCE
+from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANCE
 from mrbokeh.renderers.torch_reconstruction._filter import Number, Spread, axes, sheared_axes
 from mrbokeh.renderers.torch_reconstruction._jobs import Task
 from mrbokeh.renderers.torch_reconstruction._windows import Kernels, Offsets

@@ -84,12 +84,12 @@ class TorchReconstruction:
         return self._composited(light, jobs, screen), (len(rows.tile) / tiles, len(partitions.tile) / tiles)
 
     def _composited(self, light: TileLight, jobs: Jobs, screen: ScreenFilter) -> Float32[Tensor, "height width channels"]:
-        at_once = AT_ONCE[light.values.device.type][2] // light.tile_px**2
+        at_once = AT_ONCE[light.values.device.type][2] // light.tile_px**2 // len(screen.shares)
         starts = np.cumsum([0, *jobs.host_counts]).tolist()
         tiles, left = [], []
         for begin, end in batches(jobs, at_once):
             layers = self._filtered(light, jobs, screen, starts[begin], starts[end])
-            done = composited(layers, jobs.host_counts[begin:end])
+            done = composited(layers, jobs.host_counts[begin:end], screen.shares)
             tiles.append(done[0])
             left.append(done[1])
         picture = put_together(torch.cat(tiles), light)
@@ -98,14 +98,19 @@ class TorchReconstruction:
 
     def _filtered(
         self, light: TileLight, jobs: Jobs, screen: ScreenFilter, first: int, end: int
-    ) -> Float32[Tensor, "jobs planes side side"]:
-        """Colour, opacity and weight of some jobs over their tiles."""
+    ) -> Float32[Tensor, "jobs planes parts side side"]:
+        """Colour, opacity and weight of some jobs over their tiles, for each part; alone in a tile, a job hides nothing and is whole."""
         pairs, pixels, _ = AT_ONCE[light.values.device.type]
         side = light.tile_px
-        layers = light.values.new_zeros((max(1, end - first), light.values.shape[1] + 2, side, side))
-        for members, guard in groups(jobs, first, end, side, pixels):
-            task = task_of(jobs, light, members, guard)
-            layers[task.job - first] = screen.filtered(reprojected(jobs, light, task, self.settings.enough, pairs), jobs, task, guard)
+        layers = light.values.new_zeros((max(1, end - first), light.values.shape[1] + 2, len(screen.shares), side, side))
+        is_one_of_many = np.repeat(jobs.host_counts, jobs.host_counts) > 1
+        for together, guard in groups(jobs, first, end, side, pixels):
+            for in_parts in (False, True):
+                members = together[is_one_of_many[together] == in_parts]
+                if len(members):
+                    task = task_of(jobs, light, members, guard)
+                    planes = reprojected(jobs, light, task, self.settings.enough, pairs)
+                    layers[task.job - first] = screen.filtered(planes, jobs, task, guard, in_parts)
         return layers
 
 

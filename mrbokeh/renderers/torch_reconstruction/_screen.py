@@ -5,10 +5,11 @@ precision would leave 1e-7 of the largest value on all pixels, which is light wh
 nothing their quotients would be chance. In double precision a lamp of 1e5 leaves 1e-11.
 """
 
-import math
+from collections.abc import Iterator
+from itertools import pairwise
 
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Complex128, Float32, Int64
 from torch import Tensor
 
 from mrbokeh.aperture import Aperture
@@ -35,18 +36,21 @@ class ScreenFilter:
                 "take one of these, or leave out the device"
             )
         self.settings, self.window, self.pupil_radius = settings, light.window, light.pupil_radius
-        self.tables = PupilTables.of(aperture, light.window.device) if settings.screen_filter == "windows" else None
+        across, self.times = settings.parts
+        self.whole = PupilTables.of(aperture, light.window.device) if settings.screen_filter == "windows" else None
+        self.cells = PupilTables.in_cells(aperture, light.window.device, across) if self.whole else []
+        self.shares = [cell.share / self.times for cell in self.cells for _ in range(self.times)] or [1.0]
 
     def guards(self, slopes: Slopes) -> Int64[Tensor, "jobs 2"]:
         """How many pixels beyond a tile the filter of each job reads, along x and y."""
-        if self.tables is not None:
+        if self.whole is not None:
             return window_guards(slopes, self.pupil_radius, self.settings.sigma_x_px)
         return gaussian_guards(self._covariance(slopes), self.settings.support)
 
     def filtered(
-        self, planes: Float32[Tensor, "group side side planes"], jobs: Jobs, task: Task, guard: int
-    ) -> Float32[Tensor, "group planes tile tile"]:
-        """What of the windows comes to lie on the tiles in their middles."""
+        self, planes: Float32[Tensor, "group side side planes"], jobs: Jobs, task: Task, guard: int, in_parts: bool
+    ) -> Float32[Tensor, "group planes parts tile tile"]:
+        """What of the windows comes to lie on the tiles in their middles, through each part of pupil and shutter or through all."""
         slopes = Slopes(*(each[task.job] for each in jobs.slopes))
         values = planes.permute(0, 3, 1, 2)
         size = transform_size(task.side + _BEYOND)
@@ -55,21 +59,29 @@ class ScreenFilter:
         if self.settings.screen_filter == "sheared":
             values = recursive_rows(values, self._covariance(slopes), task, jobs.guard[task.job], self.settings.recursive_passes)
         spectrum = torch.fft.rfft2(values.double(), s=(size, size))
-        kernels = [torch.fft.rfft2(kernel) for kernel in self._kernels(slopes, jobs.guard[task.job], offset)]
-        spectrum *= math.prod(kernels[1:], start=kernels[0]).conj()[:, None]
         tile = slice(guard, task.side - guard)
-        return torch.fft.irfft2(spectrum, s=(size, size))[..., tile, tile].float()
+        parts = [
+            torch.fft.irfft(torch.fft.ifft(spectrum * kernel.conj()[:, None], dim=-2)[..., tile, :], n=size)[..., tile].float()
+            for kernel in self._spectra(slopes, jobs.guard[task.job], offset, in_parts)
+        ]
+        return torch.stack(parts, dim=2)
 
-    def _kernels(
-        self, slopes: Slopes, guard: Int64[Tensor, "group 2"], offset: Int64[Tensor, " size"]
-    ) -> list[Float64[Tensor, "group size size"]]:
-        if self.tables is not None:
-            parts = [line_kernels(slopes, offset), pupil_kernels(slopes, self.tables, offset)]
-            rest = rest_kernel(self.settings.sigma_x_px, offset)
-            return parts if rest is None else [*parts, rest.expand_as(parts[0])]
-        covariance = self._covariance(slopes)
-        make = sheared_kernels if self.settings.screen_filter == "sheared" else direct_kernels
-        return [make(covariance, guard, offset)]
+    def _spectra(
+        self, slopes: Slopes, guard: Int64[Tensor, "group 2"], offset: Int64[Tensor, " size"], in_parts: bool
+    ) -> Iterator[Complex128[Tensor, "group size half"]]:
+        """Of the filter of each part: cell by cell of the pupil, time by time within each."""
+        if self.whole is None:
+            make = sheared_kernels if self.settings.screen_filter == "sheared" else direct_kernels
+            yield torch.fft.rfft2(make(self._covariance(slopes), guard, offset))
+            return
+        cells, times = (self.cells, self.times) if in_parts else ([self.whole], 1)
+        borders = [time / times - 0.5 for time in range(times + 1)]
+        lines = [torch.fft.rfft2(line_kernels(slopes, offset, begin, end)) for begin, end in pairwise(borders)]
+        rest = rest_kernel(self.settings.sigma_x_px, offset)
+        for cell in cells:
+            pupil = torch.fft.rfft2(pupil_kernels(slopes, cell, offset))
+            for line in lines:
+                yield line * pupil if rest is None else line * pupil * torch.fft.rfft2(rest)
 
     def _covariance(self, slopes: Slopes) -> Spread:
         return less_pixel(screen_covariance(slopes, self.window, self.settings.sigma_x_px))

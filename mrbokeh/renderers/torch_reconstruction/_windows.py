@@ -9,11 +9,11 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from mrbokeh.aperture import Aperture
+from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANCE
 from mrbokeh.renderers.layered_reconstruction._pupil_spans import packed_pupil
-from mrbokeh.renderers.layered_reconstruction._tiles_numba import PIXEL_VARIANCE, STRIPS_FOR_PX
+from mrbokeh.renderers.layered_reconstruction._window_numba import LEAST_SCALE_PX, STRIPS_FOR_PX
 from mrbokeh.renderers.torch_reconstruction._filter import Number, Slopes
 
-_LEAST_SCALE_PX = 0.1
 _LEAST_VARIANCE = 0.04
 _LEAST_SHARE = 1e-6
 
@@ -23,19 +23,25 @@ Offsets = Int64[Tensor, " size"]
 
 @dataclass(frozen=True)
 class PupilTables:
-    """Drawings of the opening, coarse to fine, first as seen in front of the focus: (D, S, 5) strips, filled up with empty ones."""
+    """Drawings of the opening or of a cell of it, coarse to fine, first as seen in front of the focus: (D, S, 5) strips, filled up with
+    empty ones. share: of the light that comes through."""
 
     strips: Float64[Tensor, "drawings strips 5"]
+    share: float
 
     @classmethod
     def of(cls, aperture: Aperture, device: torch.device) -> "PupilTables":
-        spans, starts = packed_pupil(aperture)
+        return cls.in_cells(aperture, device, 1)[0]
+
+    @classmethod
+    def in_cells(cls, aperture: Aperture, device: torch.device, across: int) -> "list[PupilTables]":
+        spans, starts, shares = packed_pupil(aperture, across)
         table = np.zeros((len(starts) - 1, int(np.diff(starts).max()), 5))
         table[..., 2] = 1.0
         for k in range(len(table)):
             own = spans[starts[k] : starts[k + 1]]
             table[k, : len(own)] = own
-        return cls(torch.from_numpy(table).to(device))
+        return [cls(torch.from_numpy(table[k :: len(shares)].copy()).to(device), share) for k, share in enumerate(shares.tolist())]
 
     def drawing(self, scale: Number) -> Float64[Tensor, "group strips 5"]:
         """The strips that do for pupils of these radii in pixels."""
@@ -58,19 +64,25 @@ def window_guards(slopes: Slopes, pupil_radius: float, sigma_x_px: float) -> Int
     return torch.stack([torch.ceil(0.5 * length.abs()) + pupil for length in (length_x, length_y)], dim=1).long()
 
 
-def line_kernels(slopes: Slopes, offset: Offsets) -> Kernels:
-    """Segments centred on a pixel, shared out among pixels by the length within each."""
+def line_kernels(slopes: Slopes, offset: Offsets, begin: float = -0.5, end: float = 0.5) -> Kernels:
+    """Segments centred on a pixel, from one time to another, shared out among pixels by the length within each.
+
+    What lies at x0 is carried to x0 + length t, so the light of a pixel is read around x - length t.
+    """
     _, length_x, length_y = drawn_sizes(slopes)
-    low_x, high_x = _times_within(length_x, offset)
-    low_y, high_y = _times_within(length_y, offset)
+    low_x, high_x = _times_within(-length_x, offset, begin, end)
+    low_y, high_y = _times_within(-length_y, offset, begin, end)
     low, high = torch.maximum(low_x[:, None, :], low_y[:, :, None]), torch.minimum(high_x[:, None, :], high_y[:, :, None])
-    return (high - low).clamp(min=0.0)
+    return (high - low).clamp(min=0.0) / (end - begin)
 
 
-def _times_within(length: Number, offset: Offsets) -> tuple[Float64[Tensor, "group size"], Float64[Tensor, "group size"]]:
-    """From when to when, in -1/2 to 1/2, a segment is in the pixels of each offset along one axis; by halves of infinity if it stays."""
+def _times_within(
+    length: Number, offset: Offsets, begin: float, end: float
+) -> tuple[Float64[Tensor, "group size"], Float64[Tensor, "group size"]]:
+    """From when to when, between begin and end, a segment is in the pixels of each offset along one axis; by halves of infinity if it
+    stays."""
     one, other = (offset - 0.5) / length[:, None], (offset + 0.5) / length[:, None]
-    return torch.minimum(one, other).clamp(min=-0.5), torch.maximum(one, other).clamp(max=0.5)
+    return torch.minimum(one, other).clamp(min=begin), torch.maximum(one, other).clamp(max=end)
 
 
 def pupil_kernels(slopes: Slopes, tables: PupilTables, offset: Offsets) -> Kernels:
@@ -79,7 +91,7 @@ def pupil_kernels(slopes: Slopes, tables: PupilTables, offset: Offsets) -> Kerne
     What lies at x0 is thrown to x0 + scale u, so the light of a pixel is read around x - scale u.
     """
     scale, _, _ = drawn_sizes(slopes)
-    is_point = scale.abs() < _LEAST_SCALE_PX
+    is_point = scale.abs() < LEAST_SCALE_PX
     scale = torch.where(is_point, 1.0, scale)[:, None]
     v, first_u, last_u, weight, height = tables.drawing(scale[:, 0]).unbind(dim=2)
     half = 0.5 * scale.abs() * height
