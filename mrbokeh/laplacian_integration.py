@@ -14,6 +14,7 @@ Measured (tests/bench_laplacian_spreadlets.py, 1024 x 1024, 4 channels): the exa
 106 ms); in double the exact way takes half the pyramid's. So it is the default.
 """
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from functools import lru_cache
 from itertools import pairwise
@@ -55,17 +56,38 @@ def integrate(source: Channels, threads: int = 0) -> Channels:
     To the left and right the picture is continued antisymmetrically about the border, above and below by zeros. Widths
     as from `fast_width` are quickest. threads: 0 takes all cores; the result does not depend on it.
     """
-    from mrbokeh._laplacian_integration_numba import solve_columns
-
     _check(source)
-    height, width, _ = source.shape
-    beside, pivot = _system(height, width)
-    chunks = [*range(0, width, _CHUNK_MODES), width]
-    with workers(height * width, threads) as pool:
+    with workers(source.shape[0] * source.shape[1], threads) as pool:
         count = _threads_of(pool)
         modes = fft.dst(source, type=2, axis=1, workers=count)
-        list(pool.map(lambda chunk: solve_columns(modes, pivot, -1.0 / beside, *chunk), pairwise(chunks)))
+        solve_modes(modes, pool)
         return fft.idst(modes, type=2, axis=1, workers=count, overwrite_x=True)
+
+
+def rows_to_modes(rows: Channels) -> None:
+    """The first step of `integrate`, in place, for some rows of the source (contiguous): they become sine modes."""
+    _in_place(fft.dst, rows)
+
+
+def solve_modes(modes: Channels, pool: Executor) -> None:
+    """The second step of `integrate`, in place, for the modes of all rows."""
+    from mrbokeh._laplacian_integration_numba import solve_columns
+
+    height, width, _ = modes.shape
+    beside, pivot = _system(height, width)
+    chunks = [*range(0, width, _CHUNK_MODES), width]
+    list(pool.map(lambda chunk: solve_columns(modes, pivot, -1.0 / beside, *chunk), pairwise(chunks)))
+
+
+def modes_to_rows(modes: Channels) -> None:
+    """The last step of `integrate`, in place, for the modes of some rows (contiguous): they become rows of the picture."""
+    _in_place(fft.idst, modes)
+
+
+def _in_place(transform: Callable[..., Channels], rows: Channels) -> None:
+    found = transform(rows, type=2, axis=1, overwrite_x=True)
+    if not np.may_share_memory(found, rows):
+        rows[:] = found
 
 
 @lru_cache(maxsize=4)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,12 +12,22 @@ from mrbokeh.lens import Lens
 from mrbokeh.light_field_samples import LightFieldSamples
 from mrbokeh.psf_bank import Axis, PsfBank
 from mrbokeh.renderers._laplacian_bank import Place, turned_kernel
-from mrbokeh.renderers._laplacian_sums import splat, splat_plainly
-from mrbokeh.renderers._laplacian_tables import joined_points, stands_out, taps_of
+from mrbokeh.renderers._laplacian_sums import add_light, is_even, splat, splat_plainly
+from mrbokeh.renderers._laplacian_tables import (
+    LEVELS_PER_OCTAVE,
+    SPARSE,
+    KernelTables,
+    by_rows,
+    joined_points,
+    kind_of,
+    stands_out,
+    stands_out_plainly,
+    taps_of,
+)
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.spreadlets import whole_laplacian
+from mrbokeh.spreadlets import UNRELAXED, sparsify, whole_laplacian
 
 DISC, PENTAGON = Aperture.disc(), Aperture.blades(5)
 SIZE = (96, 120)
@@ -130,6 +141,60 @@ def test_splatting_agrees_with_its_plain_twin() -> None:
     splat(found, values, cells, points, (-8, -8))
     splat_plainly(plain, values, cells, points, (-8, -8))
     np.testing.assert_allclose(found, plain, atol=1e-12)
+
+
+def test_neighbours_of_one_kernel_agree_with_the_plain_twin() -> None:
+    """Runs of one cell go two pixels at a time where points lie apart; tiles and strips end amid the picture."""
+    rng = np.random.default_rng(14)
+    kernels = [sparsify(DISC.rasterize(size).kernel, UNRELAXED) for size in (11.0, 14.0)]
+    points = joined_points([by_rows(each) for each in kernels])
+    cells = np.repeat(rng.integers(-1, 2, (70, 9)), 5, axis=1).astype(np.int32)
+    values = rng.uniform(size=(*cells.shape, 4)).astype(np.float32)
+    found, plain = np.zeros((90, 65, 4)), np.zeros((90, 65, 4))
+    splat(found, values, cells, points, (-10, -10))
+    splat_plainly(plain, values, cells, points, (-10, -10))
+    np.testing.assert_allclose(found, plain, atol=1e-14)
+
+
+def test_what_stands_out_agrees_with_its_plain_twin() -> None:
+    """Lone pixels at the border, in corners and in pictures smaller than their surroundings."""
+    rng = np.random.default_rng(15)
+    for size in ((70, 90), (5, 40), (1, 9)):
+        values = rng.uniform(size=(*size, 3)).astype(np.float32) ** 20
+        values[0, 0, 1] = values[-1, -1, 2] = 30.0
+        found = stands_out(values)
+        np.testing.assert_array_equal(found, stands_out_plainly(values))
+        assert found[0, 0]
+        assert not found.all()
+
+
+def test_levels_are_the_nearest_powers() -> None:
+    """Steps from neighbour to neighbour and leaps; what lies on a border may go either way."""
+    sizes_px = np.random.default_rng(16).uniform(24.5, 900.0, (40, 50)).astype(np.float32)
+    sizes_px[20:] = np.sort(sizes_px[20:], axis=1)
+    exact = np.log2(sizes_px.astype(np.float64) / 24.0) * LEVELS_PER_OCTAVE
+    values = np.ones((*sizes_px.shape, 1), np.float32)
+    tables = KernelTables(24.0, UNRELAXED)
+    codes = tables.codes(np.zeros_like(values), values, sizes_px, DISC)
+    assert all(kind_of(int(code)) == SPARSE for code in np.unique(codes))
+    found = np.array([tables.diameter_px(int(code)) for code in codes.ravel()]).reshape(codes.shape)
+    clear = np.abs(exact - np.floor(exact) - 0.5) > 1e-3
+    assert clear.mean() > 0.9
+    np.testing.assert_allclose(found[clear], 24.0 * 2.0 ** (np.rint(exact[clear]) / LEVELS_PER_OCTAVE), rtol=1e-12)
+
+
+def test_single_precision_is_taken_where_it_is_as_good() -> None:
+    """Even light comes back to 1e-5 of the mean (1e-4 is allowed); amid it a lamp of 1000 and all is in double precision."""
+    values, coc_px = picture(17, (192, 192)), slope_px(30.0, 50.0, (192, 192))
+    single, double = LaplacianSpreadlets(), LaplacianSpreadlets()
+    object.__setattr__(double, "_add_light", partial(add_light, is_precise=True))
+    assert is_even(values)
+    found, exact = (each.spread(values, coc_px, DISC) for each in (single, double))
+    np.testing.assert_allclose(found, exact, atol=1e-5 * values.mean())
+    assert np.any(found != exact)
+    values[90, 100, :3] = 1000.0
+    assert not is_even(values)
+    np.testing.assert_array_equal(single.spread(values, coc_px, DISC), double.spread(values, coc_px, DISC))
 
 
 def test_by_name_and_by_mistake() -> None:

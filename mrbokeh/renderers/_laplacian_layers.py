@@ -93,8 +93,11 @@ class BankOptics:
         columns: Int64[np.ndarray, " pixels"],
         frame: Frame,
     ) -> int:
-        cells = self.tables.cells(coc_px, self._place(coc_px, motion_px, rows, columns, frame))
-        reach = int(self.tables.reaches_px[cells].max(initial=0))
+        if len(self.tables.bank.axes) == 1 and not self.tables.needed:
+            reach = self.tables.farthest_px(coc_px)
+        else:
+            cells = self.tables.cells(coc_px, self._place(coc_px, motion_px, rows, columns, frame))
+            reach = int(self.tables.reaches_px[cells].max(initial=0))
         return reach if self.tables.holds_motion else reach + self.farthest_px
 
     def _place(

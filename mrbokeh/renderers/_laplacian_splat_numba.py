@@ -3,23 +3,35 @@
 import numpy as np
 from numba import njit
 
-from mrbokeh.renderers._vectors_numba import add_to_cell
+from mrbokeh.renderers._laplacian_points_numba import add_points, add_points_of_two
 
 NONE = -1
 LANES = 4
 """Channels that are added at once."""
+_MOST_BESIDE = 0.25
+_TILE_ROWS, _TILE_COLUMNS = 64, 32
 
 
 @njit(cache=True, nogil=True)
-def _first_at_or_after(points: np.ndarray, low: int, high: int, row: int) -> int:
-    """The first of points[low:high], sorted by y, with y >= row."""
-    while low < high:
-        middle = (low + high) // 2
-        if points[middle, 1] < row:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+def rows_of(points: np.ndarray, starts: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where each row of a cell's points begins, and whether its points lie apart.
+
+    points (N, 2), cell i at starts[i]:starts[i + 1] sorted by y. Returns (cells, 2 reach + 2): the first point with y >= k - reach;
+    (cells,): False where many points have one right beside them, so that two neighbouring pixels at once would write onto what
+    was just written, for which processors wait.
+    """
+    cells = len(starts) - 1
+    rows, apart = np.empty((cells, 2 * reach_px + 2), np.int32), np.empty(cells, np.bool_)
+    for cell in range(cells):
+        n, beside = starts[cell], 0
+        for k in range(2 * reach_px + 2):
+            while n < starts[cell + 1] and points[n, 1] < k - reach_px:
+                n += 1
+            rows[cell, k] = n
+        for n in range(starts[cell] + 1, starts[cell + 1]):
+            beside += points[n, 1] == points[n - 1, 1] and points[n, 0] == points[n - 1, 0] + 1
+        apart[cell] = beside <= _MOST_BESIDE * (starts[cell + 1] - starts[cell])
+    return rows, apart
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -27,87 +39,62 @@ def splat_strip(
     out: np.ndarray,
     values: np.ndarray,
     cells: np.ndarray,
-    points: np.ndarray,
+    offsets: np.ndarray,
     weights: np.ndarray,
-    starts: np.ndarray,
-    reach_px: int,
+    rows: np.ndarray,
+    apart: np.ndarray,
     origin: tuple[int, int],
     first: int,
     end: int,
 ) -> None:
-    """Add the light that falls into rows first:end of out (h, w * C), whose first pixel is row and column `origin` of the picture.
+    """Add the light that falls into rows first:end of out (h, w, LANES), whose first pixel is row and column `origin` of the picture.
 
-    values (H, W, C), C a multiple of LANES, cells (H, W) or NONE. points (N, 2) x, y of cell i at starts[i]:starts[i + 1], sorted by
-    y; weights (N,); none reaches farther than reach_px, and all must fall into out. Every sum is taken in the order of rows,
-    columns and points, whatever the strip.
+    values (H, W, LANES) single precision, cells (H, W) or NONE. offsets (N,) int32 of points from their pixel in the flat array,
+    weights (N,), rows and apart as from `rows_of`; all points must fall into out. Tile by tile, so that what a tile reaches stays
+    in the cache. Every sum is taken in the order of tiles, rows, columns and points, neighbours of one cell together, whatever the
+    strip.
     """
-    height, width, channels = values.shape
+    height, width = cells.shape
     top, left = origin
-    flat, stride, element = out.reshape(-1), out.shape[1], out.dtype.type
-    offsets = points[:, 1].astype(np.int64) * stride + channels * points[:, 0]
-    for y in range(max(0, first + top - reach_px), min(height, end + top + reach_px)):
-        low_row, high_row = first + top - y, end + top - y
-        for x in range(width):
-            cell = cells[y, x]
-            if cell == NONE:
-                continue
-            low, high = starts[cell], starts[cell + 1]
-            if low_row > -reach_px or high_row <= reach_px:
-                low = _first_at_or_after(points, low, high, low_row)
-                high = _first_at_or_after(points, low, high, high_row)
-            for c in range(0, channels, LANES):
-                value = (element(values[y, x, c]), element(values[y, x, c + 1]), element(values[y, x, c + 2]), element(values[y, x, c + 3]))
-                here = (y - top) * stride + channels * (x - left) + c
-                for n in range(low, high):
-                    add_to_cell(flat, here + offsets[n], weights, n, value)
+    reach_px = rows.shape[1] // 2 - 1
+    flat, light, stride = out.reshape(-1), values.reshape(-1), LANES * out.shape[1]
+    first_row, end_row = max(0, first + top - reach_px), min(height, end + top + reach_px)
+    for tile in range(first_row // _TILE_ROWS * _TILE_ROWS, end_row, _TILE_ROWS):
+        for first_column in range(0, width, _TILE_COLUMNS):
+            for y in range(max(tile, first_row), min(tile + _TILE_ROWS, end_row)):
+                low_row, high_row = max(0, first + top - y + reach_px), min(2 * reach_px + 1, end + top - y + reach_px)
+                x, end_column = first_column, min(first_column + _TILE_COLUMNS, width)
+                while x < end_column:
+                    cell = cells[y, x]
+                    if cell == NONE:
+                        x += 1
+                        continue
+                    low, high = rows[cell, low_row], rows[cell, high_row]
+                    here, at = (y - top) * stride + LANES * (x - left), LANES * (y * width + x)
+                    if x + 1 < end_column and cells[y, x + 1] == cell and apart[cell]:
+                        add_points_of_two(flat, here, offsets, weights, low, high, light, at)
+                        x += 2
+                    else:
+                        add_points(flat, here, offsets, weights, low, high, light, at)
+                        x += 1
 
 
 @njit(cache=True, nogil=True)
-def choose_cells(
-    codes: np.ndarray,
-    out: np.ndarray,
-    values: np.ndarray,
-    coc_px: np.ndarray,
-    bright: np.ndarray,
-    sharp_up_to_px: float,
-    dense_up_to_px: float,
-    dense_per_px: float,
-    levels_per_octave: float,
-    blocks: int,
-) -> bool:
-    """Code of every pixel's kernel; what is sharp is copied to out and has none. False if a circle of confusion is not finite.
-
-    A code is a level + blocks * kind + 3 * blocks * (in front of the focus); kinds: 0 dense, 1 sparse, 2 whole Laplacian.
-    """
-    height, width, channels = values.shape
-    finite = True
-    for y in range(height):
-        for x in range(width):
-            lit = False
-            for c in range(channels):
-                lit = lit or values[y, x, c] != 0
-            size = abs(coc_px[y, x]) if lit else np.float32(0)
-            codes[y, x] = NONE
-            if not np.isfinite(size):
-                finite = False
-            elif size <= sharp_up_to_px:
+def add_and_clear(out: np.ndarray, sums: np.ndarray, origin: tuple[int, int], first: int, end: int) -> None:
+    """Add rows first:end of sums (h, w, LANES), as far as they fall into out (H, W, up to LANES), and make them zero."""
+    height, width, channels = out.shape
+    top, left = origin
+    for y in range(first, end):
+        if 0 <= y + top < height:
+            for x in range(max(0, left), min(width, left + sums.shape[1])):
                 for c in range(channels):
-                    out[y, x, c] = values[y, x, c]
-            else:
-                if size <= dense_up_to_px:
-                    code = int(np.rint(size * dense_per_px))
-                else:
-                    code = int(np.rint(np.log2(size / dense_up_to_px) * levels_per_octave))
-                    code += 2 * blocks if bright[y, x] else blocks
-                codes[y, x] = code + 3 * blocks if coc_px[y, x] < 0 else code
-    return finite
+                    out[y + top, x, c] += sums[y, x - left, c]
+        sums[y] = 0.0
 
 
 @njit(cache=True, nogil=True)
-def find_outshining(found: np.ndarray, values: np.ndarray, around: np.ndarray, times: float) -> None:
-    """Mark the pixels (H, W) of which a channel of values (H, W, C) is more than so many times that of around."""
-    height, width, channels = values.shape
-    for y in range(height):
-        for x in range(width):
-            for c in range(channels):
-                found[y, x] |= abs(values[y, x, c]) > times * around[y, x, c]
+def move(source: np.ndarray, target: np.ndarray) -> None:
+    """Copy a flat array in the precision of the other and leave zeros."""
+    for i in range(len(source)):
+        target[i] = source[i]
+        source[i] = 0.0

@@ -3,15 +3,16 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
 from mrbokeh.progress import track
 from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify, whole_laplacian
-from mrbokeh.workers import cores, workers
+from mrbokeh.workers import cores, in_bands, workers
 
 DENSE, SPARSE, WHOLE = 0, 1, 2
 DENSE_PER_PX = 32.0
@@ -41,6 +42,15 @@ class KernelTables:
     sparsification: Sparsification | None
     kept: dict[tuple[bytes, int, bool], Spreadlet] = field(default_factory=dict)
 
+    @cached_property
+    def _borders_px(self) -> Float32[np.ndarray, " borders"]:
+        """The smallest diameter of each level beyond dense_up_to_px, then a few infinite ones."""
+        from mrbokeh.renderers._laplacian_cells_numba import NEAR
+
+        levels = np.arange(_BLOCK + 2 * NEAR)
+        sizes_px = self.dense_up_to_px * 2.0 ** ((levels - 0.5) / LEVELS_PER_OCTAVE)
+        return np.where(levels < _BLOCK, sizes_px, np.inf).astype(np.float32)
+
     def codes(
         self,
         out: Float32[np.ndarray, "height width channels"],
@@ -49,12 +59,12 @@ class KernelTables:
         aperture: Aperture,
     ) -> Int32[np.ndarray, "height width"]:
         """Codes of the kernels, -1 for what is sharp or dark; sharp pixels are copied to out."""
-        from mrbokeh.renderers._laplacian_splat_numba import choose_cells
+        from mrbokeh.renderers._laplacian_cells_numba import choose_cells
 
         codes = np.empty(coc_px.shape, np.int32)
         large = np.abs(coc_px) > self.dense_up_to_px
         bright = stands_out(values) if self.sparsification is not None and large.any() else np.zeros(coc_px.shape, np.bool_)
-        limits = 1.0 / aperture.unit_radius, self.dense_up_to_px, DENSE_PER_PX, LEVELS_PER_OCTAVE, _BLOCK
+        limits = 1.0 / aperture.unit_radius, self.dense_up_to_px, DENSE_PER_PX, LEVELS_PER_OCTAVE, self._borders_px, _BLOCK
 
         def choose(first: int) -> bool:
             rows = slice(first, first + _ROWS_AT_ONCE)
@@ -124,13 +134,28 @@ def joined_points(cells: Sequence[Spreadlet | None], channel: int = 0) -> Points
 
 def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.ndarray, "height width"]:
     """Pixels that outshine the mean of their surroundings in any channel: lamps and lone pixels, whose PSF can be seen."""
+    from mrbokeh.renderers._laplacian_cells_numba import find_outshining
+
+    light = np.ascontiguousarray(values, np.float32)
+    found = np.zeros(values.shape[:2], np.bool_)
+    with workers(found.size) as pool:
+        in_bands(pool, len(light), _ROWS_AT_ONCE, lambda first, end: find_outshining(found, light, AROUND_PX, OUTSHINES, first, end))
+    return found
+
+
+def stands_out_plainly(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.ndarray, "height width"]:
+    """The plain twin of `stands_out`."""
     import cv2
 
-    from mrbokeh.renderers._laplacian_splat_numba import find_outshining
-
     window = (2 * AROUND_PX + 1, 2 * AROUND_PX + 1)
-    light = np.ascontiguousarray(values, np.float32)
-    around = cv2.boxFilter(np.abs(light), cv2.CV_32F, window, borderType=cv2.BORDER_REFLECT_101)
-    found = np.zeros(values.shape[:2], np.bool_)
-    find_outshining(found, light, around.reshape(light.shape), OUTSHINES)
-    return found
+    around = cv2.boxFilter(np.abs(values, dtype=np.float64), cv2.CV_64F, window, borderType=cv2.BORDER_REFLECT_101)
+    return np.any(np.abs(values) > OUTSHINES * around.reshape(values.shape), axis=2)
+
+
+def used_codes(codes: Int[np.ndarray, "height width"]) -> Int[np.ndarray, " codes"]:
+    """The codes that occur, but -1, ascending; without sorting all pixels."""
+    from mrbokeh.renderers._laplacian_cells_numba import mark_used
+
+    used = np.zeros(int(codes.max(initial=-1)) + 1, np.bool_)
+    mark_used(used, codes)
+    return np.flatnonzero(used)

@@ -7,11 +7,13 @@ get whole Laplacians. Light and centroid of every kernel are exact. Circles of c
 fast track, to 1.1 % (64 steps per octave) beyond it. Measured (tests/bench_laplacian_spreadlets.py) at a mean circle
 of 40 px: SSIM 0.998 and 55 dB to dense splatting of the same kernels, 56 dB to exact ones.
 
-Laplacians are summed in double precision: a rounding error of one pixel shows, integrated, all over the picture.
+Laplacians are summed in double precision: a rounding error of one pixel shows, integrated, all over the picture, and those of
+an even area all go the same way. Their modes are kept and solved in single precision where no light is much brighter than the
+mean (`mrbokeh.renderers._laplacian_sums.is_even`; errors of 2e-6 of what is bright, 512 to 2048 px), in double precision else.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 
 import numpy as np
@@ -28,15 +30,16 @@ from mrbokeh.renderers._laplacian_bank import BankTables, Place
 from mrbokeh.renderers._laplacian_layers import BankOptics
 from mrbokeh.renderers._laplacian_samples import reconstructed
 from mrbokeh.renderers._laplacian_sums import add_light
-from mrbokeh.renderers._laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out
+from mrbokeh.renderers._laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out, used_codes
 from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlets
+from mrbokeh.zeroed_memory import ZeroedMemory
 
 
 @dataclass(frozen=True)
 class LaplacianSpreadlets:
     """A Renderer that spreads light by spreadlets; layers, slices and hidden background as in mrbokeh.layering.
 
-    sparsification: how kernels become points; None takes the whole Laplacian (exact, 1.6 times as slow at 40 px).
+    sparsification: how kernels become points; None takes the whole Laplacian (exact, in double precision throughout).
     dense_up_to_px: the fast track: kernels of apertures up to this diameter are splatted as they are; those of a bank with
     as few taps as a disc of 24 px. integration: "exact" or "pyramid", see mrbokeh.laplacian_integration. threads: 0 takes all.
     bank: kernels to use instead of the lens's aperture; spreadlets: its own, if they have been computed before. device: where
@@ -63,7 +66,11 @@ class LaplacianSpreadlets:
         bank_tables = None if self.bank is None else BankTables(self.bank, self.sparsification, self.spreadlets)
         object.__setattr__(self, "_tables", KernelTables(self.dense_up_to_px, self.sparsification))
         object.__setattr__(self, "_bank_tables", bank_tables)
-        object.__setattr__(self, "_add_light", _adder_on(self.device))
+        object.__setattr__(self, "_add_light", _adder_on(self.device, self.sparsification is None))
+
+    def __reduce__(self) -> tuple[Callable[[], "LaplacianSpreadlets"], tuple[()]]:
+        """Made anew where it is unpickled: memory and tables stay where they are."""
+        return partial(type(self), **{each.name: getattr(self, each.name) for each in fields(self) if each.init}), ()
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         if self._bank_tables is None or not layers:
@@ -107,12 +114,14 @@ class LaplacianSpreadlets:
         if not np.isfinite(coc_px[lit]).all():
             raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
         codes = np.where(lit, tables.codes(np.where(lit, coc_px, np.float32(0)), stands_out(values), place), -1)
-        kinds = {int(code): densely or tables.is_dense(int(code)) for code in _used(codes)}
+        kinds = {int(code): densely or tables.is_dense(int(code)) for code in used_codes(codes)}
 
         def summed(colours: list[int], others: list[int], channel: int) -> np.ndarray:
             picked = np.ascontiguousarray(values[..., [*colours, *others]])
             picked[..., len(colours) :] /= tables.light(codes)[..., channel : channel + 1]
-            return self._summed(picked, codes, kinds, partial(tables.points, channel=channel))
+            out = np.zeros_like(picked)
+            self._add_summed(out, picked, codes, kinds, partial(tables.points, channel=channel))
+            return out
 
         others = list(range(3, values.shape[2]))
         if tables.bank.channels == 1:
@@ -123,19 +132,19 @@ class LaplacianSpreadlets:
     def _spread(self, values: np.ndarray, coc_px: np.ndarray, aperture: Aperture, densely: bool) -> np.ndarray:
         sharp = np.zeros_like(values)
         codes = self._tables.codes(sharp, values, coc_px, aperture)
-        kinds = {int(code): densely or kind_of(int(code)) == DENSE for code in _used(codes)}
-        blurred = self._summed(values, codes, kinds, lambda some, dense: self._tables.points(some, aperture, self.threads, dense))
-        return sharp + blurred if kinds else sharp
+        kinds = {int(code): densely or kind_of(int(code)) == DENSE for code in used_codes(codes)}
+        self._add_summed(sharp, values, codes, kinds, lambda some, dense: self._tables.points(some, aperture, self.threads, dense))
+        return sharp
 
-    def _summed(
+    def _add_summed(
         self,
+        out: Float32[np.ndarray, "height width channels"],
         values: Float32[np.ndarray, "height width channels"],
         codes: Int[np.ndarray, "height width"],
         kinds: dict[int, bool],
         points_of: Callable[[Sequence[int], bool], Points],
-    ) -> Float32[np.ndarray, "height width channels"]:
-        """The light of all pixels with a code, those whose kind is dense (True) by all taps, the others by Laplacians."""
-        out = np.zeros_like(values)
+    ) -> None:
+        """Add the light of all pixels with a code, those whose kind is dense (True) by all taps, the others by Laplacians."""
         used = np.array(sorted(kinds), np.int64)
         for dense in (True, False):
             mine = used[[kinds[int(code)] is dense for code in used]]
@@ -144,17 +153,11 @@ class LaplacianSpreadlets:
                 cell_of[mine] = np.arange(mine.size)
                 cells, points = cell_of[codes], points_of(mine.tolist(), dense)
                 self._add_light(out, values, cells, points, None if dense else self.integration, self.threads)
-        return out
 
 
-def _adder_on(device: str) -> Callable[..., None]:
+def _adder_on(device: str, is_precise: bool) -> Callable[..., None]:
     if not device:
-        return add_light
+        return partial(add_light, memory=ZeroedMemory(), is_precise=is_precise)
     from mrbokeh.renderers.torch_spreadlets._sums import add_light_on
 
     return add_light_on(device)
-
-
-def _used(codes: Int[np.ndarray, "height width"]) -> Int[np.ndarray, " codes"]:
-    """The codes that occur, but -1, ascending; without sorting all pixels."""
-    return np.flatnonzero(np.bincount(codes.reshape(-1) + 1)[1:])
