@@ -25,7 +25,7 @@ from mrbokeh.polygon_fit import LEVELS
 from mrbokeh.psf_bank_file import LOW_RANK, POLYGONS
 from mrbokeh.spreadlets_file import fingerprint
 
-_VERSION = 1
+_VERSION = 3
 
 Arrays = dict[str, np.ndarray]
 
@@ -84,14 +84,19 @@ def _write(path: Path, arrays: Arrays, key: str) -> None:
 
 
 def _apertures_to_arrays(made: BankApertures) -> Arrays:
-    """vertices of all outlines, where each outline and the outlines of each aperture end; sides one after the other."""
-    each = [aperture for side in made.apertures for node in side for place in node for aperture in place]
+    """vertices of all outlines, where each outline and the outlines of each aperture end; which aperture stands for each kernel, sides
+    one after the other.
+    """
+    of_kernels = [aperture for side in made.apertures for node in side for place in node for aperture in place]
+    each = list({id(aperture): aperture for aperture in of_kernels}.values())
+    numbers = {id(aperture): number for number, aperture in enumerate(each)}
     outlines = [outline for aperture in each for outline in aperture.outlines]
     return {
         "vertices": np.concatenate(outlines),
         "outline_ends": np.cumsum([len(outline) for outline in outlines]),
         "weights": np.array(list(chain.from_iterable(aperture.weights for aperture in each))),
         "aperture_ends": np.cumsum([len(aperture.outlines) for aperture in each]),
+        "of_kernels": np.array([numbers[id(aperture)] for aperture in of_kernels]),
         "diameters_px": np.concatenate(made.diameters_px),
         "behind": np.array(len(made.diameters_px[0])),
         "errors": np.concatenate(made.fit_errors),
@@ -101,7 +106,8 @@ def _apertures_to_arrays(made: BankApertures) -> Arrays:
 def _apertures_from(found: Arrays, lattice: BankLattice) -> BankApertures:
     outlines = np.split(found["vertices"], found["outline_ends"][:-1])
     parts = np.split(np.arange(len(outlines)), found["aperture_ends"][:-1])
-    each = iter([Aperture(tuple(outlines[i] for i in part), tuple(found["weights"][part].tolist())) for part in parts])
+    made = [Aperture(tuple(outlines[i] for i in part), tuple(found["weights"][part].tolist())) for part in parts]
+    each = iter([made[number] for number in found["of_kernels"]])
     diameters_px = np.split(found["diameters_px"], [int(found["behind"])])
     apertures = tuple(
         tuple(tuple(tuple(next(each) for _ in range(lattice.bank.channels)) for _ in range(lattice.places)) for _ in of_side)

@@ -112,8 +112,15 @@ class BankLattice:
 
     def light(self, side: int) -> Float64[np.ndarray, "nodes places channels"]:
         """What the kernels let through."""
-        nodes = range(len(self.diameters_px[side]))
-        return np.array([[self.bank.throughput[self.cell(side, node, place)] for place in range(self.places)] for node in nodes])
+        return self._light[side]
+
+    @cached_property
+    def _light(self) -> dict[int, Float64[np.ndarray, "nodes places channels"]]:
+        def of_side(side: int) -> Float64[np.ndarray, "nodes places channels"]:
+            nodes = range(len(self.diameters_px[side]))
+            return np.array([[self.bank.throughput[self.cell(side, node, place)] for place in range(self.places)] for node in nodes])
+
+        return {side: of_side(side) for side in SIDES}
 
     def _middles(self, name: str) -> Float64[np.ndarray, " middles"]:
         """Of the bank's cells along one axis, ascending; 0 where it has no such axis."""

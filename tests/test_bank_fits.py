@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
 from mrbokeh.aperture import Aperture
-from mrbokeh.bank_apertures import BankApertures
+from mrbokeh.bank_apertures import fit_apertures
 from mrbokeh.bank_fits_file import LOW_RANK, POLYGONS, apertures_beside, terms_beside
 from mrbokeh.bank_lattice import SIDES, BankLattice
 from mrbokeh.bank_low_rank import decompose_bank
@@ -18,8 +19,7 @@ from mrbokeh.exr_io import ExrPart, write_exr
 from mrbokeh.image_io import read_image
 from mrbokeh.image_metrics import psnr
 from mrbokeh.lens_file import write_lens
-from mrbokeh.polygon_fit import fit_polygons
-from mrbokeh.psf_bank import PsfBank
+from mrbokeh.polygon_fit import _fit, fit_polygons
 from mrbokeh.psf_bank_file import write_bank
 from mrbokeh.renderers.low_rank_filter import LowRankFilter
 from tests.renderer_banks import (
@@ -33,22 +33,6 @@ from tests.renderer_banks import (
     rings_polygons,
     slanted,
 )
-
-
-@pytest.fixture(scope="module", name="discs")
-def fixture_discs() -> PsfBank:
-    return discs_bank()
-
-
-@pytest.fixture(scope="module", name="rings")
-def fixture_rings() -> PsfBank:
-    return rings_bank()
-
-
-@pytest.fixture(scope="module", name="polygons")
-def fixture_polygons() -> BankApertures:
-    return rings_polygons()
-
 
 # Contours stray from an outline by what a pixel smooths: a share of its area that falls as its diameter grows; a soft kernel also
 # lacks what four levels cannot tell. Bounds at 12 and 30 px; measured 0.020 and 0.014 for the disc, 0.089 and 0.093 for the bright rim.
@@ -83,13 +67,34 @@ def test_more_levels_tell_more_of_a_soft_kernel() -> None:
     assert errors[0] > errors[1] > errors[2]
 
 
+def test_islands_of_noise_are_left_out() -> None:
+    """A disc whose brightness varies smoothly by 10 %, as that of a noisy measurement: fewer outlines, at most a third more error."""
+    kernel = Aperture.disc().rasterize(30.0).kernel
+    noise = gaussian_filter(np.random.default_rng(0).standard_normal(kernel.shape), 1.5)
+    noisy = kernel * (1.0 + 0.1 * noise / noise.std())
+    every = _fit(noisy / noisy.sum(), 30.0, 4, 0.5)
+    assert every is not None
+    fit = fit_polygons(noisy, 30.0)
+    assert len(fit.aperture.outlines) <= 0.6 * len(every.aperture.outlines)  # measured 6 and 11
+    assert every.relative_error < fit.relative_error < 4.0 / 3.0 * every.relative_error
+
+
+def test_kernels_that_are_alike_share_an_aperture() -> None:
+    """Those of a disc on both sides of the focus do; those of a ring that is clipped towards the corners do not."""
+    found = fit_apertures(BankLattice(discs_bank()))
+    assert all(behind[0][0] is in_front[0][0] for behind, in_front in zip(*found.apertures, strict=True))
+    assert not rings_polygons().is_one(1, 0)
+
+
 def test_a_kernel_that_is_a_point_has_no_polygons() -> None:
     with pytest.raises(InputError, match="more than 2 px"):
         fit_polygons(np.ones((1, 1)), 1.0)
 
 
-def test_the_stated_errors_of_a_bank_hold_for_every_kernel(rings: PsfBank, polygons: BankApertures) -> None:
+def test_the_stated_errors_of_a_bank_hold_for_every_kernel() -> None:
     """Kernels that were not fitted are within twice the worst that was, from 8 px on."""
+    rings = rings_bank()
+    polygons = rings_polygons()
     lattice = BankLattice(rings)
     fitted = max(float(each.max()) for each in polygons.fit_errors)
     assert fitted < 0.08
@@ -98,7 +103,8 @@ def test_the_stated_errors_of_a_bank_hold_for_every_kernel(rings: PsfBank, polyg
         assert polygons.relative_errors(lattice, side)[large].max() < 2.0 * fitted
 
 
-def test_shares_of_places_sum_to_one_and_are_whole_at_a_place(rings: PsfBank) -> None:
+def test_shares_of_places_sum_to_one_and_are_whole_at_a_place() -> None:
+    rings = rings_bank()
     lattice = BankLattice(rings)
     anywhere = np.random.default_rng(1).uniform(-1.2, 1.2, (40, 50, 2))
     np.testing.assert_allclose(lattice.field_shares(anywhere)[1].sum(axis=-1), 1.0, atol=1e-6)
@@ -107,7 +113,8 @@ def test_shares_of_places_sum_to_one_and_are_whole_at_a_place(rings: PsfBank) ->
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_kernels_of_a_lattice_are_those_of_the_aperture_seen_from_behind(rings: PsfBank, side: int) -> None:
+def test_kernels_of_a_lattice_are_those_of_the_aperture_seen_from_behind(side: int) -> None:
+    rings = rings_bank()
     lattice = BankLattice(rings)
     node, place = len(lattice.diameters_px[side]) - 1, 2
     seen = CAT_RING.seen(side, (2.0 / 3.0 * HIGHS[0], -2.0 / 3.0 * HIGHS[1]))
@@ -115,13 +122,15 @@ def test_kernels_of_a_lattice_are_those_of_the_aperture_seen_from_behind(rings: 
     np.testing.assert_allclose(lattice.kernel(side, node, place)[..., 0], expected, atol=1e-7)
 
 
-def test_fits_are_kept_beside_a_bank_until_its_kernels_change(tmp_path: Path, discs: PsfBank) -> None:
+def test_fits_are_kept_beside_a_bank_until_its_kernels_change(tmp_path: Path) -> None:
+    discs = discs_bank()
     lattice, filters = BankLattice(discs), LowRankFilter()
     made = apertures_beside(tmp_path, lattice), terms_beside(tmp_path, lattice, filters.decomposed, [0.1, 16])
     written = {name: (tmp_path / name).stat().st_mtime_ns for name in (POLYGONS, LOW_RANK)}
     read = apertures_beside(tmp_path, lattice), terms_beside(tmp_path, lattice, filters.decomposed, [0.1, 16])
     assert {name: (tmp_path / name).stat().st_mtime_ns for name in written} == written
     assert read[0].diameters_px == made[0].diameters_px
+    assert read[0].is_one(1, 0) == made[0].is_one(1, 0)
     for side in SIDES:
         np.testing.assert_array_equal(read[0].kernel(side, 12.0, 0, 0), made[0].kernel(side, 12.0, 0, 0))
     assert list(read[1]) == list(made[1])
@@ -141,7 +150,8 @@ def test_low_rank_terms_state_what_they_miss() -> None:
         assert terms.relative_error < 0.105  # the weights' correction for light costs up to 5 %
 
 
-def test_the_command_takes_a_bank_for_every_method_that_spreads(tmp_path: Path, discs: PsfBank) -> None:
+def test_the_command_takes_a_bank_for_every_method_that_spreads(tmp_path: Path) -> None:
+    discs = discs_bank()
     write_bank(tmp_path / "bank", discs)
     write_lens(tmp_path / "lens.json", LENS)
     layer = slanted(-9.0, 12.0)[0]

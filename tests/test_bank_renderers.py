@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.aperture import Aperture
-from mrbokeh.bank_apertures import BankApertures, fit_apertures
+from mrbokeh.bank_apertures import fit_apertures
 from mrbokeh.bank_lattice import ANGLES, BankLattice
 from mrbokeh.errors import InputError
 from mrbokeh.image_metrics import psnr
@@ -35,35 +35,36 @@ from tests.renderer_banks import (
     slanted,
 )
 
-
-@pytest.fixture(scope="module", name="discs")
-def fixture_discs() -> PsfBank:
-    return discs_bank()
-
-
-@pytest.fixture(scope="module", name="rings")
-def fixture_rings() -> PsfBank:
-    return rings_bank()
-
-
-@pytest.fixture(scope="module", name="polygons")
-def fixture_polygons() -> BankApertures:
-    return rings_polygons()
-
-
 # Measured 49.9, 58.4 and 36.6 dB; laplacian takes the nearest of 3x3 places and of diameters, where others blend them.
 AGREEMENT_DB = {"polygon": 47.0, "low-rank": 55.0, "laplacian": 34.0}
 
 
-def test_all_methods_agree_with_the_plain_twin(rings: PsfBank, polygons: BankApertures) -> None:
+def test_all_methods_agree_with_the_plain_twin() -> None:
+    rings = rings_bank()
+    polygons = rings_polygons()
     scene = slanted(-12.0, 14.0)
     seen = {name: each.render(scene, LENS).rgb for name, each in renderers(rings, polygons).items()}
     found = {name: psnr(seen[name], seen["scatter"], 2.0) for name in AGREEMENT_DB}
     assert all(found[name] > least for name, least in AGREEMENT_DB.items()), found
 
 
-def test_the_plain_twin_is_the_sum_of_kernels_of_the_bank(rings: PsfBank) -> None:
+def test_one_aperture_for_all_kernels_is_spread_at_once() -> None:
+    """The same light as when every pixel's is divided between two fitted diameters that have copies of the same polygons."""
+    shared = fit_apertures(BankLattice(discs_bank()))
+    one = shared.apertures[0][-1][0][0]
+    alike = tuple(tuple(((one,),) for _ in of_side) for of_side in shared.diameters_px)
+    copies = tuple(tuple(((replace(one),),) for _ in of_side) for of_side in shared.diameters_px)
+    scene, seen = slanted(-12.0, 14.0), []
+    for apertures in (alike, copies):
+        polygons = replace(shared, apertures=apertures)
+        assert polygons.is_one(1, 0) == (apertures is alike)
+        seen.append(renderers(discs_bank(), polygons)["polygon"].render(scene, LENS).rgb)
+    assert psnr(seen[0], seen[1], 2.0) > 60.0  # highlights are told from the light that is spread at once
+
+
+def test_the_plain_twin_is_the_sum_of_kernels_of_the_bank() -> None:
     """At a diameter and a place that the bank has, a pixel shows its kernel, by all methods that blend and by the one that does not."""
+    rings = rings_bank()
     lattice = BankLattice(rings)
     node = len(lattice.diameters_px[-1]) - 2
     coc_px = -float(lattice.diameters_px[-1][node])
@@ -83,8 +84,10 @@ def test_the_plain_twin_is_the_sum_of_kernels_of_the_bank(rings: PsfBank) -> Non
 
 @pytest.mark.parametrize("coc_px", [-11.3, 0.6, 5.2, 14.9])
 @pytest.mark.parametrize("method", ["scatter", "polygon", "low-rank"])
-def test_light_is_conserved_wherever_a_point_lies(rings: PsfBank, polygons: BankApertures, method: str, coc_px: float) -> None:
+def test_light_is_conserved_wherever_a_point_lies(method: str, coc_px: float) -> None:
     """Between places and between diameters of the bank; alpha sums to the one pixel that was opaque."""
+    rings = rings_bank()
+    polygons = rings_polygons()
     seen = renderers(rings, polygons)[method].render(lone_pixel(21, 37, coc_px), LENS)
     np.testing.assert_allclose(seen.rgb.sum(axis=(0, 1), dtype=np.float64), (4.0, 2.0, 1.0), rtol=2e-5)
     assert seen.alpha.sum(dtype=np.float64) == pytest.approx(1.0, rel=2e-5)
@@ -106,14 +109,16 @@ DISC_DB = {"scatter": 52.0, "polygon": 57.0, "low-rank": 52.0, "laplacian": 39.0
 
 
 @pytest.mark.parametrize("method", DISC_DB)
-def test_a_bank_of_discs_is_the_disc(discs: PsfBank, method: str) -> None:
+def test_a_bank_of_discs_is_the_disc(method: str) -> None:
+    discs = discs_bank()
     scene = slanted(-12.0, 14.0)
     expected = ScatterReference(FEW).render(scene, LENS).rgb
     assert psnr(renderers(discs)[method].render(scene, LENS).rgb, expected, 2.0) > DISC_DB[method]
 
 
-def test_colours_of_a_bank_take_their_own_kernels(discs: PsfBank) -> None:
+def test_colours_of_a_bank_take_their_own_kernels() -> None:
     """A bank whose red is a point and whose blue is a disc."""
+    discs = discs_bank()
     kernels = []
     for kernel in discs.kernels:
         point = np.zeros_like(kernel[..., 0])

@@ -19,13 +19,15 @@ from mrbokeh.layer import opaque
 from mrbokeh.layering import Layering
 from mrbokeh.lens import Lens
 from mrbokeh.lens_fitting._pupil_rows_numba import gather_rows
+from mrbokeh.lens_fitting.evidence import Evidence
 from mrbokeh.lens_fitting.knots import Knots
 from mrbokeh.lens_fitting.lens_fit import FitSettings, LensFit, fit_lens
 from mrbokeh.lens_fitting.measured_bank import bank_of, picture_at
 from mrbokeh.lens_fitting.point_lights import PointLight, find_lights
 from mrbokeh.lens_fitting.pupil_picture import PupilGrid, kernel_of
+from mrbokeh.lens_fitting.sharing import Sharing, simplest_of
 from mrbokeh.lens_fitting.solving import on_simplex
-from mrbokeh.lens_fitting.stack_equations import drawn_pixels, equations_of
+from mrbokeh.lens_fitting.stack_equations import SliceView, drawn_pixels, equations_of, smoothed_coc, usable_pixels
 from mrbokeh.lens_fitting.stack_views import StackSlices
 from mrbokeh.psf_bank import Axis, PsfBank
 from mrbokeh.psf_bank_file import read_bank
@@ -168,6 +170,49 @@ def _worse_than_truth(fit: LensFit, aperture: Aperture, folder: Path) -> float:
         if not aperture.is_chromatic:
             ratios.append(equations.error(fit.pictures) / equations.error(np.broadcast_to(truth, fit.pictures.shape)))
     return max(ratios, default=1.0)
+
+
+def test_a_lamp_in_front_of_a_wall_keeps_its_own_blur() -> None:
+    """Depth is smoothed without losing what is thin: a lamp of one pixel, which outshines all that tells of the wall's kernel, else
+    passed for a part of the wall. Pixels that its light reaches (a diameter of 8 px behind the focus, 6 in front) are not used. One
+    whose depth is not trusted is noise.
+    """
+    rng = np.random.default_rng(0)
+    coc_px = (8.0 + 0.1 * rng.standard_normal((60, 80))).astype(np.float32)
+    coc_px[30, 40], coc_px[12, 12] = -6.0, 14.0
+    confidence = np.ones_like(coc_px)
+    confidence[12, 12] = 0.0
+    smooth = smoothed_coc(coc_px, confidence)
+    assert smooth[30, 40] == -6.0
+    assert smooth[12, 12] == pytest.approx(8.0, abs=0.2)
+    assert np.delete(smooth.ravel(), 30 * 80 + 40).std() < 0.05
+    sharp = np.full((60, 80, 3), 0.5, np.float32)
+    usable = usable_pixels(SliceView(sharp, sharp, smooth, np.ones(coc_px.shape, bool)))
+    rows, columns = np.nonzero(usable)
+    assert usable.any()
+    assert np.hypot(rows - 30, columns - 40).min() > 4.0
+
+
+def test_shared_evidence_is_the_sum_and_goes_to_all_that_share() -> None:
+    knots, rng = Knots((5.0, 10.0)), np.random.default_rng(0)
+    evidence = Evidence(rng.random((4, 3, 7, 7)).astype(np.float32), rng.random((4, 3, 7)), rng.random(4), np.arange(4))
+    merged, fewer = Sharing(colours=True, diameters=True).merged(evidence, knots)
+    assert (len(fewer), merged.sides.shape) == (2, (2, 1, 7))
+    np.testing.assert_allclose(merged.sides[1, 0], evidence.sides[2:].sum(axis=(0, 1)))
+    np.testing.assert_allclose(merged.matrices[0, 0], evidence.matrices[:2].sum(axis=(0, 1)), rtol=1e-5)
+    np.testing.assert_array_equal(merged.counts, [1, 5])
+    both, _ = Sharing(sides=True).merged(evidence, knots)
+    np.testing.assert_allclose(both.energies, np.tile(evidence.energies[:2] + evidence.energies[2:], 2))
+    spread = Sharing(colours=True, diameters=True).spread(merged.sides, knots, 3)
+    np.testing.assert_array_equal(spread[2:], np.broadcast_to(merged.sides[1], (2, 3, 7)))
+
+
+def test_the_simplest_description_within_the_standard_error_is_taken() -> None:
+    """Squares are worse than the best by 1, 1.2 and 1.1 of everything (error 0.06), by -0.5, 0.6, 0.2 (0.32, mean 0.1), by nothing."""
+    squares = np.array([[11.0, 11.2, 11.1], [9.5, 10.6, 10.2], [10.0, 10.0, 10.0]])
+    assert simplest_of(np.sqrt(squares).tolist()) == 1
+    assert simplest_of(np.sqrt(squares[[0, 2]]).tolist()) == 1
+    assert simplest_of([[], []]) == 1
 
 
 def test_bright_rims_stay(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from mrbokeh.lens_fitting.evidence import Equations, Evidence, Pictures
 from mrbokeh.lens_fitting.knots import Knots
 from mrbokeh.lens_fitting.point_lights import PointLight, best_scale, equations_of_light, light_count
 from mrbokeh.lens_fitting.pupil_picture import PupilGrid
+from mrbokeh.lens_fitting.sharing import NOTHING, SIMPLEST_FIRST, Sharing, simplest_of
 from mrbokeh.lens_fitting.solving import Smoothness, solve
 from mrbokeh.lens_fitting.stack_equations import LEAST_DIAMETER_PX, SliceView, drawn_pixels, equations_of
 from mrbokeh.lens_fitting.stack_views import StackSlices, largest_diameter_px
@@ -60,7 +61,7 @@ class SliceScore:
 class LensFit:
     """pictures (knots, 3, cells): light through each cell of the pupil, sums to 1. largest_px: of all circles of confusion seen.
     pixels, lights (knots,): how many tell of each knot (pixels of lights count as pixels). errors (knots,): what is left of them, see
-    `Evidence.errors`.
+    `Evidence.errors`. sharing: which pictures are one and the same.
     """
 
     grid: PupilGrid
@@ -71,6 +72,7 @@ class LensFit:
     lights: Int64[np.ndarray, " knots"]
     errors: Float64[np.ndarray, " knots"]
     scores: tuple[SliceScore, ...] = ()
+    sharing: Sharing = NOTHING
 
 
 def fit_lens(
@@ -94,13 +96,13 @@ def fit_lens(
             fitting.rescale_lights(pictures)
         evidence = fitting.evidence(pictures, with_lights=bool(number) or not stacks)
         pictures = solve(evidence, grid, knots, Smoothness().times(settings.smoothness))
-    tied = [Smoothness().times(settings.smoothness).tied(factor) for factor in _TIES if factor > 1.0 and fitting.holds_out]
-    candidates = [pictures, *(solve(evidence, grid, knots, each) for each in tied)]
-    scores = fitting.scores(candidates)
-    best = int(np.argmin([sum(score.fitted for score in each) for each in scores]))
+    candidates = [*fitting.shared(evidence), *fitting.tied(evidence, pictures)]
+    scores = fitting.scores([candidate for _, candidate in candidates])
+    chosen = simplest_of([[score.fitted for score in each] for each in scores])
+    sharing, pictures = candidates[chosen]
     counts = light_count(fitting.lights, knots)
-    errors = evidence.errors(candidates[best])
-    return LensFit(grid, knots, candidates[best], largest_px, evidence.counts, counts, errors, scores[best])
+    errors = evidence.errors(pictures)
+    return LensFit(grid, knots, pictures, largest_px, evidence.counts, counts, errors, scores[chosen], sharing)
 
 
 def _knots(settings: FitSettings, largest_px: float, size: tuple[int, int]) -> Knots:
@@ -130,6 +132,27 @@ class _Fitting:
         """One slice in six, another one of each stack; none where there are fewer."""
         first = min(_HELD_OUT, self.slices.longest) - 1
         return len(self.slices) >= _HELD_OUT and sum(divmod(number, self.slices.longest)) % _HELD_OUT == first
+
+    def shared(self, evidence: Evidence) -> list[tuple[Sharing, Pictures]]:
+        """The pictures of every sharing, the simplest first; none without slices to judge them by."""
+        if not self.holds_out:
+            return []
+        found, channels = [], evidence.sides.shape[1]
+        for sharing in SIMPLEST_FIRST:
+            merged, knots = sharing.merged(evidence, self.knots)
+            pictures = solve(merged, self.grid, knots, self._smoothness)
+            found.append((sharing, sharing.spread(pictures, self.knots, channels)))
+        return found
+
+    def tied(self, evidence: Evidence, pictures: Pictures) -> list[tuple[Sharing, Pictures]]:
+        """Nothing shared, but neighbours held together, firmly first; at last the pictures given, which are those of the weakest ties."""
+        firmly = sorted((factor for factor in _TIES if factor > 1.0 and self.holds_out), reverse=True)
+        made = [solve(evidence, self.grid, self.knots, self._smoothness.tied(factor)) for factor in firmly]
+        return [(NOTHING, each) for each in [*made, pictures]]
+
+    @property
+    def _smoothness(self) -> Smoothness:
+        return Smoothness().times(self.settings.smoothness)
 
     def evidence(self, pictures: Pictures, with_lights: bool) -> Evidence:
         """That of all slices but those held out, and of lights; weighted by how well the pictures explain it."""

@@ -20,6 +20,7 @@ _NODES = 3
 def bank_of(fit: LensFit) -> PsfBank:
     """A bank over signed diameters and, where the lens varies over the field, positions (or eccentricity, for a symmetric lens).
 
+    Kernels have one channel where colours share theirs, else three.
     Each kernel is averaged over its cell's diameters. settings hold for each cell of the bank how many pixels and lights tell of it, and
     how far they disagree with it.
     """
@@ -51,18 +52,19 @@ def _field(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> int:
     return int(fit.knots.fields_at(np.array([middle[0], 0.0 if fit.knots.rings else middle[1]])))
 
 
-def _kernel(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> Float32[np.ndarray, "size size 3"]:
+def _kernel(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> Float32[np.ndarray, "size size channels"]:
     """The mean over diameters of a cell; the one around the focus holds the focus."""
     low, high = box[0]
     diameters = [0.0] if low < 0.0 < high else low + (np.arange(_NODES) + 0.5) / _NODES * (high - low)
-    made = [kernel_of(fit.grid, picture_at(fit, float(each), _field(fit, box)), float(each)) for each in diameters]
+    channels = slice(0, 1 if fit.sharing.colours else 3)
+    made = [kernel_of(fit.grid, picture_at(fit, float(each), _field(fit, box))[:, channels], float(each)) for each in diameters]
     size = max(kernel.shape[0] for kernel in made)
     mean = np.mean([centred(kernel, size) for kernel in made], axis=0, dtype=np.float64)
     return (mean / mean.sum(axis=(0, 1))).astype(np.float32)
 
 
 def picture_at(fit: LensFit, diameter_px: float, field: int) -> Float64[np.ndarray, "cells 3"]:
-    """The pupil at a signed diameter: between the knots' diameters in proportion to the logarithm."""
+    """The pupil at a signed diameter, for each colour: between the knots' diameters in proportion to the logarithm."""
     pictures = fit.pictures.reshape(*fit.knots.shape, *fit.pictures.shape[1:])[int(diameter_px > 0), :, field]
     known = np.log(fit.knots.diameters_px)
     place = float(np.interp(np.log(max(abs(diameter_px), 1e-6)), known, np.arange(len(known))))
@@ -75,6 +77,7 @@ def _settings(fit: LensFit, boxes: Float64[np.ndarray, "cells axes 2"]) -> dict[
     knots = [_knot(fit, box) for box in boxes]
     return {
         "pupil_side": fit.grid.side,
+        "shared": [name for name, is_one in vars(fit.sharing).items() if is_one],
         "knot_diameters_px": [float(each) for each in fit.knots.diameters_px],
         "pixels": [int(fit.pixels[knot]) for knot in knots],
         "lights": [int(fit.lights[knot]) for knot in knots],

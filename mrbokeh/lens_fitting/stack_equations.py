@@ -56,9 +56,20 @@ def known_pixels(confidence: Plane, masks: SliceMasks, exclusions: Mapping[str, 
     return np.asarray(known)
 
 
-def smoothed_coc(coc_px: Plane) -> Plane:
-    """Without the noise of single pixels, edges where they were."""
-    return np.asarray(cv2.medianBlur(np.ascontiguousarray(coc_px), 5))
+def smoothed_coc(coc_px: Plane, confidence: Plane) -> Plane:
+    """Without the noise of single pixels, edges where they were.
+
+    What is thin (a lamp in front of a wall, a wire) keeps its own diameter where its depth is trusted: lost to its surroundings its light
+    would be taken for theirs, and one lamp outshines all that tells of the kernel there.
+    """
+    smooth = cv2.medianBlur(np.ascontiguousarray(coc_px), 5)
+    thin = (np.abs(coc_px - smooth) > _jump_px(coc_px)) & (confidence >= _LEAST_CONFIDENCE)
+    return np.asarray(np.where(thin, coc_px, smooth), np.float32)
+
+
+def _jump_px(coc_px: Plane) -> Plane:
+    """What two neighbours of one surface differ by at most."""
+    return np.maximum(np.float32(_JUMP_PX), np.float32(_JUMP_SHARE) * np.abs(coc_px))
 
 
 def usable_pixels(view: SliceView) -> Mask:
@@ -66,7 +77,7 @@ def usable_pixels(view: SliceView) -> Mask:
     size = np.abs(view.coc_px)
     square = np.ones((3, 3), np.uint8)
     jump = cv2.dilate(view.coc_px, square) - cv2.erode(view.coc_px, square)
-    edges = jump > np.maximum(_JUMP_PX, _JUMP_SHARE * size)
+    edges = jump > _jump_px(size)
     reach = 0.5 * size
     inside = np.ones_like(edges)
     if edges.any():

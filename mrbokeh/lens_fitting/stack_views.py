@@ -53,7 +53,7 @@ class StackSlices:
             self._of_stack = {id(stack): (stack.all_in_focus(), stack.depth_m(), stack.depth_confidence())}
         sharp, depth_m, confidence = self._of_stack[id(stack)]
         known = known_pixels(confidence, stack.slice_masks(index), stack.exclusions()) & (depth_m > 0.0)
-        return SliceView(sharp, stack.slice_rgb(index), smoothed_coc(stack.coc_px(index, depth_m)), known)
+        return SliceView(sharp, stack.slice_rgb(index), smoothed_coc(stack.coc_px(index, depth_m), confidence), known)
 
 
 def largest_diameter_px(stacks: Sequence[FocalStack]) -> float:

@@ -12,19 +12,22 @@ from mrbokeh.bank_apertures import BankApertures
 from mrbokeh.bank_lattice import SIDES, BankLattice
 from mrbokeh.optics import Channels, Plane
 from mrbokeh.psf import kernel_radius_px
-from mrbokeh.renderers._bank_spread import Around
+from mrbokeh.renderers._bank_around import Around
+from mrbokeh.renderers._bank_spread import not_black
 
 SHARP_PX = 1.0
 
-Shares = Iterator[tuple[Plane, Any]]
-"""How much of each pixel's light an opening takes, and the opening."""
+Shares = Iterator[tuple[Plane | None, Any]]
+"""How much of each pixel's light an opening takes, and the opening; None is all, for the only opening there is."""
 
 
 def spread_shares(values: Channels, coc_px: Plane, shares: Shares, spread: Callable[..., Channels]) -> Channels:
     """What is sharp, and every share spread within the window that its light reaches."""
-    blurred = np.any(values != 0, axis=-1) & (np.abs(coc_px) > SHARP_PX)
+    blurred = not_black(values) & (np.abs(coc_px) > SHARP_PX)
     total = np.where(blurred[..., None], np.float32(0.0), values)
     for share, opening in shares:
+        if share is None:
+            return spread(np.ascontiguousarray(values), coc_px, opening)
         mine = blurred & (share > 0)
         rows, columns = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
         if not rows.size:
@@ -37,13 +40,6 @@ def spread_shares(values: Channels, coc_px: Plane, shares: Shares, spread: Calla
     return total
 
 
-def by_place(around: Around) -> Iterator[tuple[int, Plane]]:
-    """The anchors in use, and each pixel's share of them."""
-    used = np.unique(around.anchors[around.shares > 0])
-    for anchor in used.tolist():
-        yield anchor, np.where(around.anchors == anchor, around.shares, np.float32(0.0)).sum(axis=-1)
-
-
 @dataclass(frozen=True, eq=False)
 class TurnedApertures:
     """The apertures of a bank turned to where they are used, kept: renderers keep tables for each as long as it lives.
@@ -54,26 +50,41 @@ class TurnedApertures:
     lattice: BankLattice
     apertures: BankApertures
     prepare: Callable[[Aperture], object]
-    _kept: dict[tuple[int, int, int, int], Aperture] = field(default_factory=dict, repr=False)
+    _kept: dict[tuple[int, float], Aperture] = field(default_factory=dict, repr=False)
     _preparing: Lock = field(default_factory=Lock, repr=False)
 
     def shares(self, coc_px: Plane, side: int, channel: int, around: Around) -> Shares:
-        """One opening for each place and fitted diameter."""
+        """One for each opening that some pixel takes: places and diameters that share an aperture are one."""
+        if self.apertures.is_one(side, channel) and self.lattice.directions == 1:
+            yield None, self._aperture(side, 0, 0, channel)
+            return
+        taken: dict[int, tuple[Plane, Aperture]] = {}
+        of_nodes = list(self._by_node(coc_px, side))
+        for anchor, share in around.by_anchor():
+            for node, of_node in of_nodes:
+                mine = of_node if share is None else share * of_node
+                if (mine > 0).any():
+                    opening = self._aperture(side, node, anchor, channel)
+                    before = taken.get(id(opening))
+                    taken[id(opening)] = (mine if before is None else before[0] + mine, opening)
+        yield from taken.values()
+
+    def _by_node(self, coc_px: Plane, side: int) -> Iterator[tuple[int, Plane]]:
+        """The fitted diameters in use, and each pixel's share of them; sharp pixels have none."""
         lower, upper = self.apertures.shares(side, np.abs(coc_px))
         live = np.abs(coc_px) > SHARP_PX
-        for anchor, share in by_place(around):
-            for node in range(len(self.apertures.diameters_px[SIDES.index(side)])):
-                of_node = np.where(lower == node, 1.0 - upper, np.where(lower + 1 == node, upper, 0.0)).astype(np.float32)
-                mine = share * of_node
-                if (mine[live] > 0).any():
-                    yield mine, self._aperture(side, node, anchor, channel)
+        for node in range(len(self.apertures.diameters_px[SIDES.index(side)])):
+            of_node = live * np.where(lower == node, 1.0 - upper, np.where(lower + 1 == node, upper, 0.0)).astype(np.float32)
+            if of_node.any():
+                yield node, of_node
 
     def _aperture(self, side: int, node: int, anchor: int, channel: int) -> Aperture:
-        key = side, node, anchor, channel
+        place, angle_rad = self.lattice.place_and_angle(anchor)
+        upright = self.apertures.apertures[SIDES.index(side)][node][place][channel]
+        key = id(upright), angle_rad
         with self._preparing:
             if key not in self._kept:
-                place, angle_rad = self.lattice.place_and_angle(anchor)
-                aperture = self.apertures.apertures[SIDES.index(side)][node][place][channel].rotated(angle_rad)
+                aperture = upright.rotated(angle_rad)
                 self.prepare(aperture)
                 self._kept[key] = aperture
             return self._kept[key]

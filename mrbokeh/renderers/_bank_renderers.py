@@ -14,10 +14,11 @@ from mrbokeh.lens import Lens
 from mrbokeh.low_rank import LowRankKernel
 from mrbokeh.optics import Channels, Plane
 from mrbokeh.psf_bank import PsfBank
-from mrbokeh.renderers._bank_by_aperture import TurnedApertures, by_place, spread_shares
+from mrbokeh.renderers._bank_around import Around
+from mrbokeh.renderers._bank_by_aperture import TurnedApertures, spread_shares
 from mrbokeh.renderers._bank_opening import KernelOpening
 from mrbokeh.renderers._bank_scatter import scatter_side
-from mrbokeh.renderers._bank_spread import AnchorKernels, Around, BlendedTables, SpreadSide, spread_by_bank
+from mrbokeh.renderers._bank_spread import AnchorKernels, BlendedTables, SpreadSide, spread_by_bank
 from mrbokeh.renderers._laplacian_bank import Place
 from mrbokeh.renderers._laplacian_layers import BankOptics
 
@@ -73,5 +74,7 @@ class _ByLowRank:
     kept: dict[tuple[int, int, int, int], LowRankKernel] = field(default_factory=dict)
 
     def __call__(self, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels:
-        shares = ((share, KernelOpening(self.kernels, side, anchor, channel, self.terms, self.kept)) for anchor, share in by_place(around))
+        shares = (
+            (share, KernelOpening(self.kernels, side, anchor, channel, self.terms, self.kept)) for anchor, share in around.by_anchor()
+        )
         return spread_shares(values, coc_px, shares, self.inner)

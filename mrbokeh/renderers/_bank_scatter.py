@@ -3,7 +3,8 @@
 import numpy as np
 
 from mrbokeh.optics import Channels, Plane
-from mrbokeh.renderers._bank_spread import AnchorKernels, Around
+from mrbokeh.renderers._bank_around import Around
+from mrbokeh.renderers._bank_spread import AnchorKernels
 
 
 def scatter_side(kernels: AnchorKernels, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels:

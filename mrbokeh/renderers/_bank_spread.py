@@ -4,30 +4,23 @@ Places in the frame share in proportion (bilinearly), so that nothing jumps wher
 pixel sum to 1, so no light is lost or doubled. Renderers differ in how a side of the focus is spread (`SpreadSide`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import product
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from mrbokeh.bank_lattice import BankLattice
 from mrbokeh.errors import InputError
 from mrbokeh.optics import Channels, Plane
 from mrbokeh.psf import kernel_radius_px
+from mrbokeh.renderers._bank_around import Around
 from mrbokeh.renderers._laplacian_bank import BankTables, Place, turned_kernel
 
 _LARGE_PX = 8.0
-
-
-@dataclass(frozen=True)
-class Around:
-    """The anchors of the bank's places around each pixel, and how much of its light each takes."""
-
-    anchors: Int64[np.ndarray, "height width 4"]
-    shares: Float32[np.ndarray, "height width 4"]
+_ALL_LIGHT = 1e-6  # kernels that sum to 1 within the rounding of float32
 
 
 @runtime_checkable
@@ -110,32 +103,44 @@ def _without_border(kernel: Float64[np.ndarray, "_ _ channels"]) -> Float64[np.n
 
 def spread_by_bank(tables: BlendedTables, spread_side: SpreadSide, values: Channels, coc_px: Plane, place: Place) -> Channels:
     """R, G, B, coverage (for a bank of three colours three times), others; as LaplacianSpreadlets.spread_bank has it."""
-    lit = np.any(values != 0, axis=-1)
+    lit = not_black(values)
     if not np.isfinite(coc_px[lit]).all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
     coc_px = np.where(lit, np.clip(coc_px, -tables.largest_px, tables.largest_px), np.float32(0.0)).astype(np.float32)
-    field_xy = np.zeros((*coc_px.shape, 2), np.float32) if place.field_xy is None else place.field_xy
-    around = Around(*tables.lattice.field_shares(field_xy))
+    around = Around.of(tables.lattice, place, coc_px.shape)
+    behind = coc_px > 0
+    sides = {side: here for side, here in ((1, behind), (-1, lit & ~behind)) if here.any()}
 
-    def summed(colours: Sequence[int], others: Sequence[int], channel: int) -> Channels:
-        total = np.zeros((*coc_px.shape, len(colours) + len(others)), np.float32)
-        for side, here in ((1, lit & (coc_px > 0)), (-1, lit & ~(coc_px > 0))):
-            if here.any():
-                picked = values[..., [*colours, *others]] * here[..., None]
-                picked[..., : len(colours)] *= _light(tables.lattice, coc_px, side, channel, around)[..., None]
-                total += spread_side(picked, coc_px, side, channel, around)
+    def summed(picked: Channels, colours: int, channel: int) -> Channels:
+        """picked: channels of the picture, the first of which are colours."""
+        total = np.zeros_like(picked) if len(sides) != 1 else None
+        for side, here in sides.items():
+            passed = _passed(tables.lattice, coc_px, side, channel, around)
+            mine = picked if len(sides) == 1 and passed is None else picked * here[..., None]
+            if passed is not None:
+                mine[..., :colours] *= passed[..., None]
+            seen = spread_side(mine, coc_px, side, channel, around)
+            total = seen if total is None else total + seen
+        assert total is not None
         return total
 
-    others = list(range(3, values.shape[2]))
     if tables.bank.channels == 1:
-        return summed([0, 1, 2][: values.shape[2]], others, 0)
-    each = [summed([c], others if c == 1 else [3], c) for c in range(3)]
+        return summed(values, 3, 0)
+    others = list(range(3, values.shape[2]))
+    each = [summed(values[..., [c, *(others if c == 1 else [3])]], 1, c) for c in range(3)]
     return np.concatenate([*(light[..., :1] for light in each), *(light[..., 1:2] for light in each), each[1][..., 2:]], axis=2)
 
 
-def _light(lattice: BankLattice, coc_px: Plane, side: int, channel: int, around: Around) -> Plane:
-    """What the lens lets through of each pixel's light."""
+def not_black(values: Channels) -> Bool[np.ndarray, "height width"]:
+    """Which hold anything, faster than `any` along a short axis."""
+    return np.asarray(reduce(np.logical_or, np.moveaxis(values[..., 1:], -1, 0), values[..., 0] != 0.0))
+
+
+def _passed(lattice: BankLattice, coc_px: Plane, side: int, channel: int, around: Around) -> Plane | None:
+    """What the lens lets through of each pixel's light; None is all."""
     known = lattice.light(side)[..., channel]
+    if np.abs(known - 1.0).max() < _ALL_LIGHT:
+        return None
     lower, upper = lattice.diameter_shares(side, np.abs(coc_px))
     places = around.anchors // lattice.directions
     ends = [(known[np.minimum(lower + i, len(known) - 1)[..., None], places] * around.shares).sum(axis=-1) for i in (0, 1)]

@@ -74,6 +74,13 @@ class BankTables:
         planes = [self._coordinate(axis.name, coc_px, place) for axis in self.bank.axes]
         return self.bank.nearest(np.stack(planes, axis=-1).astype(np.float64))
 
+    def farthest_px(self, coc_px: Float32[np.ndarray, " pixels"]) -> int:
+        """How far light travels at most between the least and the greatest of these, of a bank over diameters alone."""
+        if coc_px.size == 0:
+            return 0
+        first, last = self.cells(np.array([coc_px.min(), coc_px.max()], np.float32), Place())
+        return int(self.reaches_px[first : last + 1].max())
+
     def codes(
         self, coc_px: Float32[np.ndarray, "height width"], bright: Bool[np.ndarray, "height width"], place: Place
     ) -> Int64[np.ndarray, "height width"]:
