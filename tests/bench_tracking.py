@@ -20,7 +20,7 @@ from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.charuco.board_alignment import AlignedDetector, aligned_corners
 from mrbokeh.charuco.corner_flow import flow
 from mrbokeh.charuco.detector import CharucoDetector, Grey
-from mrbokeh.charuco.pose_from_points import pose_from_plane
+from mrbokeh.charuco.pose_from_points import poses_from_plane
 from mrbokeh.lens import Lens
 from mrbokeh.video_io import read_display_frames
 from tests.machine import machine_line, memory_line
@@ -118,7 +118,7 @@ def _stages(clip: Frames) -> None:
         ("search", lambda: [detector.detect(grey) for grey in greys[:10]], len(found)),
         ("alignment", lambda: [aligned_corners(BOARD, grey, read) for grey, read in zip(greys, found, strict=False)], len(found)),
         ("flow", lambda: [flow(a, b, at.xy_px) for a, b, at in zip(greys, greys[1:], found, strict=False)], len(found)),
-        ("pose", lambda: [pose_from_plane(BOARD.corners_m[at.ids], at.xy_px, clip[0][1]) for at in found], len(found)),
+        ("pose", lambda: [poses_from_plane(BOARD.corners_m[at.ids], at.xy_px, clip[0][1]) for at in found], len(found)),
     )
     times = []
     for name, work, count in stages:

@@ -86,6 +86,7 @@ class MadeControls:
             height_px=HEIGHT,
             dioptre_range=(0.0, 2.0),
             focus_distance_m=finite(self.values["focus"]),
+            focus_from=self.values.get("focus_from"),
             f_number=self.values["f_number"],
             f_numbers=[1.4, 2.0, 2.8],
             lens=self.values["lens"],
@@ -117,7 +118,11 @@ def made_frame(controls: MadeControls, sequence: int) -> OutputFrame:
     if blur_px := controls.values.get("blur_px"):
         bgr = np.asarray(cv2.GaussianBlur(bgr, (0, 0), blur_px), np.uint8)
     status = FrameStatus(
-        focus_distance_m=controls.values["focus"], f_number=controls.values["f_number"], tracking=0.9, stages_ms={"composite": 1.25}
+        focus_distance_m=controls.values["focus"],
+        f_number=controls.values["f_number"],
+        tracking=controls.values.get("tracking", 0.9),
+        tracking_unsure=controls.values.get("tracking_unsure", False),
+        stages_ms={"composite": 1.25},
     )
     return OutputFrame(bgr, time.monotonic(), sequence, status)
 

@@ -11,13 +11,14 @@ from datasets_scripts.sheet_tracer import pack_table, trace_sheet
 from mrbokeh.atomic_files import write_json
 from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_to_json
+from mrbokeh.camera_track.world_axes import inverted, rigid
 from mrbokeh.charuco.board_file import write_board
 from mrbokeh.color import display_rgb8
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import write_lens
 from tests.traced_board_clip import BOARD, clip_of
 from viewfinder.frames import Pose
-from viewfinder.tracking.rigid_motion import inverted, rigid, rigid_of
+from viewfinder.tracking.rigid_motion import rigid_of
 
 CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.06, 0.02]))
 """The phone 6 cm above the lens, 3 cm to its left, a little askew."""

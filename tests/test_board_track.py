@@ -33,6 +33,7 @@ from tests.traced_board_clip import BOARD, MOTION, clip_of, pose_error
 
 FRAMES, HIDDEN = 16, (6, 7, 8)
 CAMERA = Camera(640, 360, (609.0, 609.0), (320.0, 180.0))
+TIMES_S = [number / 30.0 for number in range(60)]
 
 
 @cache
@@ -170,7 +171,7 @@ def test_smoothing_takes_noise_away_and_leaves_the_trembling_hand(motion: HandHe
     """16 corners off by 0.3 px, as in a dim clip. A gliding camera gets much better poses; a hand that trembles at 6 to 11 Hz by more
     than the noise leaves little to take away, and must not be taken for noise."""
     corners, cameras = noisy(sigma_px, 16, motion)
-    fits = poses_of(corners, BOARD, CAMERA)
+    fits = poses_of(corners, BOARD, CAMERA, TIMES_S)
     steady = steadied({n: Observation(f.camera_from_world, corners[n].only(f.inliers)) for n, f in fits.items()}, BOARD, CAMERA)
     before, after = (errors_px(each, cameras) for each in ([fits[n].camera_from_world for n in range(60)], [steady[n] for n in range(60)]))
     assert after < most * before
@@ -179,14 +180,14 @@ def test_smoothing_takes_noise_away_and_leaves_the_trembling_hand(motion: HandHe
 def test_exact_poses_stay() -> None:
     """To a hundredth of a pixel, with a hand that trembles by half a pixel."""
     corners, cameras = noisy(1e-4, 16)
-    fits = poses_of(corners, BOARD, CAMERA)
+    fits = poses_of(corners, BOARD, CAMERA, TIMES_S)
     steady = steadied({n: Observation(f.camera_from_world, corners[n]) for n, f in fits.items()}, BOARD, CAMERA)
     assert errors_px([steady[n] for n in range(60)], cameras) < 0.01
 
 
 def test_asked_for_more_smoothing_gives_calmer_poses() -> None:
     corners, _ = noisy(0.2, 16)
-    fits = poses_of(corners, BOARD, CAMERA)
+    fits = poses_of(corners, BOARD, CAMERA, TIMES_S)
     observed = {n: Observation(f.camera_from_world, corners[n].only(f.inliers)) for n, f in fits.items()}
     rest = [
         np.mean(np.diff(np.array([poses[n][:3, 3] for n in range(60)]), 3, axis=0) ** 2)

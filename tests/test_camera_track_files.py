@@ -245,7 +245,7 @@ def test_opentrackio_distortion_is_in_millimetres(tmp_path: Path) -> None:
 
 
 def test_the_viewfinder_reads_the_same_pose_from_our_samples(tmp_path: Path) -> None:
-    """An independent reader in this house: its world has -z up, as a board does."""
+    """Samples are read by one code; what is the viewfinder's own is its world, which has -z up, as a board does."""
     opentrackio = pytest.importorskip("viewfinder.tracking.opentrackio")
     track = moving(plain=False)
     write_track(tmp_path / "a.jsonl", track)

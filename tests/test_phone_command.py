@@ -17,6 +17,7 @@ import typer
 from typer.testing import CliRunner, Result
 
 from mrbokeh.camera import Camera
+from mrbokeh.camera_track.world_axes import inverted
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import write_layer
 from mrbokeh.layer import clear
@@ -47,7 +48,7 @@ from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.phone_calibration import Calibration
 from viewfinder.tracking.phone_rig import PhoneRig, read_phone_rig, write_phone_rig
 from viewfinder.tracking.phone_tracker import PhoneTracker
-from viewfinder.tracking.rigid_motion import angle_deg, inverted, rigid_of
+from viewfinder.tracking.rigid_motion import angle_deg, rigid_of
 from viewfinder.tracking.still_pairs import StillPairs
 from viewfinder.tracking_choice import PhoneChoice, TrackingChoice, open_tracker
 

@@ -7,13 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from datasets_scripts.hand_held import HandHeld
 from datasets_scripts.sheet_tracer import Sheet, pack_table, trace_sheet
 from mrbokeh.camera import Camera
+from mrbokeh.camera_track.board_calibration import calibrated
 from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.charuco.board_file import board_from_json, board_to_json, read_board, write_board
-from mrbokeh.charuco.detector import CharucoDetector
+from mrbokeh.charuco.detector import CharucoDetector, Corners
 from mrbokeh.charuco.drawing import black_rectangles_mm
 from mrbokeh.color import display_rgb8
 from mrbokeh.errors import InputError
@@ -189,3 +191,48 @@ def test_where_no_paper_helps_the_plan_says_so() -> None:
     assert plan.board is None and "phone on the camera" in plan.sentence
     with pytest.raises(InputError, match="nearest <= farthest"):
         View(Lens(50.0, 1.8, 0.8, 36.0), 1.5, 1.2, 1280)
+
+
+def seen_from_all_sides(board: CharucoBoard) -> list[Corners]:
+    """24 views by OpenCV's own formula, tilted by up to 40 degrees about x and y in turn, with noise of 0.1 px."""
+    rng, matrix, middle = (
+        np.random.default_rng(0),
+        np.array([[600.0, 0, 319.5], [0, 600.0, 179.5], [0, 0, 1]]),
+        board.corners_m.mean(axis=0),
+    )
+    seen = []
+    for index, tilt_deg in enumerate(np.linspace(-40.0, 40.0, 24)):
+        turn = Rotation.from_euler("yx"[index % 2], tilt_deg, degrees=True)
+        shift = np.array([0.0, 0.0, 0.6]) - turn.apply(middle)
+        xy = cv2.projectPoints(board.corners_m, turn.as_rotvec(), shift, matrix, None)[0].reshape(-1, 2).astype(np.float64)
+        seen.append(Corners(np.arange(len(xy)), xy + 0.5 + rng.normal(0.0, 0.1, xy.shape)))
+    return seen
+
+
+def coarse_only(board: CharucoBoard) -> CharucoBoard:
+    """What is read of it where the blur is strongest."""
+    return CharucoBoard(board.grids[:1])
+
+
+@pytest.mark.parametrize(
+    ("view", "corners"),
+    [
+        # With 3 rows of 57 mm squares, as it was, 6 corners would be left where the blur is strongest.
+        pytest.param(View(Lens(28.0, 4.0, 0.7, 24.0), 0.5, 1.2, 1280), 9, id="two scales"),
+        pytest.param(View(Lens(22.0, 8.0, 0.7, 24.0), 0.5, 2.0, 1280), 8, id="one scale"),
+    ],
+)
+def test_a_planned_board_keeps_enough_corners_to_calibrate_by(view: View, corners: int) -> None:
+    plan = plan_board(view)
+    assert plan.board is not None and np.bincount(plan.board.grid_of_corner)[0] == corners and "--calibrate" not in plan.sentence
+    coarse = coarse_only(plan.board)
+    found = calibrated(coarse, seen_from_all_sides(coarse), 640, 360)
+    assert found.camera.focal_px[0] == pytest.approx(600.0, rel=0.02)
+
+
+def test_a_planned_board_with_too_few_corners_to_calibrate_by_says_so() -> None:
+    plan = plan_board(View(Lens(22.0, 5.6, 0.7, 24.0), 0.5, 2.0, 1280))
+    assert plan.board is not None and len(plan.board.corners_m) == 6
+    assert plan.sentence.endswith("its 6 corners are too few for `mrbokeh track clip --calibrate` (8): give it --camera")
+    with pytest.raises(InputError, match="only 0 frames show 8 corners"):
+        calibrated(plan.board, seen_from_all_sides(plan.board), 640, 360)

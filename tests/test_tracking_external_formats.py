@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mrbokeh.camera_track.between_frames import pose_between
+from mrbokeh.camera_track.stage_axes import pan_tilt_roll_deg
+from mrbokeh.camera_track.world_axes import inverted, rigid
 from mrbokeh.errors import InputError
 from viewfinder.frames import LensState
 from viewfinder.tracking.encoder_table import read_encoder_table
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, freed_sample, read_freed, write_freed
 from viewfinder.tracking.opentrackio import StageReading, decode_opentrackio, encode_opentrackio, opentrackio_document
 from viewfinder.tracking.opentrackio_packets import CBOR, JSON, Reassembly, fletcher16, packets, read_packet
-from viewfinder.tracking.rigid_motion import between, inverted, rigid, rigid_of
-from viewfinder.tracking.stage_axes import pan_tilt_roll_deg
+from viewfinder.tracking.rigid_motion import rigid_of
 from viewfinder.tracking.tracking_sample import MalformedMessageError, TrackingSample, lens_between
 
 IDENTITY = {"pan": 0.0, "tilt": 0.0, "roll": 0.0}
@@ -261,10 +263,10 @@ def test_between_two_poses() -> None:
     place = np.array([1.0, 2.0, 3.0])
     turn = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     a, b = inverted(rigid(np.eye(3), place)), inverted(rigid(turn, place))
-    half = inverted(between(a, b, 0.5))
+    half = inverted(pose_between(a, b, 0.5))
     assert half[:3, 3] == pytest.approx(place)
     assert half[:3, :3] == pytest.approx(Rotation.from_euler("y", 45, degrees=True).as_matrix())
-    assert between(a, b, 0.0) == pytest.approx(a) and between(a, b, 1.0) == pytest.approx(b)
+    assert pose_between(a, b, 0.0) == pytest.approx(a) and pose_between(a, b, 1.0) == pytest.approx(b)
 
 
 def test_between_two_lenses() -> None:

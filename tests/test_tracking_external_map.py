@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 
 from mrbokeh.camera import Camera
+from mrbokeh.camera_track.world_axes import inverted, rigid
 from mrbokeh.errors import InputError
 from tests.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera
 from viewfinder.frames import CameraFrame, Pose
@@ -19,7 +20,7 @@ from viewfinder.tracking.detection_thread import ImmediateDetections
 from viewfinder.tracking.map_localiser import MapLocaliser, matches
 from viewfinder.tracking.map_pose import pose_in_map, pose_refined
 from viewfinder.tracking.map_tracker import MapTracker
-from viewfinder.tracking.rigid_motion import angle_deg, inverted, rigid
+from viewfinder.tracking.rigid_motion import angle_deg
 from viewfinder.tracking.sparse_map import CACHE_NAME, SparseMap, read_sparse_map
 
 INTRINSICS = Camera(WIDTH_PX, HEIGHT_PX, (FOCAL_PX, FOCAL_PX), (WIDTH_PX / 2, HEIGHT_PX / 2))

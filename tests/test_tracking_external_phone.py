@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.camera import Camera
+from mrbokeh.camera_track.world_axes import inverted
 from mrbokeh.errors import InputError
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
@@ -22,7 +23,7 @@ from viewfinder.tracking.phone_rig import (
     write_phone_rig,
 )
 from viewfinder.tracking.phone_tracker import PhoneTracker
-from viewfinder.tracking.rigid_motion import angle_deg, inverted, rigid_of
+from viewfinder.tracking.rigid_motion import angle_deg, rigid_of
 
 # The phone 8 cm above the lens, 3 cm to its left, a little askew.
 CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.08, 0.02]))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.camera import Camera
-from viewfinder.tracking.rigid_motion import inverted, rigid
+from mrbokeh.camera_track.world_axes import inverted, rigid
 
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 400, 300, 380.0
 _TEXTURE_PX = 1024

@@ -60,6 +60,10 @@ def viewfinder(
     width: words.WidthOption = 640,
     fps: Annotated[float | None, typer.Option(help="At most so many frames per second.")] = None,
     captures: Annotated[Path, typer.Option(help="Folder for captured bundles and recordings.")] = Path("captures"),
+    webcam: Annotated[
+        str | None,
+        typer.Option(metavar="DEVICE", help="Also show it as a webcam for OBS or Zoom: its name (/dev/video9), or auto."),
+    ] = None,
     port: words.PortOption = 8080,
     lan: words.LanOption = False,
     interface: words.InterfaceOption = None,
@@ -104,6 +108,7 @@ def viewfinder(
             width,
             fps,
             captures,
+            webcam,
             listening,
         )
     )

@@ -20,6 +20,7 @@ def frame_header(frame: OutputFrame) -> dict[str, Any]:
         "f_number": status.f_number,
         "focus_pending": status.focus_pending,
         "tracking": status.tracking,
+        "tracking_unsure": status.tracking_unsure,
         "layer_age_ms": round(status.layer_age_ms, 1),
         "stages_ms": {name: round(took_ms, 2) for name, took_ms in status.stages_ms.items()},
         "dropped": status.dropped,

@@ -50,7 +50,8 @@ class FrameStatus:
     """What the page tells about a picture.
 
     focus_distance_m, f_number: of the lens that blurred the virtual layer; focus_pending: another one was asked for and is not shown yet.
-    tracking: quality of the pose from 0 (lost) to 1, None without a tracker. layer_age_ms: since the virtual layer was drawn.
+    tracking: quality of the pose from 0 (lost) to 1, None without a tracker. tracking_unsure: another pose would fit as well, so that
+      nothing is shown by this one. layer_age_ms: since the virtual layer was drawn.
     stages_ms: how long each stage took, by name, in the order in which they ran. dropped: captures so far that were never composited.
     """
 
@@ -58,6 +59,7 @@ class FrameStatus:
     f_number: float
     focus_pending: bool = False
     tracking: float | None = None
+    tracking_unsure: bool = False
     layer_age_ms: float = 0.0
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     dropped: int = 0

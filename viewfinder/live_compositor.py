@@ -34,7 +34,7 @@ class LiveCompositor:
 
     camera: intrinsics of the source in any size; None takes the pinhole of the lens, in the middle of the picture.
     tracker: None is a camera that stands where the world begins, unless the source knows its pose.
-    last: what the newest picture was made of, for those who ask what lies where; last_tracked: the newest with a pose, to be captured.
+    last: what the newest picture was made of, for those who ask what lies where. last_tracked: the newest with a certain pose.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class LiveCompositor:
         camera = replace(intrinsics, camera_from_world=pose.camera_from_world) if pose else intrinsics
         output = OutputFrame(bgr, frame.captured_s, frame.sequence, self._status(lens, pose, watch, dropped))
         self.last = Moment(frame, output, overlay, camera, lens, pose)
-        self.last_tracked = self.last_tracked if pose is None else self.last
+        self.last_tracked = self.last if pose is not None and pose.is_certain else self.last_tracked
         return output
 
     def _intrinsics(self, bgr: Bgr) -> Camera:
@@ -95,7 +95,14 @@ class LiveCompositor:
         shown = drawn.lens or lens
         tracking = None if self._tracker is None else 0.0 if pose is None else pose.quality
         return FrameStatus(
-            shown.focus_distance_m, shown.f_number, drawn.focus_pending, tracking, drawn.layer_age_ms or 0.0, watch.stages_ms, dropped
+            shown.focus_distance_m,
+            shown.f_number,
+            focus_pending=drawn.focus_pending,
+            tracking=tracking,
+            tracking_unsure=pose is not None and not pose.is_certain,
+            layer_age_ms=drawn.layer_age_ms or 0.0,
+            stages_ms=watch.stages_ms,
+            dropped=dropped,
         )
 
     def close(self) -> None:

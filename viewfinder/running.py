@@ -31,6 +31,7 @@ from viewfinder.stage.stage import Stage
 from viewfinder.streaming.alpha_stream import AlphaStream, ObsPart
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.recording import Recorder
+from viewfinder.streaming.virtual_webcam import VirtualWebcam
 from viewfinder.streaming.whep import Whep
 from viewfinder.tracking.base import Tracker
 from viewfinder.tracking.smoothed_tracker import SmoothedTracker
@@ -44,7 +45,7 @@ class Parts:
 
     scene: the scene file, whose text bundles keep. smoothing: whether the track is smoothed to begin with. focus_from: names of
     `focus_choice.FOCUS_SOURCES` that are asked first; focus_board: the board whose blur tells the focus. cameras: what else browsers
-    send to, by name.
+    send to, by name. webcam: where the pictures go, too.
     """
 
     source: FrameSource
@@ -60,6 +61,7 @@ class Parts:
     focus_from: tuple[str, ...] = ()
     focus_board: CharucoBoard | None = None
     cameras: Mapping[str, Part] = field(default_factory=dict)
+    webcam: VirtualWebcam | None = None
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ class Viewfinder:
     pipeline: Pipeline
     compositor: LiveCompositor
     site: Site
+    webcam: VirtualWebcam | None = None
 
 
 @contextmanager
@@ -86,6 +89,9 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         for each in (jpeg, stream, alone, alpha, recorder):
             closing.callback(each.close)
         sinks: list[FrameSink] = [jpeg, stream, recorder, OverlaySink(alpha, compositor)]
+        if parts.webcam is not None:
+            sinks.append(parts.webcam)
+            closing.callback(parts.webcam.close)
         pipeline = closing.enter_context(Pipeline(parts.source, compositor, sinks))
         controls = LiveControls(
             compositor,
@@ -94,7 +100,7 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
             recorder,
             parts.captures,
             parts.renderers,
-            lambda: pipeline.failure or pipeline.problem or parts.source.status or getattr(parts.tracker, "remark", None),
+            lambda: pipeline.failure or pipeline.problem or _remark(parts),
             parts.source.name,
             parts.scenery if isinstance(parts.scenery, Stage) else None,
             smoothed,
@@ -103,7 +109,15 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         if isinstance(parts.source, Part):
             of_site["whip"] = parts.source
         of_site |= parts.cameras
-        yield Viewfinder(pipeline, compositor, Site(controls, parts.access, jpeg.room, of_site, lambda: matte_of(compositor)))
+        site = Site(controls, parts.access, jpeg.room, of_site, lambda: matte_of(compositor))
+        yield Viewfinder(pipeline, compositor, site, parts.webcam)
+
+
+def _remark(parts: Parts) -> str | None:
+    """One sentence of the first part that has something to say."""
+    of_tracker: str | None = getattr(parts.tracker, "remark", None)
+    of_webcam = None if parts.webcam is None else parts.webcam.failure
+    return parts.source.status or of_tracker or of_webcam
 
 
 def _blur_focus(parts: Parts, last: Callable[[], Moment | None]) -> FocusSource | None:

@@ -6,10 +6,13 @@ of lenses and the blur do, the aperture in stops.
 """
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.camera import Camera
 from mrbokeh.camera_track.tracked_frame import Distortion, TrackedFrame
+
+Pose = Float64[np.ndarray, "4 4"]
 
 
 def between(one: TrackedFrame, other: TrackedFrame, share: float) -> TrackedFrame:
@@ -17,23 +20,29 @@ def between(one: TrackedFrame, other: TrackedFrame, share: float) -> TrackedFram
     return TrackedFrame(
         camera_between(one.camera, other.camera, share),
         focus_between_m(one.focus_distance_m, other.focus_distance_m, share),
-        _stop(one.f_number, other.f_number, share),
+        stop_between(one.f_number, other.f_number, share),
         _linear(one.time_s, other.time_s, share),
         _distortion(one.distortion, other.distortion, share),
     )
 
 
 def camera_between(one: Camera, other: Camera, share: float) -> Camera:
-    a, b = one.world_from_camera, other.world_from_camera
-    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
-    pose = np.eye(4)
-    pose[:3, :3] = (a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()).T
-    pose[:3, 3] = -pose[:3, :3] @ ((1.0 - share) * a[:3, 3] + share * b[:3, 3])
+    pose = pose_between(one.camera_from_world, other.camera_from_world, share)
     focal, principal = (
         tuple((1.0 - share) * x + share * y for x, y in zip(*pair, strict=True))
         for pair in ((one.focal_px, other.focal_px), (one.principal_px, other.principal_px))
     )
     return Camera(one.width_px, one.height_px, (focal[0], focal[1]), (principal[0], principal[1]), pose)
+
+
+def pose_between(one: Pose, other: Pose, share: float) -> Pose:
+    """Of two camera_from_world."""
+    a, b = np.linalg.inv(one), np.linalg.inv(other)
+    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
+    pose = np.eye(4)
+    pose[:3, :3] = (a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()).T
+    pose[:3, 3] = -pose[:3, :3] @ ((1.0 - share) * a[:3, 3] + share * b[:3, 3])
+    return pose
 
 
 def focus_between_m(one_m: float | None, other_m: float | None, share: float) -> float | None:
@@ -43,7 +52,7 @@ def focus_between_m(one_m: float | None, other_m: float | None, share: float) ->
     return 1.0 / dioptres if dioptres > 0.0 else float("inf")
 
 
-def _stop(one: float | None, other: float | None, share: float) -> float | None:
+def stop_between(one: float | None, other: float | None, share: float) -> float | None:
     if one is None or other is None:
         return None
     return float(one ** (1.0 - share) * other**share)

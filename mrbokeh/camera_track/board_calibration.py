@@ -13,7 +13,9 @@ from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.charuco.detector import Corners
 from mrbokeh.errors import InputError
 
-_FEWEST_CORNERS = 8
+FEWEST_CORNERS = 8
+"""That a frame must show."""
+
 _FEWEST_VIEWS = 4
 _MOST_VIEWS = 40
 _WORST_FOCAL = 0.03
@@ -28,6 +30,8 @@ _FREED = (
     (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_FIX_PRINCIPAL_POINT),
 )
 _PARAMETERS = (1, 2, 3, 5)
+_WORST_PX, _WORST_SHARE = 2.0, 0.002
+"""RMS of corners of a blurred, hand-held board is below 1 px at 1920 px; of another board it is above 10."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,10 @@ def calibrated(board: CharucoBoard, seen: Sequence[Corners], width_px: int, heig
     Square pixels; then in turn k1, k2 and the principal point are freed where Schwarz's criterion (BIC 1978) says that the views know
     them. Raises InputError where they leave the focal length open.
     """
-    views = _spread([each for each in seen if len(each) >= _FEWEST_CORNERS], board)
+    views = _spread([each for each in seen if len(each) >= FEWEST_CORNERS], board)
     if len(views) < _FEWEST_VIEWS:
         raise InputError(
-            f"only {len(views)} frames show {_FEWEST_CORNERS} corners of the board, too few to calibrate by: give --camera, "
+            f"only {len(views)} frames show {FEWEST_CORNERS} corners of the board, too few to calibrate by: give --camera, "
             f"or film the board nearer and from several sides, or print one of more squares (this one has {len(board.corners_m)} corners)"
         )
     solutions = [_solved(board, views, (width_px, height_px), index) for index in range(len(_FREED))]
@@ -59,6 +63,11 @@ def calibrated(board: CharucoBoard, seen: Sequence[Corners], width_px: int, heig
         raise InputError(
             "the clip shows the board under too few angles to tell the focal length: tilt the camera by 20 degrees or more "
             "against the board, or give --camera"
+        )
+    if (off_px := best[1].residual_px) > max(_WORST_PX, _WORST_SHARE * width_px):
+        raise InputError(
+            f"no camera explains where the corners are seen, they are off by {off_px:.1f} px: is this the board in the clip? "
+            f"Compare its squares and markers with the print, or give --camera"
         )
     return best[1]
 

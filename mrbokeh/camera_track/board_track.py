@@ -11,12 +11,12 @@ from mrbokeh.camera import Camera
 from mrbokeh.camera_track.board_calibration import Calibration, calibrated
 from mrbokeh.camera_track.board_corners import RollingCorners, Undistorting, read_greys
 from mrbokeh.camera_track.board_smoothing import Observation, residual_px, steadied
-from mrbokeh.camera_track.steady_poses import Pose
 from mrbokeh.camera_track.track import CameraTrack
 from mrbokeh.camera_track.tracked_frame import Distortion, TrackedFrame
 from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
-from mrbokeh.charuco.pose_from_points import PoseFit, pose_from_plane
+from mrbokeh.charuco.pose_branches import PoseFit, fits_of_shot
+from mrbokeh.charuco.pose_from_points import poses_from_plane
 from mrbokeh.errors import InputError
 from mrbokeh.progress import track as with_progress
 from mrbokeh.video_io import probe
@@ -42,6 +42,7 @@ class TrackSettings:
 class BoardTrack:
     """frame_count: of the clip. seen: frames in which the pose was measured; bridged: interpolated; lost: in neither, and not in the track.
 
+    unsure: frames in which the board was found, but so small or so much head on that two poses fit alike; each is bridged or lost, too.
     residual_px: RMS distance of all corners from where the track's poses put them; measured_residual_px: with the poses as measured.
     """
 
@@ -52,6 +53,7 @@ class BoardTrack:
     lost: tuple[int, ...]
     residual_px: float
     measured_residual_px: float
+    unsure: tuple[int, ...] = ()
 
 
 def calibrate_clip(clip: Path, board: CharucoBoard) -> Calibration:
@@ -79,25 +81,24 @@ def track_board(
             yield undistorted(grey)
 
     corners = RollingCorners(board).all(greys())
-    fits = poses_of(corners, board, camera)
+    fits = poses_of(corners, board, camera, times_s)
     if len(fits) < 2:
         raise InputError(
             f"the board ({board.squares_text} squares, {board.dictionary}) was found in {len(fits)} of {len(corners)} frames of {clip}: "
             f"check that --board is the one in the picture, and that it is lit and sharp"
         )
+    if sum(fit.is_certain for fit in fits.values()) < 2:
+        raise InputError(
+            f"the board was found in {len(fits)} of {len(corners)} frames of {clip}, but so small, or so much head on, that nobody can "
+            f"tell how it is tilted: film it from nearer, or more from the side, or print a larger one"
+        )
     return _judged(corners, fits, _Shot(board, camera, distortion, tuple(times_s)), settings)
 
 
-def poses_of(corners: Sequence[Corners], board: CharucoBoard, camera: Camera) -> dict[int, PoseFit]:
-    """By frame; of two poses that explain a frame alike the one nearer to the frame before is taken."""
-    fits: dict[int, PoseFit] = {}
-    before: Pose | None = None
-    for number, each in enumerate(corners):
-        fit = pose_from_plane(board.corners_m[each.ids], each.xy_px, camera, before)
-        if fit is not None:
-            fits[number] = fit
-            before = fit.camera_from_world
-    return fits
+def poses_of(corners: Sequence[Corners], board: CharucoBoard, camera: Camera, times_s: Sequence[float]) -> dict[int, PoseFit]:
+    """By frame; of two poses that explain a frame alike the one that fits into the whole shot is taken."""
+    found = {number: poses_from_plane(board.corners_m[each.ids], each.xy_px, camera) for number, each in enumerate(corners)}
+    return fits_of_shot({number: each for number, each in found.items() if each is not None}, times_s)
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,8 @@ class _Shot:
     times_s: tuple[float, ...]
 
 
-def _judged(corners: Sequence[Corners], fits: dict[int, PoseFit], shot: _Shot, settings: TrackSettings) -> BoardTrack:
+def _judged(corners: Sequence[Corners], found: dict[int, PoseFit], shot: _Shot, settings: TrackSettings) -> BoardTrack:
+    fits = {number: fit for number, fit in found.items() if fit.is_certain}
     observed = {number: Observation(fit.camera_from_world, corners[number].only(fit.inliers)) for number, fit in fits.items()}
     steady = steadied(observed, shot.board, shot.camera, settings.extra_px)
     measured = {number: each.pose for number, each in observed.items()}
@@ -122,7 +124,16 @@ def _judged(corners: Sequence[Corners], fits: dict[int, PoseFit], shot: _Shot, s
     }
     lost = tuple(number for number in range(len(corners)) if number not in poses)
     after_px, before_px = (residual_px(observed, each, shot.board, shot.camera) for each in (poses, measured))
-    return BoardTrack(CameraTrack(frames, "-z"), len(corners), len(fits), tuple(sorted(bridged)), lost, after_px, before_px)
+    return BoardTrack(
+        CameraTrack(frames, "-z"),
+        len(corners),
+        len(fits),
+        tuple(sorted(bridged)),
+        lost,
+        after_px,
+        before_px,
+        tuple(sorted(set(found) - set(fits))),
+    )
 
 
 def _gap(number: int, fits: dict[int, PoseFit]) -> int:

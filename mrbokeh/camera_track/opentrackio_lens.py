@@ -1,12 +1,12 @@
 """Sensor and lens of an OpenTrackIO sample: see `opentrackio_file` for the conventions."""
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from mrbokeh.camera import Camera
+from mrbokeh.camera_track.opentrackio_sample import lens_numbers
 from mrbokeh.camera_track.options import TrackOptions
 from mrbokeh.camera_track.tracked_frame import Distortion, TrackedFrame
 from mrbokeh.errors import InputError
@@ -53,7 +53,6 @@ def distortion_of(lens: Mapping[str, Any], focal_mm: float, where: str) -> Disto
 
 
 def lens_document(frame: TrackedFrame, sensor_mm: float) -> dict[str, Any]:
-    """What is not known, and a focus at infinity, for which JSON has no number, are left out."""
     camera = frame.camera
     mm_per_px = sensor_mm / camera.width_px
     focal_mm = camera.focal_px[0] * mm_per_px
@@ -65,9 +64,7 @@ def lens_document(frame: TrackedFrame, sensor_mm: float) -> dict[str, Any]:
             "y": (camera.principal_px[1] / camera.height_px - 0.5) * height_mm,
         },
     }
-    for name, value in (("focusDistance", frame.focus_distance_m), ("fStop", frame.f_number)):
-        if value is not None and math.isfinite(value):
-            document[name] = value
+    document |= lens_numbers(focusDistance=frame.focus_distance_m, fStop=frame.f_number)
     if told := frame.coefficients:
         radial = [told.get(name, 0.0) / focal_mm ** (2 * (index // 2 + 1)) for index, name in enumerate(_RADIAL)]
         tangential = [told.get(name, 0.0) / focal_mm for name in ("p1", "p2")]

@@ -6,5 +6,7 @@ board_file        read_board, write_board: JSON with any grids, TOML with one
 detector          CharucoDetector: Corners in a grey picture
 board_alignment   AlignedDetector: corners from all of the print, ten times as exact out of focus
 corner_flow       flow, FrameHistory: corners carried from frame to frame
-pose_from_points  pose_from_plane: the camera that sees them there
+pose_from_points  poses_from_plane: the cameras that see them there, of which a plane seen from afar has two
+pose_accuracy     how far the scatter of corners turns a pose
+pose_branches     PoseBranches, fits_of_shot: which of the two it is, and how sure that is
 """

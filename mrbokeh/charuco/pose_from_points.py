@@ -1,7 +1,7 @@
-"""The pose of a camera from points of a plane and where it sees them.
+"""The poses of a camera from points of a plane and where it sees them.
 
-A plane seen from far away or head on has two poses that fit almost alike (Collins and Bartoli 2014, IPPE gives both). Both are
-refined, and of two that fit alike the one nearer to the pose before is taken.
+A plane seen from far away or head on has two poses that fit almost alike (Collins and Bartoli 2014, IPPE gives both). Both are refined
+and given, with how well they fit and how exact each is; `pose_branches` tells them apart over time.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from mrbokeh.camera import Camera
+from mrbokeh.charuco.pose_accuracy import corner_sigma_px, turn_sigma_rad
 
 FEWEST_POINTS = 6
 """With fewer, near the limit of defocus, poses were off by degrees."""
 
-_ALIKE = 1.1
-_ALIKE_PX = 0.03
+_SAME_RAD = 0.01
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-10)
 
 Pose = Float64[np.ndarray, "4 4"]
@@ -25,11 +25,23 @@ PointsPx = Float64[np.ndarray, "points 2"]
 
 
 @dataclass(frozen=True)
-class PoseFit:
-    """camera_from_world: (4, 4). residual_px: RMS distance over the inliers."""
+class PlanePose:
+    """camera_from_world: (4, 4). residual_px: RMS distance over the inliers. turn_sigma_rad: of its rotation, if it is the right one.
+
+    misfit: sum of squared distances over the variance of a corner, of which a wrong pose has more.
+    """
 
     camera_from_world: Pose
     residual_px: float
+    turn_sigma_rad: float
+    misfit: float
+
+
+@dataclass(frozen=True)
+class PlanePoses:
+    """poses: one or two, the best fit first."""
+
+    poses: tuple[PlanePose, ...]
     inliers: Bool[np.ndarray, " points"]
 
 
@@ -38,24 +50,33 @@ def largest_residual_px(camera: Camera) -> float:
     return max(1.5, 3.0 * camera.width_px / 1280)
 
 
-def pose_from_plane(points_m: PointsM, xy_px: PointsPx, camera: Camera, before: Pose | None = None) -> PoseFit | None:
-    """points_m: z = 0. camera: intrinsics. before: the pose of the frame before. None if fewer than 6 points agree on a pose."""
+def poses_from_plane(points_m: PointsM, xy_px: PointsPx, camera: Camera) -> PlanePoses | None:
+    """points_m: z = 0. camera: intrinsics. None if fewer than 6 points agree on a pose."""
     wrong_px = largest_residual_px(camera)
     inliers = _of_one_plane(points_m, xy_px, wrong_px)
-    fit = _fit(points_m, xy_px, inliers, camera, before)
-    if fit is None:
+    found = _fit(points_m, xy_px, inliers, camera)
+    if found is None:
         return None
-    near = _off_px(points_m, xy_px, camera, fit.camera_from_world) < wrong_px
+    near = _off_px(points_m, xy_px, camera, found.poses[0].camera_from_world) < wrong_px
     if (near != inliers).any():
-        fit = _fit(points_m, xy_px, near, camera, fit.camera_from_world)
-    return fit if fit is not None and fit.residual_px < wrong_px / 2 else None
+        found = _fit(points_m, xy_px, near, camera)
+    return found if found is not None and found.poses[0].residual_px < wrong_px / 2 else None
 
 
-def _fit(points_m: PointsM, xy_px: PointsPx, inliers: Bool[np.ndarray, " points"], camera: Camera, before: Pose | None) -> PoseFit | None:
-    if np.count_nonzero(inliers) < FEWEST_POINTS or _on_a_line(points_m[inliers]):
+def _fit(points_m: PointsM, xy_px: PointsPx, inliers: Bool[np.ndarray, " points"], camera: Camera) -> PlanePoses | None:
+    points_m, xy_px = points_m[inliers], xy_px[inliers]
+    if len(points_m) < FEWEST_POINTS or _on_a_line(points_m):
         return None
-    pose = _refined_pose(points_m[inliers], xy_px[inliers], camera, before)
-    return None if pose is None else PoseFit(pose, _rms(_off_px(points_m[inliers], xy_px[inliers], camera, pose)), inliers)
+    fits = [(_rms(_off_px(points_m, xy_px, camera, pose)), pose) for pose in _refined_poses(points_m, xy_px, camera)]
+    if not fits:
+        return None
+    fits = _apart(sorted(fits, key=lambda fit: fit[0]))
+    sigma_px = corner_sigma_px(fits[0][0], len(points_m))
+    poses = [
+        PlanePose(pose, rms_px, turn_sigma_rad(points_m, camera, pose, sigma_px), len(points_m) * (rms_px / sigma_px) ** 2)
+        for rms_px, pose in fits
+    ]
+    return PlanePoses(tuple(poses), inliers)
 
 
 def _of_one_plane(points_m: PointsM, xy_px: PointsPx, wrong_px: float) -> Bool[np.ndarray, " points"]:
@@ -71,19 +92,20 @@ def _on_a_line(points_m: PointsM) -> bool:
     return bool(spread[1] < 0.02 * spread[0])
 
 
-def _refined_pose(points_m: PointsM, xy_px: PointsPx, camera: Camera, before: Pose | None) -> Pose | None:
+def _refined_poses(points_m: PointsM, xy_px: PointsPx, camera: Camera) -> list[Pose]:
     matrix = opencv_matrix(camera)
     _, turns, shifts, _ = cv2.solvePnPGeneric(points_m, xy_px, matrix, None, flags=cv2.SOLVEPNP_IPPE)
-    starts = list(zip(turns, shifts, strict=True)) + ([] if before is None else [(_turn(before), before[:3, 3:])])
-    poses = [_pose(*cv2.solvePnPRefineLM(points_m, xy_px, matrix, None, turn.copy(), shift.copy(), _STOP)) for turn, shift in starts]
-    fits = [(_rms(_off_px(points_m, xy_px, camera, pose)), pose) for pose in poses if _before_camera(points_m, pose)]
-    if not fits:
-        return None
-    least_px = min(residual_px for residual_px, _ in fits)
-    alike = [(residual_px, pose) for residual_px, pose in fits if residual_px <= _ALIKE * least_px + _ALIKE_PX]
-    if before is None:
-        return min(alike, key=lambda fit: fit[0])[1]
-    return min(alike, key=lambda fit: _turn_rad(fit[1], before))[1]
+    poses = [
+        _pose(*cv2.solvePnPRefineLM(points_m, xy_px, matrix, None, turn.copy(), shift.copy(), _STOP))
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
+    return [pose for pose in poses if _before_camera(points_m, pose)]
+
+
+def _apart(fits: list[tuple[float, Pose]]) -> list[tuple[float, Pose]]:
+    """The best, and the best of those that refinement did not lead to the same pose."""
+    others = [fit for fit in fits[1:] if turn_between_rad(fit[1], fits[0][1]) > _SAME_RAD]
+    return [fits[0], *others[:1]]
 
 
 def opencv_matrix(camera: Camera) -> Float64[np.ndarray, "3 3"]:
@@ -101,12 +123,8 @@ def _before_camera(points_m: PointsM, pose: Pose) -> bool:
     return bool(np.isfinite(pose).all() and (points_m @ pose[2, :3] + pose[2, 3] > 0).all())
 
 
-def _turn(pose: Pose) -> Float64[np.ndarray, "3 1"]:
-    """As a rotation vector."""
-    return np.asarray(cv2.Rodrigues(pose[:3, :3])[0], np.float64)
-
-
-def _turn_rad(one: Pose, other: Pose) -> float:
+def turn_between_rad(one: Pose, other: Pose) -> float:
+    """The angle between two rotations."""
     return float(np.linalg.norm(cv2.Rodrigues(one[:3, :3] @ other[:3, :3].T)[0]))
 
 

@@ -22,6 +22,7 @@ from viewfinder.server.app import serving_site
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.exact_size import ExactSize
 from viewfinder.still_layer import StillLayer
+from viewfinder.streaming.virtual_webcam import VirtualWebcam
 from viewfinder.tracking.base import Tracker
 from viewfinder.tracking.fixed_pose import FixedPose, read_fixed_pose
 from viewfinder.tracking.phone_tracker import PhoneTracker
@@ -45,6 +46,9 @@ def _parts(options: ServeOptions, access: Access, closing: ExitStack) -> Parts:
     focus_board = _focus_board(options)
     scenery = open_scenery(options.scene, options.layer, lambda: lenses.lens, renderers, options.backend)
     closing.callback(scenery.close)
+    webcam = None if options.webcam is None else VirtualWebcam(options.webcam)
+    if webcam is not None:
+        closing.callback(webcam.close)
     tracker = open_tracker(options.tracking)
     if tracker is not None:
         closing.callback(tracker.close)
@@ -65,6 +69,7 @@ def _parts(options: ServeOptions, access: Access, closing: ExitStack) -> Parts:
         options.focus_from,
         focus_board,
         cameras,
+        webcam,
     )
 
 
@@ -86,6 +91,8 @@ async def _served(viewfinder: Viewfinder, door: Door) -> None:
     on_stop(stopped.set)
     async with serving_site(viewfinder.site, door.host, door.port, door.tls) as url:
         door.announce(f"viewfinder of {viewfinder.pipeline.source.name}", url)
+        if viewfinder.webcam is not None:
+            typer.echo(f"also a webcam for other programs: {viewfinder.webcam.name}")
         if "whip" in viewfinder.site.parts:
             door.announce_camera(url, CAMERA_PAGE)
         await stopped.wait()

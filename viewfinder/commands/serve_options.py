@@ -30,6 +30,7 @@ class ServeOptions:
     width_px: int | None = 640
     fps: float | None = None
     captures: Path = Path("captures")
+    webcam: str | None = None
     listening: ListeningOptions = field(default_factory=ListeningOptions)
 
 

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5ef19728dd5e66b3d395c1f0b2a206ece800053f9aab3c47e59cc221af7ca1e8
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 630d4fa69bf41fc469c95f62cd0bd85be67f3eaf837e0e85fc77ac686d2241b8
 "use strict";
 (() => {
   // src/model.ts

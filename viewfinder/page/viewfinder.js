@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5ef19728dd5e66b3d395c1f0b2a206ece800053f9aab3c47e59cc221af7ca1e8
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 630d4fa69bf41fc469c95f62cd0bd85be67f3eaf837e0e85fc77ac686d2241b8
 "use strict";
 (() => {
   // src/aids.ts
@@ -325,7 +325,7 @@
     metres;
     touched_ms = -Infinity;
     connectedCallback() {
-      this.innerHTML = `<label for="focus">Focus <output id="metres" for="focus">-</output></label>
+      this.innerHTML = `<label for="focus">Focus <span id="focus_from"></span><output id="metres" for="focus">-</output></label>
       <input id="focus" type="range" min="0" max="1" step="any" disabled>
       <div class="ends"><span>∞</span><span id="nearest"></span></div>`;
       this.slider = this.querySelector("#focus");
@@ -344,6 +344,7 @@
     onState() {
       const { dioptre_range, focus_distance_m } = model.state;
       this.hidden = dioptre_range === void 0;
+      this.querySelector("#focus_from").textContent = toldBy(model.state.focus_from);
       if (dioptre_range === void 0) return;
       [this.slider.min, this.slider.max] = dioptre_range.map(String);
       this.slider.disabled = !model.mayControl;
@@ -363,6 +364,10 @@
       this.metres.textContent = distanceText(distance_m);
     }
   };
+  function toldBy(name) {
+    if (name === void 0) return "";
+    return name === null ? "from the file of the lens" : name.startsWith("by ") ? name : `from ${name}`;
+  }
 
   // src/objects.ts
   var selection = { name: "" };
@@ -797,7 +802,7 @@ void main() {
         this.marks.draw(pixels, { peakReal: aids.has("peakReal"), peakVirtual: aids.has("peakVirtual"), zebra: aids.has("zebra") });
         if (aids.has("histogram")) this.histogram.draw(this.marks);
       }
-      if (header) this.showTracking(header.tracking ?? null);
+      if (header) this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
     }
     get marking() {
       return ["peakReal", "peakVirtual", "zebra", "histogram"].some((aid) => aids.has(aid));
@@ -811,12 +816,12 @@ void main() {
       if (!this.marking) this.marks?.clear();
       this.matte.run(aids.has("peakReal") || aids.has("peakVirtual"));
     }
-    showTracking(quality) {
+    showTracking(quality, unsure) {
       const badge = this.find("tracking");
       badge.hidden = quality === null;
       if (quality === null) return;
-      badge.dataset["quality"] = quality === 0 ? "lost" : quality < 0.5 ? "weak" : "good";
-      badge.textContent = quality === 0 ? "tracking lost" : `tracking ${(100 * quality).toFixed(0)} %`;
+      badge.dataset["quality"] = quality === 0 ? "lost" : unsure ? "unsure" : quality < 0.5 ? "weak" : "good";
+      badge.textContent = quality === 0 ? "tracking lost" : unsure ? "tilt unsure: go nearer" : `tracking ${(100 * quality).toFixed(0)} %`;
     }
   };
 

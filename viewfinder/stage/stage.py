@@ -67,12 +67,14 @@ class Stage:
     def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:
         """The newest drawing, moved to this pose; asks for a new one where it is too old. Takes about a millisecond.
 
-        pose None: the track is lost; what is shown fades where it was. intrinsics: of this frame's size, its pose is not looked
-        at. lens: as it is focused now. time_s: of the frame, `CameraFrame.captured_s`; animations and fading go by it.
+        pose None: the track is lost; what is shown fades where it was. It fades, too, where a pose is not certain. intrinsics: of this
+        frame's size, its pose is not looked at. lens: as it is focused now. time_s: of the frame, `CameraFrame.captured_s`; animations
+        and fading go by it.
         """
-        opacity = self._fade.at(pose is not None, time_s)
+        is_tracked = pose is not None and pose.is_certain
+        opacity = self._fade.at(is_tracked, time_s)
         pose_now = pose.camera_from_world if pose is not None else None if self._camera is None else self._camera.camera_from_world
-        if pose_now is None:
+        if pose_now is None or (self._camera is None and not is_tracked):
             return _nothing()
         self._camera = replace(intrinsics, camera_from_world=pose_now)
         self._began_s = time_s if self._began_s is None else self._began_s

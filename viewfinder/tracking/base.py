@@ -11,7 +11,8 @@ from viewfinder.frames import CameraFrame, Pose
 class TrackedPose:
     """camera_from_world: (4, 4), metres. quality: 0 (a guess) to 1. residual_px: RMS of the reprojected points; points: how many.
 
-    captured_s: of the frame that it belongs to, so that a late pose is not taken for a new one.
+    captured_s: of the frame that it belongs to, so that a late pose is not taken for a new one. is_certain: False where another pose fits
+      as well, as for a board that is small in the picture; nothing should be shown or measured by it then.
     """
 
     camera_from_world: Pose
@@ -19,6 +20,7 @@ class TrackedPose:
     captured_s: float
     residual_px: float = 0.0
     points: int = 0
+    is_certain: bool = True
 
 
 @runtime_checkable

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mrbokeh.camera_track.board_calibration import FEWEST_CORNERS
 from mrbokeh.charuco.board import DICTIONARY, CharucoBoard, CharucoGrid
 from mrbokeh.errors import InputError
 from mrbokeh.lens import MM_PER_M, Lens
@@ -67,9 +68,9 @@ class BoardPlan:
 
 def plan_board(view: View, paper: str = "a4") -> BoardPlan:
     """A board for that paper; for the next larger one where its markers would be too small."""
-    distances = np.linspace(1.0 / view.farthest_m, 1.0 / view.nearest_m, _STEPS)
-    markers_mm = [view.needed_marker_mm(1.0 / float(each)) for each in distances]
-    blur_px = max(abs(float(view.lens.coc_px(1.0 / float(each), view.width_px))) for each in distances)
+    distances_m = [1.0 / float(each) for each in np.linspace(1.0 / view.farthest_m, 1.0 / view.nearest_m, _STEPS)]
+    markers_mm = [view.needed_marker_mm(each) for each in distances_m]
+    blur_px = max(abs(float(view.lens.coc_px(each, view.width_px))) for each in distances_m)
     needed = (
         f"from {view.nearest_m:g} to {view.farthest_m:g} m the blur grows to {blur_px:.1f} px, so markers must be at least "
         f"{max(markers_mm):.0f} mm ({BLURS_PER_MARKER:g} blurs)"
@@ -78,9 +79,24 @@ def plan_board(view: View, paper: str = "a4") -> BoardPlan:
         board = _board_on(page_of(name), max(markers_mm), min(markers_mm))
         if board is not None:
             larger = "" if name == paper.lower() else f", which {paper} cannot hold"
-            return BoardPlan(max(markers_mm), blur_px, board, name, f"{needed}{larger}: print {_words(board)} on {name}")
+            told = f"{needed}{larger}: print {_words(board)} on {name}{_calibrating(board)}"
+            return BoardPlan(max(markers_mm), blur_px, board, name, told)
     advice = "stop the lens down, stay nearer to its focus, or track with a phone on the camera, whose own lens is sharp at all distances"
     return BoardPlan(max(markers_mm), blur_px, None, None, f"{needed}, which no paper up to a3 holds: {advice}")
+
+
+def _calibrating(board: CharucoBoard) -> str:
+    """That a clip of the board cannot tell the camera's intrinsics; empty if it can at every distance."""
+    corners = _coarse_corners(board)
+    if corners >= FEWEST_CORNERS:
+        return ""
+    where = "where the blur is strongest " if len(board.grids) > 1 else ""
+    return f"; {where}its {corners} corners are too few for `mrbokeh track clip --calibrate` ({FEWEST_CORNERS}): give it --camera"
+
+
+def _coarse_corners(board: CharucoBoard) -> int:
+    """What is read at every distance."""
+    return int(np.count_nonzero(board.grid_of_corner == 0))
 
 
 def _from(paper: str) -> list[str]:
@@ -97,22 +113,36 @@ def _board_on(page: Page, coarse_mm: float, fine_mm: float) -> CharucoBoard | No
 
 
 def _board_in(room_mm: tuple[float, float], coarse_mm: float, fine_mm: float) -> CharucoBoard | None:
-    """One grid, and a fine one below it where the distances differ so much that small markers are read at some of them."""
+    """One grid, and a fine one below it where the distances differ so much that small markers are read at some of them.
+
+    Enough corners at every distance go before a second scale.
+    """
     square_mm = _whole_mm(coarse_mm / MARKER_PER_SQUARE)
     columns = min(int(room_mm[0] / square_mm), _MOST_COLUMNS)
     rows = min(int(room_mm[1] / square_mm), _MOST_ROWS)
     if columns < _FEWEST_COLUMNS or rows < _FEWEST_ROWS:
         return None
-    fine_square_mm = _whole_mm(fine_mm / MARKER_PER_SQUARE)
-    top_mm = _FEWEST_ROWS * square_mm + _GAP_SQUARES * square_mm
-    fine_columns = min(int(room_mm[0] / fine_square_mm), _MOST_COLUMNS)
-    fine_rows = min(int((room_mm[1] - top_mm) / fine_square_mm), _MOST_ROWS)
-    if square_mm / fine_square_mm < _WORTH_A_SECOND_SCALE or fine_columns < _FEWEST_COLUMNS or fine_rows < _FEWEST_ROWS:
-        return _within_dictionary((_grid(columns, rows, square_mm),))
-    coarse = _grid(columns, _FEWEST_ROWS, square_mm)
-    fine = _grid(fine_columns, fine_rows, fine_square_mm)
-    below = CharucoGrid(fine.squares, fine.square_mm, fine.marker_mm, (0.0, top_mm), coarse.marker_ids.stop)
-    return _within_dictionary((coarse, below))
+    enough_rows = max(int(np.ceil(FEWEST_CORNERS / (columns - 1))) + 1, _FEWEST_ROWS)
+    one_scale = (_grid(columns, rows, square_mm),)
+    two_scales = [
+        (coarse, fine)
+        for coarse in (_grid(columns, each, square_mm) for each in {enough_rows, _FEWEST_ROWS} if each <= rows)
+        if (fine := _below(coarse, room_mm, _whole_mm(fine_mm / MARKER_PER_SQUARE))) is not None
+    ]
+    wanted = sorted(two_scales, key=lambda grids: -grids[0].squares[1])
+    boards = [_within_dictionary(grids) for grids in (*wanted, one_scale)]
+    return next((board for board in boards if _coarse_corners(board) >= FEWEST_CORNERS), boards[0])
+
+
+def _below(coarse: CharucoGrid, room_mm: tuple[float, float], square_mm: float) -> CharucoGrid | None:
+    """A fine grid in what is left of the room; None where that is too little, or its squares are hardly smaller."""
+    top_mm = coarse.size_mm[1] + _GAP_SQUARES * coarse.square_mm
+    columns = min(int(room_mm[0] / square_mm), _MOST_COLUMNS)
+    rows = min(int((room_mm[1] - top_mm) / square_mm), _MOST_ROWS)
+    hardly_smaller = coarse.square_mm / square_mm < _WORTH_A_SECOND_SCALE
+    if hardly_smaller or columns < _FEWEST_COLUMNS or rows < _FEWEST_ROWS:
+        return None
+    return CharucoGrid((columns, rows), square_mm, MARKER_PER_SQUARE * square_mm, (0.0, top_mm), coarse.marker_ids.stop)
 
 
 def _grid(columns: int, rows: int, square_mm: float) -> CharucoGrid:

@@ -10,7 +10,8 @@ from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.charuco.board_alignment import AlignedDetector
 from mrbokeh.charuco.corner_flow import FrameHistory
 from mrbokeh.charuco.detector import NO_CORNERS, Corners
-from mrbokeh.charuco.pose_from_points import PoseFit, pose_from_plane
+from mrbokeh.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit
+from mrbokeh.charuco.pose_from_points import poses_from_plane
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.detection_thread import Detections, DetectionThread
@@ -33,6 +34,7 @@ class CharucoTracker:
         self.board, self._grace_s = board, grace_s
         self._detections = detections or DetectionThread(AlignedDetector(board))
         self._history = FrameHistory()
+        self._branches = PoseBranches()
         self._last: TrackedPose | None = None
         self.corners = NO_CORNERS
         self.detection_s = 0.0
@@ -43,15 +45,14 @@ class CharucoTracker:
             self.corners = NO_CORNERS
         self._detections.offer(frame.sequence, grey, hurry=not len(self.corners))
         corners = self._newest_corners()
-        before = None if self._last is None else self._last.camera_from_world
-        fit = pose_from_plane(self.board.corners_m[corners.ids], corners.xy_px, intrinsics, before)
-        if fit is None:
+        found = poses_from_plane(self.board.corners_m[corners.ids], corners.xy_px, intrinsics)
+        if found is None:
             self.corners = NO_CORNERS
             return self._held(frame.captured_s)
+        fit = self._branches.take(found, frame.captured_s)
         self.corners = corners.only(fit.inliers)
-        self._last = TrackedPose(
-            fit.camera_from_world, self._quality(fit, intrinsics), frame.captured_s, fit.residual_px, int(fit.inliers.sum())
-        )
+        quality = self._quality(fit, intrinsics)
+        self._last = TrackedPose(fit.camera_from_world, quality, frame.captured_s, fit.residual_px, int(fit.inliers.sum()), fit.is_certain)
         return self._last
 
     def close(self) -> None:
@@ -70,14 +71,16 @@ class CharucoTracker:
     def _held(self, now_s: float) -> TrackedPose | None:
         if self._last is None or now_s - self._last.captured_s > self._grace_s:
             self._last = None
+            self._branches.reset()
             return None
         share = 1.0 - (now_s - self._last.captured_s) / self._grace_s
         return replace(self._last, quality=self._last.quality * share)
 
     def _quality(self, fit: PoseFit, camera: Camera) -> float:
-        """1 for 16 corners that fit to the pixel and span 15 % of the picture's diagonal both ways; a product of three shares."""
+        """1 for 16 corners that fit to the pixel, span 15 % of the picture's diagonal both ways and leave no doubt; a product of shares."""
         xy_px = self.corners.xy_px
         spread = np.linalg.svd(xy_px - xy_px.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(xy_px))
         across = 2.0 * spread / np.hypot(camera.width_px, camera.height_px) / _ENOUGH_SPREAD
         exact = 1.0 / (1.0 + (fit.residual_px / _GOOD_RESIDUAL_PX) ** 2)
-        return float(min(len(xy_px) / _ENOUGH_CORNERS, 1.0) * min(across, 1.0) * exact)
+        certain = 1.0 / (1.0 + (fit.turn_sigma_deg / CERTAIN_DEG) ** 2)
+        return float(min(len(xy_px) / _ENOUGH_CORNERS, 1.0) * min(across, 1.0) * exact * certain)

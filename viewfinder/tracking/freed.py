@@ -11,13 +11,12 @@ import struct
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from mrbokeh.camera_track.stage_axes import CAMERA_FROM_STAGE_CAMERA, pan_tilt_roll_deg, stage_rotation
+from mrbokeh.camera_track.world_axes import inverted, rigid
 from viewfinder.frames import UNKNOWN_LENS, Pose
 from viewfinder.tracking.encoder_table import EncoderTable
-from viewfinder.tracking.rigid_motion import inverted, rigid
-from viewfinder.tracking.stage_axes import CAMERA_FROM_STAGE_CAMERA, STAGE_FROM_BOARD, pan_tilt_roll_deg
-from viewfinder.tracking.tracking_sample import MalformedMessageError, TrackingSample
+from viewfinder.tracking.tracking_sample import STAGE_FROM_BOARD, MalformedMessageError, TrackingSample
 
 PORT = 40000
 MESSAGE_BYTES = 29
@@ -78,7 +77,7 @@ def freed_sample(message: FreeDMessage, reading: FreeDReading) -> TrackingSample
     """In our conventions; without a table the counts of the lens say nothing and are told as ignored."""
     numbers = np.array([*message.pan_tilt_roll_deg, *message.xyz_m]) * reading.signs
     pan, tilt, roll = numbers[:3]
-    stage_from_camera = rigid(Rotation.from_euler("ZXY", [-pan, tilt, roll], degrees=True).as_matrix(), numbers[3:])
+    stage_from_camera = rigid(stage_rotation(-pan, tilt, roll), numbers[3:])
     stage_from_pupil = stage_from_camera @ rigid(np.eye(3), np.array([0.0, reading.pupil_before_m, 0.0]))
     camera_from_world = CAMERA_FROM_STAGE_CAMERA @ inverted(stage_from_pupil) @ reading.stage_from_world
     if reading.table is None:

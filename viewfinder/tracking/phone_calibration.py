@@ -37,7 +37,7 @@ class Calibration:
             started_s = frame.captured_s if started_s is None else started_s
             pose = self.tracker.track(frame, self.intrinsics(frame.bgr.shape[1], frame.bgr.shape[0]))
             # A pose that is held after the board was lost says nothing of this moment.
-            seen = pose is not None and pose.captured_s == frame.captured_s
+            seen = pose is not None and pose.is_certain and pose.captured_s == frame.captured_s
             told.frame(frame, seen)
             if found.take(frame.captured_s, pose.camera_from_world if pose is not None and seen else None):
                 self.say(self._progress(found))

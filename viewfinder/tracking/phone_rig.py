@@ -17,10 +17,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.camera_track.world_axes import inverted, rigid
 from mrbokeh.errors import InputError
 from mrbokeh.lens import MM_PER_M
 from viewfinder.frames import Pose
-from viewfinder.tracking.rigid_motion import angle_deg, inverted, parameters_of, rigid, rigid_of
+from viewfinder.tracking.rigid_motion import angle_deg, parameters_of, rigid_of
 
 FORMAT = "mrbokeh-phone-rig"
 VERSION = 1

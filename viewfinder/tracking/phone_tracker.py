@@ -98,7 +98,7 @@ class PhoneTracker:
             return
         pose = self._tracker.track(frame, self._intrinsics.resized(width_px, height_px))
         # A tracker may give its last pose again for a while; that tells nothing new of this moment.
-        if pose is not None and pose.captured_s == frame.captured_s:
+        if pose is not None and pose.is_certain and pose.captured_s == frame.captured_s:
             self._newest = (pose.quality, pose.residual_px, pose.points)
             self._history.add(frame.captured_s, TrackingSample(pose.camera_from_world))
 

@@ -4,8 +4,8 @@ from bisect import bisect_right, insort
 from dataclasses import dataclass
 from threading import Lock
 
+from mrbokeh.camera_track.between_frames import pose_between
 from viewfinder.frames import LensState, Pose
-from viewfinder.tracking.rigid_motion import between
 from viewfinder.tracking.tracking_sample import TrackingSample, lens_between
 
 
@@ -55,5 +55,5 @@ class PoseHistory:
             after_s = self._times[after]
             following = self._samples[after_s]
         share = (time_s - before_s) / (after_s - before_s)
-        pose = between(before.camera_from_world, following.camera_from_world, share)
+        pose = pose_between(before.camera_from_world, following.camera_from_world, share)
         return PoseAtTime(pose, lens_between(before.lens, following.lens, share), 0.0)

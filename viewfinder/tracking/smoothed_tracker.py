@@ -18,7 +18,7 @@ class SmoothedTracker:
 
     def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
         tracked = self.tracker.track(frame, intrinsics)
-        if tracked is None or not self.smoothing:
+        if tracked is None or not tracked.is_certain or not self.smoothing:
             self._filter.reset()
             return tracked
         return replace(tracked, camera_from_world=self._filter(tracked.camera_from_world, tracked.captured_s))

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mrbokeh.camera_track.world_axes import inverted, rigid
 from mrbokeh.lens import MM_PER_M
 from viewfinder.frames import Pose
 from viewfinder.tracking.phone_rig import PosePair
-from viewfinder.tracking.rigid_motion import angle_deg, inverted, rigid
+from viewfinder.tracking.rigid_motion import angle_deg
 
 _FEWEST = 4
 

@@ -1,9 +1,14 @@
 """What one message of an external tracking system says, in our conventions."""
 
-import math
 from dataclasses import dataclass
 
+import numpy as np
+
+from mrbokeh.camera_track.between_frames import focus_between_m, stop_between
 from viewfinder.frames import UNKNOWN_LENS, LensState, Pose
+
+STAGE_FROM_BOARD = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Our world (x right, y down the board, z into it) lies on the stage's ground: y along -Y, z along -Z."""
 
 
 class MalformedMessageError(ValueError):
@@ -26,25 +31,9 @@ class TrackingSample:
 def lens_between(a: LensState, b: LensState, share: float) -> LensState:
     """Focus in dioptres, f-numbers in stops: as the rings of a lens turn; what only one knows is taken from it."""
     a, b = a.completed_by(b), b.completed_by(a)
-    dioptres = _line(_inverse(a.focus_distance_m), _inverse(b.focus_distance_m), share)
-    stops = _line(_logarithm(a.f_number), _logarithm(b.f_number), share)
+    both_mm = a.focal_length_mm, b.focal_length_mm
     return LensState(
-        _inverse(dioptres),
-        None if stops is None else math.exp(stops),
-        _line(a.focal_length_mm, b.focal_length_mm, share),
+        focus_between_m(a.focus_distance_m, b.focus_distance_m, share),
+        stop_between(a.f_number, b.f_number, share),
+        None if both_mm[0] is None or both_mm[1] is None else (1.0 - share) * both_mm[0] + share * both_mm[1],
     )
-
-
-def _line(a: float | None, b: float | None, share: float) -> float | None:
-    return None if a is None or b is None else (1.0 - share) * a + share * b
-
-
-def _inverse(value: float | None) -> float | None:
-    """Metres to dioptres and back; the inverse of 0 is inf."""
-    if value is None:
-        return None
-    return 1.0 / value if value > 0.0 else math.inf
-
-
-def _logarithm(value: float | None) -> float | None:
-    return None if value is None else math.log(value)

@@ -1,4 +1,4 @@
-// <vf-focus>: the focus distance as a slider in dioptres (one over metres), in which blur grows evenly, and the f-number.
+// <vf-focus>: the focus distance as a slider in dioptres (one over metres), in which blur grows evenly, and who told it.
 import { distanceText, model } from "./model";
 import { controlLatest } from "./server";
 
@@ -11,7 +11,7 @@ export class FocusControl extends HTMLElement {
   private touched_ms = -Infinity;
 
   connectedCallback(): void {
-    this.innerHTML = `<label for="focus">Focus <output id="metres" for="focus">-</output></label>
+    this.innerHTML = `<label for="focus">Focus <span id="focus_from"></span><output id="metres" for="focus">-</output></label>
       <input id="focus" type="range" min="0" max="1" step="any" disabled>
       <div class="ends"><span>∞</span><span id="nearest"></span></div>`;
     this.slider = this.querySelector("#focus")!;
@@ -32,6 +32,7 @@ export class FocusControl extends HTMLElement {
   private onState(): void {
     const { dioptre_range, focus_distance_m } = model.state!;
     this.hidden = dioptre_range === undefined;
+    this.querySelector("#focus_from")!.textContent = toldBy(model.state!.focus_from);
     if (dioptre_range === undefined) return;
     [this.slider.min, this.slider.max] = dioptre_range.map(String) as [string, string];
     this.slider.disabled = !model.mayControl;
@@ -52,4 +53,9 @@ export class FocusControl extends HTMLElement {
     this.slider.value = String(distance_m === null ? 0 : 1 / distance_m);
     this.metres.textContent = distanceText(distance_m);
   }
+}
+
+function toldBy(name: string | null | undefined): string {
+  if (name === undefined) return "";
+  return name === null ? "from the file of the lens" : name.startsWith("by ") ? name : `from ${name}`;
 }

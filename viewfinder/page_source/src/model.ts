@@ -13,6 +13,8 @@ export interface State {
   height_px?: number;
   dioptre_range?: [number, number];
   focus_distance_m?: number | null;
+  /** Who told it; null is the file of the lens. */
+  focus_from?: string | null;
   f_number?: number;
   f_numbers?: number[];
   lens?: string;
@@ -38,6 +40,7 @@ export interface FrameHeader {
   f_number?: number;
   focus_pending?: boolean;
   tracking?: number | null;
+  tracking_unsure?: boolean;
   layer_age_ms?: number;
   stages_ms?: Record<string, number>;
   dropped?: number;

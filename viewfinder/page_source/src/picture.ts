@@ -86,7 +86,7 @@ export class PictureView extends HTMLElement {
       this.marks.draw(pixels, { peakReal: aids.has("peakReal"), peakVirtual: aids.has("peakVirtual"), zebra: aids.has("zebra") });
       if (aids.has("histogram")) this.histogram.draw(this.marks);
     }
-    if (header) this.showTracking(header.tracking ?? null);
+    if (header) this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
   }
 
   private get marking(): boolean {
@@ -103,11 +103,11 @@ export class PictureView extends HTMLElement {
     this.matte.run(aids.has("peakReal") || aids.has("peakVirtual"));
   }
 
-  private showTracking(quality: number | null): void {
+  private showTracking(quality: number | null, unsure: boolean): void {
     const badge = this.find("tracking");
     badge.hidden = quality === null;
     if (quality === null) return;
-    badge.dataset["quality"] = quality === 0 ? "lost" : quality < 0.5 ? "weak" : "good";
-    badge.textContent = quality === 0 ? "tracking lost" : `tracking ${(100 * quality).toFixed(0)} %`;
+    badge.dataset["quality"] = quality === 0 ? "lost" : unsure ? "unsure" : quality < 0.5 ? "weak" : "good";
+    badge.textContent = quality === 0 ? "tracking lost" : unsure ? "tilt unsure: go nearer" : `tracking ${(100 * quality).toFixed(0)} %`;
   }
 }
