@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mrbokeh.atomic_files import atomic_path
-from mrbokeh.color import linear_to_srgb, srgb_to_linear
+from mrbokeh.color import srgb_to_linear
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.exr_primaries import in_rec709, stated_primaries
 from mrbokeh.layer import Layer
 from mrbokeh.sound_values import require_depth_ahead
+from mrbokeh.srgb_codes import srgb_codes
 
 Encoding = Literal["srgb", "linear"]
 
@@ -169,14 +170,17 @@ def _write_integer_image(path: Path, rgb: Float32[np.ndarray, "height width 3"],
     suffix = path.suffix.lower()
     if suffix not in INTEGER_SUFFIXES:
         raise InputError(f"cannot write {path}: expected .exr, {', '.join(INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
-    stored = linear_to_srgb(rgb) if encoding == "srgb" else rgb
     dtype = np.uint8 if suffix in (".jpg", ".jpeg") else np.uint16
-    integers = np.round(np.clip(np.nan_to_num(stored), 0, 1) * np.iinfo(dtype).max).astype(dtype)
+    integers = srgb_codes(rgb, dtype) if encoding == "srgb" else _linear_codes(rgb, dtype)
     done, data = cv2.imencode(suffix, np.ascontiguousarray(integers[..., ::-1]))
     if not done:
         raise InputError(f"cannot encode a picture of shape {rgb.shape} as {suffix}")
     with atomic_path(path) as temporary:
         data.tofile(temporary)
+
+
+def _linear_codes(rgb: Float32[np.ndarray, "height width 3"], dtype: type) -> np.ndarray:
+    return np.round(np.clip(np.nan_to_num(rgb), 0, 1) * np.iinfo(dtype).max).astype(dtype)
 
 
 def write_preview(path: Path | str, rgb: Float32[np.ndarray, "height width 3"], exposure_stops: float = 0.0) -> None:

@@ -60,6 +60,11 @@ def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = 
 
     lens: overrides what the photograph's metadata or the stack tell, but keeps the focus of a slice. focus_m overrides all.
     """
+    if photo.is_dir() and not (photo / FILE_NAME).is_file():
+        raise InputError(
+            f"{photo} is a folder, but neither a merged focal stack ({FILE_NAME}) nor a capture of the viewfinder: "
+            f"give a photograph, or make a stack of its photographs by `mrbokeh capture process`"
+        )
     if photo.is_dir():
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
@@ -99,7 +104,7 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     stack = read_focal_stack(folder)
     if slice_index is None or not 0 <= slice_index < len(stack):
         raise InputError(
-            f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, got {slice_index}"
+            f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, or --all-slices"
         )
     focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)

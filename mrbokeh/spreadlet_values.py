@@ -18,7 +18,6 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float64, Int16, Int64
 from scipy.ndimage import map_coordinates, spline_filter
-from scipy.signal import fftconvolve
 
 from mrbokeh.laplacian_integration import fast_width, integrate
 
@@ -43,6 +42,9 @@ def potential_of(charges: Float64[np.ndarray, "size size channels"], table: Floa
     quarter = table[: reach + 1, : reach + 1]
     half = np.concatenate([quarter[:0:-1], quarter])
     kernel = np.concatenate([half[:, :0:-1], half], axis=1)
+    # Here, for this import takes a second.
+    from scipy.signal import fftconvolve
+
     return fftconvolve(charges, kernel[..., None], mode="same", axes=(0, 1)) if reach else charges * table[0, 0]
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from mrbokeh.camera import Camera
 from mrbokeh.layer import Layer
 from mrbokeh.lens_distortion import LensDistortion, distorted, overscan_camera
-from mrbokeh.lens_distortion.resampling import touched_box
 from mrbokeh.lens_distortion.warping import _reached_box, sampled_positions_px
 from mrbokeh.motion import with_motion
 from mrbokeh.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer
+from mrbokeh.pixel_box import lit_box
 from mrbokeh.scene import Scene, sun, world_from_scene_placing
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf_loader import load_glb
@@ -51,7 +51,7 @@ def _layer(camera: Camera, box: tuple[int, int, int, int]) -> Layer:
 
 
 def _remap_ms(layer: Layer, wide: Camera) -> float:
-    box = _reached_box(touched_box(layer), wide, PLATE, DISTORTION)
+    box = _reached_box(lit_box(layer), wide, PLATE, DISTORTION)
     positions = (sampled_positions_px(DISTORTION, PLATE, wide, box)[1:-1, 1:-1] - 0.5).astype(np.float32)
     values = np.dstack([layer.rgb, layer.alpha])
     return _milliseconds(lambda: cv2.remap(values, positions[..., 0], positions[..., 1], cv2.INTER_LINEAR))

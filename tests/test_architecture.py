@@ -48,6 +48,7 @@ ROWS = (
     ("image_io", "camera_rgb"),
     ("exr_primaries", "color_management", "blender."),
     ("exr_io",),
+    ("srgb_codes", "_srgb_codes_numba"),
     ("layering",),
     ("other_view",),
     ("slices",),
@@ -62,6 +63,7 @@ ROWS = (
     ("spreadlets",),
     ("spreadlet_values", "_spreadlets_numba"),
     ("laplacian_integration", "_laplacian_integration_numba"),
+    ("pixel_box", "_pixel_box_numba"),
     ("lens",),
     ("bank_apertures", "bank_low_rank"),
     ("polygon_rectification", "directional_differences", "low_rank", "polygon_fit", "bank_lattice"),
@@ -73,7 +75,7 @@ ROWS = (
     ("nested_grid", "proportional_grid", "psf_axis", "level_plane"),
     ("layer", "camera", "color", "image_metrics", "field_position"),
     ("html_page",),
-    ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device", "gphoto2_library"),
+    ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device", "gphoto2_library", "sound_values"),
     ("errors",),
 )
 ALLOWED_ACROSS = {

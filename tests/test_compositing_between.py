@@ -124,6 +124,25 @@ def test_a_matte_of_the_user_stands_in_for_sharp_picture_and_depth() -> None:
     np.testing.assert_allclose(rgb, near[:, None] * GREEN + (1.0 - near)[:, None] * RED, atol=0.06)
 
 
+def test_where_rays_see_one_far_colour_the_pupil_is_shared_as_in_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rays themselves, where they are asked, say the same. Depth alone: what is far is as the photograph has it."""
+    size = (48, 160)
+    depth_m, rgb = np.full(size, FAR_M, np.float32), np.random.default_rng(2).uniform(0.1, 1.0, (*size, 3)).astype(np.float32)
+    depth_m[:, :20] = NEAR_M
+    alpha = np.zeros(size, np.float32)
+    alpha[10:40, 8:140], alpha[10:40, 100:140] = 1.0, 0.4
+    virtual = Layer(alpha[..., None] * RED, alpha, np.where(alpha > 0, VIRTUAL_M, np.inf).astype(np.float32))
+    plate = plate_of(rgb, Lens(50.0, 2.0, FAR_M, 36.0), depth_m)
+    short = Between().insert(plate, [virtual], ScatterReference())
+    asked = []
+    monkeypatch.setattr(Rays, "one_far_colour", property(lambda rays: asked.append(rays) or np.zeros(size, bool)))
+    whole = Between().insert(plate, [virtual], ScatterReference())
+    soft = (short.virtual.alpha > 0.01) & (short.virtual.alpha < 0.99)
+    assert asked and soft[:, 60:].sum() > 1000
+    np.testing.assert_allclose(short.rgb, whole.rgb, atol=1e-5)
+    np.testing.assert_allclose(short.virtual.alpha, whole.virtual.alpha, atol=1e-5)
+
+
 def test_what_is_missing_is_asked_for() -> None:
     virtual, bare = half_plane(True, VIRTUAL_M, RED), replace(photograph(), depth_m=None, sharp_rgb=None)
     with pytest.raises(InputError, match=r"needs depth .* or a matte"):
@@ -185,7 +204,7 @@ def test_transmission_is_the_sum_of_the_outlines_around_a_point() -> None:
     np.testing.assert_allclose(transmission(ring, np.array([[0.0, 0.0], [0.75, 0.0], [0.0, -0.75], [1.2, 0.0]])), [0, 1, 1, 0], atol=1e-9)
 
 
-def rays_through_flat_layers() -> Rays:
+def rays_through_flat_layers(focus_m: float = 1.0) -> Rays:
     rng = np.random.default_rng(1)
     near = half_plane(True, NEAR_M, GREEN)
     scene = NearAndFar(
@@ -196,11 +215,13 @@ def rays_through_flat_layers() -> Rays:
     )
     alpha = rng.uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32)
     virtual = Layer(alpha[..., None] * RED, alpha, np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32))
-    return Rays.of(scene, virtual, virtual.depth_m, LENS.focused_at(1.0), 32)
+    return Rays.of(scene, virtual, virtual.depth_m, LENS.focused_at(focus_m), 32)
 
 
-def test_compiled_rays_are_those_of_a_plain_loop() -> None:
-    rays = rays_through_flat_layers()
+@pytest.mark.parametrize("focus_m", [1.0, FAR_M])
+def test_compiled_rays_are_those_of_a_plain_loop(focus_m: float) -> None:
+    """Focused on what is far, all rays of a pixel end in one point there, which is looked up once."""
+    rays = rays_through_flat_layers(focus_m)
     places = np.array([20 * WIDTH + 30, 20 * WIDTH + EDGE, 3 * WIDTH + EDGE + 5])
     found, pupil = rays.means(places), pupil_points(rays.lens.aperture, 32)
     near_px, virtual_px, far_px = (float(plane[0, 0]) for plane in rays.coc_px)

@@ -126,7 +126,7 @@ def test_the_box_gives_what_the_whole_frame_gives(mode: str, focus_m: float) -> 
     assert isinstance(boxed, InTouchedBox)
     whole, part = (each.insert(photo, [layer], ScatterReference()) for each in (boxed.insertion, boxed))
     box = touched_box(photo, [layer])
-    assert box is not None and (box.bottom - box.top) * (box.right - box.left) < 0.75 * size[0] * size[1]
+    assert (box.bottom - box.top) * (box.right - box.left) < 0.75 * size[0] * size[1]
     np.testing.assert_allclose(part.rgb, whole.rgb, atol=2e-5)
     np.testing.assert_allclose(part.virtual.alpha, whole.virtual.alpha, atol=2e-5)
 

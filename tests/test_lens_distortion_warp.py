@@ -8,10 +8,11 @@ from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer, clear
 from mrbokeh.lens_distortion import LensDistortion, distorted, overscan_camera
 from mrbokeh.lens_distortion.overscan import source_positions_px
-from mrbokeh.lens_distortion.resampling import Box, resampled, touched_box
+from mrbokeh.lens_distortion.resampling import resampled
 from mrbokeh.lens_distortion.st_map import StMap
 from mrbokeh.lens_distortion.warping import sampled_positions_px
 from mrbokeh.motion import MOTION, with_motion
+from mrbokeh.pixel_box import Box, lit_box
 
 PLATE = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
 BARREL = LensDistortion.of("opencv", k1=-0.25, k2=0.08, p1=1e-3, p2=-8e-4)
@@ -52,7 +53,7 @@ def test_pincushion_distortion_takes_more_pixels_where_sampling_would_drop() -> 
     wide = overscan_camera(PLATE, PINCUSHION)
     assert wide.focal_px[0] > 1.02 * PLATE.focal_px[0]
     assert wide.focal_px[0] / wide.focal_px[1] == pytest.approx(PLATE.focal_px[0] / PLATE.focal_px[1])
-    positions = sampled_positions_px(PINCUSHION, PLATE, wide, Box(0, 0, 214, 320))
+    positions = sampled_positions_px(PINCUSHION, PLATE, wide, Box(0, 214, 0, 320))
     right, down = 0.5 * (positions[1:-1, 2:] - positions[1:-1, :-2]), 0.5 * (positions[2:, 1:-1] - positions[:-2, 1:-1])
     least = np.linalg.svd(np.stack([right, down], axis=-1), compute_uv=False)[..., 1].min()
     assert 0.99 < least < 1.05
@@ -80,7 +81,7 @@ def test_whole_pixels_of_overscan_are_cut_off_bit_for_bit() -> None:
 def test_positions_are_those_of_the_exact_inverse(distortion: LensDistortion) -> None:
     """Splines over nodes every 16 px: on this small, strongly bent frame to 1e-2 px, on 1080p to 3e-5."""
     for plate, within_px in ((PLATE, 1e-2), (PLATE.resized(1920, 1284), 1e-4)):
-        wide, box = overscan_camera(plate, distortion), Box(plate.height_px - 101, 0, plate.height_px, 103)
+        wide, box = overscan_camera(plate, distortion), Box(plate.height_px - 101, plate.height_px, 0, 103)
         x, y = np.arange(-1, 104) + 0.5, np.arange(box.top - 1, box.bottom + 1) + 0.5
         exact = source_positions_px(distortion, plate, wide, np.stack(np.meshgrid(x, y), axis=-1))
         np.testing.assert_allclose(sampled_positions_px(distortion, plate, wide, box), exact, atol=within_px)
@@ -109,8 +110,8 @@ def plainly(layer: Layer, positions_px: np.ndarray) -> tuple[np.ndarray, np.ndar
 def test_the_compiled_loop_does_what_the_plain_one_does(distortion: LensDistortion) -> None:
     plate = PLATE.resized(40, 27)
     wide = overscan_camera(plate, distortion)
-    layer, positions = random_layer(wide), sampled_positions_px(distortion, plate, wide, Box(0, 0, 27, 40))
-    fast, (rgb, alpha) = resampled(layer, positions, touched_box(layer)), plainly(layer, positions)
+    layer, positions = random_layer(wide), sampled_positions_px(distortion, plate, wide, Box(0, 27, 0, 40))
+    fast, (rgb, alpha) = resampled(layer, positions, lit_box(layer)), plainly(layer, positions)
     np.testing.assert_allclose(fast.rgb, rgb, atol=2e-6)
     np.testing.assert_allclose(fast.alpha, alpha, atol=1e-6)
 
@@ -211,7 +212,7 @@ def test_a_small_object_is_warped_as_within_the_whole_picture() -> None:
     speck = np.zeros_like(some)
     speck[0, 0] = speck[-1, -1] = 1e-6
     large = Layer(small.rgb + speck[..., None], small.alpha, small.depth_m)
-    assert touched_box(small).right - touched_box(small).left <= 60
+    assert lit_box(small).right - lit_box(small).left <= 60
     np.testing.assert_allclose(
         distorted(small, wide, PLATE, BARREL).rgb, distorted(large, wide, PLATE, BARREL).rgb, atol=2e-2
     )  # splines over other nodes: 2e-3 px, times steps of up to 5

@@ -13,6 +13,7 @@ from mrbokeh.errors import InputError
 from mrbokeh.image_io import read_image
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
+from mrbokeh.pixel_box import lit_box
 from mrbokeh.plate import Plate, plate_of
 from mrbokeh.plate_look.colour_match import ColourMatch
 from mrbokeh.plate_look.finishing import Finishing, finished
@@ -20,7 +21,6 @@ from mrbokeh.plate_look.grain import Grain, measured_grain
 from mrbokeh.plate_look.grain_light import GrainDraw, add_grain_to, added_variance
 from mrbokeh.plate_look.light_wrap import LightWrap
 from mrbokeh.plate_look.noise_level import NoiseLevel
-from mrbokeh.plate_look.touched_box import touched_box
 from mrbokeh.plate_look.vignetting import RadialFalloff
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from tests.test_plate_look_grain import READ, SHOT, smooth_scene, unit_noise
@@ -208,7 +208,7 @@ def test_grain_stands_in_the_frame_and_not_in_the_box() -> None:
     alpha, rgb = disc.alpha.copy(), disc.rgb.copy()
     alpha[2, 380], rgb[2, 380] = 1.0, 0.5
     larger = replace(disc, alpha=alpha, rgb=rgb)
-    assert touched_box(put_in(plate, larger)) != touched_box(put_in(plate, disc))
+    assert lit_box(larger) != lit_box(disc)
     found = [finished(put_in(plate, each), plate, ALL, 2).virtual.rgb for each in (disc, larger)]
     np.testing.assert_array_equal(found[0][20:, :350], found[1][20:, :350])
 

@@ -14,6 +14,7 @@ _STEPS = 3
 def gather(
     sums: np.ndarray,
     places: np.ndarray,
+    which: np.ndarray,
     near_alpha: np.ndarray,
     near_in_reach: np.ndarray,
     virtual: np.ndarray,
@@ -23,7 +24,7 @@ def gather(
     first: int,
     end: int,
 ) -> None:
-    """Means over the pupil for the pixels places[first:end].
+    """Means over the pupil for the pixels places[which[first:end]], at the same rows of sums.
 
     All numbers are single precision. sums (N, 16): f (past the near), a (virtual coverage), f a, virtual light v (3), f v (3), f s (3:
     of the far), f (1 - a) s (3), f (1 - a). near_in_reach (H, W): whether any ray may meet something near. coc_px (3, H, W): near,
@@ -32,10 +33,12 @@ def gather(
     width = near_alpha.shape[1]
     seen, here, mean = np.empty(4, np.float32), np.empty(3, np.float32), np.empty(16, np.float32)
     weights = pupil[:, 2].sum()
-    for i in range(first, end):
+    for i in which[first:end]:
         row, column = places[i] // width, places[i] % width
         y_px, x_px = np.float32(row + 0.5), np.float32(column + 0.5)
-        is_near = near_in_reach[row, column]
+        is_near, far_is_still = near_in_reach[row, column], coc_px[2, row, column] == 0.0
+        if far_is_still:
+            _look(far_rgb, x_px, y_px, here)
         mean[:] = 0.0
         for k in range(len(pupil)):
             ux, uy, weight = pupil[k, 0], pupil[k, 1], pupil[k, 2]
@@ -45,8 +48,9 @@ def gather(
                 free *= np.float32(1.0) - _plane_at(near_alpha, x, y)
             x, y = _meet(coc_px[1], x_px, y_px, ux, uy)
             _look(virtual, x, y, seen)
-            x, y = _meet(coc_px[2], x_px, y_px, ux, uy)
-            _look(far_rgb, x, y, here)
+            if not far_is_still:
+                x, y = _meet(coc_px[2], x_px, y_px, ux, uy)
+                _look(far_rgb, x, y, here)
             past = free * (np.float32(1.0) - seen[3])
             mean[0] += free
             mean[1] += weight * seen[3]

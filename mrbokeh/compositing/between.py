@@ -22,7 +22,7 @@ from mrbokeh.compositing.clean_colours import clean_colours
 from mrbokeh.compositing.near_and_far import NO_LIGHTS, NearAndFar, continued, cut_in_two, nearer_than
 from mrbokeh.compositing.pupil_shares import Rays
 from mrbokeh.compositing.three_parts import put_together
-from mrbokeh.compositing.virtual_surface import shows, virtual_depth_m
+from mrbokeh.compositing.virtual_surface import shows_anything, virtual_depth_m
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer, clear, flatten
 from mrbokeh.lens import Lens
@@ -50,7 +50,7 @@ class Between:
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         same_size(plate, layers)
-        if not any(shows(layer).any() for layer in layers):
+        if not any(shows_anything(layer) for layer in layers):
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
         sharp = flatten([replace(layer, extra={}) for layer in layers])
         depth_m = virtual_depth_m(sharp)

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from mrbokeh.compositing.near_and_far import Lights
 from mrbokeh.compositing.pupil_points import pupil_points
 from mrbokeh.compositing.pupil_shares import Rays
-from mrbokeh.lit_pixels import lights, without_lights
+from mrbokeh.lit_pixels import lights
 
 _LEAST_POINTS, _MOST_POINTS = 64, 16384
 _POINTS_PER_PX = 4.0
@@ -62,10 +62,9 @@ def _gains(rays: Rays, ratio: Plane) -> Float32[np.ndarray, " lights"]:
 
 def virtual_lights(rays: Rays) -> LightThrough:
     """As if nothing hid them, and past the near things."""
-    sharp = np.dstack([rays.virtual.rgb, rays.virtual.alpha])
-    excess = (sharp - without_lights(sharp))[..., :3].reshape(-1, 3)
-    places = np.flatnonzero(lights(sharp))
-    bright = Lights(places, excess[places], np.zeros(len(places), np.float32))
+    places = np.flatnonzero(lights(rays.virtual_rgba))
+    whole, dark = (each.reshape(-1, 4)[places, :3] for each in (rays.virtual_rgba, rays.virtual_without_lights))
+    bright = Lights(places, whole - dark, np.zeros(len(places), np.float32))
     nothing = (np.zeros_like(rays.virtual.alpha), rays.coc_px[0])
     return _followed(rays, bright, rays.coc_px[1], nothing, (rays.scene.near.alpha, rays.coc_px[0]))
 

@@ -109,8 +109,8 @@ def _parted(rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance
     is_far = behind.coc_px > -0.5 * step_px
     far.reshape(-1, 3)[behind.places[is_far]] = behind.values[is_far, :3]
     smooth = _without_edge(depth_m, tolerance)
-    near_values[smooth] = np.dstack([rgb, np.ones_like(depth_m)])[smooth] * near[smooth, None]
-    far[smooth & ~near] = rgb[smooth & ~near]
+    np.multiply(values, near[..., None], out=near_values, where=smooth[..., None])
+    np.copyto(far, rgb, where=(smooth & ~near)[..., None])
     return near_values, far
 
 

@@ -7,9 +7,10 @@ are taken from so few rays; coverages and light by themselves come from the rend
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Int64
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.compositing.near_and_far import NearAndFar
@@ -33,14 +34,14 @@ class PupilMeans:
     virtual, far: light of the virtual surface (premultiplied) and of the rest; past: beyond near and virtual, 1 where f (1 - a) is.
     """
 
-    f: Float64[np.ndarray, " places"]
-    a: Float64[np.ndarray, " places"]
-    f_a: Float64[np.ndarray, " places"]
-    virtual: Float64[np.ndarray, "places 3"]
-    f_virtual: Float64[np.ndarray, "places 3"]
-    f_far: Float64[np.ndarray, "places 3"]
-    past_far: Float64[np.ndarray, "places 3"]
-    past: Float64[np.ndarray, " places"]
+    f: Float32[np.ndarray, " places"]
+    a: Float32[np.ndarray, " places"]
+    f_a: Float32[np.ndarray, " places"]
+    virtual: Float32[np.ndarray, "places 3"]
+    f_virtual: Float32[np.ndarray, "places 3"]
+    f_far: Float32[np.ndarray, "places 3"]
+    past_far: Float32[np.ndarray, "places 3"]
+    past: Float32[np.ndarray, " places"]
 
 
 @dataclass(frozen=True)
@@ -64,21 +65,31 @@ class Rays:
         """At places (row times width plus column) of the picture."""
         from mrbokeh.compositing._between_numba import gather
 
-        sums, near, far = np.zeros((len(places), 16)), self.scene.near.alpha, self.scene.far_rgb
-        in_reach = self._near_in_reach()
-        sharp = np.dstack([self.virtual.rgb, self.virtual.alpha])
-        dark = np.ascontiguousarray(without_lights(np.ascontiguousarray(sharp)))
+        sums, near, far = np.zeros((len(places), 16), np.float32), self.scene.near.alpha, self.scene.far_rgb
+        in_reach, dark = self.near_in_reach, self.virtual_without_lights
         for which, aperture in self.cells(places):
-            pupil, found = pupil_points(aperture, self.points).astype(np.float32), np.zeros((len(which), 16), np.float32)
-            here = places[which]
-            with workers(len(here) * self.points) as pool:
-                work = lambda first, end: gather(found, here, near, in_reach, dark, far, self.coc_px, pupil, first, end)  # noqa: B023, E731
-                in_bands(pool, len(here), _BAND_PLACES, work)
-            sums[which] = found
+            pupil = pupil_points(aperture, self.points).astype(np.float32)
+            with workers(len(which) * self.points) as pool:
+                work = lambda first, end: gather(sums, places, which, near, in_reach, dark, far, self.coc_px, pupil, first, end)  # noqa: B023, E731
+                in_bands(pool, len(which), _BAND_PLACES, work)
         f, a, f_a, past = (sums[:, c] for c in (0, 1, 2, 15))
         return PupilMeans(f, a, f_a, sums[:, 3:6], sums[:, 6:9], sums[:, 9:12], sums[:, 12:15], past)
 
-    def _near_in_reach(self) -> Bool[np.ndarray, "height width"]:
+    @cached_property
+    def virtual_rgba(self) -> Float32[np.ndarray, "height width 4"]:
+        return np.ascontiguousarray(np.dstack([self.virtual.rgb, self.virtual.alpha]))
+
+    @cached_property
+    def virtual_without_lights(self) -> Float32[np.ndarray, "height width 4"]:
+        return np.ascontiguousarray(without_lights(self.virtual_rgba))
+
+    @property
+    def one_far_colour(self) -> Bool[np.ndarray, "height width"]:
+        """Where all rays get past the near things and end in one point of the rest: there the pupil is shared as in "over"."""
+        return ~self.near_in_reach & (self.coc_px[2] == 0.0)
+
+    @cached_property
+    def near_in_reach(self) -> Bool[np.ndarray, "height width"]:
         """Where rays may meet something near: within its blur and a pixel."""
         from cv2 import MORPH_RECT, dilate, getStructuringElement
 

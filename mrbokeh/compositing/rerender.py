@@ -8,7 +8,7 @@ import numpy as np
 from mrbokeh.compositing.base import Inserted, same_size
 from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.three_parts import LEAST_LIGHT
-from mrbokeh.compositing.virtual_surface import shows
+from mrbokeh.compositing.virtual_surface import shows_anything
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer, clear, flatten
 from mrbokeh.plate import Plate
@@ -31,7 +31,7 @@ class Rerendered:
             raise InputError(
                 "to blur a photograph anew its all-in-focus picture and depth are needed: give a focal stack, or use the mode over"
             )
-        if not any(shows(layer).any() for layer in layers):
+        if not any(shows_anything(layer) for layer in layers):
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
         scene = Between(self.tolerance).cut(plate, layers)
         near = [scene.near] if scene.near.alpha.any() else []

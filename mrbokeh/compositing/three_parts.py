@@ -29,10 +29,11 @@ def put_together(plate: Plate, near: Layer, blurred: Layer, rays: Rays) -> Inser
     """The picture, from what near and virtual light do by themselves."""
     arrives = (blurred.alpha > LEAST_LIGHT) | (np.abs(blurred.rgb).max(axis=2) > LEAST_LIGHT)
     alone = arrives & (near.alpha <= _ALL)
-    simple = alone & (blurred.alpha >= 1.0 - _ALL)
-    photo_rgb, virtual_rgb = plate.rgb.copy(), np.where(simple[..., None], blurred.rgb, np.float32(0.0))
-    virtual_alpha = np.where(simple, blurred.alpha, np.float32(0.0))
-    photo_rgb[simple] *= (1.0 - np.minimum(blurred.alpha[simple], 1.0))[:, None]
+    simple = alone & ((blurred.alpha >= 1.0 - _ALL) | rays.one_far_colour)
+    virtual_rgb = np.where(simple[..., None], np.maximum(blurred.rgb, 0.0), np.float32(0.0))
+    virtual_alpha = np.where(simple, np.maximum(blurred.alpha, 0.0), np.float32(0.0))
+    hides = np.where(virtual_alpha > LEAST_LIGHT, np.minimum(virtual_alpha, 1.0), np.float32(0.0))
+    photo_rgb = (np.float32(1.0) - hides)[..., None] * plate.rgb
     places = np.flatnonzero(arrives & ~simple & (_least_around(near.alpha) < 1.0 - _ALL))
     at = np.unravel_index(places, blurred.alpha.shape)
     photo_rgb[at], virtual_rgb[at], virtual_alpha[at] = _shared(plate.rgb[at], near, blurred, rays, places)
@@ -86,11 +87,11 @@ def _least_around(alpha: Plane) -> Plane:
     return np.asarray(erode(alpha, np.ones((3, 3), np.uint8)), np.float32)
 
 
-def _colour_change(means: PupilMeans) -> ExactColours:
+def _colour_change(means: PupilMeans) -> Colours:
     """Mean far colour in the part of the pupil that looks past near and virtual, over that past the near alone."""
     change = means.past_far * means.f[:, None] / np.maximum(means.f_far * means.past[:, None], _ROUND)
     enough = (means.past > _LEAST_PART)[:, None]
-    return np.where(enough, np.clip(change, 1.0 / _MOST_CHANGE, _MOST_CHANGE), 1.0)
+    return np.where(enough, np.clip(change, 1.0 / _MOST_CHANGE, _MOST_CHANGE), np.float32(1.0))
 
 
 def _explained(photo_rgb: Colours, near_rgb: Colours, far_rgb: ExactColours) -> ExactColours:

@@ -74,22 +74,3 @@ def _add_box(
                 if distance < least or (distance == least and depth_m[j, i] < nearest_m):
                     least, nearest_m = distance, depth_m[j, i]
     return nearest_m
-
-
-@_compiled
-def widen(box: np.ndarray, flat: np.ndarray, channels: int) -> None:
-    """Widen the box (top, left, bottom, right) by all pixels of rows (H, W * channels) that are not 0."""
-    height, count = flat.shape
-    for y in range(height):
-        touched = 0
-        for i in range(count):  # without a way out, so that it runs on whole vectors
-            touched += flat[y, i] != 0.0
-        if touched == 0:
-            continue
-        first, last = 0, count - 1
-        while flat[y, first] == 0.0:
-            first += 1
-        while flat[y, last] == 0.0:
-            last -= 1
-        box[0], box[1] = min(box[0], y), min(box[1], first // channels)
-        box[2], box[3] = max(box[2], y + 1), max(box[3], last // channels + 1)

@@ -5,50 +5,20 @@ smaller than an old pixel. All weights are positive and sum to 1: colour does no
 alpha and extra channels keep their proportions. Side by side, boxes of one size leave no gaps, so that light is kept.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from mrbokeh.layer import Layer
 from mrbokeh.motion import motion_channels
+from mrbokeh.pixel_box import Box
 
 NO_MOTION = -1
-
-
-@dataclass(frozen=True)
-class Box:
-    """Rows and columns of a picture, from a pixel on, up to another without it."""
-
-    top: int
-    left: int
-    bottom: int
-    right: int
-
-    @property
-    def is_empty(self) -> bool:
-        return self.bottom <= self.top or self.right <= self.left
-
-    @property
-    def where(self) -> tuple[slice, slice]:
-        return slice(self.top, self.bottom), slice(self.left, self.right)
-
-
-def touched_box(layer: Layer) -> Box:
-    """The box of all pixels that cover or hold any light; empty where there are none."""
-    from mrbokeh.lens_distortion._resampling_numba import widen
-
-    box = np.array([layer.height_px, layer.width_px, 0, 0])
-    for values in (layer.alpha[..., None], layer.rgb, *layer.extra.values()):
-        if values.shape[2]:
-            widen(box, np.ascontiguousarray(values).reshape(layer.height_px, -1), values.shape[2])
-    return Box(*box.tolist()) if box[2] > 0 else Box(0, 0, 0, 0)
 
 
 def resampled(layer: Layer, positions_px: Float64[np.ndarray, "rows_and_2 columns_and_2 2"], box: Box) -> Layer:
     """The layer (h, w) seen at positions_px (h + 2, w + 2, 2), which have one more on every side; NaN sees nothing.
 
-    box: outside it the layer is clear (`touched_box`).
+    box: outside it the layer is clear (`mrbokeh.pixel_box.lit_box`).
 
     Depth is that of the nearest covering pixel, never a mixture. Motion becomes that of the new picture, by the derivatives of
     the positions.
@@ -75,17 +45,3 @@ def _layer(values: Float32[np.ndarray, "height width channels"], depth_m: Float3
         extra[name] = values[..., start : start + channels.shape[2]].copy()
         start += channels.shape[2]
     return Layer(values[..., :3].copy(), alpha, np.where(alpha > 0, depth_m, np.float32(np.inf)), extra)
-
-
-def placed(part: Layer, top_left_px: tuple[int, int], size_px: tuple[int, int]) -> Layer:
-    """A part in a clear layer of size (height, width)."""
-    (top, left), (height, width) = top_left_px, size_px
-    where = np.s_[top : top + part.height_px, left : left + part.width_px]
-
-    def whole(values: np.ndarray, rest: float = 0.0) -> np.ndarray:
-        result = np.full((height, width, *values.shape[2:]), rest, np.float32)
-        result[where] = values
-        return result
-
-    extra = {name: whole(values) for name, values in part.extra.items()}
-    return Layer(whole(part.rgb), whole(part.alpha), whole(part.depth_m, np.inf), extra)

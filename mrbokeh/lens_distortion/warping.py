@@ -9,7 +9,8 @@ from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.lens_distortion.distortion import LensDistortion
 from mrbokeh.lens_distortion.overscan import GRID_STEP_PX, source_positions_px
-from mrbokeh.lens_distortion.resampling import Box, placed, resampled, touched_box
+from mrbokeh.lens_distortion.resampling import resampled
+from mrbokeh.pixel_box import NOWHERE, Box, lit_box
 
 _ROOM_PX = 3
 _BORDER_STEP_PX = 4
@@ -33,25 +34,25 @@ def distorted(layer: Layer, overscan: Camera, plate: Camera, distortion: LensDis
     same = (overscan.width_px, overscan.height_px, overscan.focal_px, overscan.principal_px)
     if distortion.is_none and same == (plate.width_px, plate.height_px, plate.focal_px, plate.principal_px):
         return layer
-    touched = touched_box(layer)
+    touched = lit_box(layer)
     box = _reached_box(touched, overscan, plate, distortion)
     part = resampled(layer, sampled_positions_px(distortion, plate, overscan, box), touched)
-    return placed(part, (box.top, box.left), (plate.height_px, plate.width_px))
+    return box.placed(part, (plate.height_px, plate.width_px))
 
 
 def _reached_box(box: Box, overscan: Camera, plate: Camera, distortion: LensDistortion) -> Box:
     """The plate's pixels to which anything of a box of the overscanned picture can come: those within its warped border."""
     if box.is_empty:
-        return Box(0, 0, 0, 0)
+        return NOWHERE
     enlarged = np.asarray(overscan.focal_px) / np.asarray(plate.focal_px)
     pinhole_px = (_border_px(box) - np.asarray(overscan.principal_px)) / enlarged + np.asarray(plate.principal_px)
     border_px = distortion.distorted_px(pinhole_px, plate)
     if not np.isfinite(border_px).all():
-        return Box(0, 0, plate.height_px, plate.width_px)
+        return Box(0, plate.height_px, 0, plate.width_px)
     size = (plate.width_px, plate.height_px)
     left, top = np.clip(np.floor(border_px.min(axis=0)) - _ROOM_PX, 0, size).astype(int).tolist()
     right, bottom = np.clip(np.ceil(border_px.max(axis=0)) + _ROOM_PX, 0, size).astype(int).tolist()
-    return Box(top, left, bottom, right) if bottom > top and right > left else Box(0, 0, 0, 0)
+    return Box(top, bottom, left, right) if bottom > top and right > left else NOWHERE
 
 
 def _border_px(box: Box) -> Float64[np.ndarray, "points 2"]:

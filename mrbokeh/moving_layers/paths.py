@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float32, Float64
 
 from mrbokeh.camera import Camera
 from mrbokeh.layer import Layer
-from mrbokeh.lens_distortion.resampling import Box, touched_box
 from mrbokeh.moving_layers.filmed_scene import FilmedScene
+from mrbokeh.pixel_box import Box, lit_box
 from mrbokeh.scene.surface_motion import SurfacePoints
 
 FRACTIONS = (-0.5, -0.25, 0.0, 0.25, 0.5)
@@ -42,7 +42,7 @@ def paths_of(layer: Layer, filmed: FilmedScene, middle_s: float, span_s: float) 
     The layer's depth is taken to lie in the middle of the pixel. Where the surface is not found again, and around what is
     visible, a pixel moves like the nearest one that was found.
     """
-    box, camera = touched_box(layer), filmed.camera_at(middle_s)
+    box, camera = lit_box(layer), filmed.camera_at(middle_s)
     depth_m = layer.depth_m[box.where]
     visible = np.isfinite(depth_m) & (layer.alpha[box.where] > 0)
     rows, columns = np.nonzero(visible)

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mrbokeh.layer import Layer
-from mrbokeh.lens_distortion.resampling import Box, placed, resampled
+from mrbokeh.lens_distortion.resampling import resampled
 from mrbokeh.moving_layers.paths import Paths
 from mrbokeh.moving_layers.shutter import ShutterTiming
 
@@ -19,16 +19,11 @@ def rolled(layer: Layer, paths: Paths, span_s: float, shutter: ShutterTiming) ->
     paths: over `span_s`, of what the layer shows. Motion channels become what the rows see of them: what runs with the readout
     is drawn longer. Things that move differently side by side are told apart only where they are in the middle.
     """
-    box = _grown(paths.box, int(np.ceil(paths.length_px)) + 1, layer.alpha.shape)
+    box = paths.box.grown(int(np.ceil(paths.length_px)) + 1).within(layer.alpha.shape)
     x, y = np.meshgrid(np.arange(box.left - 1, box.right + 1) + 0.5, np.arange(box.top - 1, box.bottom + 1) + 0.5)
     delay_s = np.array([shutter.row_delay_s(row, layer.height_px) for row in y[:, 0].tolist()]) - 0.5 * shutter.readout_s
     positions_px = _sources_px(np.stack([x, y], axis=-1), paths, delay_s / span_s)
-    return placed(resampled(layer, positions_px, paths.box), (box.top, box.left), (layer.height_px, layer.width_px))
-
-
-def _grown(box: Box, by_px: int, size_px: tuple[int, ...]) -> Box:
-    top, left = max(box.top - by_px, 0), max(box.left - by_px, 0)
-    return Box(top, left, min(box.bottom + by_px, size_px[0]), min(box.right + by_px, size_px[1]))
+    return box.placed(resampled(layer, positions_px, paths.box), layer.alpha.shape)
 
 
 def _sources_px(

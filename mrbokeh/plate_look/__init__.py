@@ -21,7 +21,6 @@ What lies where:
     vignetting       falloff towards the corners: RadialFalloff, FlatField
     lensfun_falloff  RadialFalloff from lensfun's measurements
     light_wrap       light of the photograph around soft edges; off by default
-    touched_box      the part of a picture that virtual light reaches
     finishing        Finishing, finished: all of it in the order that a camera has
     look_options     LookOptions, finishing_of: from what a user types
 """

@@ -4,19 +4,6 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
-def touched_rows_and_columns(alpha: np.ndarray, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows and columns have a pixel with alpha (H, W) or light (H, W, 3)."""
-    height, width = alpha.shape
-    rows, columns = np.zeros(height, np.bool_), np.zeros(width, np.bool_)
-    for y in range(height):
-        for x in range(width):
-            if alpha[y, x] != 0.0 or rgb[y, x, 0] != 0.0 or rgb[y, x, 1] != 0.0 or rgb[y, x, 2] != 0.0:
-                rows[y] = True
-                columns[x] = True
-    return rows, columns
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_grain(
     light: np.ndarray,

@@ -15,12 +15,12 @@ import numpy as np
 from mrbokeh.compositing.base import Inserted
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
+from mrbokeh.pixel_box import Box, lit_box
 from mrbokeh.plate import Plate
 from mrbokeh.plate_look.colour_match import ColourMatch
 from mrbokeh.plate_look.grain import Grain
 from mrbokeh.plate_look.grain_light import GrainDraw, add_grain_to
 from mrbokeh.plate_look.light_wrap import LightWrap
-from mrbokeh.plate_look.touched_box import Box, touched_box
 from mrbokeh.plate_look.vignetting import Vignetting, darkened
 
 
@@ -48,12 +48,14 @@ def finished(inserted: Inserted, plate: Plate, finishing: Finishing, frame: int 
     """
     if plate.rgb.shape != inserted.photo_rgb.shape:
         raise InputError(f"expected the plate that was inserted into, of {inserted.photo_rgb.shape}, got one of {plate.rgb.shape}")
-    touched = touched_box(inserted)
-    if finishing.is_nothing or touched.is_empty:
+    if finishing.is_nothing:
         return inserted
-    box = touched if finishing.light_wrap is None else touched.grown(finishing.light_wrap.reach_px)
+    touched, frame_px = lit_box(replace(inserted.virtual, extra={})), plate.rgb.shape[:2]
+    if touched.is_empty:
+        return inserted
+    box = touched if finishing.light_wrap is None else touched.grown(finishing.light_wrap.reach_px).within(frame_px)
     photo_rgb = box.of(inserted.photo_rgb)
-    part = _lit(box.of_layer(inserted.virtual), photo_rgb, finishing, box)
+    part = _lit(inserted.virtual, photo_rgb, finishing, box)
     light = np.array(part.rgb)
     if finishing.grain is not None and not finishing.grain.is_nothing:
         draw = GrainDraw(finishing.grain, frame, box.origin_px)
@@ -65,9 +67,9 @@ def finished(inserted: Inserted, plate: Plate, finishing: Finishing, frame: int 
 
 def _lit(layer: Layer, photo_rgb: np.ndarray, finishing: Finishing, box: Box) -> Layer:
     """Steps 1 to 4 on one part of the frame."""
-    colour = finishing.colour or ColourMatch()
-    layer = colour.gained(layer)
+    frame_px, colour = layer.alpha.shape, finishing.colour or ColourMatch()
+    layer = colour.gained(Layer(box.of(layer.rgb), box.of(layer.alpha), box.of(layer.depth_m)))
     if finishing.vignetting is not None:
-        layer = darkened(layer, finishing.vignetting.gain(box))
+        layer = darkened(layer, finishing.vignetting.gain(box, frame_px))
     layer = colour.lifted(layer)
     return layer if finishing.light_wrap is None else finishing.light_wrap.wrapped(layer, photo_rgb)

@@ -9,13 +9,14 @@ from jaxtyping import Float32
 from mrbokeh.errors import InputError
 from mrbokeh.plate_look.black_level import darkest_black, picked_black
 from mrbokeh.plate_look.colour_match import ColourMatch, Triple, triple_of
-from mrbokeh.plate_look.exposure_match import exposure_of_photo, matched_exposure
+from mrbokeh.plate_look.exposure_match import matched_exposure
 from mrbokeh.plate_look.finishing import Finishing
 from mrbokeh.plate_look.grain import Grain, measured_grain, measured_grain_of_pair
 from mrbokeh.plate_look.grain_file import read_grain
 from mrbokeh.plate_look.grey_card import GREY_CARD, PixelBox, grey_card_match
 from mrbokeh.plate_look.lensfun_falloff import falloff_of_photo
 from mrbokeh.plate_look.light_wrap import LightWrap
+from mrbokeh.plate_look.stated_exposure import stated_exposure
 from mrbokeh.plate_look.vignetting import RadialFalloff, Vignetting, falloff_at, read_flat_field
 from mrbokeh.plate_look.white_balance import white_balance_gain
 
@@ -47,7 +48,7 @@ class LookOptions:
 def finishing_of(options: LookOptions, plate_rgb: Picture, photo: Path | None = None, next_rgb: Picture | None = None) -> Finishing:
     """plate_rgb: the photograph, or the first frame of a video; next_rgb: its second frame, if it is a video.
 
-    photo: the file, where its Exif are asked. Raises InputError where an option cannot be understood or met.
+    photo: the file of the plate, where its metadata are asked. Raises InputError where an option cannot be understood or met.
     """
     vignetting = _vignetting(options.vignetting, photo)
     colour = _colour(options, plate_rgb, photo, vignetting)
@@ -66,8 +67,8 @@ def _colour(options: LookOptions, plate_rgb: Picture, photo: Path | None, vignet
         return grey_card_match(plate_rgb, box, rendered=options.grey_value, black=black, falloff=falloff)
     gain = np.ones(3)
     if options.match_exposure is not None:
-        exposure = exposure_of_photo(_required(photo, "--match-exposure"))
-        gain = gain * matched_exposure(exposure, exposure_of_photo(options.match_exposure)).gain
+        exposure = stated_exposure(_required(photo, "--match-exposure"))
+        gain = gain * matched_exposure(exposure, stated_exposure(options.match_exposure)).gain
     if options.match_white_k is not None:
         gain = gain * white_balance_gain(options.match_white_k)
     return ColourMatch(triple_of(gain), black)
@@ -117,5 +118,5 @@ def _light_wrap(text: str | None) -> LightWrap | None:
 
 def _required(photo: Path | None, option: str) -> Path:
     if photo is None:
-        raise InputError(f"{option} needs a photograph with Exif (JPEG, TIFF): this plate has none")
+        raise InputError(f"{option} needs a photograph that states how it was taken (Exif; an EXR header): this plate is in no such file")
     return photo

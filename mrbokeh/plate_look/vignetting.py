@@ -15,8 +15,8 @@ from mrbokeh.errors import InputError
 from mrbokeh.field_position import field_positions
 from mrbokeh.image_io import read_image
 from mrbokeh.layer import Layer
+from mrbokeh.pixel_box import Box
 from mrbokeh.plate_look.colour_match import Triple, triple_of
-from mrbokeh.plate_look.touched_box import Box
 
 Gain = Float32[np.ndarray, "height width channels"]
 _LEAST_GAIN = 1e-3
@@ -27,8 +27,8 @@ _DEGREE, _CELLS = 6, 64
 class Vignetting(Protocol):
     """What share of its light a lens sends to each pixel, 1 in the middle of the frame."""
 
-    def gain(self, box: Box) -> Gain:
-        """(h, w, 1 or 3) of the pixels of a box."""
+    def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:
+        """(h, w, 1 or 3) of the pixels of a box within a frame of (height, width)."""
         ...
 
 
@@ -64,8 +64,8 @@ class RadialFalloff:
             raise InputError(f"--vignetting: expected K1,K2,K3 (such as -0.4,0.1,0), got {text!r}")
         return cls(*numbers)
 
-    def gain(self, box: Box) -> Gain:
-        position = field_positions(box.size_px, box.frame_px, box.origin_px) * np.float32(self.reach)
+    def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:
+        position = field_positions(box.size_px, frame_px, box.origin_px) * np.float32(self.reach)
         return self._polynomial((position * position).sum(axis=2, keepdims=True)).astype(np.float32)
 
     def _polynomial(self, squared: np.ndarray) -> np.ndarray:
@@ -81,8 +81,8 @@ class FlatField:
 
     coefficients: Float64[np.ndarray, "powers powers 3"]
 
-    def gain(self, box: Box) -> Gain:
-        position = field_positions(box.size_px, box.frame_px, box.origin_px)
+    def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:
+        position = field_positions(box.size_px, frame_px, box.origin_px)
         y, x = (np.polynomial.polynomial.polyvander(each, _DEGREE) for each in (position[:, 0, 1], position[0, :, 0]))
         gain = np.einsum("yi,ijc,xj->yxc", y, self.coefficients, x, optimize=True)
         return np.maximum(gain, _LEAST_GAIN).astype(np.float32)
@@ -121,4 +121,4 @@ def darkened(layer: Layer, gain: Gain) -> Layer:
 
 def falloff_at(vignetting: Vignetting, x_px: int, y_px: int, frame_px: tuple[int, int]) -> Triple:
     """At one pixel of a frame (height, width), for `grey_card_match`."""
-    return triple_of(np.broadcast_to(vignetting.gain(Box(y_px, y_px + 1, x_px, x_px + 1, frame_px))[0, 0], 3))
+    return triple_of(np.broadcast_to(vignetting.gain(Box(y_px, y_px + 1, x_px, x_px + 1), frame_px)[0, 0], 3))

@@ -8,15 +8,17 @@ from jaxtyping import Float32
 
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.layer import Layer, clear
 from mrbokeh.lens_distortion import LensDistortion, distorted, overscan_camera
 from mrbokeh.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
 from mrbokeh.moving_layers.moving_shadow import ShadowCatcher
+from mrbokeh.pixel_box import Box
 from mrbokeh.scene import Scene, SceneRenderer
 from mrbokeh.scene.choose import scene_renderer
 from mrbokeh.scene.light_change import GREY, light_change
 from mrbokeh.scene.shadow_layer import shadow_layer
 from mrbokeh.staging.assets import Assets
+from mrbokeh.staging.picture_box import shadow_box
 from mrbokeh.staging.scene_description import SceneDescription
 from mrbokeh.staging.staged_scene import StagedScene
 from mrbokeh.staging.upright import upright_camera
@@ -111,6 +113,15 @@ class FilmedLayers:
         if shadow is None or catcher is None:
             return []
         if self._filming.catches == "shadow":
-            return [shadow_layer(self._renderer, scene, camera, catcher, shadow.strength)]
+            return [self._shadow(scene, camera, ShadowCatcher(catcher, shadow.strength))]
         change = light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
         return [change.evenly().as_layer(np.zeros_like(change.ratio)) if sharp_rgb is None else change.as_layer(sharp_rgb)]
+
+    def _shadow(self, scene: Scene, camera: Camera, catcher: ShadowCatcher) -> Layer:
+        """Drawn where hard shadows fall; the path tracer's are soft and may fall anywhere."""
+        frame = Box(0, camera.height_px, 0, camera.width_px)
+        box = frame if self._filming.backend == "mitsuba" else shadow_box(scene, camera, catcher.mesh)
+        if box.is_empty:
+            return clear(camera.height_px, camera.width_px)
+        part = shadow_layer(self._renderer, scene, box.camera_of(camera), catcher.mesh, catcher.strength)
+        return part if box == frame else box.placed(part, frame.size_px)

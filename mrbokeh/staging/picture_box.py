@@ -1,12 +1,13 @@
 """PictureBox: the part of a picture (it may reach beyond the frame) in which something is drawn, and the Camera cut to it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from mrbokeh.camera import Camera
 from mrbokeh.lens import Lens
+from mrbokeh.pixel_box import NOWHERE, Box, is_same_everywhere
 from mrbokeh.scene import Light, Mesh, Scene
 from mrbokeh.spreading import reach_px
 
@@ -15,6 +16,7 @@ STEP_PX = 16
 _BEYOND_FRAME = 1 / 16
 """How much of the frame's width is drawn beyond its border: what the next poses may bring into the picture."""
 NEAREST_M = 0.01
+_ROOM_PX = 2
 
 
 @dataclass(frozen=True)
@@ -24,20 +26,17 @@ class PictureBox:
     width_px: int
     height_px: int
 
+    @property
+    def box(self) -> Box:
+        return Box(self.top_px, self.top_px + self.height_px, self.left_px, self.left_px + self.width_px)
+
     def cut(self, camera: Camera, resolution: float = 1.0) -> Camera:
         """The camera that sees just this part, at `resolution` of the pixels (1, 3/4 or 1/2)."""
-        principal = (camera.principal_px[0] - self.left_px, camera.principal_px[1] - self.top_px)
-        part = Camera(self.width_px, self.height_px, camera.focal_px, principal, camera.camera_from_world)
+        part = self.box.camera_of(camera)
         return part if resolution == 1.0 else part.resized(round(self.width_px * resolution), round(self.height_px * resolution))
 
     def lens_of(self, lens: Lens, frame_width_px: int) -> Lens:
-        """The lens with so much of its sensor as sees this part, so that circles of confusion keep their size."""
-        return replace(lens, sensor_width_mm=lens.sensor_width_mm * self.width_px / frame_width_px)
-
-
-def is_same_everywhere(lens: Lens) -> bool:
-    """Whether a point's blur depends on its depth alone, so that a part of the picture can be blurred by itself."""
-    return lens.has_flat_focus and not lens.aperture.cat_eye and not any(lens.aperture.lateral_chromatic)
+        return self.box.lens_of(lens, frame_width_px)
 
 
 def box_around(points_m: Float[np.ndarray, "points 3"], camera: Camera, lens: Lens) -> PictureBox | None:
@@ -79,6 +78,23 @@ def drawn_points_m(scene: Scene, catcher: Mesh | None) -> Float[np.ndarray, "poi
     points_m = np.concatenate(points)
     shadows = [] if catcher is None else [_thrown(points_m, light, catcher) for light in scene.lighting[0] if light.casts_shadow]
     return np.concatenate([points_m, *shadows])
+
+
+def shadow_box(scene: Scene, camera: Camera, catcher: Mesh) -> Box:
+    """What of a camera's frame may see hard shadows of the lights on the level catcher; all of it where the camera is too near to tell."""
+    points_m = [mesh.positions_m for mesh in scene.meshes if not mesh.catches_shadow]
+    lights = [light for light in scene.lighting[0] if light.casts_shadow]
+    if not points_m or not lights:
+        return NOWHERE
+    thrown_m = np.concatenate([_thrown(np.concatenate(points_m), light, catcher) for light in lights])
+    frame_px = (camera.height_px, camera.width_px)
+    depth_m = thrown_m @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+    if not len(thrown_m) or depth_m.min() < NEAREST_M:
+        return Box(0, frame_px[0], 0, frame_px[1]) if len(thrown_m) else NOWHERE
+    xy_px, _ = camera.project(thrown_m)
+    (left, top), (right, bottom) = (each.astype(int).tolist() for each in (np.floor(xy_px.min(0)), np.ceil(xy_px.max(0))))
+    found = Box(top, bottom, left, right).grown(_ROOM_PX).within(frame_px)
+    return NOWHERE if found.is_empty else found
 
 
 def _thrown(points_m: Float[np.ndarray, "points 3"], light: Light, catcher: Mesh) -> Float[np.ndarray, "shadows 3"]:
