@@ -80,6 +80,49 @@ class ColorConversion:
             self.processor.applyRGB(rgb)
 
 
+@dataclass(frozen=True)
+class NamedSpace:
+    """A colour space by its name and its configuration, which can be pickled: opened by whoever uses it.
+
+    config: as of ColorConversion.of, files as absolute paths. Premultiplied pictures may only go through spaces that are linear.
+    """
+
+    name: str
+    config: str = "aces"
+
+    @classmethod
+    def of(cls, name: str, config: Path | str) -> "NamedSpace":
+        """Raises InputError where there is no such configuration, or none of its spaces has that name."""
+        is_file = str(config) not in BUILT_IN and not str(config).startswith("ocio://")
+        space = cls(name, str(Path(config).resolve()) if is_file else str(config))
+        _known(open_config(space.config), name)
+        return space
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """That of the configuration, where it is one."""
+        return (Path(self.config),) if Path(self.config).is_absolute() else ()
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether twice the light is twice the number, as in ACEScg and unlike in camera curves and on displays."""
+        once = np.array([[[0.05, 0.2, 0.3]]], np.float32)
+        return bool(np.allclose(self.from_rec709(2 * once), 2 * self.from_rec709(once), rtol=1e-4))
+
+    def to_rec709(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        """Numbers of this space as linear Rec.709."""
+        return _conversion(self.config, self.name, True).applied(rgb)
+
+    def from_rec709(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        """Linear Rec.709 as numbers of this space."""
+        return _conversion(self.config, self.name, False).applied(rgb)
+
+
+@lru_cache(maxsize=8)
+def _conversion(config: str, name: str, inwards: bool) -> ColorConversion:
+    return ColorConversion.to_rec709(config, name) if inwards else ColorConversion.from_rec709(config, name)
+
+
 def open_config(config: Path | str | None) -> Any:
     """An OpenColorIO configuration; opening the built-in ones takes a moment, so they are kept."""
     if config is None:

@@ -21,6 +21,7 @@ UNSPECIFIED = 2
 LIMITED, FULL = 1, 2
 _LUMA_OF_MATRIX = {1: (0.2126, 0.0722), 4: (0.30, 0.11), 5: (0.299, 0.114), 6: (0.299, 0.114), 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
 _NAME_OF_TRANSFER = {1: "bt709", 4: "gamma22", 5: "gamma28", 6: "bt709", 8: "linear", 13: "srgb", 14: "bt709", 15: "bt709"}
+_LINEAR = 8
 _GAMMA = {"gamma22": 2.2, "gamma28": 2.8}
 # x, y of red, green and blue; all with the white of D65.
 _XY_OF_PRIMARIES = {
@@ -47,7 +48,8 @@ class VideoColor:
 
     @property
     def transfer_name(self) -> str:
-        return _NAME_OF_TRANSFER[self.transfer]
+        """Codes without a curve of H.273 are numbers that stay as they are."""
+        return "linear" if self.transfer == UNSPECIFIED else _NAME_OF_TRANSFER[self.transfer]
 
     @property
     def luma_weights(self) -> tuple[float, float]:
@@ -56,21 +58,24 @@ class VideoColor:
 
 
 BT709 = VideoColor(matrix=1, code_range=LIMITED, transfer=1, primaries=1)
+UNNAMED = VideoColor(matrix=1, code_range=LIMITED, transfer=UNSPECIFIED, primaries=UNSPECIFIED)
+"""Codes of a colour space that H.273 does not know, such as those of cameras."""
+UNNAMED_RGB = VideoColor(matrix=0, code_range=FULL, transfer=UNSPECIFIED, primaries=UNSPECIFIED)
 BT709_RGB = VideoColor(matrix=0, code_range=FULL, transfer=1, primaries=1)
 
 
-def color_of(frame: Any, where: str) -> VideoColor:
+def color_of(frame: Any, where: str, *, as_codes: bool = False) -> VideoColor:
     """The tags of a decoded PyAV frame; what is untagged is BT.709 from HD on, BT.601 below, limited range.
 
-    The transfer and the primaries of an untagged video are those of BT.709 at every size.
+    The transfer and the primaries of an untagged video are those of BT.709 at every size. as_codes: code values stay as they are,
+    whatever transfer and primaries the tags say; only matrix and range are theirs.
     """
     is_rgb = frame.format.is_rgb
     hd = frame.width >= 1280 or frame.height > 576
     matrix = 0 if is_rgb else frame.colorspace if frame.colorspace != UNSPECIFIED else 1 if hd else 6
     full = is_rgb or frame.color_range == FULL or (frame.color_range == 0 and frame.format.name.startswith("yuvj"))
-    color = VideoColor(
-        matrix, FULL if full else LIMITED, *(1 if tag in (0, UNSPECIFIED) else int(tag) for tag in (frame.color_trc, frame.color_primaries))
-    )
+    tagged = (1 if tag in (0, UNSPECIFIED) else int(tag) for tag in (frame.color_trc, frame.color_primaries))
+    color = VideoColor(matrix, FULL if full else LIMITED, *((_LINEAR, 1) if as_codes else tagged))
     _require_known(color, is_rgb, where)
     return color
 

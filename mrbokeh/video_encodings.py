@@ -21,6 +21,11 @@ class Encoding(NamedTuple):
     alpha: bool = False
     least_px: tuple[int, int] = (2, 2)
 
+    @property
+    def stands_alone(self) -> bool:
+        """Whether every picture can be shown without any other, so that pictures may be left out or come twice."""
+        return ".nut" not in self.suffixes
+
     def part_suffix(self, suffix: str) -> str:
         """Of a file that holds a part of the video: NUT keeps packets of H.264 and H.265 as they left the encoder."""
         return ".nut" if ".nut" in self.suffixes else suffix
@@ -62,7 +67,8 @@ def encoding_name(path: Path, name: str | None = None) -> str:
     suffix = Path(path).suffix.lower()
     name = name or _BY_SUFFIX.get(suffix)
     if name is None:
-        raise InputError(f"cannot write {path}: expected .mp4, .mov or .mkv, not {suffix or 'a file without suffix'}")
+        expected = f"{', '.join(_BY_SUFFIX)} or frames.%04d.exr"
+        raise InputError(f"cannot write {path}: expected {expected}, not {suffix or 'a file without suffix'}")
     if name not in ENCODINGS:
         raise InputError(f"expected an encoding ({', '.join(ENCODINGS)}), got {name!r}")
     if suffix not in ENCODINGS[name].suffixes:

@@ -45,14 +45,14 @@ class VideoInfo:
     rotation_deg: int
 
 
-def probe(path: Path) -> VideoInfo:
-    """Header and first frame of a video; refuses what `read_frames` would refuse."""
+def probe(path: Path, *, as_codes: bool = False) -> VideoInfo:
+    """Header and first frame of a video; refuses what `read_frames` would refuse. as_codes: as of `upright_frame`."""
     with opened(path) as (container, stream):
         frame = next(container.decode(stream), None)
         if frame is None:
             raise InputError(f"{path} holds no picture that can be decoded: it is damaged or cut off")
         width_px, height_px = (frame.height, frame.width) if quarter_turns(frame, path) % 2 else (frame.width, frame.height)
-        color = color_of(frame, str(path))
+        color = color_of(frame, str(path), as_codes=as_codes)
         return VideoInfo(width_px, height_px, frame_rate(stream), stream.time_base, stream.frames or None, color, frame.rotation)
 
 
@@ -62,9 +62,12 @@ def read_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator
         yield upright_frame(stored, time_s, path)
 
 
-def upright_frame(stored: Any, time_s: float, path: Path) -> Frame:
-    """A decoded PyAV frame as linear light, turned as it is to be shown."""
-    rgb = linear_rgb(stored, color_of(stored, str(path)))
+def upright_frame(stored: Any, time_s: float, path: Path, *, as_codes: bool = False) -> Frame:
+    """A decoded PyAV frame as linear light, turned as it is to be shown.
+
+    as_codes: the code values of red, green and blue instead (0 black, 1 white), for a curve and primaries that the file does not say.
+    """
+    rgb = linear_rgb(stored, color_of(stored, str(path), as_codes=as_codes))
     return Frame(np.ascontiguousarray(np.rot90(rgb, quarter_turns(stored, path))), time_s)
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Float32
 
 from mrbokeh.atomic_files import atomic_path
 from mrbokeh.errors import InputError
-from mrbokeh.video_audio import AudioCopy
-from mrbokeh.video_color import BT709, BT709_RGB
+from mrbokeh.video_audio import CarriedAudio
+from mrbokeh.video_color import BT709, BT709_RGB, UNNAMED, UNNAMED_RGB, VideoColor
 from mrbokeh.video_encodings import Encoding, encoding_for
 from mrbokeh.video_frames import encoded_frame
 
@@ -28,8 +28,9 @@ class VideoWriter:
     MXF has none and needs an even rate).
     encoding: a name in ENCODINGS, or None for the usual one of the suffix. Colour is tagged BT.709 throughout. Values
     beyond what the codes can hold are clipped: the limited range of h264, prores and dnxhr goes from -0.06 to 1.08, ffv1 from 0 to 1.
-    audio_from: a video whose first audio stream is copied, from audio_start_s on; `audio_note` says what became of it.
+    audio_from: a video whose first audio stream is carried over, from audio_start_s on; `audio_note` says what became of it.
     threads: of the encoder, 0 for all cores; H.264 comes out a little different with another number.
+    as_codes: pictures are code values already (0 black, 1 white), of a colour space for which video has no tags.
     """
 
     def __init__(
@@ -44,13 +45,14 @@ class VideoWriter:
         audio_from: Path | None = None,
         audio_start_s: float = 0.0,
         threads: int = 0,
+        as_codes: bool = False,
     ) -> None:
         self.path, self.encoding, self.suffix = Path(path), encoding_for(path, encoding), Path(path).suffix.lower()
         self.size_px, self.frame_rate = (width_px, height_px), frame_rate
         _require_storable(self.path, self.encoding, self.size_px)
         even = self.suffix == ".mxf"
         self.time_base = 1 / frame_rate if even else time_base or 1 / (frame_rate * 1000)
-        self.color = BT709_RGB if self.encoding.pixel_format.startswith("gbr") else BT709
+        self.color = _color(self.encoding, as_codes)
         self.audio_note = "no audio"
         self._audio_from, self._audio_start_s, self._threads = audio_from, audio_start_s, threads
         self._last_tick: int | None = None
@@ -67,7 +69,7 @@ class VideoWriter:
             self._stream = self._add_stream()
             self._audio = None
             if self._audio_from is not None:
-                self._audio = stack.enter_context(AudioCopy(self._audio_from, self._container, self.suffix, self._audio_start_s))
+                self._audio = stack.enter_context(CarriedAudio(self._audio_from, self._container, self.suffix, self._audio_start_s))
                 self.audio_note = self._audio.note
             self._stack = stack.pop_all()
         return self
@@ -103,7 +105,10 @@ class VideoWriter:
         """The time of one more picture in units of time_base. Raises InputError where the container cannot hold it."""
         tick = round(Fraction(time_s) / self.time_base)
         if self.suffix == ".mxf" and (tick != self.frame_count or abs(time_s - tick * self.time_base) > self.time_base / 4):
-            raise InputError(f"{self.path}: MXF holds even rates only, but picture {self.frame_count} comes at {time_s:.4f} s: write .mov")
+            raise InputError(
+                f"{self.path}: MXF holds even rates only, but picture {self.frame_count} comes at {time_s:.4f} s: write .mov, or "
+                f"give --constant-rate {float(self.frame_rate):.5g} to hold and leave out pictures"
+            )
         if self._last_tick is not None and tick <= self._last_tick:
             raise InputError(
                 f"{self.path}: expected growing times, got {time_s:.6f} s after {float(self._last_tick * self.time_base):.6f} s"
@@ -140,7 +145,7 @@ class VideoWriter:
             raise InputError(f"{self.path}: expected at least one frame, got none; the video was not written")
         self._flush()
         if self._audio is not None:
-            self._audio.copy_until(float((self._last_tick + 1) * self.time_base) + float(1 / self.frame_rate))
+            self._audio.finish(float(self._last_tick * self.time_base + 1 / self.frame_rate))
 
     def _flush(self) -> None:
         self._mux(self._stream.encode(None))
@@ -154,6 +159,13 @@ class VideoWriter:
                 packet.dts = earliest + self._muxed * self._ticks_per_frame
             self._muxed += 1
             self._container.mux(packet)
+
+
+def _color(encoding: Encoding, as_codes: bool) -> VideoColor:
+    is_rgb = encoding.pixel_format.startswith("gbr")
+    if as_codes:
+        return UNNAMED_RGB if is_rgb else UNNAMED
+    return BT709_RGB if is_rgb else BT709
 
 
 def _require_storable(path: Path, encoding: Encoding, size_px: tuple[int, int]) -> None:

@@ -13,10 +13,12 @@ from mrbokeh.commands.composite import app
 from mrbokeh.demo.plan import DATA
 from mrbokeh.errors import InputError
 from mrbokeh.exr_layers.composite_exr import read_composite_exr
+from mrbokeh.exr_layers.deep_layers import DeepSurfaces
 from mrbokeh.exr_layers.deep_out import write_deep_exr
+from mrbokeh.exr_layers.deep_samples import DeepSamples
 from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.image_io import read_image, write_image, write_layer
-from mrbokeh.layer import Layer
+from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.layer import Layer, flatten
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import write_lens
 
@@ -97,6 +99,32 @@ def test_every_mode_leaves_what_it_does_not_touch(files: Path, mode: str) -> Non
 
 def test_a_deep_picture_is_what_it_flattens_to(files: Path) -> None:
     np.testing.assert_allclose(put_in(files, card="deep.exr"), put_in(files), atol=2e-3)
+
+
+def test_sharp_layers_go_out_as_a_deep_picture(files: Path) -> None:
+    """A second card stands behind the first and is seen beside it: two samples where both are, and flat it is what was put in."""
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[40:80, 60:110] = 0.5
+    behind = Layer(np.repeat(0.4 * alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, 1.8, np.inf).astype(np.float32))
+    write_layer(files / "behind.exr", behind, half=False)
+    put_in(files, "--layer", files / "behind.exr", "--deep-out", files / "virtual.exr")
+    deep = DeepSamples.read(files / "virtual.exr")
+    counts = deep.counts.reshape(HEIGHT, WIDTH)
+    assert (counts[50, 70], counts[50, 40], counts[50, 100], counts[5, 5]) == (2, 1, 1, 0)
+    at = deep.starts[50 * WIDTH + 70]
+    assert deep.front_m[at : at + 2] == pytest.approx([1.3, 1.8], rel=1e-6)
+    read, sharp = flatten(DeepSurfaces().layers(files / "virtual.exr")), flatten([read_layer(files / "card.exr"), behind])
+    np.testing.assert_allclose(read.rgb, sharp.rgb, atol=2**-11)
+    np.testing.assert_allclose(read.alpha, sharp.alpha, atol=2**-11)
+    # Put in again it gives the same picture.
+    again = put_in(files, card="virtual.exr")
+    np.testing.assert_allclose(again, put_in(files, "--layer", files / "behind.exr"), atol=2e-3)
+    with pytest.raises(InputError, match="--deep-out: expected a name"):
+        put_in(files, "--deep-out", files / "virtual.png")
+    with pytest.raises(InputError, match="exists already"):
+        put_in(files, "--deep-out", files / "virtual.exr")
+    with pytest.raises(InputError, match="leave --all-slices out"):
+        put_in(files, "--all-slices", "--deep-out", files / "other.exr")
 
 
 def test_an_exr_holds_all_that_it_was_put_together_from(files: Path) -> None:

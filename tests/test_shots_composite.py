@@ -26,7 +26,8 @@ from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.frame_sources import DepthFiles, FocusPulled
 from mrbokeh.shots.hooks import Description, LayerSource, Moment
 from mrbokeh.shots.kept import Kept
-from mrbokeh.shots.layer_sources import LayerFiles, SceneLayers
+from mrbokeh.shots.layer_sources import LayerFiles
+from mrbokeh.shots.scene_layers import SceneLayers
 from mrbokeh.staging.filming import Filming
 from tests.stage_scenes import ONE_CARD, camera, scene_file
 

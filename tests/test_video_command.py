@@ -27,6 +27,8 @@ from mrbokeh.plate import plate_of
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video_io import VideoWriter, read_frames
 from tests.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
+from tests.test_exr_layers_cryptomatte import beauty, crypto_channels, header
+from tests.test_plate_look_options import photo_with_exif
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=6.0)
 # One 16-bit step of BT.709 codes, in linear light at white, where the curve is steepest: 1 / 65535 * 1 / 0.495.
@@ -228,6 +230,46 @@ def test_the_virtual_layer_alone_and_pictures_out(clip: Path, settings: list[str
         run(tmp_path / "in.%03d.exr", *settings, "--out", tmp_path / "no.mov")
     with pytest.raises(InputError, match="is for videos"):
         run(clip, *settings, "--encoding", "h264", "--out", tmp_path / "no.%03d.exr")
+
+
+@pytest.mark.usefixtures("settings")
+def test_exposures_that_pictures_state_are_matched_frame_by_frame(clip: Path, tmp_path: Path) -> None:
+    """A panorama of 1/100 s; frames of 1/25, 1/50 and 1/100 s at the same ISO and f-number show its light 4, 2 and 1 times as bright."""
+    alpha = np.ones((32, 48), np.float32)
+    write_layer(tmp_path / "grey.exr", Layer(np.full((32, 48, 3), 0.1, np.float32), alpha, 2 * alpha), half=False)
+    panorama = photo_with_exif(tmp_path / "panorama.jpg", 0.01)
+    for i, exposure_time_s in enumerate((0.04, 0.02, 0.01)):
+        photo_with_exif(tmp_path / f"taken.{i}.jpg", exposure_time_s)
+        stated = {"expTime": exposure_time_s, "isoSpeed": 200.0, "aperture": 2.8}
+        write_exr(tmp_path / f"taken.{i}.exr", ExrPart(dict.fromkeys("RGB", 0.5 * alpha), attributes=stated))
+    for suffix in ("jpg", "exr"):
+        options = ["--rate", "25", "--lens", tmp_path / "lens.json", "--layer", tmp_path / "grey.exr", "--match-exposure", panorama]
+        run(tmp_path / f"taken.%d.{suffix}", *options, "--out", tmp_path / f"{suffix}.%d.exr")
+        found = [float(read_image(tmp_path / f"{suffix}.{i}.exr")[16, 24, 0]) for i in range(3)]
+        assert found == pytest.approx([0.4, 0.2, 0.1], rel=2e-3)
+        run(tmp_path / f"taken.%d.{suffix}", *options, "--frames", "1:", "--out", tmp_path / f"{suffix}.later.%d.exr")
+        assert float(read_image(tmp_path / f"{suffix}.later.2.exr")[16, 24, 0]) == pytest.approx(0.1, rel=2e-3)
+    with pytest.raises(InputError, match="--match-exposure needs a photograph that states how it was taken"):
+        run(clip, *options[2:], "--out", tmp_path / "no.mkv")
+
+
+@pytest.mark.usefixtures("settings")
+def test_objects_are_taken_out_of_a_render_by_their_cryptomatte(tmp_path: Path) -> None:
+    """Red "near" covers columns 0 to 5 of 9, green "far" 6 to 8; both are in focus, and only one is wanted."""
+    height, width = beauty()["R"].shape
+    for i in range(2):
+        planes = beauty() | {"Z": np.full((height, width), 2.0, np.float32)}
+        write_exr(tmp_path / f"render.{i}.exr", ExrPart(planes | crypto_channels(), attributes=header()))
+        write_image(tmp_path / f"plate.{i}.exr", np.zeros((height, width, 3), np.float32))
+    options = ["--rate", "25", "--lens", tmp_path / "lens.json", "--layer", tmp_path / "render.%d.exr"]
+    run(tmp_path / "plate.%d.exr", *options, "--objects", "far", "--out", tmp_path / "far.%d.exr")
+    made, render = read_image(tmp_path / "far.1.exr"), beauty()
+    np.testing.assert_allclose(made[:, 6:8, 1], render["G"][:, 6:8], atol=2e-3)
+    assert made[:, :5].max() == 0.0
+    run(tmp_path / "plate.%d.exr", *options, "--objects", "near,far", "--out", tmp_path / "both.%d.exr")
+    np.testing.assert_allclose(read_image(tmp_path / "both.0.exr")[..., 0], render["R"], atol=2e-3)
+    with pytest.raises(InputError, match="give --layer"):
+        run(tmp_path / "plate.%d.exr", *options[:4], "--scene", "s.toml", "--objects", "far", "--out", tmp_path / "no.%d.exr")
 
 
 def test_parts_of_another_lens_are_refused(clip: Path, settings: list[str], tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.atomic_files import refuse_existing
+from mrbokeh.atomic_files import require_safe_outputs
+from mrbokeh.errors import InputError
 
 HELP = "\n\n".join(
     (
@@ -36,10 +37,13 @@ def matchmove_command(
 ) -> None:
     from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
     from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
-    from mrbokeh.camera_track.formats import write_track
+    from mrbokeh.camera_track.formats import format_of_name, write_track
     from mrbokeh.charuco.board_file import read_board
 
-    refuse_existing(out, overwrite)
+    if not clip.is_file():
+        raise InputError(f"expected a video at {clip}, but {'it is a folder' if clip.is_dir() else 'there is none'}")
+    require_safe_outputs((out,), (clip, board), overwrite)
+    format_of_name(out)
     printed = None if board is None else read_board(board)
     settings = MatchmoveSettings(
         keyframes,

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from mrbokeh.camera import Camera
 from mrbokeh.capture_bundle import CaptureBundle
+from mrbokeh.commands._composite_options import ObjectOptions, RenderingOptions
+from mrbokeh.commands._insertion_options import VirtualOptions
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.plate import Plate
@@ -16,103 +17,66 @@ LayersFor = Callable[[Plate], list[Layer]]
 """The same scene for every plate of one view: sharp layers, front first."""
 
 
-@dataclass(frozen=True)
-class ObjectOptions:
-    """Where the --object stands: at or at_pixel, as typed; angles in degrees."""
-
-    glb: Path | None
-    at: str | None
-    at_pixel: str | None
-    height_m: float | None
-    turn_deg: float
-    tilt_deg: float
-    environment: Path | None
-    exposure: float
-    shadow: float
-
-
-@dataclass(frozen=True)
-class SceneOptions:
-    """A scene file with its camera, and how objects and scenes are rendered; time_s: of their animations."""
-
-    path: Path | None
-    camera: Path | None
-    time_s: float
-    backend: str
-    samples: int
-    catches: str
-    distortion: Path | None
-
-
-@dataclass(frozen=True)
-class VirtualOptions:
-    """files: of layers; cryptomatte: names of the objects that are taken of them, as typed."""
-
-    files: tuple[Path, ...]
-    cryptomatte: str | None
-    standing: ObjectOptions
-    rendering: SceneOptions
-
-
-def layers_by(options: VirtualOptions, first: Plate, bundle: CaptureBundle | None) -> LayersFor:
+def layers_by(
+    virtual: VirtualOptions, standing: ObjectOptions, rendering: RenderingOptions, first: Plate, bundle: CaptureBundle | None
+) -> LayersFor:
     """first: the plate on whose pixel the object stands. Raises InputError where there is nothing to put in."""
-    still = [*_file_layers(options.files, options.cryptomatte), *(bundle.layers if bundle else ())]
+    still = [*_file_layers(virtual.layer or (), virtual.object_names), *(bundle.layers if bundle else ())]
     rendered = []
-    if options.standing.glb is not None:
-        rendered.append(_object_layers(options.standing.glb, options.standing, options.rendering, first))
-    if options.rendering.path is not None:
-        rendered.append(_scene_layers(options.rendering.path, options.rendering))
+    if standing.object_ is not None:
+        rendered.append(_object_layers(standing.object_, standing, rendering, first))
+    if virtual.scene is not None:
+        rendered.append(_scene_layers(virtual.scene, virtual.camera, rendering))
     if not still and not rendered:
         raise InputError("nothing to put into the photograph: give --object OBJ.glb, --scene SCENE.toml or --layer RGBAZ.exr")
     return lambda plate: [*still, *(layer for make in rendered for layer in make(plate))]
 
 
-def _file_layers(paths: Sequence[Path], cryptomatte: str | None) -> list[Layer]:
+def _file_layers(paths: Sequence[Path], object_names: tuple[str, ...]) -> list[Layer]:
     """Layers of EXR files, front first."""
-    from mrbokeh.exr_layers.object_split import ObjectSplit
-    from mrbokeh.exr_layers.sequence import ExrSequence
+    from mrbokeh.shots.layer_sources import layer_sequence
 
-    reader = None if cryptomatte is None else ObjectSplit(objects=tuple(cryptomatte.split(",")), with_rest=False)
-    sequences = [ExrSequence.of(path, reader) for path in paths]
+    sequences = [layer_sequence(path, object_names) for path in paths]
     return [layer for sequence in sequences for layer in sequence.layers(sequence.frames[0])]
 
 
-def _object_layers(glb: Path, options: ObjectOptions, rendering: SceneOptions, first: Plate) -> LayersFor:
+def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate) -> LayersFor:
     from mrbokeh.staging.one_object import OneObject
     from mrbokeh.staging.scene_description import Lighting
 
+    if options.at and options.at_pixel:
+        raise InputError("--at and --at-pixel both say where the object stands: give one of them")
+    if options.height is not None and not 0.0 < options.height < math.inf:
+        raise InputError(f"--height: expected metres above 0, got {options.height:g}")
     stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*_pair(options.at_pixel))
     light = Lighting(options.environment, exposure=options.exposure)
-    turn, tilt = math.radians(options.turn_deg), math.radians(options.tilt_deg)
-    one = OneObject(glb, stands_at_m, options.height_m, turn, tilt, light, options.shadow)
+    turn, tilt = math.radians(options.turn), math.radians(options.tilt)
+    one = OneObject(glb, stands_at_m, options.height, turn, tilt, light, options.shadow)
     return _filmed(one.described(), rendering, lambda plate: one.seen_by(plate.camera))
 
 
-def _scene_layers(path: Path, options: SceneOptions) -> LayersFor:
+def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) -> LayersFor:
     """Without a camera file the world of the scene is the plate's camera."""
-    from mrbokeh.camera_track.formats import read_track
-    from mrbokeh.camera_track.options import TrackOptions
+    from mrbokeh.shots.scene_camera import scene_track
     from mrbokeh.staging.scene_file import read_scene_file
+
+    description = read_scene_file(path)
 
     def seen_by(plate: Plate) -> Camera:
         size_px = (plate.rgb.shape[1], plate.rgb.shape[0])
-        if options.camera is None:
-            return plate.camera
-        return read_track(options.camera, TrackOptions(size_px=size_px)).at(0).camera.resized(*size_px)
+        return plate.camera if camera is None else scene_track(camera, size_px, description.up).at(0).camera.resized(*size_px)
 
-    return _filmed(read_scene_file(path), options, seen_by)
+    return _filmed(description, rendering, seen_by)
 
 
-def _filmed(description: SceneDescription, options: SceneOptions, seen_by: Callable[[Plate], Camera]) -> LayersFor:
-    from mrbokeh.lens_distortion.distortion_json import read_distortion
-    from mrbokeh.staging.filming import FilmedLayers, Filming
+def _filmed(description: SceneDescription, rendering: RenderingOptions, seen_by: Callable[[Plate], Camera]) -> LayersFor:
+    from mrbokeh.staging.filming import FilmedLayers
 
-    filming = Filming(options.backend, options.samples, catches=options.catches, distortion=read_distortion(options.distortion))
-    filmed = FilmedLayers(filming, description)
+    filmed = FilmedLayers(rendering.filming(), description)
 
     def layers(plate: Plate) -> list[Layer]:
         sharp_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
-        return filmed.at(lambda _: seen_by(plate), options.time_s, sharp_rgb)
+        return filmed.at(lambda _: seen_by(plate), rendering.time, sharp_rgb)
 
     return layers
 

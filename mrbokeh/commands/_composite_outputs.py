@@ -1,23 +1,62 @@
-"""What `mrbokeh composite` writes: the picture, or with .exr all that it was put together from."""
+"""What `mrbokeh composite` writes: the picture, or with .exr all that it was put together from, and what was asked for beside it."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from mrbokeh.atomic_files import require_safe_outputs
+from mrbokeh.commands._composite_options import ResultOptions
+from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.compositing.base import Inserted
+from mrbokeh.errors import InputError
+from mrbokeh.image_io import INTEGER_SUFFIXES, require_suffix
 from mrbokeh.layer import Layer, flatten
 from mrbokeh.plate import Plate
 
 
-def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], space: str | None, config: str) -> None:
-    """space: of OpenColorIO, in which the picture alone is written; None is linear Rec.709, with layers, or sRGB."""
+def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None], *, all_slices: bool) -> None:
+    """read: the files that the command reads. Raises InputError where a file would be lost, or cannot be what is asked for."""
+    require_suffix(out, ("",) if all_slices else (".exr", *INTEGER_SUFFIXES), "--out, a folder," if all_slices else "--out")
+    for path, name in ((result.save_layer, "--save-layer"), (result.deep_out, "--deep-out")):
+        if path is not None:
+            require_suffix(path, (".exr",), name)
+    require_safe_outputs((out, result.save_layer, result.deep_out), read, result.overwrite)
+    if result.deep_out is not None and all_slices:
+        raise InputError("--deep-out writes the layers of one picture: leave --all-slices out, for they are the same in every slice")
+
+
+def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
+    """The lens that blurred, and how much."""
+    lens, flat = plate.lens, flatten(sharp)
+    told = f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g} focused at {lens.focus_distance_m:.3g} m"
+    seen_m = flat.depth_m[(flat.alpha > 0.5) & np.isfinite(flat.depth_m)]
+    if not len(seen_m):
+        return told
+    coc_px = np.abs(lens.coc_px(np.array([seen_m.min(), np.median(seen_m), seen_m.max()]), flat.depth_m.shape[1]))
+    return f"{told}; put in at {seen_m.min():.3g} to {seen_m.max():.3g} m, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
+
+
+def write_results(
+    out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions, result: ResultOptions
+) -> None:
+    """sharp: the layers that were put in, front first."""
+    from mrbokeh.exr_layers.deep_out import write_deep_exr
+    from mrbokeh.image_io import write_layer
+
+    write_picture(out, inserted, plate, sharp, colour)
+    if result.save_layer is not None:
+        write_layer(result.save_layer, inserted.virtual)
+    if result.deep_out is not None:
+        write_deep_exr(result.deep_out, sharp)
+
+
+def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions) -> None:
+    """With an output space the picture alone; else linear Rec.709 with its layers, or sRGB."""
     from mrbokeh.image_io import write_image
 
-    if space is not None:
-        from mrbokeh.color_management import ColorConversion
-
-        write_image(out, ColorConversion.from_rec709(config, space).applied(inserted.rgb), "linear")
+    if colour.of_result is not None:
+        write_image(out, colour.of_result.from_rec709(inserted.rgb), "linear")
     elif out.suffix.lower() == ".exr":
         _write_layers(out, inserted, plate, flatten(sharp))
     else:

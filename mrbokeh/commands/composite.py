@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 import typer
 
 from mrbokeh.commands import _composite_options as options
-from mrbokeh.commands import _look_options as look
+from mrbokeh.commands._insertion_options import ColourOptions, VirtualOptions
+from mrbokeh.commands._look_options import LookGroup
+from mrbokeh.commands._option_groups import grouped
 
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_layers import LayersFor
@@ -18,52 +20,18 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command()
+@grouped
 def composite(
     photo: options.PhotoArgument,
+    taken: options.PlateOptions,
+    virtual: VirtualOptions,
+    standing: options.ObjectOptions,
+    rendering: options.RenderingOptions,
+    look: LookGroup,
+    optics: options.LensOptions,
     out: options.OutOption,
-    slice_: options.SliceOption = None,
-    all_slices: options.AllSlicesOption = False,
-    depth: options.DepthOption = None,
-    disparity: options.DisparityOption = None,
-    depth_scale: options.DepthScaleOption = None,
-    matte: options.MatteOption = None,
-    near_distance: options.NearDistanceOption = None,
-    input_space: options.InputSpaceOption = None,
-    layer: options.LayerOption = None,
-    objects: options.ObjectsOption = None,
-    object_: options.ObjectOption = None,
-    at: options.AtOption = None,
-    at_pixel: options.AtPixelOption = None,
-    height: options.HeightOption = None,
-    turn: options.TurnOption = 0.0,
-    tilt: options.TiltOption = 0.0,
-    scene: options.SceneOption = None,
-    camera: options.CameraOption = None,
-    time: options.TimeOption = 0.0,
-    mode: options.ModeOption = None,
-    scene_renderer: options.BackendOption = "embree",
-    samples: options.SamplesOption = 64,
-    environment: options.EnvironmentOption = None,
-    exposure: options.ExposureOption = 1.0,
-    shadow: options.ShadowOption = 0.0,
-    catch: options.CatchOption = "shadow",
-    match_grey: look.MatchGreyOption = None,
-    grey_value: look.GreyValueOption = 0.18,
-    match_exposure: look.MatchExposureOption = None,
-    match_white: look.MatchWhiteOption = None,
-    match_black: look.MatchBlackOption = None,
-    vignetting: look.VignettingOption = None,
-    grain: look.GrainOption = None,
-    light_wrap: look.LightWrapOption = None,
-    seed: look.SeedOption = 0,
-    lens: options.LensOption = None,
-    focus: options.FocusOption = None,
-    renderer: options.RendererOption = None,
-    distortion: options.DistortionOption = None,
-    save_layer: options.SaveLayerOption = None,
-    output_space: options.OutputSpaceOption = None,
-    ocio: options.OcioOption = "aces",
-    overwrite: options.OverwriteOption = False,
+    colour: ColourOptions,
+    result: options.ResultOptions,
 ) -> None:
     """Put virtual objects into a photograph, blurred by its lens, behind and before what is blurred in it.
 
@@ -73,38 +41,33 @@ def composite(
 
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
-    from mrbokeh.atomic_files import refuse_existing
     from mrbokeh.capture_bundle import is_bundle, read_bundle
-    from mrbokeh.commands._composite_layers import ObjectOptions, SceneOptions, VirtualOptions, layers_by
-    from mrbokeh.commands._composite_outputs import write_picture
-    from mrbokeh.commands._composite_plate import PlateOptions, insertion_for, plate_by
-    from mrbokeh.image_io import write_layer
+    from mrbokeh.commands._composite_layers import layers_by
+    from mrbokeh.commands._composite_outputs import blur_told, check_outputs, write_results
+    from mrbokeh.commands._composite_plate import best_mode, plate_by
+    from mrbokeh.compositing.choose import insertion_of
     from mrbokeh.plate_look.finishing import finished
-    from mrbokeh.plate_look.look_options import LookOptions, finishing_of
+    from mrbokeh.plate_look.look_options import finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
 
-    for path in (out, save_layer):
-        if path is not None:
-            refuse_existing(path, overwrite)
+    read = (photo, taken.depth, taken.matte, *virtual.files, standing.object_, standing.environment, rendering.distortion, optics.lens)
+    check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
-    used_lens, used_renderer = lens_and_renderer(lens, renderer or (bundle.renderer if bundle and lens is None else None))
-    plate_options = PlateOptions(photo, 0 if all_slices else slice_, focus, depth, disparity, depth_scale, matte, input_space, ocio)
-    plate = plate_by(plate_options, used_lens, bundle)
-    standing = ObjectOptions(object_, at, at_pixel, height, turn, tilt, environment, exposure, shadow)
-    rendering = SceneOptions(scene, camera, time, scene_renderer, samples, catch, distortion)
-    layers_for = layers_by(VirtualOptions(tuple(layer or ()), objects, standing, rendering), plate, bundle)
-    insertion = insertion_for(mode, plate, near_distance)
-    if all_slices:
-        _into_all_slices(photo, out, layers_for, insertion, used_renderer, used_lens)
+    lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
+    plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus)
+    layers_for = layers_by(virtual, standing, rendering, plate, bundle)
+    mode = virtual.mode or best_mode(plate)
+    insertion = insertion_of(mode, taken.near_distance)
+    if taken.all_slices:
+        _into_all_slices(photo, out, layers_for, insertion, renderer, lens)
         return
-    wanted = LookOptions(match_grey, grey_value, match_exposure, match_white, match_black, vignetting, grain, light_wrap, seed)
-    finishing = finishing_of(wanted, plate.rgb, None if photo.is_dir() else photo)
+    finishing = finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
     sharp = layers_for(plate)
-    inserted = finished(insertion.insert(plate, sharp, used_renderer), plate, finishing)
-    write_picture(out, inserted, plate, sharp, output_space, ocio)
-    if save_layer is not None:
-        write_layer(save_layer, inserted.virtual)
-    typer.echo(f"wrote {out}")
+    if not any((layer.alpha > 0).any() for layer in sharp):
+        typer.echo("warning: nothing of what is put in is in the picture: is it behind the camera, or beside the frame?", err=True)
+    inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
+    write_results(out, inserted, plate, sharp, colour, result)
+    typer.echo(f"wrote {out} ({mode}; {blur_told(plate, sharp)})")
 
 
 def _into_all_slices(

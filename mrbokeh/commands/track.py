@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.atomic_files import refuse_existing
+from mrbokeh.atomic_files import refuse_existing, require_safe_outputs
 from mrbokeh.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,9 +47,12 @@ def track(
     Example: mrbokeh track clip clip.mp4 --board board.json --calibrate --out track.json
     """
     from mrbokeh.camera_track.board_track import TrackSettings, calibrate_clip, track_board
+    from mrbokeh.camera_track.formats import format_of_name
     from mrbokeh.charuco.board_file import read_board
 
-    refuse_existing(out, overwrite)
+    require_safe_outputs((out,), (clip, board, camera), overwrite)
+    if format_ is None:
+        format_of_name(out)
     if calibrate == (camera is not None):
         raise InputError("expected either --camera CAMERA.json or --calibrate, which finds the camera from the clip: give one of them")
     printed = read_board(board)
@@ -121,10 +124,11 @@ def _write(out: Path, made: "CameraTrack", options: "TrackOptions | None", forma
 
 def _told(tracked: "BoardTrack", out: Path) -> str:
     lost = f", {len(tracked.lost)} lost ({_ranges(tracked.lost)})" if tracked.lost else ""
+    unsure = f", {len(tracked.unsure)} of unsure tilt ({_ranges(tracked.unsure)})" if tracked.unsure else ""
     bridged = f", {len(tracked.bridged)} bridged ({_ranges(tracked.bridged)})" if tracked.bridged else ""
     return (
         f"{out}: board seen in {tracked.seen} of {tracked.frame_count} frames "
-        f"({100 * tracked.seen / tracked.frame_count:.1f} %){bridged}{lost}; reprojection {tracked.residual_px:.2f} px RMS"
+        f"({100 * tracked.seen / tracked.frame_count:.1f} %){unsure}{bridged}{lost}; reprojection {tracked.residual_px:.2f} px RMS"
     )
 
 

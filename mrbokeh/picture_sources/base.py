@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64
 
+from mrbokeh.color_management import NamedSpace
 from mrbokeh.video_io import Frame, VideoInfo
 
 
@@ -34,6 +35,15 @@ class PictureSource(Protocol):
     @property
     def first_number(self) -> int:
         """The number that users know frame 0 by: of the first file of a sequence, 0 of a video."""
+        ...
+
+    def file_of(self, index: int) -> Path | None:
+        """The picture that frame is stored in, whose metadata may be asked; None of a video."""
+        ...
+
+    @property
+    def space(self) -> NamedSpace | None:
+        """The colour space of its numbers, where the user names it; None is what the files say themselves."""
         ...
 
     def frames(self, start: int, stop: int, threads: int = 0) -> Iterator[Frame]:

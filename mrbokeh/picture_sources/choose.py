@@ -3,22 +3,33 @@
 from fractions import Fraction
 from pathlib import Path
 
+from mrbokeh.color_management import NamedSpace
 from mrbokeh.errors import InputError
 from mrbokeh.picture_sources.base import PictureSource
 from mrbokeh.picture_sources.image_sequence import ImageSequence
-from mrbokeh.picture_sources.numbered_files import is_pattern
+from mrbokeh.picture_sources.numbered_files import is_pattern, pattern_of_folder
 from mrbokeh.picture_sources.video_source import VideoSource
 
 
-def open_source(clip: Path, rate: str | None = None) -> PictureSource:
-    """A video, or numbered pictures with a rate in frames per second ("25", "23.976" or "24000/1001"); paths become absolute."""
+def open_source(clip: Path, rate: str | None = None, space: NamedSpace | None = None) -> PictureSource:
+    """A video, or numbered pictures (a pattern or their folder) with a rate in frames per second ("25", "23.976" or "24000/1001").
+
+    Paths become absolute.
+
+    space: what the numbers of the clip mean, in place of what its files say.
+    """
+    clip = pattern_of_folder(clip) if clip.is_dir() else clip
     if is_pattern(clip):
         if rate is None:
             raise InputError(f"{clip}: numbered pictures have no rate of their own: give --rate, such as 25 or 24000/1001")
-        return ImageSequence.open(clip.resolve(), parse_rate(rate))
+        return ImageSequence.open(clip.resolve(), parse_rate(rate), space)
     if rate is not None:
         raise InputError(f"--rate is for numbered pictures (frames.%04d.exr), but {clip} has its own times: leave it out")
-    return VideoSource.open(clip.resolve())
+    if space is not None and space.is_linear:
+        raise InputError(
+            f"{clip}: the numbers of a video follow a curve, but {space.name} is linear: name the camera's own space (--input-space)"
+        )
+    return VideoSource.open(clip.resolve(), space)
 
 
 def parse_rate(text: str) -> Fraction:

@@ -1,4 +1,4 @@
-"""Files of one sequence, by a pattern such as frames.%04d.exr."""
+"""Files of one sequence, by a pattern such as frames.%04d.exr or frames.####.exr, or by the folder that holds nothing else."""
 
 import re
 from dataclasses import dataclass
@@ -6,7 +6,8 @@ from pathlib import Path
 
 from mrbokeh.errors import InputError
 
-_NUMBER = re.compile(r"%(?:0(\d+))?d")
+_NUMBER = re.compile(r"%(?:0(\d+))?d|(#+)")
+_LAST_DIGITS = re.compile(r"\d+(?=\D*$)")
 
 
 def is_pattern(path: Path | str) -> bool:
@@ -29,7 +30,7 @@ class NumberedFiles:
         if place is None:
             raise InputError(f"expected a pattern such as frames.%04d.exr, got {pattern}")
         before, after = re.escape(pattern.name[: place.start()]), re.escape(pattern.name[place.end() :])
-        digits = rf"\d{{{place.group(1)},}}" if place.group(1) else r"\d+"
+        digits = rf"\d{{{_width(place)},}}"
         named = re.compile(f"{before}({digits}){after}")
         folder = pattern.parent
         matches = (named.fullmatch(file.name) for file in folder.iterdir()) if folder.is_dir() else ()
@@ -61,4 +62,20 @@ def numbered(pattern: Path, number: int) -> Path:
     place = _NUMBER.search(pattern.name)
     if place is None:
         return pattern
-    return pattern.with_name(f"{pattern.name[: place.start()]}{number:0{place.group(1) or 1}d}{pattern.name[place.end() :]}")
+    return pattern.with_name(f"{pattern.name[: place.start()]}{number:0{_width(place)}d}{pattern.name[place.end() :]}")
+
+
+def pattern_of_folder(folder: Path) -> Path:
+    """The pattern of the only sequence in a folder. Raises InputError where there is none, or several."""
+    files = sorted(file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".") and _LAST_DIGITS.search(file.stem))
+    widths = {len(_LAST_DIGITS.findall(file.stem)[-1]) for file in files}
+    width = min(widths, default=0)
+    names = {f"{_LAST_DIGITS.sub(f'%0{width}d', file.stem)}{file.suffix}" for file in files}
+    if len(names) != 1:
+        told = f"holds {len(names)} sequences ({', '.join(sorted(names)[:3])})" if names else "holds no numbered pictures"
+        raise InputError(f"{folder} {told}: name one, such as {folder / 'frames.%04d.exr'}")
+    return folder / names.pop()
+
+
+def _width(place: "re.Match[str]") -> int:
+    return len(place.group(2)) if place.group(2) else int(place.group(1) or 1)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from mrbokeh.color_management import NamedSpace
 from mrbokeh.errors import InputError
 from mrbokeh.picture_sources.frame_index import FrameIndex
 from mrbokeh.video_decoding import chroma_placement, opened, told_as_damage
@@ -21,11 +22,12 @@ class VideoSource:
     path: Path
     info: VideoInfo
     index: FrameIndex
+    space: NamedSpace | None = None
 
     @classmethod
-    def open(cls, path: Path) -> "VideoSource":
-        info, index = probe(path), FrameIndex.of(path)
-        return cls(path, replace(info, frame_count=len(index.shown)), index)
+    def open(cls, path: Path, space: NamedSpace | None = None) -> "VideoSource":
+        info, index = probe(path, as_codes=space is not None), FrameIndex.of(path)
+        return cls(path, replace(info, frame_count=len(index.shown)), index, space)
 
     @property
     def times_s(self) -> Float64[np.ndarray, " frames"]:
@@ -34,6 +36,9 @@ class VideoSource:
     @property
     def first_number(self) -> int:
         return 0
+
+    def file_of(self, index: int) -> Path | None:  # noqa: ARG002
+        return None
 
     def frames(self, start: int, stop: int, threads: int = 0) -> Iterator[Frame]:
         with opened(self.path, threads) as (container, stream), told_as_damage(self.path):
@@ -46,10 +51,13 @@ class VideoSource:
                 if number != expected:
                     break
                 time_s = float(self.index.shown[number].item() * self.index.time_base)
-                yield upright_frame(placed(stored), time_s, self.path)
+                yield self._linear(upright_frame(placed(stored), time_s, self.path, as_codes=self.space is not None))
                 expected += 1
         if expected < stop:
             raise InputError(f"{self.path}: frame {expected} cannot be decoded; the file is damaged or cut off there")
+
+    def _linear(self, frame: Frame) -> Frame:
+        return frame if self.space is None else replace(frame, rgb=self.space.to_rec709(frame.rgb))
 
     def _numbered_from(self, start: int, container: Any, stream: Any) -> Iterator[tuple[int, Any]]:
         """(number, PyAV frame) from a keyframe on; the first is not after `start`."""

@@ -14,18 +14,16 @@ from jaxtyping import Float32
 from mrbokeh.compositing.base import Inserted, Insertion, same_size
 from mrbokeh.compositing.occlusion import covered_by, occlusion_matte
 from mrbokeh.compositing.over import OverPhotograph, behind
-from mrbokeh.compositing.touched_box import Box, InTouchedBox, touched_box
+from mrbokeh.compositing.touched_box import InTouchedBox, touched_box
 from mrbokeh.layer import Layer, clear, flatten
 from mrbokeh.lens import Lens
+from mrbokeh.pixel_box import NOWHERE, Box, is_same_everywhere
 from mrbokeh.plate import Plate, plate_of
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.shots.kept import Kept
-from mrbokeh.staging.picture_box import is_same_everywhere
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
-
-_NOWHERE = Box(0, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -47,11 +45,9 @@ class Part:
         """As if it had been made in the whole frame."""
         if self.box is None:
             return self.inserted
-        photo_rgb, virtual, part = rgb.copy(), clear(*rgb.shape[:2]), self.inserted.virtual
+        photo_rgb = rgb.copy()
         self.box.paste(self.inserted.photo_rgb, photo_rgb)
-        for plane, target in ((part.rgb, virtual.rgb), (part.alpha, virtual.alpha), (part.depth_m, virtual.depth_m)):
-            self.box.paste(plane, target)
-        return Inserted(photo_rgb, virtual)
+        return Inserted(photo_rgb, self.box.placed(replace(self.inserted.virtual, extra={}), rgb.shape))
 
 
 class BoxedInsertion:
@@ -70,7 +66,7 @@ class BoxedInsertion:
         if not (self._keeps and is_same_everywhere(plate.lens)):
             return Part(None, self._insertion.insert(plate, layers, self._renderer))
         box = self._box(same_size(plate, layers), plate.lens)
-        if box is _NOWHERE:
+        if box.is_empty:
             return Part(box, Inserted(plate.rgb[:0, :0], clear(0, 0)))
         visible = self._cut(layers, box)
         if self._by_depth and plate.depth_m is not None:
@@ -82,28 +78,20 @@ class BoxedInsertion:
         """With so much of the sensor as sees the box, so that circles of confusion keep their size."""
         if not any(layer.alpha.any() or layer.rgb.any() for layer in layers):
             return flatten(layers)
-        sensor_width_mm = lens.sensor_width_mm * layers[0].width_px / frame_width_px
-        return self._renderer.render(layers, replace(lens, sensor_width_mm=sensor_width_mm))
+        box = Box(0, layers[0].height_px, 0, layers[0].width_px)
+        return self._renderer.render(layers, box.lens_of(lens, frame_width_px))
 
 
 def _reached_box(layers: Sequence[Layer], lens: Lens) -> Box:
     """Within the frame, for the photograph is not blurred again."""
     if not layers:
-        return _NOWHERE
+        return NOWHERE
     blank = np.broadcast_to(np.float32(0.0), (*layers[0].alpha.shape, 3))
-    return touched_box(plate_of(blank, lens), layers) or _NOWHERE
+    return touched_box(plate_of(blank, lens), layers)
 
 
 def _cut_layers(layers: Sequence[Layer], box: Box) -> list[Layer]:
-    return [
-        Layer(
-            box.cut(each.rgb, "constant"),
-            box.cut(each.alpha, "constant"),
-            box.cut(each.depth_m, "constant", np.inf),
-            {name: box.cut(values, "constant") for name, values in each.extra.items()},
-        )
-        for each in layers
-    ]
+    return [box.cut_layer(each) for each in layers]
 
 
 def _hidden_layers(layers: Sequence[Layer], photo_depth_m: Plane, box: Box) -> list[Layer]:

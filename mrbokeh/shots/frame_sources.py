@@ -11,8 +11,6 @@ from jaxtyping import Float32
 from mrbokeh.camera import Camera
 from mrbokeh.camera_track.focus_metadata import read_focus_pull
 from mrbokeh.camera_track.focus_pull import parse_focus_keys
-from mrbokeh.camera_track.formats import read_track
-from mrbokeh.camera_track.options import TrackOptions
 from mrbokeh.camera_track.track import CameraTrack
 from mrbokeh.camera_track.tracked_frame import TrackedFrame
 from mrbokeh.depth_sources.temporal_filter import TemporalDepthFilter
@@ -21,6 +19,7 @@ from mrbokeh.image_io import read_depth, read_image
 from mrbokeh.picture_sources.numbered_files import is_pattern, numbered
 from mrbokeh.shots.hooks import CameraSource, DepthSource, FocusSource, MatteSource, Moment
 from mrbokeh.shots.kept import Kept
+from mrbokeh.shots.scene_camera import scene_track
 from mrbokeh.video_io import VideoInfo
 
 Plane = Float32[np.ndarray, "height width"]
@@ -30,23 +29,24 @@ Plane = Float32[np.ndarray, "height width"]
 class CameraFile:
     """Description of a fixed camera (JSON) or a track, in any form that mrbokeh.camera_track reads.
 
-    size_px, frame_rate: of the clip.
+    size_px, frame_rate: of the clip. up: what points up in the world of the scene that it looks at (mrbokeh.shots.scene_camera).
     """
 
     path: Path
     size_px: tuple[int, int]
     frame_rate: Fraction = Fraction(25)
+    up: str = "-z"
 
     @classmethod
-    def of_clip(cls, path: Path, clip: VideoInfo) -> "CameraFile":
-        return cls(path, (clip.width_px, clip.height_px), clip.frame_rate)
+    def of_clip(cls, path: Path, clip: VideoInfo, up: str) -> "CameraFile":
+        return cls(path, (clip.width_px, clip.height_px), clip.frame_rate, up)
 
     @property
     def files(self) -> tuple[Path, ...]:
         return (self.path,)
 
     def opened(self, threads: int) -> CameraSource:  # noqa: ARG002
-        return _OpenedTrack(read_track(self.path, TrackOptions(size_px=self.size_px)), float(self.frame_rate))
+        return _OpenedTrack(scene_track(self.path, self.size_px, self.up), float(self.frame_rate))
 
 
 class _OpenedTrack:

@@ -1,33 +1,38 @@
-"""Layers of a frame: EXR files of other renderers, or a staged scene rendered here."""
+"""Layers of a frame from EXR files of other renderers (of a scene rendered here: mrbokeh.shots.scene_layers)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
+from mrbokeh.exr_layers.object_split import ObjectSplit
 from mrbokeh.exr_layers.sequence import ExrSequence
 from mrbokeh.layer import Layer
 from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
 from mrbokeh.shots.kept import Kept
-from mrbokeh.staging.filming import FilmedLayers, Filming
-from mrbokeh.staging.scene_file import read_scene_file
 
 
 @dataclass(frozen=True)
 class LayerFiles:
-    """Description of a still (RGBAZ.exr, the same in every frame) or numbered files (seq.%04d.exr)."""
+    """Description of a still (RGBAZ.exr, the same in every frame) or numbered files (seq.%04d.exr).
+
+    objects: names in their Cryptomatte; only these are taken, each as a layer. Empty takes all.
+    """
 
     path: Path
+    objects: tuple[str, ...] = ()
 
     @property
     def files(self) -> tuple[Path, ...]:
         return (self.path,)
 
     def opened(self, threads: int) -> LayerSource:  # noqa: ARG002
-        return _OpenedFiles(ExrSequence.of(self.path))
+        return _OpenedFiles(layer_sequence(self.path, self.objects))
+
+
+def layer_sequence(path: Path, objects: tuple[str, ...] = ()) -> ExrSequence:
+    """One file or numbered ones, of which only some objects may be wanted."""
+    return ExrSequence.of(path, ObjectSplit(objects=objects, with_rest=False) if objects else None)
 
 
 class _OpenedFiles:
@@ -43,45 +48,3 @@ class _OpenedFiles:
                 sizes = f"{path} is {layer.width_px}x{layer.height_px} px but the clip is {moment.size_px[0]}x{moment.size_px[1]} px"
                 raise InputError(f"{sizes}: render the layer in the size of the clip")
         return layers
-
-
-@dataclass(frozen=True)
-class SceneLayers:
-    """Description of a scene file (mrbokeh.staging) and how it is filmed; begin_s: when in the clip its animations start."""
-
-    path: Path
-    filming: Filming = field(default_factory=Filming)
-    begin_s: float = 0.0
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        return read_scene_file(self.path).files
-
-    def opened(self, threads: int) -> LayerSource:
-        return _OpenedScene(self, FilmedLayers(self.filming, read_scene_file(self.path), threads))
-
-
-class _OpenedScene:
-    """Filmed anew only where the camera or the scene moved."""
-
-    def __init__(self, described: SceneLayers, filmed: FilmedLayers) -> None:
-        self._described, self._filmed = described, filmed
-        self._last: tuple[Camera, Sequence[Layer]] | None = None
-
-    def layers_at(self, moment: Moment, cameras: CameraSource | None) -> Sequence[Layer]:
-        if cameras is None:
-            raise InputError(f"to render {self._described.path} a camera is needed: give --camera with a fixed camera or a track")
-        camera, last = cameras.camera_at(moment), self._last
-        if last is None or self._filmed.changes_by_itself or not same_view(last[0], camera):
-            last = self._last = camera, self._film(moment, cameras)
-        return last[1]
-
-    def _film(self, moment: Moment, cameras: CameraSource) -> Sequence[Layer]:
-        begin_s = moment.time_s - self._described.begin_s
-        return self._filmed.at(lambda time_s: cameras.camera_at(moment, time_s - begin_s), begin_s)
-
-
-def same_view(one: Camera, other: Camera) -> bool:
-    """Whether two cameras see the same."""
-    facts = [(each.width_px, each.height_px, each.focal_px, each.principal_px) for each in (one, other)]
-    return facts[0] == facts[1] and np.array_equal(one.camera_from_world, other.camera_from_world)

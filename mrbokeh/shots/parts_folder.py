@@ -33,7 +33,7 @@ class PartsFolder:
         if manifest.is_file():
             before = read_json(manifest, "the manifest of finished segments")["settings"]
             changed = sorted(name for name in {*before, *settings} if before.get(name) != settings.get(name))
-            if changed and not overwrite:
+            if changed and not overwrite and folder.holds_parts:
                 raise InputError(
                     f"{folder.path} holds finished segments of a run with other settings ({', '.join(changed)}): "
                     f"run with the same to go on, or --overwrite to begin anew"
@@ -46,6 +46,10 @@ class PartsFolder:
     @property
     def missing(self) -> list[Segment]:
         return [segment for segment in self.shot.segments if not self.shot.target.part(self.path, segment).exists()]
+
+    @property
+    def holds_parts(self) -> bool:
+        return any(each.name != MANIFEST for each in self.path.iterdir())
 
     def remove(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
@@ -60,6 +64,7 @@ def settings_of(shot: Shot) -> dict[str, str]:
     return {
         "version": __version__,
         "clip": _stamps([shot.source.path]),
+        "input space": "" if shot.source.space is None else f"{shot.source.space} {_stamps(shot.source.space.files)}",
         "frames": f"{shot.start}:{shot.stop} by {shot.segment_frames} at {shot.source.info.frame_rate}",
         **of_recipe,
         "files": _stamps(recipe.files),

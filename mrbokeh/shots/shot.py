@@ -50,6 +50,11 @@ class Shot:
         """When the frames of a segment are shown in the result."""
         return [float(time_s) - self.begin_s for time_s in self.source.times_s[segment.start : segment.stop]]
 
+    @property
+    def all_times_s(self) -> list[float]:
+        """Of all frames of the shot."""
+        return self.times_s(Segment(0, self.start, self.stop))
+
 
 @runtime_checkable
 class PartSink(Protocol):

@@ -1,0 +1,145 @@
+"""Options that `mrbokeh composite` and `mrbokeh video` have in common."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mrbokeh.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.color_management import NamedSpace
+    from mrbokeh.moving_layers import ShutterTiming
+    from mrbokeh.staging.filming import Filming
+
+PLATE, VIRTUAL, LENS, RESULT = "The plate", "What is put in", "The lens", "The result"
+
+BackendOption = Annotated[str, typer.Option(help="Who renders objects and scenes: auto, embree, wgpu or mitsuba.", rich_help_panel=VIRTUAL)]
+OverwriteOption = Annotated[bool, typer.Option(help="Replace what exists.", rich_help_panel=RESULT)]
+
+
+@dataclass(frozen=True)
+class NearOptions:
+    """What of the plate stands in front of virtual things. near_distance: in metres."""
+
+    matte: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MATTE.png",
+            help="White where something real stands in front, sharp, for --mode between; of a clip also matte.%04d.png.",
+            rich_help_panel=PLATE,
+        ),
+    ] = None
+    near_distance: Annotated[
+        float | None, typer.Option(metavar="METRES", help="How far what --matte shows is, where there is no depth.", rich_help_panel=PLATE)
+    ] = None
+
+
+@dataclass(frozen=True)
+class VirtualOptions:
+    """Layers of other renderers and a scene, and how they go in."""
+
+    layer: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RGBAZ.exr",
+            help="All-in-focus virtual layer: EXR with R, G, B, A (linear, premultiplied) and Z in metres, deep EXR too, of a clip also "
+            "layer.%04d.exr; may be given several times, front first.",
+            rich_help_panel=VIRTUAL,
+        ),
+    ] = None
+    objects: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,NAME", help="Only these objects of the layers, by their Cryptomatte.", rich_help_panel=VIRTUAL),
+    ] = None
+    scene: Annotated[
+        Path | None,
+        typer.Option(metavar="SCENE.toml", help="Scene file with objects, lights and shadow, which is rendered.", rich_help_panel=VIRTUAL),
+    ] = None
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CAMERA",
+            help="For --scene: a fixed camera (JSON) or a track (JSON, .chan, nerfstudio, COLMAP, OpenTrackIO); in a photograph by "
+            "default one that looks along z from the origin.",
+            rich_help_panel=VIRTUAL,
+        ),
+    ] = None
+    mode: Annotated[
+        str | None,
+        typer.Option(
+            help="How layers go in: front, over (by depth), matte, between (behind blurred near things) or rerender. Default: the best "
+            "that what is known of the plate allows.",
+            rich_help_panel=VIRTUAL,
+        ),
+    ] = None
+
+    @property
+    def files(self) -> tuple[Path | None, ...]:
+        """That are read."""
+        return (*(self.layer or ()), self.scene, self.camera)
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """As typed in --objects, without commas. Raises InputError where there is no layer to take them from."""
+        if self.objects is not None and not self.layer:
+            raise InputError(f"--objects {self.objects} are taken out of layers: give --layer RENDER.exr with a Cryptomatte")
+        return () if self.objects is None else tuple(self.objects.split(","))
+
+
+@dataclass(frozen=True)
+class RenderingOptions:
+    """How --scene and --object are rendered."""
+
+    scene_renderer: BackendOption = "auto"
+    samples: Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.", rich_help_panel=VIRTUAL)] = 64
+    catch: Annotated[
+        str,
+        typer.Option(
+            help="What the ground under them catches: shadow, or light (also reflections, with mitsuba).", rich_help_panel=VIRTUAL
+        ),
+    ] = "shadow"
+    distortion: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DISTORTION.json", help="How the lens bends straight lines: what is rendered is bent alike.", rich_help_panel=LENS
+        ),
+    ] = None
+
+    def filming(self, shutter: "ShutterTiming | None" = None) -> "Filming":
+        """shutter: None stands still."""
+        from mrbokeh.lens_distortion.distortion_json import read_distortion
+        from mrbokeh.staging.filming import Filming
+
+        distortion = read_distortion(self.distortion)
+        return Filming(self.scene_renderer, self.samples, catches=self.catch, distortion=distortion, shutter=shutter)
+
+
+@dataclass(frozen=True)
+class ColourOptions:
+    """Colour spaces of OpenColorIO, by name; None is as files state, and linear Rec.709 or sRGB out."""
+
+    input_space: Annotated[
+        str | None, typer.Option(help="OpenColorIO space of the plate's numbers, such as ACEScg or 'ARRI LogC4'.", rich_help_panel=PLATE)
+    ] = None
+    output_space: Annotated[
+        str | None,
+        typer.Option(help="OpenColorIO space of OUT, such as ACEScg; OUT then holds the picture alone.", rich_help_panel=RESULT),
+    ] = None
+    ocio: Annotated[
+        str, typer.Option(metavar="CONFIG", help="OpenColorIO configuration: aces, aces-cg or a file.", rich_help_panel=RESULT)
+    ] = "aces"
+
+    @property
+    def of_plate(self) -> "NamedSpace | None":
+        return self._space(self.input_space)
+
+    @property
+    def of_result(self) -> "NamedSpace | None":
+        return self._space(self.output_space)
+
+    def _space(self, name: str | None) -> "NamedSpace | None":
+        from mrbokeh.color_management import NamedSpace
+
+        return None if name is None else NamedSpace.of(name, self.ocio)

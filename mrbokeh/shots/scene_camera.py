@@ -1,0 +1,39 @@
+"""The camera of a scene file: a track whose world points up as the scene's does."""
+
+from pathlib import Path
+
+from mrbokeh.atomic_files import read_json
+from mrbokeh.camera_track.formats import format_of_file, read_track
+from mrbokeh.camera_track.options import TrackOptions
+from mrbokeh.camera_track.track import CameraTrack
+from mrbokeh.errors import InputError
+
+
+def scene_track(path: Path, size_px: tuple[int, int], scene_up: str) -> CameraTrack:
+    """size_px: (width, height) of the plate. scene_up: what points up in the world of the scene, in which its objects are placed.
+
+    A file of one camera does not say what is up, so it is the scene's. Any other track has an axis of its own; where that is another
+    one, places of objects and poses of the camera are not of one world, and no turn can tell which of them is meant: InputError.
+    """
+    if _is_single_camera(path):
+        return read_track(path, TrackOptions(up=scene_up, size_px=size_px))
+    track = read_track(path, TrackOptions(size_px=size_px))
+    if track.up != scene_up:
+        raise InputError(
+            f"{path}: {track.up} points up in this track{_remark(path)}, but {scene_up} in the scene: where the scene's places are the "
+            f"track's, write up = {track.up!r} into the scene file, else turn the track: "
+            f"mrbokeh track convert {path.name} turned.json --out-up={scene_up}"
+        )
+    return track
+
+
+def _is_single_camera(path: Path) -> bool:
+    if not path.exists() or format_of_file(path) != "json":
+        return False
+    document = read_json(path, "a camera track")
+    return isinstance(document, dict) and "camera_from_world" in document
+
+
+def _remark(path: Path) -> str:
+    """What is no more than usual may be stated otherwise."""
+    return " (as in most of COLMAP's maps; state another by --up in that conversion)" if format_of_file(path) == "colmap" else ""

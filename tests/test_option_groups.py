@@ -1,0 +1,70 @@
+"""Options in groups make the very command line that options one by one make."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from mrbokeh.commands import composite, video
+from mrbokeh.commands._option_groups import grouped
+
+
+@dataclass(frozen=True)
+class Size:
+    width: Annotated[int, typer.Option(min=1)] = 3
+    height_: Annotated[int | None, typer.Option("--height")] = None
+
+
+@dataclass(frozen=True)
+class Named(Size):
+    name: Annotated[str, typer.Option()] = "nobody"
+    width: Annotated[int, typer.Option(min=1)] = 5
+
+
+def made_app(*, of: type) -> typer.Typer:
+    app = typer.Typer()
+
+    def command(where: Annotated[str, typer.Argument()], size, loud: bool = False) -> None:  # type: ignore[no-untyped-def]
+        """Says what came."""
+        typer.echo(f"{where} {size} {loud}")
+
+    command.__annotations__["size"] = of
+    app.command()(grouped(command))
+    return app
+
+
+def said(*words: str, of: type = Size) -> str:
+    return CliRunner().invoke(made_app(of=of), list(words)).output.strip()
+
+
+def test_a_group_comes_whole() -> None:
+    assert said("there") == "there Size(width=3, height_=None) False"
+    assert said("there", "--height", "7", "--loud", "--width", "2") == "there Size(width=2, height_=7) True"
+
+
+def test_a_command_may_add_to_a_group_and_change_its_defaults() -> None:
+    assert said("there", "--height", "7", of=Named) == "there Named(width=5, height_=7, name='nobody') False"
+
+
+def test_what_an_option_asks_is_checked() -> None:
+    assert CliRunner().invoke(made_app(of=Size), ["there", "--width", "0"]).exit_code == 2
+    assert "Says what came" in said("--help")
+
+
+@pytest.mark.parametrize("module", [composite, video])
+def test_every_option_says_what_it_is(module: object) -> None:
+    command = typer.main.get_command(module.app)  # type: ignore[attr-defined]
+    assert all(getattr(each, "help", None) for each in command.params)
+
+
+def test_composite_and_video_share_what_they_can() -> None:
+    """Same names, same words, same defaults but for the renderer of scenes: of a photograph the exact one."""
+    one, other = ({each.name: each for each in typer.main.get_command(each.app).params} for each in (composite, video))
+    shared = {"layer", "objects", "scene", "camera", "mode", "matte", "near_distance", "scene_renderer", "samples", "catch", "distortion"}
+    shared |= {"match_grey", "match_exposure", "match_white", "match_black", "vignetting", "grain", "light_wrap", "seed", "grey_value"}
+    shared |= {"input_space", "output_space", "ocio", "overwrite"}
+    assert shared <= one.keys() & other.keys()
+    assert all(one[name].help == other[name].help for name in shared)  # type: ignore[attr-defined]
+    assert {name for name in shared if one[name].default != other[name].default} == {"scene_renderer"}
