@@ -9,11 +9,28 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def cover(shown: np.ndarray, free: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
-    """Let pixels of values (N, C) take what they cover from what is free (H W); shown (N,) is what was free at their places before."""
+def cover(
+    shown: np.ndarray,
+    crossing: np.ndarray,
+    free: np.ndarray,
+    nearest_px: np.ndarray,
+    places: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    sharp_px: np.float32,
+) -> None:
+    """Let pixels of values (N, C) take what they cover from what is free (H W); shown (N,) is what was free at their places before.
+
+    crossing (N,): the rest, where they lie behind the focus and the nearest so far (nearest_px, (H W), not above 0) in front of it.
+    """
+    one, nothing = np.float32(1.0), np.float32(0.0)
     for i in range(len(places)):
-        shown[i] = free[places[i]]
-        free[places[i]] *= np.float32(1.0) - values[i, 3]
+        place, coverage = places[i], values[i, 3]
+        shown[i] = free[place]
+        crossing[i] = one - free[place] if coc_px[i] > sharp_px and nearest_px[place] < -sharp_px else nothing
+        free[place] *= one - coverage
+        if coverage > nothing:
+            nearest_px[place] = min(nearest_px[place], coc_px[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

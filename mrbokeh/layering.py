@@ -11,6 +11,8 @@ Shared by all renderers that spread light; they differ in the `Spread` alone.
    one surface share the pupil side by side, so coverage adds up and neither seams nor slanted surfaces turn
    translucent, as they would under "over". What the pinhole picture shows goes first. What hides there, real layers before filled-in
    background (mrbokeh.hidden_background), gets what is left: the part of the pupil that looks past the edge of the occluder.
+   But where the occluder is in front of the focus and what it hides behind it, that part of the pupil looks behind the edge, for
+   kernels are mirrored at the focus: there what hides goes right before the rest of its slice.
 5. What moves while the shutter is open is drawn out along its path, slice by slice, before it is spread (mrbokeh.motion),
    unless the kernels hold motion themselves.
 6. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage. Coverage counts shares of

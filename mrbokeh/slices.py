@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from itertools import chain
+from heapq import merge
+from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Float32
@@ -20,6 +21,7 @@ _LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add
 _FEW_PIXELS = 1 << 20
 _MANY_PIXELS = 1 << 22
+_SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
 
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]
@@ -88,7 +90,7 @@ def _laid_out(memory: Float32[np.ndarray, " elements"], window: Window, channels
 
 
 def composited(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tuple[Channels, Channels]:
-    """What the pinhole picture shows of the sheets, then the rest: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
+    """All sheets as the lens sees them, put together front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
 
     by_depth: which sheet the pinhole picture shows at a pixel is a matter of depth, else of their order (slices are always by depth).
     The pupil is counted per colour where the optics are chromatic.
@@ -105,16 +107,32 @@ def composited(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tu
 
 
 def _pieces(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[tuple[list[Part], int]]:
-    """Parts of slices that can be spread by themselves, and how far their light travels at most: front to back, what is seen first."""
+    """Parts of slices that can be spread by themselves, and how far their light travels at most, in the order in which they claim."""
     nearest, farthest = _range_px(sheets, slicing.size[0] * slicing.size[1])
     step_px = max((farthest - nearest) / slicing.slices, _LEAST_STEP_PX)
-    seen_and_hidden = _seen_and_hidden(sheets, by_depth, slicing.size)
-    slices = [sorted_slices(sheets, shares, step_px, slicing.size[1], slicing.pool) for shares in seen_and_hidden]
-    for k, parts in chain.from_iterable(slices):
+    for k, parts in _in_turn(sheets, slicing, by_depth, step_px):
         largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
         reach = slicing.optics.reach_px(parts, largest_px, slicing.frame)
         for island in islands(parts, reach, slicing.size):
             yield island, reach
+
+
+def _in_turn(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px: float) -> Iterator[tuple[int, list[Part]]]:
+    """Numbers and parts of the slices in the order in which they claim the pupil.
+
+    Front to back, what the pinhole picture shows; last what hides. But what hides behind something on the other side of the focus
+    goes right before its slice: kernels are mirrored at the focus, so there the pupil that an edge leaves free looks behind it.
+    """
+
+    def cut(shares: list[Shares]) -> list[tuple[int, list[Part]]]:
+        return sorted_slices(sheets, shares, step_px, slicing.size[1], slicing.pool)
+
+    if len(sheets) == 1:
+        yield from cut([np.ones_like(sheets[0].coc_px)])
+        return
+    seen, crossing = (_shown_by_depth if by_depth else _shown_in_order)(sheets, slicing.size)
+    yield from merge(cut(crossing), cut(seen), key=itemgetter(0))
+    yield from cut([1.0 - shown - across for shown, across in zip(seen, crossing, strict=True)])
 
 
 def _range_px(sheets: Sequence[Pixels], pixels: int) -> tuple[float, float]:
@@ -124,36 +142,27 @@ def _range_px(sheets: Sequence[Pixels], pixels: int) -> tuple[float, float]:
     return float(min([*in_focus, *(coc_px.min() for coc_px in used)])), float(max([*in_focus, *(coc_px.max() for coc_px in used)]))
 
 
-def _seen_and_hidden(sheets: Sequence[Pixels], by_depth: bool, size: tuple[int, int]) -> Iterator[list[Shares]]:
-    """Per sheet the share of each pixel that the pinhole picture shows, then, if there is any, the share that hides behind others."""
-    if len(sheets) == 1:
-        yield [np.ones_like(sheets[0].coc_px)]
-        return
-    seen = _shown_by_depth(sheets, size) if by_depth else _shown_in_order(sheets, size)
-    yield seen
-    yield [1.0 - each for each in seen]
-
-
-def _shown_in_order(sheets: Sequence[Pixels], size: tuple[int, int]) -> list[Shares]:
-    """How much of each pixel the sheets listed before leave uncovered."""
+def _shown_in_order(sheets: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
+    """How much of each pixel the sheets listed before leave uncovered, and how much hides behind one on the other side of the focus."""
     from mrbokeh._slices_numba import cover
 
-    free = np.ones(size[0] * size[1], np.float32)
-    shown = [np.empty_like(sheet.coc_px) for sheet in sheets]
-    for share, sheet in zip(shown, sheets, strict=True):
-        cover(share, free, sheet.places, sheet.values)
-    return shown
+    free, nearest_px = np.ones(size[0] * size[1], np.float32), np.zeros(size[0] * size[1], np.float32)
+    shown, crossing = ([np.empty_like(sheet.coc_px) for sheet in sheets] for _ in range(2))
+    for each, across, sheet in zip(shown, crossing, sheets, strict=True):
+        cover(each, across, free, nearest_px, sheet.places, sheet.values, sheet.coc_px, _SHARP_PX)
+    return shown, crossing
 
 
-def _shown_by_depth(sheets: Sequence[Pixels], size: tuple[int, int]) -> list[Shares]:
-    """How much of each pixel nearer sheets leave uncovered, and of those at one depth the ones listed before."""
-    shown = [np.ones_like(sheet.coc_px) for sheet in sheets]
+def _shown_by_depth(sheets: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
+    """The same of nearer sheets, and of those at one depth the ones listed before."""
+    shown, crossing = ([np.full_like(sheet.coc_px, value) for sheet in sheets] for value in (1.0, 0.0))
     for j, front in enumerate(sheets):
         coverage, coc_px = np.zeros(size[0] * size[1], np.float32), np.zeros(size[0] * size[1], np.float32)
         coverage[front.places], coc_px[front.places] = front.values[:, 3], front.coc_px
         for i, sheet in enumerate(sheets):
             if i != j:
-                there_px = coc_px[sheet.places]
+                there_px, over = coc_px[sheet.places], coverage[sheet.places]
                 nearer = there_px <= sheet.coc_px if j < i else there_px < sheet.coc_px
-                shown[i] *= np.where(nearer, np.float32(1.0) - coverage[sheet.places], np.float32(1.0))
-    return shown
+                shown[i] *= np.where(nearer, np.float32(1.0) - over, np.float32(1.0))
+                crossing[i][(over > 0) & (there_px < -_SHARP_PX) & (sheet.coc_px > _SHARP_PX)] = 1.0
+    return shown, [across * (np.float32(1.0) - each) for across, each in zip(crossing, shown, strict=True)]

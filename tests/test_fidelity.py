@@ -90,25 +90,34 @@ def cards(seeds: list[int], radius_px: int) -> Iterator[Case]:
     return (case for case in card_cases(seeds, None) if case.group == f"cards {radius_px} px")
 
 
-def check_cards(cases: list[Case], method: str, picture_db: tuple[float, float], layers_db: tuple[float, float]) -> None:
-    """(frame, edges) in dB that must be reached on average, and the light within 0.5 %."""
+def check_cards(cases: list[Case], method: str, *wanted_db: tuple[float, float]) -> None:
+    """(frame, edges) in dB that must be reached on average from the picture, from the picture with all cards behind it and from the
+    cards alone. The light: within 0.5 % in every scene where the cards are known, on average and within 0.6 % where they are not.
+
+    Measured at worst, at 32 px: 0.52 % from the picture, 0.25 % with the cards behind it, 0.18 % from the cards. What is more than
+    0.25 % is not the method's, then: in seed 1 the wall behind the leaves is darker than beside them, which no picture tells.
+    """
     renderer = make_renderer(method)
-    from_picture = [case.measure(renderer.render([case.picture], case.lens).rgb) for case in cases]
-    from_layers = [case.measure(renderer.render(case.layers, case.lens).rgb) for case in cases]
-    for reached, (frame, edges) in ((from_picture, picture_db), (from_layers, layers_db)):
+    for kind, (frame, edges) in enumerate(wanted_db):
+        inputs = [([case.picture], [case.picture, *case.layers], case.layers)[kind] for case in cases]
+        reached = [case.measure(renderer.render(layers, case.lens).rgb) for case, layers in zip(cases, inputs, strict=True)]
+        energy = np.array([each["energy"] for each in reached])
         assert np.mean([each["frame"] for each in reached]) > frame
         assert np.mean([each["edges"] for each in reached]) > edges
-        assert np.mean([each["energy"] for each in reached]) == pytest.approx(1.0, abs=0.005)
+        assert energy.mean() == pytest.approx(1.0, abs=0.005)
+        assert np.abs(energy - 1.0).max() < (0.006 if kind == 0 else 0.005)
 
 
 def test_cards_blurred_by_12_px() -> None:
+    """37.4 / 32.5, 39.4 / 34.8 and 39.2 / 35.4 dB."""
     cases = [next(cards([0], 12))]
     for method in FAST:
-        check_cards(cases, method, (34.5, 29.0), (38.0, 34.0))
+        check_cards(cases, method, (36.5, 31.5), (38.0, 33.0), (38.0, 34.0))
 
 
 @pytest.mark.slow
 def test_cards_blurred_by_32_px() -> None:
+    """34.0 / 30.8, 35.5 / 32.5 and 36.0 / 33.8 dB."""
     cases = list(cards([0, 1], 32))
     for method in FAST:
-        check_cards(cases, method, (32.0, 29.0), (35.0, 32.5))
+        check_cards(cases, method, (33.5, 30.3), (34.8, 31.8), (35.0, 32.5))

@@ -80,6 +80,19 @@ def test_real_layers_go_before_what_is_filled_in() -> None:
     assert with_plate.rgb[36, 36, 1] > 0.2 and with_plate.rgb[36, 36, 0] < 1e-6
 
 
+def test_across_the_focus_the_pupil_beside_an_edge_looks_behind_it() -> None:
+    """A black card blurred by -20 px left of x = 48, behind it a wall blurred by +20 px, red where the picture shows it, green behind
+    the card. d px right of the edge the card takes the part A of the pupil with u < -d/10, and as its kernel is mirrored the part
+    with u > d/10, A too, sees green; red is between. A = (acos(s) - s sqrt(1 - s^2)) / pi at s = d/10."""
+    rgb, coc_px, clean = np.tile([1.0, 0.0, 0.0], (*SIZE, 1)), np.full(SIZE, 20.0), np.tile([1.0, 0.0, 0.0], (*SIZE, 1))
+    rgb[:, :48], coc_px[:, :48], clean[:, :48] = 0.0, -20.0, [0.0, 1.0, 0.0]
+    result = rendered([picture(rgb, coc_px), picture(clean, 20.0)]).rgb[36, 48:58]
+    s = (np.arange(10) + 0.5) / 10.0
+    part = (np.arccos(s) - s * np.sqrt(1.0 - s**2)) / np.pi
+    np.testing.assert_allclose(result[:, 1], part, atol=0.005)
+    np.testing.assert_allclose(result[:, 0], 1.0 - 2.0 * part, atol=0.01)
+
+
 def test_layers_that_interleave_are_sorted_by_depth() -> None:
     """Two crossing cards listed in the wrong order for the left half: on both sides the nearer one is seen."""
     alpha = np.ones(SIZE, np.float32) * 0.999999  # not opaque, so that only the depth can group them

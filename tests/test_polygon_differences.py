@@ -313,3 +313,23 @@ def test_sparse_light_is_spread_like_any() -> None:
     parts = [renderer.spread(np.where(mask[..., None], values, 0.0).astype(np.float32), coc_px, octagon) for mask in (sparse, ~sparse)]
     np.testing.assert_allclose(parts[0] + parts[1], renderer.spread(values, coc_px, octagon), atol=3e-7)
     assert 0.0 < sparse.mean() < 0.2
+
+
+@pytest.mark.parametrize(("step", "margin"), [(96, 5), (33, 20), (500, 12)])
+@pytest.mark.parametrize("lit", [0.02, 0.1, 1.0])
+def test_parts_hold_all_light_once_and_are_as_small_as_can_be(step: int, margin: int, lit: float) -> None:
+    """Rows 8 to 150 of 211 columns of tiles: every lit tile is in the part of its column of `step` px, parts of a column lie
+    more than two margins apart, and each begins and ends with light on all four sides."""
+    occupied = np.random.default_rng(step).uniform(size=(19, 27)) < lit
+    parts = _polygon_bands.parts_of(occupied, 8, 150, 211, step, margin)
+    pixels = np.kron(occupied, np.ones((8, 8), bool))[:150, :211]
+    pixels[:8] = False
+    held = np.zeros(pixels.shape, int)
+    for first, end, left, right in parts:
+        held[first:end, left:right] += 1
+        assert left // step == (right - 1) // step
+        assert all(edge.any() for edge in (pixels[first, left:right], pixels[end - 1, left:right], pixels[first:end, left]))
+        assert pixels[first:end, right - 1].any()
+    assert held.max() == 1 and (held[pixels] == 1).all()
+    for one, following in pairwise(parts):
+        assert one[2] // step != following[2] // step or (following[0] - (one[1] - 8)) > 2 * margin

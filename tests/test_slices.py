@@ -47,32 +47,38 @@ def slicing(aperture: Aperture, spread: Spread = SPREAD, slices: int = 6) -> Sli
 def plainly_composited(
     sheets: Sequence[Pixels], aperture: Aperture, slices: int, by_depth: bool, spread: Spread = SPREAD
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slice by slice and sheet by sheet over whole arrays; where two sheets meet in a pixel of a slice the later one goes after."""
+    """Slice by slice and sheet by sheet over whole arrays; where two sheets meet in a pixel of a slice the later one goes after.
+
+    What hides behind something on the other side of the focus goes before its slice, what else hides after all.
+    """
     dense = []
     for each in sheets:
         values, coc_px = np.zeros((SIZE[0] * SIZE[1], each.values.shape[1]), np.float32), np.zeros(SIZE[0] * SIZE[1], np.float32)
         values[each.places], coc_px[each.places] = each.values, each.coc_px
         dense.append((values.reshape(*SIZE, -1), coc_px.reshape(SIZE)))
     coverage, diameters_px = np.stack([values[..., 3] for values, _ in dense]), np.stack([coc_px for _, coc_px in dense])
-    shown = np.ones_like(coverage)
+    shown, across = np.ones_like(coverage), np.zeros(coverage.shape, bool)
     for i in range(len(sheets)):
         for j in range(len(sheets)):
             before = j < i if not by_depth else (diameters_px[j] < diameters_px[i]) | ((diameters_px[j] == diameters_px[i]) & (j < i))
             shown[i] *= np.where(before, 1.0 - coverage[j], 1.0)
+            across[i] |= before & (coverage[j] > 0) & (diameters_px[j] < -6.0) & (diameters_px[i] > 6.0)
+    hidden = np.float32(1.0) - shown
     step = np.float32(max((diameters_px.max() - diameters_px.min()) / slices, 0.5))
     index = np.floor(diameters_px / step + np.float32(0.5)).astype(int)
     kinds = 3 if aperture.is_chromatic else 1
     colour, taken = np.zeros((*SIZE, dense[0][0].shape[2] - 1)), np.zeros((*SIZE, kinds))
-    for shares in (shown, 1.0 - shown):
-        for k in np.unique(index):
-            there = (index == k) & (shares > 0) & (coverage > 0)
-            turn = np.cumsum(there, axis=0)
-            for turn_of in range(1, len(sheets) + 1):
-                mine = there & (turn == turn_of)
-                light = sum(values * (mine[i] * shares[i])[..., None] for i, (values, _) in enumerate(dense)).astype(np.float32)
-                coc_px = np.where(mine, diameters_px, 0.0).sum(axis=0, dtype=np.float32)
-                if mine.any():
-                    plainly_claim(colour, taken, spread_light(spread, light, coc_px, aperture, FRAME, (4, 3)))
+    slices = np.unique(index)
+    turns = [*((shares, k) for k in slices for shares in (hidden * across, shown)), *((hidden * ~across, k) for k in slices)]
+    for shares, k in turns:
+        there = (index == k) & (shares > 0) & (coverage > 0)
+        turn = np.cumsum(there, axis=0)
+        for turn_of in range(1, len(sheets) + 1):
+            mine = there & (turn == turn_of)
+            light = sum(values * (mine[i] * shares[i])[..., None] for i, (values, _) in enumerate(dense)).astype(np.float32)
+            coc_px = np.where(mine, diameters_px, 0.0).sum(axis=0, dtype=np.float32)
+            if mine.any():
+                plainly_claim(colour, taken, spread_light(spread, light, coc_px, aperture, FRAME, (4, 3)))
     return colour[INSIDE], taken[INSIDE]
 
 

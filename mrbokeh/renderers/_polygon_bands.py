@@ -1,6 +1,5 @@
 """The pieces of work of polygon_differences, and the threads that work through them."""
 
-from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,7 +13,7 @@ from mrbokeh.renderers._polygon_halves import halves_of
 from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
 from mrbokeh.renderers._polygon_memory import laid_out, ring_elements, ring_of, scratch_of
 from mrbokeh.renderers._polygon_ring_numba import Picture, Target
-from mrbokeh.renderers._polygon_survey_numba import TILE_PX
+from mrbokeh.renderers._polygon_survey_numba import TILE_PX, find_parts
 from mrbokeh.renderers._polygon_tables import ApertureTables
 from mrbokeh.zeroed_memory import ZeroedMemory
 
@@ -51,9 +50,7 @@ def bands_of(light: SurveyedLight, margin: int, bytes_per_cell: int) -> list[Ban
     cuts[-1] = end
     sparse = occupied.mean() < SPARSE
     step = max(SPARSE_PART_PX, 2 * margin) if sparse else _part_width(width, margin, bytes_per_cell)
-    return [
-        Band(int(top), int(bottom), tuple(_parts(occupied, int(top), int(bottom), width, step, margin))) for top, bottom in pairwise(cuts)
-    ]
+    return [Band(int(top), int(bottom), parts_of(occupied, int(top), int(bottom), width, step, margin)) for top, bottom in pairwise(cuts)]
 
 
 def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
@@ -61,21 +58,14 @@ def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
     return -(-width // max(1, round(width / max(fitting, 4 * margin, 256))))
 
 
-def _parts(
+def parts_of(
     occupied: Bool[np.ndarray, "rows columns"], top: int, bottom: int, width: int, step: int, margin: int
-) -> Iterator[tuple[int, int, int, int]]:
-    """Column by column, and within one apart where light of one does not reach that of the other."""
-    first = top // TILE_PX
-    for start in range(0, width, step):
-        end = min(start + step, width)
-        tiles = occupied[first : -(-bottom // TILE_PX), start // TILE_PX : -(-end // TILE_PX)]
-        rows = np.flatnonzero(tiles.any(axis=1))
-        for run in np.split(rows, np.flatnonzero(np.diff(rows) * TILE_PX > 2 * margin) + 1):
-            if run.size:
-                columns = np.flatnonzero(tiles[run[0] : run[-1] + 1].any(axis=0))
-                left, right = (start // TILE_PX + int(columns[0])) * TILE_PX, (start // TILE_PX + int(columns[-1]) + 1) * TILE_PX
-                above, below = (first + int(run[0])) * TILE_PX, (first + int(run[-1]) + 1) * TILE_PX
-                yield max(above, top), min(below, bottom), max(left, start), min(right, end)
+) -> tuple[tuple[int, int, int, int], ...]:
+    """Column by column, `step` px wide, and within one apart where light of one does not reach that of the other."""
+    first, end = top // TILE_PX, -(-bottom // TILE_PX)
+    parts = np.empty((-(-width // step) * (end - first), 4), np.int64)
+    count = find_parts(occupied, (top, bottom), width, step, margin, parts)
+    return tuple((above, below, left, right) for above, below, left, right in parts[:count].tolist())
 
 
 @dataclass(frozen=True)
