@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from datasets_scripts.headless_chromium import CHROMIUM, chromium_page
 from mrbokeh.color import display_rgb8
 from mrbokeh.errors import InputError
 from mrbokeh.image_io import LINEAR_SUFFIXES, read_image
-from tests.chromium import CHROMIUM, chromium_page
 
 WIDEST_PX = 960
 _QUALITY = 82

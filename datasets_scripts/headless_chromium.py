@@ -87,7 +87,7 @@ class Page:
     async def screenshot(self) -> np.ndarray:
         """(H, W, 3) of the window, red first."""
         png = base64.b64decode((await self.send("Page.captureScreenshot", format="png"))["data"])
-        return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))[..., ::-1]
 
 
 @asynccontextmanager

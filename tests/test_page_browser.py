@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.chromium import CHROMIUM, Page, chromium_page
+from datasets_scripts.headless_chromium import CHROMIUM, Page, chromium_page
 from tests.made_viewfinder import LENS_RGB, VIEW_RGB, Made, in_time, made_viewfinder
 from viewfinder.server.access import Access
 from viewfinder.server.sessions import Role, Sessions

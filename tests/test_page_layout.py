@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.chromium import CHROMIUM, Page, chromium_page
+from datasets_scripts.headless_chromium import CHROMIUM, Page, chromium_page
 from tests.made_viewfinder import in_time, made_viewfinder
 
 pytestmark = [

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from aiohttp import web
 
-from tests.chromium import CHROMIUM, chromium_page
+from datasets_scripts.headless_chromium import CHROMIUM, chromium_page
 from tests.made_viewfinder import LENS_RGB, VIEW_RGB, Made, in_time, made_viewfinder
 from tests.test_page_browser import color_at
 from viewfinder.server.access import Access

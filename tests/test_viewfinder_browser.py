@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.chromium import CHROMIUM, chromium_page
+from datasets_scripts.headless_chromium import CHROMIUM, chromium_page
 from tests.layer_viewfinder import HEIGHT, WIDTH, in_time, running, write_plate
 from viewfinder.sources.video_file import VideoFileSource
 
