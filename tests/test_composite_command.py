@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,14 +17,20 @@ from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import write_lens
 from mrbokeh.plate import open_plate
+from tests.test_user_mistakes import said
 
 HEIGHT, WIDTH = 96, 144
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 CAKE = DATA / "objects" / "cakeBirthday.glb"
 
 
-def mrbokeh(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "mrbokeh.cli", *map(str, arguments)], capture_output=True, text=True)
+Composite = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def composite(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Composite:
+    """`mrbokeh composite` with these arguments: (exit code, what was said)."""
+    return lambda *arguments: said(capsys, monkeypatch, "composite", *arguments)
 
 
 def plate_rgb() -> np.ndarray:
@@ -45,11 +52,11 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_layer_goes_behind_the_post_and_before_the_wall(files: Path) -> None:
+def test_a_layer_goes_behind_the_post_and_before_the_wall(files: Path, composite: Composite) -> None:
     out, layer = files / "out.exr", files / "blurred.exr"
     arguments = ("--layer", files / "card.exr", "--lens", files / "lens.json", "--depth", files / "depth.exr")
-    done = mrbokeh("composite", files / "photo.exr", *arguments, "--out", out, "--save-layer", layer)
-    assert done.returncode == 0, done.stderr
+    code, told = composite(files / "photo.exr", *arguments, "--out", out, "--save-layer", layer)
+    assert code == 0, told
     picture, blurred = read_image(out), read_layer(layer)
     # The blur reaches half a circle of confusion beyond the visible part of the card, which begins at the post's edge.
     reach_px = int(np.ceil(float(LENS.coc_px(1.3, WIDTH)) / 2)) + 1
@@ -59,14 +66,14 @@ def test_a_layer_goes_behind_the_post_and_before_the_wall(files: Path) -> None:
     np.testing.assert_allclose(picture[untouched], plate_rgb()[untouched], rtol=2**-11)
 
 
-def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path) -> None:
+def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path, composite: Composite) -> None:
     out, layer = files / "out.png", files / "cake.exr"
     arguments = ("--object", CAKE, "--at-pixel", "100,70", "--height", 0.1, "--shadow", 0.6)
-    done = mrbokeh(
-        *("composite", files / "photo.exr", "--lens", files / "lens.json", "--focus", 2.0, "--depth", files / "depth.exr"),
+    code, told = composite(
+        *(files / "photo.exr", "--lens", files / "lens.json", "--focus", 2.0, "--depth", files / "depth.exr"),
         *(*arguments, "--out", out, "--save-layer", layer),
     )
-    assert done.returncode == 0, done.stderr
+    assert code == 0, told
     rows, columns = np.nonzero(read_layer(layer).alpha > 0.5)
     # 0.1 m at 2 m through 35 mm on 23.5 mm is 10.9 px of 144; it stands on row 70 and is wider than high.
     assert 68 <= rows.max() <= 76 and 8 <= 70 - rows.min() <= 16
@@ -74,7 +81,7 @@ def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path) -> None:
     assert read_image(out).shape == (HEIGHT, WIDTH, 3)
 
 
-def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path) -> None:
+def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path, composite: Composite) -> None:
     stack_folder = files / "stack"
     for i in range(3):
         write_image(stack_folder / f"{i}.exr", plate_rgb())
@@ -86,11 +93,9 @@ def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path) -> None:
     spread = []
     for index in range(3):
         layer = files / f"layer_{index}.exr"
-        done = mrbokeh(
-            *("composite", stack_folder, "--slice", index, "--layer", files / "card.exr"),
-            *("--out", files / f"{index}.png", "--save-layer", layer),
-        )
-        assert done.returncode == 0, done.stderr
+        words = stack_folder, "--slice", index, "--layer", files / "card.exr", "--out", files / f"{index}.png", "--save-layer", layer
+        code, told = composite(*words)
+        assert code == 0, told
         spread.append(int((read_layer(layer).alpha > 0).sum()))
     assert spread[1] == 40 * 60, "slice 1 is focused on the card"
     assert spread[0] > spread[1] < spread[2]
@@ -121,14 +126,23 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     ({"--layer": "card.exr", "--slice": "1"}, "not a folder"),
     ({"--layer": "card.exr", "--out": "out.gif"}, "cannot write"),
 ])  # fmt: skip
-def test_mistakes_end_in_one_sentence(files: Path, change: dict[str, str | None], message: str) -> None:
+def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change: dict[str, str | None], message: str) -> None:
     options = {"--lens": "lens.json", "--out": "out.exr"} | change
     words: list[object] = []
     for option, value in options.items():
         if value is not None:
             path = CAKE if value == "cake" else files / value if "." in value and "," not in value else value
             words += [option, path]
-    done = mrbokeh("composite", files / "photo.exr", *words)
-    assert done.returncode == 2
-    assert message in " ".join(done.stderr.split()) and "Traceback" not in done.stderr
+    code, told = composite(files / "photo.exr", *words)
+    assert code == 2
+    assert message in told and "Traceback" not in told
     assert not (files / "out.exr").exists() and not (files / "out.gif").exists()
+
+
+def test_a_shell_gets_the_code_and_the_sentence(files: Path) -> None:
+    """A process of its own, as a user starts it."""
+    command = [sys.executable, "-m", "mrbokeh.cli", "composite", files / "photo.exr", "--out", files / "out.exr"]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True)
+    assert done.returncode == 2 and not done.stdout
+    assert "nothing to put into the photograph" in " ".join(done.stderr.split()) and "Traceback" not in done.stderr
+    assert not (files / "out.exr").exists()

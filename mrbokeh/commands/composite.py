@@ -48,6 +48,7 @@ def composite(
     from mrbokeh.compositing.choose import insertion_of
     from mrbokeh.plate_look.finishing import finished
     from mrbokeh.plate_look.look_options import finishing_of
+    from mrbokeh.progress import working
     from mrbokeh.renderers.choose import lens_and_renderer
 
     read = (photo, taken.depth, taken.matte, *virtual.files, standing.object_, standing.environment, rendering.distortion, optics.lens)
@@ -65,7 +66,8 @@ def composite(
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         typer.echo("warning: nothing of what is put in is in the picture: is it behind the camera, or beside the frame?", err=True)
-    inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
+    with working("blurring (the first time on a machine it takes a minute to compile)"):
+        inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
     write_results(out, inserted, plate, sharp, colour, result)
     typer.echo(f"wrote {out} ({mode}; {blur_told(plate, sharp)})")
 

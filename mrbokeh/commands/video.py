@@ -54,7 +54,8 @@ def video(
     target.require_new(shot, result.overwrite or shot.was_begun)
     _try_first_frame(shot)
     note = _made(shot, _crew(work, len(shot.segments)), result.overwrite)
-    typer.echo(f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {shot.stop - shot.start} frames, {note})")
+    frames = shot.stop - shot.start
+    typer.echo(f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})")
 
 
 def _crew(work: options.WorkOptions, segments: int) -> Crew:

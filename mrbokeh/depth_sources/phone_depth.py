@@ -81,7 +81,9 @@ def _depth(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] |
     if kind == "RangeLinear" and not np.isfinite(far):
         raise InputError(f"{path}: its depth is linear in metres, so that FAR cannot be infinite: give a distance")
     level = _decoded(xmp[_DEPTH + "Data"], path)[..., 0]
-    units = xmp.get(_DEPTH + "Units", "") or ("metres as stated" if near_far_m else "no unit")
+    units = xmp.get(_DEPTH + "Units", "") or (
+        "metres as stated" if near_far_m else "no unit, taken as metres; --disparity NEAR:FAR says better"
+    )
     note = f"GDepth of the phone, {near:g} to {far:g} ({units})"
     everywhere = np.ones(level.shape, bool)
     if kind == "RangeInverse":
