@@ -141,6 +141,10 @@ def _refused(error: OSError) -> str:
     """What the system would not do with a file or folder; of a file that is being written under a temporary name, its folder."""
     path = Path(os.fsdecode(error.filename))
     shown = path.parent if path.name.startswith(".") and ".part" in path.name else path
+    if isinstance(error, IsADirectoryError):
+        return f"{shown} is a folder (it is a directory), but a file was expected there: check the name"
+    if isinstance(error, NotADirectoryError | FileExistsError):
+        return f"{shown}: a file is where a folder was expected: check the name"
     return f"{shown}: {(error.strerror or 'the system refused it').lower()}; check the name, the space left and who may write there"
 
 

@@ -108,14 +108,17 @@ def test_no_file_at_all(tmp_path: Path) -> None:
 
 def test_the_example_in_the_documentation_reads_with_all_that_it_comments_out(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "viewfinder_scene.toml").read_text(encoding="utf-8")
-    for name in ("lantern.glb", "studio.hdr", "lens.json", "in_front.png"):
+    for name in ("studio.hdr", "lens.json", "in_front.png"):
         (tmp_path / name).touch()
-    assert described(tmp_path, text).objects[0].name == "lantern"
+    assert read_scene_file(ROOT / "docs" / "viewfinder_scene.toml").objects[0].glb.is_file()
+    text = text.replace("../mrbokeh", str(ROOT / "mrbokeh"))
+    assert described(tmp_path, text).objects[0].name == "alien"
     # Optional lines begin with "# " and hold a table or a key; depth and mask exclude one another.
-    lines = [line[2:] if line.startswith(("# [", "# up", "# animation", "# loop", "# vis", "# dir", "# irr", "# cent", "# mask")) else line
-             for line in text.splitlines()]  # fmt: skip
+    names = ("[", "up", "animation", "loop", "vis", "dir", "irr", "cent", "mask", "env", "rot", "exp", "file")
+    optional = tuple(f"# {name}" for name in names)
+    lines = [line[2:] if line.startswith(optional) else line for line in text.splitlines()]
     scene = described(tmp_path, "\n".join(lines))
-    assert scene.objects[0].animation == "Swing" and scene.light.suns and scene.shadow and scene.occlusion
+    assert scene.objects[0].animation == "Walk" and scene.light.suns and scene.shadow and scene.occlusion
 
 
 def test_an_object_stands_on_the_board(tmp_path: Path) -> None:

@@ -173,3 +173,44 @@ def test_strong_colours_of_a_camera_are_not_negative_light(tmp_path: Path) -> No
         report = CheckReport()
         check_numbers(report, next(iter(open_shot(tmp_path / "out.exr").pictures())), None)
         assert len(report.findings) == findings, colour
+
+
+def test_training_is_not_poured_into_a_folder_of_other_things(
+    card: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as the data set itself, or a folder of photographs."""
+    before = sorted(card.parent.iterdir())
+    code, told = said(capsys, monkeypatch, "train", "fit", card.parent, "--out", card.parent)
+    assert code == 2 and "holds no training run" in told and sorted(card.parent.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("batch", "-3"), ("learning_rate", "nan"), ("learning_rate", "-1"), ("crops_per_picture", "0")]
+)
+def test_settings_that_cannot_train_are_refused(
+    card: Path, name: str, value: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = card.parent / "run"
+    code, told = said(capsys, monkeypatch, "train", "fit", card.parent, "--out", run, "--set", f"{name}={value}")
+    assert code == 2 and f"{name} must be" in told and not run.exists()
+
+
+def test_a_network_goes_into_an_onnx_file(card: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    code, told = said(capsys, monkeypatch, "train", "export", card.parent, "--out", card.parent / "checkpoint.pt", "--overwrite")
+    assert code == 2 and "--out: expected a name that ends in .onnx" in told
+
+
+def test_a_plan_does_not_replace_the_lens(card: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = card.with_name("lens.json")
+    before = lens.read_bytes()
+    asked = ("capture", "plan", lens, "--near", 0.5, "--far", 3, "--image-width", 600, "--out", lens, "--overwrite")
+    code, told = said(capsys, monkeypatch, *asked)
+    assert code == 2 and "is read and would be written over" in told and lens.read_bytes() == before
+
+
+def test_a_board_that_cannot_be_meant_is_told_before_hours_of_work(
+    card: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for option, value in (("--board", "8by6"), ("--distance", "a,b,0.2,3")):
+        code, told = said(capsys, monkeypatch, "capture", "process", card.parent, "--out", card.parent / "scene", option, value)
+        assert code == 2 and option in told and not (card.parent / "scene").exists()

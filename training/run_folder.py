@@ -3,6 +3,7 @@
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -90,7 +91,10 @@ def load_run(folder: Path) -> tuple[BlurNetwork, TrainSettings, RunFacts]:
             f"{folder} has no finished network ({NETWORK_NAME}): run the same `mrbokeh train fit` again, it goes on where it was"
         )
     network = build_network(settings, facts)
-    network.load_state_dict(torch.load(folder / NETWORK_NAME, map_location="cpu", weights_only=True))
+    try:
+        network.load_state_dict(torch.load(folder / NETWORK_NAME, map_location="cpu", weights_only=True))
+    except (OSError, RuntimeError, ValueError, EOFError, UnpicklingError):
+        raise InputError(f"{folder / NETWORK_NAME} is cut off or not of this run: copy it again, or train again") from None
     return network.eval(), settings, facts
 
 

@@ -1,5 +1,6 @@
 """Every choice of a training run in one frozen dataclass, saved as JSON beside the result."""
 
+import math
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -80,6 +81,11 @@ class TrainSettings:
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.epochs is None):
             raise InputError(f"give the budget either in minutes or in epochs, got minutes={self.minutes} and epochs={self.epochs}")
+        for name, least in (("batch", 1), ("crops_per_picture", 1), ("crop_px", 0), ("patience", 0), ("threads", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} must be {least} or more, got {getattr(self, name)}")
+        if not 0.0 < self.learning_rate < math.inf:
+            raise InputError(f"learning_rate must be a positive number, got {self.learning_rate}")
         if self.crop_px and self.network.tile_px:
             raise InputError(
                 f"crops of {self.crop_px} px cannot train a network of {self.network.tile_px} px tiles, each of which has its own place "

@@ -49,12 +49,15 @@ def plan_command(
     from capture.tether.focus_plan import plan_focus, plan_for_motor
     from capture.tether.plan_file import write_plan, write_plan_table
     from capture.tether.plan_table import print_plan
-    from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.atomic_files import require_safe_outputs
+    from mrbokeh.image_io import require_suffix
 
     if scale is not None and motor_step is not None:
         raise InputError("give either --scale, for a ring turned by hand, or --motor-step, for a motor")
-    for path in (each for each in (out, csv) if each is not None):
-        refuse_existing(path, overwrite)
+    for path, suffix, name in ((out, ".json", "--out"), (csv, ".csv", "--csv")):
+        if path is not None:
+            require_suffix(path, (suffix,), name)
+    require_safe_outputs((out, csv), (lens,), overwrite)
     planned_lens = planned_for(lens, focal_length, f_number, sensor_width, near)
     focus_range = range_from(origin, near, far, planned_lens)
     if motor_step is not None:
@@ -65,8 +68,10 @@ def plan_command(
     print_plan(plan, Console())
     if out is not None:
         write_plan(out, plan)
+        typer.echo(f"wrote {out}")
     if csv is not None:
         write_plan_table(csv, plan)
+        typer.echo(f"wrote {csv}")
 
 
 def planned_for(

@@ -32,9 +32,15 @@ def process_command(
     from capture.commands.poses import poses_command
     from capture.commands.report import report_command
     from capture.commands.scale import scale_command
+    from capture.views.board_options import board_from_options
+    from capture.views.scale_distance import parse_distance
     from mrbokeh.errors import InputError
     from mrbokeh.focal_stack import find_focal_stacks
 
+    if distance is not None:
+        parse_distance(distance)
+    if board is not None:
+        board_from_options(board, square_mm, marker_mm, "DICT_4X4_50")
     ingest_command(photographs, out, sidecar=sidecar, max_width=max_width)
     merge_command(out)
     if len(find_focal_stacks(out)) < 2:
@@ -43,7 +49,8 @@ def process_command(
         try:
             poses_command(out)
         except InputError as error:
-            typer.echo(f"no camera poses, so depth comes from focus alone: {error}")
+            unused = " (--board and --distance are not used)" if board or distance else ""
+            typer.echo(f"no camera poses, so depth comes from focus alone{unused}: {error}")
         else:
             scale_command(out, board=board, square_mm=square_mm, marker_mm=marker_mm, distance=distance)
             depth_command(out)

@@ -40,7 +40,7 @@ def shoot_command(
     camera: Annotated[str, typer.Option(metavar="CAMERA", help="gphoto2, gphoto2:PORT, folder:DIR or simulated")],
     out: Annotated[Path, typer.Option(metavar="OUT", help="folder of this bracket; one for each viewpoint")],
     exposure_time: Annotated[str | None, typer.Option(metavar="S", help="seconds, such as 1/60; else what the camera has")] = None,
-    iso: Annotated[float | None, typer.Option(help="ISO; else what the camera has")] = None,
+    iso: Annotated[float | None, typer.Option(min=1, max=1e7, help="ISO; else what the camera has")] = None,
     f_number: Annotated[float | None, typer.Option(help="f-number; else what the camera has")] = None,
     white_balance: Annotated[str | None, typer.Option(metavar="WORD", help="in the camera's words, such as Daylight")] = None,
     focus_steps: Annotated[Path | None, typer.Option(metavar="FILE", help="focus_steps.json of an earlier shoot with this lens")] = None,

@@ -108,7 +108,9 @@ def _choice(document: dict[str, Any]) -> CameraChoice:
 def _completed(choice: CameraChoice, groups: Sequence[PhotoGroup], wanted: WhiteBalance | None) -> CameraChoice:
     """A choice with the gaps filled: the white balance of the first RAW that opens, the exposure of the first slice."""
     if choice.white_balance is None:
-        balance, source = _white_balance((photo for group in groups for photo in group.photos), wanted)
+        model = camera_of([photo for group in groups for photo in group.photos])
+        own = (photo for group in groups for photo in group.photos if photo.metadata.camera_model in (model, None, ""))
+        balance, source = _white_balance(own, wanted)
         choice = replace(choice, white_balance=balance, white_balance_source=source)
     if not choice.reference_stack:
         in_order = [(photo, group.name) for group in groups for photo in in_focus_order(group.photos)]

@@ -155,8 +155,15 @@ class StackWork:
 
 
 def stack_work(folder: Path, development: Development, choice: CameraChoice, *, overwrite: bool) -> StackWork:
-    """The work on a stack, with the slices of earlier runs found."""
-    existing = {} if overwrite else {json.dumps(record["request"], sort_keys=True): (path, record) for path, record in find_slices(folder)}
+    """The work on a stack, with the slices of earlier runs found. Raises InputError where those were made in another size."""
+    made = [] if overwrite else find_slices(folder)
+    for _, record in made:
+        for name in ("max_width", "half_size"):
+            before, now = record["request"].get(name), getattr(development, name)
+            if before != now:
+                option = "--" + name.replace("_", "-")
+                raise InputError(f"{folder} was ingested with {option} {before}, now it is {now}: give the same, or --overwrite")
+    existing = {json.dumps(record["request"], sort_keys=True): (path, record) for path, record in made}
     return StackWork(folder, development, choice, existing)
 
 

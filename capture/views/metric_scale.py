@@ -59,7 +59,7 @@ def scale_scene(scene: Path | str, request: ScaleRequest) -> ScaledScene:
     scene = Path(scene)
     folder = reconstruction_folder(scene)
     if (folder / SCALE_NAME).exists() and not request.overwrite:
-        return ScaledScene(read_scale(folder))
+        return ScaledScene(_kept(folder, request))
     model = replace(read_sparse_model(folder), metres_per_unit=None)
     stacks = merged_stacks(scene, model)
     samples = {view: focus_sample(model, view, stack) for view, stack in stacks.items()}
@@ -68,6 +68,19 @@ def scale_scene(scene: Path | str, request: ScaleRequest) -> ScaledScene:
     # Last, as the sign that all is done: a run that was interrupted before starts anew.
     write_scale(folder, result)
     return scaled
+
+
+def _kept(folder: Path, request: ScaleRequest) -> ScaleResult:
+    """The scale that is there. Raises InputError where something is asked for that it does not rest on."""
+    kept = read_scale(folder)
+    facts = {each.method: each.facts for each in kept.answers}
+    if request.board is not None and "board" not in facts:
+        raise InputError(f"{folder / SCALE_NAME} was found without a board: --overwrite finds the scale again with it")
+    if request.distance is not None:
+        *views, metres = request.distance
+        if facts.get("distance") != {"views": views, "metres": metres}:
+            raise InputError(f"{folder / SCALE_NAME} was found without this --distance: --overwrite finds the scale again with it")
+    return kept
 
 
 def reconstruction_folder(scene: Path) -> Path:

@@ -21,9 +21,9 @@ def distance_scale(model: SparseModel, view_a: str, view_b: str, metres: float) 
 
 def parse_distance(text: str) -> tuple[str, str, float]:
     """ "VIEW_A,VIEW_B,METRES"."""
-    parts = [each.strip() for each in text.split(",")]
     try:
-        view_a, view_b, metres = parts[0], parts[1], float(parts[2])
-    except (IndexError, ValueError):
-        raise InputError(f"--distance must be VIEW_A,VIEW_B,METRES such as view_0,view_3,0.25, got {text!r}") from None
-    return view_a, view_b, metres
+        view_a, view_b, metres = (each.strip() for each in text.split(","))
+        return view_a, view_b, float(metres)
+    except ValueError:
+        told = "--distance must be VIEW_A,VIEW_B,METRES such as view_0,view_3,0.25 (with a decimal point)"
+        raise InputError(f"{told}, got {text!r}") from None

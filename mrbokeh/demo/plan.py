@@ -72,7 +72,7 @@ def _network(folder: Path, minutes: float, held_out: str | None) -> list[Stage]:
         ),
     ]
     if held_out:
-        evaluate = ("train", "evaluate", str(network), str(scene), "--out", str(folder / "evaluation"), *QUICK_EVALUATION)
+        evaluate = ("train", "evaluate", str(network), str(scene), "--out", str(folder / "evaluation"), "--overwrite", *QUICK_EVALUATION)
         outputs = (folder / "evaluation" / "evaluation.csv", folder / "evaluation" / "evaluation.png")
         stages.append(
             Stage(f"{folder.name}_evaluate", f"Compare the network with photographs it has not seen ({held_out})", evaluate, outputs)

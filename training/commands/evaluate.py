@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.atomic_files import refuse_existing
 from mrbokeh.errors import InputError
 
 
@@ -36,6 +37,7 @@ def evaluate_command(
         Path | None, typer.Option(help="Weights of LPIPS as .onnx, which are not shipped; without them it is left out.")
     ] = None,
     device: Annotated[str, typer.Option(help="Where runs compute: cpu, cuda.")] = "cpu",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an evaluation that is there.")] = False,
 ) -> None:
     """Compare networks with no blur, Gaussians of the right size and our renderers on stacks that none of them was trained on.
 
@@ -55,6 +57,9 @@ def evaluate_command(
 
     networks, scenes = _networks_and_data(networks, data or [])
     folder = _folder(networks, out)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out: expected a folder, but {folder} is a file")
+    refuse_existing(folder / "evaluation.md", overwrite)
     of_networks, trained_on = network_methods(networks, device)
     chosen = _renderers(renderer, reference)
     measured = [] if psf is None else bank_methods(chosen, psf)

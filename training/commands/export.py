@@ -29,12 +29,14 @@ def export_command(
 
     Example: mrbokeh train export runs/attic --out attic_fast.onnx --fast --max-psnr-loss 0.1 --data scenes/attic
     """
-    from mrbokeh.atomic_files import refuse_existing
+    from mrbokeh.atomic_files import require_safe_outputs
     from mrbokeh.errors import InputError
+    from mrbokeh.image_io import require_suffix
 
     if data and not fast:
         raise InputError("--data measures what --fast loses: add --fast, or leave --data out")
-    refuse_existing(out, overwrite)
+    require_suffix(out, (".onnx",), "--out")
+    require_safe_outputs((out,), (run, *(data or ())), overwrite)
     if fast:
         _export_fast(run, out, max_psnr_loss, data or [])
         return

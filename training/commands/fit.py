@@ -79,8 +79,10 @@ def fit_command(
     try:
         settings = with_overrides(_begun_with(preset, settings_file), choices or ())
         settings = replace(settings, **budget | {name: value for name, value in given.items() if value is not None})
-        if overwrite and out.exists() and _number("RANK") == 0:
-            _remove_run(out)
+        if _number("RANK") == 0:
+            _require_run(out)
+            if overwrite and out.exists():
+                shutil.rmtree(out)
         _fit(scenes, out, settings, held_out or [])
     except InputError:
         if _number("LOCAL_RANK"):  # one sentence for each machine
@@ -129,8 +131,9 @@ def _begun_with(preset: Preset, settings_file: Path | None) -> "TrainSettings":
     return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
 
 
-def _remove_run(out: Path) -> None:
-    """Remove an earlier run, and nothing that is not one."""
-    if not (out / "settings.json").exists() and any(out.iterdir()):
+def _require_run(out: Path) -> None:
+    """A run is written into a folder of its own: new, empty, or that of a run."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out: expected a folder, but {out} is a file")
+    if out.is_dir() and not (out / "settings.json").exists() and any(out.iterdir()):
         raise InputError(f"{out} is not empty and holds no training run: give another --out")
-    shutil.rmtree(out)
