@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +16,13 @@ from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
 class Brighter:
     """Adds `amount` to every frame, more for later ones, so that a frame in the wrong place is seen.
 
-    pause_s: how long each frame takes. killing: a file that, while it exists, costs the worker its life after it deleted it;
-    pids: a folder in which every worker leaves its number.
+    gate: a file without which no frame from number `held_from` on is made: all of them wait until it is there. killing: a file that,
+    while it exists, costs the worker its life after it deleted it; pids: a folder in which every worker leaves its number.
     """
 
     amount: float = 0.1
-    pause_s: float = 0.0
+    gate: Path | None = None
+    held_from: int = 0
     killing: Path | None = None
     pids: Path | None = None
     as_layer: bool = False
@@ -43,7 +44,8 @@ class Brightening:
 
     def make(self, index: int, rgb: np.ndarray, time_s: float) -> np.ndarray | Layer:  # noqa: ARG002
         recipe = self._recipe
-        time.sleep(recipe.pause_s)
+        if recipe.gate is not None and index >= recipe.held_from:
+            wait_for(recipe.gate.exists)
         if recipe.killing is not None and recipe.killing.exists() and index % 7 == 3:
             recipe.killing.unlink()
             os.kill(os.getpid(), 9)
@@ -52,6 +54,14 @@ class Brightening:
             alpha = np.full(rgb.shape[:2], 0.5, np.float32)
             return Layer(result * alpha[..., None], alpha, np.full_like(alpha, 2.0))
         return result
+
+
+def wait_for(reached: Callable[[], object], seconds: float = 60.0) -> None:
+    """Look every 10 ms. Raises AssertionError where it takes too long."""
+    deadline_s = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline_s, "waited in vain"
+        time.sleep(0.01)
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,8 @@ def test_no_cycles() -> None:
 @pytest.mark.parametrize(
     ("library", "homes"),
     [("torch", {"training"})]
-    + [(name, {"viewfinder"}) for name in ("aiohttp", "aiortc", "segno", "reportlab")]
+    + [("aiohttp", {"viewfinder", "datasets_scripts"})]  # the gallery looks at pages through a browser
+    + [(name, {"viewfinder"}) for name in ("aiortc", "segno", "reportlab")]
     + [(name, {"capture"}) for name in ("rawpy", "pyexiv2", "exifread", "lensfunpy")]
     + [("pycolmap", {"capture", "viewfinder"}), ("gphoto2", set())],
 )

@@ -1,6 +1,9 @@
 """Renderers that spread by a bank of kernels: that they agree, keep its light, its places and its colours."""
 
+import pickle
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,11 +42,20 @@ from tests.renderer_banks import (
 AGREEMENT_DB = {"polygon": 47.0, "low-rank": 55.0, "laplacian": 34.0}
 
 
+@cache
+def of_rings() -> dict[str, Any]:
+    """With the tables that they make of the bank, which takes longer than a picture."""
+    return renderers(rings_bank(), rings_polygons())
+
+
+@cache
+def of_discs() -> dict[str, Any]:
+    return renderers(discs_bank())
+
+
 def test_all_methods_agree_with_the_plain_twin() -> None:
-    rings = rings_bank()
-    polygons = rings_polygons()
     scene = slanted(-12.0, 14.0)
-    seen = {name: each.render(scene, LENS).rgb for name, each in renderers(rings, polygons).items()}
+    seen = {name: each.render(scene, LENS).rgb for name, each in of_rings().items()}
     found = {name: psnr(seen[name], seen["scatter"], 2.0) for name in AGREEMENT_DB}
     assert all(found[name] > least for name, least in AGREEMENT_DB.items()), found
 
@@ -86,9 +98,7 @@ def test_the_plain_twin_is_the_sum_of_kernels_of_the_bank() -> None:
 @pytest.mark.parametrize("method", ["scatter", "polygon", "low-rank"])
 def test_light_is_conserved_wherever_a_point_lies(method: str, coc_px: float) -> None:
     """Between places and between diameters of the bank; alpha sums to the one pixel that was opaque."""
-    rings = rings_bank()
-    polygons = rings_polygons()
-    seen = renderers(rings, polygons)[method].render(lone_pixel(21, 37, coc_px), LENS)
+    seen = of_rings()[method].render(lone_pixel(21, 37, coc_px), LENS)
     np.testing.assert_allclose(seen.rgb.sum(axis=(0, 1), dtype=np.float64), (4.0, 2.0, 1.0), rtol=2e-5)
     assert seen.alpha.sum(dtype=np.float64) == pytest.approx(1.0, rel=2e-5)
 
@@ -110,10 +120,9 @@ DISC_DB = {"scatter": 52.0, "polygon": 57.0, "low-rank": 52.0, "laplacian": 39.0
 
 @pytest.mark.parametrize("method", DISC_DB)
 def test_a_bank_of_discs_is_the_disc(method: str) -> None:
-    discs = discs_bank()
     scene = slanted(-12.0, 14.0)
     expected = ScatterReference(FEW).render(scene, LENS).rgb
-    assert psnr(renderers(discs)[method].render(scene, LENS).rgb, expected, 2.0) > DISC_DB[method]
+    assert psnr(of_discs()[method].render(scene, LENS).rgb, expected, 2.0) > DISC_DB[method]
 
 
 def test_colours_of_a_bank_take_their_own_kernels() -> None:
@@ -159,6 +168,20 @@ def test_a_symmetric_bank_is_turned_with_the_field(symmetric: PsfBank) -> None:
         of_bank = renderers(symmetric)[name]._of_bank
         seen = of_bank.spread(values, coc_px, Place(field_xy=down))[..., 1]
         assert psnr(seen / expected.max(), np.pad(expected, (33 - len(expected)) // 2) / expected.max()) > least, name
+
+
+def test_a_renderer_is_sent_to_another_process_without_its_tables() -> None:
+    """What it was made with travels, and nothing that rendering left in it; the copy makes the same picture to the bit."""
+    bank, scene = discs_bank(), slanted(-12.0, 14.0)
+    made: dict[str, Any] = {"layering": FEW, "threads": 1, "integration": "pyramid", "sparsification": None, "dense_up_to_px": 8.0}
+    ScatterReference(FEW, bank=bank).render(scene, LENS)  # the bank itself remembers a few numbers, which travel with it
+    renderer = LaplacianSpreadlets(bank, **made)
+    sent = pickle.dumps(renderer)
+    picture = renderer.render(scene, LENS)
+    assert pickle.dumps(renderer) == sent
+    copy = pickle.loads(sent)
+    assert type(copy) is LaplacianSpreadlets and {name: getattr(copy, name) for name in made} == made
+    np.testing.assert_array_equal(copy.render(scene, LENS).rgb, picture.rgb)
 
 
 def test_banks_of_motion_and_depth_are_refused_with_one_sentence() -> None:

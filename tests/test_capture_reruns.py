@@ -13,6 +13,7 @@ from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.slice_files import find_slices
 from capture.stacks.stack_ingest import Development
+from mrbokeh.errors import InputError
 from tests.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
 
 
@@ -79,6 +80,18 @@ def test_copies_of_one_photograph_stay_apart(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     shutil.copy2(path, tmp_path / "b" / "0.dng")
     folders = [tmp_path / "a", tmp_path / "b"]
-    for max_width in (None, 16, None):
-        settings = IngestSettings(grouping=Grouping.none, development=Development(max_width=max_width))
+    for max_width, overwrite in ((None, False), (None, False), (16, True), (16, False)):
+        settings = IngestSettings(grouping=Grouping.none, development=Development(max_width=max_width), overwrite=overwrite)
         assert len(only_stack(ingest(folders, tmp_path / "scene", settings))) == 2
+
+
+def test_another_size_is_asked_for_by_overwrite_only(tmp_path: Path) -> None:
+    """Forgetting --max-width on a later run must not make hours of work anew, nor leave two sizes in a scene."""
+    path = make_raw_photo(tmp_path / "shoot" / "0.dng", scene_rgb(24, 32), 0.6)
+    small = IngestSettings(development=Development(max_width=16))
+    made = only_stack(ingest([path.parent], tmp_path / "scene", small))
+    with pytest.raises(InputError, match="was ingested with --max-width 16, now it is None"):
+        ingest([path.parent], tmp_path / "scene")
+    assert made.slice_rgb(0).shape[1] == 16
+    again = only_stack(ingest([path.parent], tmp_path / "scene", IngestSettings(overwrite=True)))
+    assert again.slice_rgb(0).shape[1] == 32

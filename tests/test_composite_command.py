@@ -122,9 +122,10 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     ({"--object": "cake", "--at-pixel": "10,10"}, "needs depth"),
     ({"--object": "cake", "--at": "1,2"}, "--at expects 3 numbers"),
     ({"--layer": "card.exr", "--renderer": "magic"}, "expected a renderer"),
-    ({"--layer": "card.exr", "--out": "photo.exr"}, "--overwrite"),
+    ({"--layer": "card.exr", "--out": "photo.exr"}, "is read and would be written over"),
+    ({"--layer": "card.exr", "--out": "depth.exr"}, "exists already: give another name, or --overwrite"),
     ({"--layer": "card.exr", "--slice": "1"}, "not a folder"),
-    ({"--layer": "card.exr", "--out": "out.gif"}, "cannot write"),
+    ({"--layer": "card.exr", "--out": "out.gif"}, "expected a name that ends in .exr or .png"),
 ])  # fmt: skip
 def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change: dict[str, str | None], message: str) -> None:
     options = {"--lens": "lens.json", "--out": "out.exr"} | change
@@ -141,7 +142,8 @@ def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change:
 
 def test_a_shell_gets_the_code_and_the_sentence(files: Path) -> None:
     """A process of its own, as a user starts it."""
-    command = [sys.executable, "-m", "mrbokeh.cli", "composite", files / "photo.exr", "--out", files / "out.exr"]
+    command = [sys.executable, "-m", "mrbokeh.cli", "composite", files / "photo.exr"]
+    command += ["--lens", files / "lens.json", "--out", files / "out.exr"]
     done = subprocess.run([*map(str, command)], capture_output=True, text=True)
     assert done.returncode == 2 and not done.stdout
     assert "nothing to put into the photograph" in " ".join(done.stderr.split()) and "Traceback" not in done.stderr

@@ -239,11 +239,47 @@ def test_compiled_rays_are_those_of_a_plain_loop(focus_m: float) -> None:
         np.testing.assert_allclose(compiled, plain, atol=2e-4)
 
 
+def test_what_hides_behind_near_things_is_filled_in_as_far_as_the_lens_sees_at_their_edges_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wall 1.6 m away behind a near wing; the hills far to the right have larger circles of confusion, but no near edge."""
+    size, lens = (40, 160), Lens(100.0, 1.0, 1.2, 36.0)
+    depth_m = np.full(size, 1.6, np.float32)
+    depth_m[:, :70], depth_m[:, 130:] = NEAR_M, 40.0
+    rgb = np.random.default_rng(3).uniform(0.1, 1.0, (*size, 3)).astype(np.float32)
+    plate = replace(plate_of(ScatterReference().render([opaque(rgb, depth_m)], lens).rgb, lens, depth_m), sharp_rgb=rgb)
+    alpha = np.zeros(size, np.float32)
+    alpha[8:32, 40:100] = 1.0
+    virtual = Layer(alpha[..., None] * RED, alpha, np.where(alpha > 0, VIRTUAL_M, np.inf).astype(np.float32))
+    found = [(Between().cut(plate, [virtual]), Between().insert(plate, [virtual], ScatterReference()))]
+    coc_px = lens.coc_px(depth_m, size[1])
+    monkeypatch.setattr("mrbokeh.compositing.between._reach_px", lambda *_: 0.5 * float(coc_px.max() - coc_px.min()))
+    found.append((Between().cut(plate, [virtual]), Between().insert(plate, [virtual], ScatterReference())))
+    (small, short), (large, whole) = found
+    only_large = (small.far_rgb != large.far_rgb).any(axis=(0, 2))
+    assert only_large.sum() >= 10 and not only_large[60:].any()
+    assert 0.05 < short.virtual.alpha[20, 68] < 0.95
+    np.testing.assert_allclose(short.rgb, whole.rgb, atol=1e-6)
+    np.testing.assert_allclose(short.virtual.alpha, whole.virtual.alpha, atol=1e-6)
+
+
+def test_lights_whose_discs_come_to_no_wanted_pixel_are_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where light is wanted it is that of all lights."""
+    rays, wanted = rays_through_flat_layers(), np.zeros((HEIGHT, WIDTH), bool)
+    rays.virtual.rgb[:] = 0.1 * rays.virtual.alpha[..., None]
+    rays.virtual.rgb[[20, 6, 30], [70, 20, 50]] = 100.0
+    wanted[:, 72:] = True
+    few = virtual_lights(rays, wanted)
+    monkeypatch.setattr("mrbokeh.compositing.light_points._arriving", lambda *given: given[1])
+    every = virtual_lights(rays, wanted)
+    assert few.one[wanted].sum() > 10.0 and few.one.sum() < 0.5 * every.one.sum()
+    np.testing.assert_array_equal(few.one[wanted], every.one[wanted])
+    np.testing.assert_array_equal(few.both[wanted], every.both[wanted])
+
+
 def test_all_light_of_a_light_arrives_where_nothing_hides_it() -> None:
     rays = rays_through_flat_layers()
     rays.virtual.rgb[:] = 0.1 * rays.virtual.alpha[..., None]
     rays.virtual.rgb[20, 70] = 100.0
-    through = virtual_lights(rays)
+    through = virtual_lights(rays, np.ones_like(rays.virtual.alpha, bool))
     assert through.one.sum() == pytest.approx(300.0, rel=0.02) and through.both.sum() == pytest.approx(through.one.sum(), rel=1e-5)
 
 

@@ -21,7 +21,7 @@ GAIN_DB, MEAN_DB = 3.0, 40.0
 
 @cache
 def small() -> tuple[MixedCase, ...]:
-    return tuple(card_cases(128, 96, ("disc",), positions=160, radius_px=6.0))
+    return tuple(card_cases(96, 96, ("disc",), positions=120, radius_px=4.5))
 
 
 @pytest.mark.parametrize("index", range(3), ids=["on leaves", "on the object", "on a fence behind"])

@@ -11,6 +11,25 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = ("capture", "train", "lens", "render", "composite", "video", "viewfinder", "demo", "doctor")
 
+HELP_OF_ALL = """
+import sys
+
+site, *commands = sys.argv[1:]
+codes = []
+for command in commands:
+    for name in [each for each in sys.modules if each.partition(".")[0] in ("mrbokeh", "capture", "training", "viewfinder")]:
+        del sys.modules[name]
+    from mrbokeh.cli import main
+    assert sys.modules["mrbokeh"].__file__.startswith(site)
+    sys.argv = ["mrbokeh", command, "--help"]
+    try:
+        main()
+    except SystemExit as stop:
+        codes.append(stop.code)
+print(*codes, end=" \\n")
+"""
+"""Each imports all modules of the wheel that it needs anew, so that none lives on what another imported."""
+
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -64,11 +83,9 @@ def test_every_command_runs_from_the_installed_wheel(wheel: Path, tmp_path: Path
     install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(site), str(wheel)]
     subprocess.run(install, check=True, capture_output=True)
     environment = os.environ | {"PYTHONPATH": str(site), "PYTHONSAFEPATH": "1", "NO_COLOR": "1"}
-    check = "import mrbokeh, sys; assert mrbokeh.__file__.startswith(sys.argv.pop(1))"
-    script = f"{check}; from mrbokeh.cli import main; sys.argv[0] = 'mrbokeh'; main()"
-    for command in COMMANDS:
-        done = subprocess.run(
-            [sys.executable, "-c", script, str(site), command, "--help"], cwd=tmp_path, env=environment, capture_output=True, text=True
-        )
-        assert done.returncode == 0, f"{command}: {done.stderr}"
+    command = [sys.executable, "-c", HELP_OF_ALL, str(site), *COMMANDS]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split("\n")[-2] == "0 " * len(COMMANDS), done.stderr
+    assert all(f"Usage: mrbokeh {name} " in done.stdout for name in COMMANDS)
     assert (site / "bin" / "mrbokeh").is_file()

@@ -13,7 +13,7 @@ from mrbokeh.image_io import read_image, write_image
 from mrbokeh.picture_sources.base import PictureSource
 from mrbokeh.picture_sources.choose import open_source, parse_rate
 from mrbokeh.picture_sources.frame_index import FrameIndex
-from mrbokeh.picture_sources.numbered_files import NumberedFiles, is_pattern, numbered
+from mrbokeh.picture_sources.numbered_files import NumberedFiles, is_pattern, numbered, pattern_of_folder
 from mrbokeh.picture_sources.video_source import VideoSource
 from mrbokeh.video_io import VideoWriter, read_frames
 
@@ -169,6 +169,50 @@ def test_patterns_are_understood(tmp_path: Path) -> None:
         NumberedFiles.found(tmp_path / "c.%04d.exr")
     with pytest.raises(InputError, match=r"frame 4 needs .*b11\.exr, but the sequence ends with .*b10\.exr"):
         NumberedFiles.found(tmp_path / "b%d.exr").file(4)
+
+
+def test_number_signs_stand_for_digits(tmp_path: Path) -> None:
+    """frames.####.exr is frames.%04d.exr: four digits at least."""
+    for number in (9998, 9999, 10000):
+        write_image(tmp_path / f"frames.{number}.exr", np.full((8, 12, 3), (number - 9990) / 16, np.float32))
+    (tmp_path / "frames.12.exr").touch()
+    pattern = tmp_path / "frames.####.exr"
+    found, same = NumberedFiles.found(pattern), NumberedFiles.found(tmp_path / "frames.%04d.exr")
+    assert (found.first, found.count) == (9998, 3) and found.files == same.files
+    names = [numbered(Path(name), 12).name for name in ("f.####.exr", "f.#.exr", "f_##_left.png")]
+    assert names == ["f.0012.exr", "f.12.exr", "f_12_left.png"]
+    assert is_pattern("f.####.exr") and not is_pattern("folder##/f.exr")
+    source = open_source(pattern, "24")
+    assert (source.first_number, source.info.frame_count) == (9998, 3)
+    assert [float(frame.rgb[0, 0, 0]) for frame in source.frames(0, 3)] == [8 / 16, 9 / 16, 10 / 16]
+    (tmp_path / "frames.9999.exr").unlink()
+    with pytest.raises(InputError, match=r"frames\.9999\.exr is missing \(1 of 3"):
+        open_source(pattern, "24")
+
+
+def test_a_folder_stands_for_the_only_sequence_in_it(tmp_path: Path) -> None:
+    """Hidden files, folders and files without a number beside it do not matter; where there is none, or two, the user says which."""
+    with pytest.raises(InputError, match=r"holds no numbered pictures: name one, such as .*frames\.%04d\.exr"):
+        open_source(tmp_path, "25")
+    for number in (8, 9, 10):
+        write_image(tmp_path / f"shot2_v{number:03d}.exr", np.full((8, 12, 3), number / 16, np.float32))
+    for name in ("notes.txt", ".shot2_v011.exr.part"):
+        (tmp_path / name).touch()
+    (tmp_path / "take1").mkdir()
+    assert pattern_of_folder(tmp_path) == tmp_path / "shot2_v%03d.exr"
+    source = open_source(tmp_path, "25")
+    assert (source.first_number, source.info.frame_count) == (8, 3)
+    assert [float(frame.rgb[0, 0, 0]) for frame in source.frames(0, 3)] == [8 / 16, 9 / 16, 10 / 16]
+    (tmp_path / "depth.008.exr").touch()
+    with pytest.raises(InputError, match=r"holds 2 sequences \(depth\.%03d\.exr, shot2_v%03d\.exr\): name one"):
+        open_source(tmp_path, "25")
+
+
+def test_a_folder_whose_numbers_grow_longer_is_one_sequence(tmp_path: Path) -> None:
+    """As 9.png and 10.png: the shortest number says how many digits there are at least."""
+    for number in (9, 10):
+        (tmp_path / f"{number}.png").touch()
+    assert NumberedFiles.found(pattern_of_folder(tmp_path)).files == [tmp_path / "9.png", tmp_path / "10.png"]
 
 
 def test_rates_are_understood(tmp_path: Path) -> None:

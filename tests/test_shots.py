@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +30,7 @@ from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.video_target import VideoTarget
 from mrbokeh.video_io import VideoWriter, probe, read_frames
-from tests.shot_makers import Brighter
+from tests.shot_makers import Brighter, wait_for
 
 INTRA = [("prores4444", ".mov"), ("prores4444-alpha", ".mov"), ("dnxhr-hqx", ".mov"), ("dnxhr-hqx", ".mxf"), ("ffv1", ".mkv")]
 INTER = [("h264", ".mp4"), ("h264-10bit", ".mkv"), ("h265-10bit", ".mp4"), ("h265-10bit", ".mov"), ("h265-10bit", ".mkv")]
@@ -226,7 +228,8 @@ def test_what_is_finished_is_not_made_again(tmp_path: Path) -> None:
 def test_parts_of_other_settings_are_refused(tmp_path: Path) -> None:
     clip, other = clip_of_blobs(tmp_path), tmp_path / "lens.json"
     other.write_text("one")
-    PartsFolder.opened(shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,))))
+    begun = shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,)))
+    make_segment(SegmentTask(begun, begun.segments[0], PartsFolder.opened(begun).path))
     changes = {
         "amount": shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.2, reads=(other,))),
         "frames": shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,)), (0, 9)),
@@ -243,15 +246,46 @@ def test_parts_of_other_settings_are_refused(tmp_path: Path) -> None:
         make_shot(changes["amount"], OneProcess())
 
 
+def test_a_folder_without_parts_is_not_refused(tmp_path: Path) -> None:
+    """A run that was stopped before its first segment leaves its manifest alone: nothing of it can be mixed with other settings."""
+    clip, target = clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv")
+    before = PartsFolder.opened(shot_of(clip, target, Brighter(0.1)))
+    assert before.path.is_dir() and not before.holds_parts and len(before.missing) == 5
+    begun = PartsFolder.opened(shot_of(clip, target, Brighter(0.2)))
+    make_segment(SegmentTask(begun.shot, begun.shot.segments[0], begun.path))
+    assert begun.holds_parts and len(begun.missing) == 4
+    with pytest.raises(InputError, match=r"other settings \(amount\)"):
+        make_shot(before.shot, OneProcess())
+    make_shot(begun.shot, OneProcess())
+    make_shot(shot_of(clip, VideoTarget(tmp_path / "whole.mkv"), Brighter(0.2)), OneProcess())
+    assert target.path.read_bytes() == (tmp_path / "whole.mkv").read_bytes()
+
+
+@contextmanager
+def opened_once_two_work(recipe: Brighter) -> Iterator[None]:
+    """No frame is made before two workers have come, so that neither finds all done."""
+    assert recipe.gate is not None and recipe.pids is not None
+    gate, pids = recipe.gate, recipe.pids
+    pids.mkdir()
+
+    def open_it() -> None:
+        wait_for(lambda: len(list(pids.iterdir())) == 2)
+        gate.touch()
+
+    opener = threading.Thread(target=open_it, daemon=True)
+    opener.start()
+    yield
+    opener.join()
+
+
 def test_worker_processes_make_the_same_file(tmp_path: Path) -> None:
     clip = clip_of_blobs(tmp_path)
     make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), OneProcess())
-    pids = tmp_path / "pids"
-    pids.mkdir()
     told: list[int] = []
-    shot = shot_of(clip, VideoTarget(tmp_path / "two.mp4"), Brighter(pause_s=0.02, pids=pids))
-    make_shot(shot, ProcessCrew(2), progress=told.append)
-    assert len(list(pids.iterdir())) == 2
+    recipe = Brighter(gate=tmp_path / "gate", pids=tmp_path / "pids")
+    with opened_once_two_work(recipe):
+        make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), ProcessCrew(2), progress=told.append)
+    assert len(list((tmp_path / "pids").iterdir())) == 2
     assert sum(told) == COUNT
     assert (tmp_path / "two.mp4").read_bytes() == (tmp_path / "one.mp4").read_bytes()
 
@@ -276,18 +310,20 @@ def test_a_mistake_in_a_worker_is_told_once(tmp_path: Path) -> None:
         make_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True)), ProcessCrew(2))
 
 
+def held_shot(folder: Path) -> Shot:
+    """The clip in a folder; frames from the third segment on wait for its gate."""
+    recipe = Brighter(gate=folder / "gate", held_from=2 * PER_SEGMENT, pids=folder / "pids")
+    return shot_of(folder / "clip.mkv", VideoTarget(folder / "out.mkv"), recipe)
+
+
 PROGRAM = """
 import sys
 from pathlib import Path
 from mrbokeh.shots.making import make_shot
 from mrbokeh.shots.process_crew import ProcessCrew
-from mrbokeh.shots.video_target import VideoTarget
-from tests.shot_makers import Brighter
-from tests.test_shots import shot_of
 if __name__ == "__main__":
-    folder = Path(sys.argv[1])
-    recipe = Brighter(pause_s=float(sys.argv[2]), pids=folder / "pids")
-    make_shot(shot_of(folder / "clip.mkv", VideoTarget(folder / "out.mkv"), recipe), ProcessCrew(2))
+    from tests.test_shots import held_shot
+    make_shot(held_shot(Path(sys.argv[1])), ProcessCrew(2))
 """
 
 
@@ -299,28 +335,23 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     (tmp_path / "pids").mkdir()
     root = Path(__file__).parent.parent
     (tmp_path / "program.py").write_text(PROGRAM)
-    command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path), "0.15"]
+    command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path)]
     process = subprocess.Popen(command, cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
-    parts = tmp_path / "out.mkv.parts"
-    wait_until(lambda: len(list(parts.glob("0*.mkv"))) >= 2, process)
+    shot = held_shot(tmp_path)
+    parts = [shot.target.part(shot.parts_path, segment) for segment in shot.segments]
+    wait_for(lambda: all(part.exists() for part in parts[:2]) or process.poll() is not None)
     process.send_signal(signal.SIGKILL)
-    process.wait()
+    assert process.wait() == -signal.SIGKILL
     workers = [int(file.name) for file in (tmp_path / "pids").iterdir()]
-    wait_until(lambda: not any(alive(pid) for pid in workers))
-    left = {file.name: file.stat().st_mtime_ns for file in parts.glob("0*.mkv")}
-    assert 2 <= len(left) < 5
+    wait_for(lambda: not any(alive(pid) for pid in workers))
+    assert workers and [part.exists() for part in parts] == [True, True, False, False, False]
     assert not (tmp_path / "out.mkv").exists()
-    subprocess.run(command, cwd=root, env={**os.environ, "PYTHONPATH": str(root)}, check=True)
+    (tmp_path / "gate").touch()
+    told: list[int] = []
+    make_shot(shot, OneProcess(), progress=told.append)
+    assert told[0] == 2 * PER_SEGMENT and sum(told) == COUNT, "what was finished is not made again"
     assert (tmp_path / "out.mkv").read_bytes() == (tmp_path / "whole.mkv").read_bytes()
-    assert not parts.exists()
-
-
-def wait_until(reached: Any, process: "subprocess.Popen[bytes] | None" = None, seconds: float = 60.0) -> None:
-    deadline_s = time.monotonic() + seconds
-    while not reached():
-        assert process is None or process.poll() is None
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
+    assert not shot.parts_path.exists()
 
 
 def alive(pid: int) -> bool:

@@ -1,11 +1,11 @@
 """Shots on a Dask cluster of real processes: a scheduler and workers of their own."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ from mrbokeh.shots.crew import Crew, OneProcess
 from mrbokeh.shots.dask_crew import DaskCrew, require_same_files
 from mrbokeh.shots.making import make_shot
 from mrbokeh.shots.video_target import VideoTarget
-from tests.shot_makers import Brighter
-from tests.test_shots import COUNT, clip_of_blobs, shot_of
+from tests.shot_makers import Brighter, wait_for
+from tests.test_shots import COUNT, clip_of_blobs, opened_once_two_work, shot_of
 
 distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,35 +37,35 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     try:
         yield address_in(told)
     finally:
+        # Killed, for saying goodbye takes 8 s; workers leave when their nanny is gone.
         for process in reversed(processes):
-            process.send_signal(signal.SIGTERM)
+            process.kill()
         for process in processes:
             process.wait(timeout=30)
 
 
 def address_in(told: Path) -> str:
-    import json
-
-    deadline_s = time.monotonic() + 60
-    while time.monotonic() < deadline_s:
+    def is_told() -> bool:
         try:
-            address = str(json.loads(told.read_text(encoding="utf-8"))["address"])
+            return "address" in json.loads(told.read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            time.sleep(0.1)
-            continue
-        with distributed.Client(address, timeout=60, set_as_default=False) as client:
-            client.wait_for_workers(2, timeout=60)
-        return address
-    raise AssertionError("the scheduler did not start")
+            return False
+
+    wait_for(is_told)
+    address = str(json.loads(told.read_text(encoding="utf-8"))["address"])
+    with distributed.Client(address, timeout=60, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=60)
+    return address
 
 
 def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
     clip, crew = clip_of_blobs(tmp_path), DaskCrew(address)
     assert isinstance(crew, Crew)
     make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), OneProcess())
-    (tmp_path / "pids").mkdir()
     told: list[int] = []
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), Brighter(pause_s=0.05, pids=tmp_path / "pids")), crew, progress=told.append)
+    recipe = Brighter(gate=tmp_path / "gate", pids=tmp_path / "pids")
+    with opened_once_two_work(recipe):
+        make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), crew, progress=told.append)
     assert len(list((tmp_path / "pids").iterdir())) == 2, "both workers took part"
     assert str(os.getpid()) not in {file.name for file in (tmp_path / "pids").iterdir()}
     assert sum(told) == COUNT
@@ -75,21 +75,24 @@ def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
 
 def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: str) -> None:
     """One of the two is killed by signal 9 from outside in the middle of its segment; its nanny starts another."""
-    clip, pids = clip_of_blobs(tmp_path), tmp_path / "pids"
+    clip, pids, gate = clip_of_blobs(tmp_path), tmp_path / "pids", tmp_path / "gate"
     make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mkv")), OneProcess())
     pids.mkdir()
+    shot = shot_of(clip, VideoTarget(tmp_path / "two.mkv"), Brighter(gate=gate, held_from=2, pids=pids))
     killed: list[int] = []
 
     def kill_one() -> None:
-        while not (started := list(pids.iterdir())):
-            time.sleep(0.01)
-        time.sleep(0.2)
-        killed.append(int(started[0].name))
+        # While the gate is shut both have a segment, neither can finish it, and the one of the first has begun to write.
+        wait_for(lambda: len(list(pids.iterdir())) == 2 and list(shot.parts_path.glob(".00000.*")))
+        (half,) = shot.parts_path.glob(".00000.*")
+        killed.append(int(half.name.split(".")[2]))
+        assert (pids / str(killed[0])).exists() and not any(shot.parts_path.glob("0*"))
         os.kill(killed[0], signal.SIGKILL)
+        gate.touch()
 
     killer = threading.Thread(target=kill_one, daemon=True)
     killer.start()
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mkv"), Brighter(pause_s=0.1, pids=pids)), DaskCrew(address))
+    make_shot(shot, DaskCrew(address))
     killer.join()
     assert killed
     assert (tmp_path / "two.mkv").read_bytes() == (tmp_path / "one.mkv").read_bytes()

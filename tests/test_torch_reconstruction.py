@@ -94,6 +94,8 @@ def test_shipped_samples_give_the_picture_of_the_compiled_renderer(name: str, sc
         {"sigma_x_px": 1.0},
         {"sigma_x_px": 0.8, "screen_filter": "sheared", "recursive_passes": 3},
         {"bandwidth": 0.0},
+        {"pupil_parts": 1, "shutter_parts": 1},
+        {"pupil_parts": 2, "shutter_parts": 4},
     ],
 )
 def test_every_setting_means_the_same(changed: dict) -> None:
@@ -119,7 +121,13 @@ def test_lamps_and_pixels_without_samples_are_the_same() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size_px", "count", "nearest_m", "farthest_m"), [((1, 1), 1, 2.0, 2.0), ((20, 33), 1500, np.inf, np.inf), ((70, 40), 500, 0.3, 3.0)]
+    ("size_px", "count", "nearest_m", "farthest_m"),
+    [
+        ((1, 1), 1, 2.0, 2.0),
+        ((20, 33), 700, np.inf, np.inf),
+        ((40, 35), 120, 0.3, 3.0),
+        pytest.param((70, 40), 500, 0.3, 3.0, marks=pytest.mark.slow),
+    ],
 )
 def test_few_samples_and_bare_background_are_the_same(size_px: tuple[int, int], count: int, nearest_m: float, farthest_m: float) -> None:
     """One sample, nothing but background, and less than a sample a pixel with depth and motion all by chance."""

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 _STEPS = 3
+_NONE, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -31,38 +32,78 @@ def gather(
     virtual, far, continued to where each layer has nothing. pupil (K, 3): x, y, weight.
     """
     width = near_alpha.shape[1]
-    seen, here, mean = np.empty(4, np.float32), np.empty(3, np.float32), np.empty(16, np.float32)
-    weights = pupil[:, 2].sum()
+    free, past, mean = np.empty(len(pupil), np.float32), np.empty(len(pupil), np.float32), np.empty(16, np.float32)
+    rays = np.ascontiguousarray(pupil.T)
     for i in which[first:end]:
         row, column = places[i] // width, places[i] % width
-        y_px, x_px = np.float32(row + 0.5), np.float32(column + 0.5)
-        is_near, far_is_still = near_in_reach[row, column], coc_px[2, row, column] == 0.0
-        if far_is_still:
-            _look(far_rgb, x_px, y_px, here)
-        mean[:] = 0.0
-        for k in range(len(pupil)):
-            ux, uy, weight = pupil[k, 0], pupil[k, 1], pupil[k, 2]
-            free = weight
-            if is_near:
-                x, y = _meet(coc_px[0], x_px, y_px, ux, uy)
-                free *= np.float32(1.0) - _plane_at(near_alpha, x, y)
-            x, y = _meet(coc_px[1], x_px, y_px, ux, uy)
-            _look(virtual, x, y, seen)
-            if not far_is_still:
-                x, y = _meet(coc_px[2], x_px, y_px, ux, uy)
-                _look(far_rgb, x, y, here)
-            past = free * (np.float32(1.0) - seen[3])
-            mean[0] += free
-            mean[1] += weight * seen[3]
-            mean[2] += free * seen[3]
-            mean[15] += past
-            for c in range(3):
-                mean[3 + c] += weight * seen[c]
-                mean[6 + c] += free * seen[c]
-                mean[9 + c] += free * here[c]
-                mean[12 + c] += past * here[c]
-        for c in range(16):
-            sums[i, c] = mean[c] / weights
+        free[:] = rays[2]
+        if near_in_reach[row, column]:
+            _past_near(free, near_alpha, coc_px[0], row, column, rays)
+        mean[0] = free.sum()
+        _virtual_means(mean, past, free, virtual, coc_px[1], row, column, rays)
+        if coc_px[2, row, column] == _NONE:
+            _still_far(mean, far_rgb, row, column)
+        else:
+            _far_means(mean, past, free, far_rgb, coc_px[2], row, column, rays)
+        sums[i] = mean / rays[2].sum()
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _past_near(free: np.ndarray, near_alpha: np.ndarray, coc_px: np.ndarray, row: int, column: int, rays: np.ndarray) -> None:
+    """How much of each ray (x, y, weight: 3 K) gets past the near things. This loop and the next two hold nothing but numbers, so that
+    many rays are followed at once."""
+    here_px, x_px, y_px = coc_px[row, column], np.float32(column + 0.5), np.float32(row + 0.5)
+    for k in range(len(free)):
+        x, y = _meet_from(coc_px, here_px, x_px, y_px, rays[0, k], rays[1, k])
+        free[k] *= _ONE - _plane_at(near_alpha, x, y)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _virtual_means(
+    mean: np.ndarray, past: np.ndarray, free: np.ndarray, virtual: np.ndarray, coc_px: np.ndarray, row: int, column: int, rays: np.ndarray
+) -> None:
+    """Set the sums of what rays meet of the virtual surface, and what of each gets past that too."""
+    here_px, x_px, y_px = coc_px[row, column], np.float32(column + 0.5), np.float32(row + 0.5)
+    covered, covered_free, beyond = _NONE, _NONE, _NONE
+    red, green, blue, red_free, green_free, blue_free = _NONE, _NONE, _NONE, _NONE, _NONE, _NONE
+    for k in range(len(free)):
+        x, y = _meet_from(coc_px, here_px, x_px, y_px, rays[0, k], rays[1, k])
+        corners, weight = _corners(virtual.shape, x, y), rays[2, k]
+        r, g, b, alpha = (
+            _channel_at(virtual, corners, 0),
+            _channel_at(virtual, corners, 1),
+            _channel_at(virtual, corners, 2),
+            _channel_at(virtual, corners, 3),
+        )
+        past[k] = free[k] * (_ONE - alpha)
+        covered, covered_free, beyond = covered + weight * alpha, covered_free + free[k] * alpha, beyond + past[k]
+        red, green, blue = red + weight * r, green + weight * g, blue + weight * b
+        red_free, green_free, blue_free = red_free + free[k] * r, green_free + free[k] * g, blue_free + free[k] * b
+    mean[1], mean[2], mean[15] = covered, covered_free, beyond
+    mean[3], mean[4], mean[5], mean[6], mean[7], mean[8] = red, green, blue, red_free, green_free, blue_free
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _far_means(
+    mean: np.ndarray, past: np.ndarray, free: np.ndarray, far_rgb: np.ndarray, coc_px: np.ndarray, row: int, column: int, rays: np.ndarray
+) -> None:
+    """Set the sums of the far light that rays see past the near things, and past near and virtual ones."""
+    here_px, x_px, y_px = coc_px[row, column], np.float32(column + 0.5), np.float32(row + 0.5)
+    red, green, blue, red_past, green_past, blue_past = _NONE, _NONE, _NONE, _NONE, _NONE, _NONE
+    for k in range(len(free)):
+        x, y = _meet_from(coc_px, here_px, x_px, y_px, rays[0, k], rays[1, k])
+        corners = _corners(far_rgb.shape, x, y)
+        r, g, b = _channel_at(far_rgb, corners, 0), _channel_at(far_rgb, corners, 1), _channel_at(far_rgb, corners, 2)
+        red, green, blue = red + free[k] * r, green + free[k] * g, blue + free[k] * b
+        red_past, green_past, blue_past = red_past + past[k] * r, green_past + past[k] * g, blue_past + past[k] * b
+    mean[9], mean[10], mean[11], mean[12], mean[13], mean[14] = red, green, blue, red_past, green_past, blue_past
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _still_far(mean: np.ndarray, far_rgb: np.ndarray, row: int, column: int) -> None:
+    """What is far is in focus: all rays of the pixel see one point of it."""
+    for c in range(3):
+        mean[9 + c], mean[12 + c] = mean[0] * far_rgb[row, column, c], mean[15] * far_rgb[row, column, c]
 
 
 @njit(cache=True, nogil=True)
@@ -102,33 +143,47 @@ def follow(
 @njit(cache=True, nogil=True, fastmath=True)
 def _meet(coc_px: np.ndarray, x_px: np.float32, y_px: np.float32, ux: np.float32, uy: np.float32) -> tuple[np.float32, np.float32]:
     """Where a ray meets a surface, by steps that settle where it is smooth."""
-    x, y = x_px, y_px
-    for _ in range(_STEPS):
-        row, column = min(max(int(y), 0), coc_px.shape[0] - 1), min(max(int(x), 0), coc_px.shape[1] - 1)
-        half_px = np.float32(0.5) * coc_px[row, column]
-        x, y = x_px - ux * half_px, y_px - uy * half_px
-    return x, y
+    return _meet_from(coc_px, _nearest(coc_px, x_px, y_px), x_px, y_px, ux, uy)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _corners(shape: tuple[int, ...], x: np.float32, y: np.float32) -> tuple[int, int, int, int, np.float32, np.float32]:
+def _meet_from(
+    coc_px: np.ndarray, here_px: np.float32, x_px: np.float32, y_px: np.float32, ux: np.float32, uy: np.float32
+) -> tuple[np.float32, np.float32]:
+    """here_px: the circle of confusion of the pixel that the ray ends in."""
+    half_px = _HALF * here_px
+    for _ in range(_STEPS - 1):
+        half_px = _HALF * _nearest(coc_px, x_px - ux * half_px, y_px - uy * half_px)
+    return x_px - ux * half_px, y_px - uy * half_px
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _nearest(plane: np.ndarray, x: np.float32, y: np.float32) -> np.float32:
+    row, column = min(max(y, _NONE), np.float32(plane.shape[0] - 1)), min(max(x, _NONE), np.float32(plane.shape[1] - 1))
+    return plane[np.uint32(np.int32(row)), np.uint32(np.int32(column))]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _corners(
+    shape: tuple[int, ...], x: np.float32, y: np.float32
+) -> tuple[np.uint32, np.uint32, np.uint32, np.uint32, np.float32, np.float32]:
     """Rows and columns of the four pixel centres around a place, the border going on outwards, and the shares of the later ones."""
-    x, y = (
-        min(max(x - np.float32(0.5), np.float32(0.0)), np.float32(shape[1] - 1)),
-        min(max(y - np.float32(0.5), np.float32(0.0)), np.float32(shape[0] - 1)),
-    )
-    left, top = int(x), int(y)
-    return top, min(top + 1, shape[0] - 1), left, min(left + 1, shape[1] - 1), y - np.float32(top), x - np.float32(left)
+    last_row, last_column = np.float32(shape[0] - 1), np.float32(shape[1] - 1)
+    x, y = min(max(x - _HALF, _NONE), last_column), min(max(y - _HALF, _NONE), last_row)
+    left, top = np.int32(x), np.int32(y)
+    right, low = left + np.int32(x < last_column), top + np.int32(y < last_row)
+    return np.uint32(top), np.uint32(low), np.uint32(left), np.uint32(right), y - np.float32(top), x - np.float32(left)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _look(picture: np.ndarray, x: np.float32, y: np.float32, found: np.ndarray) -> None:
+def _channel_at(
+    picture: np.ndarray, corners: tuple[np.uint32, np.uint32, np.uint32, np.uint32, np.float32, np.float32], channel: int
+) -> np.float32:
     """Bilinear between pixel centres."""
-    top, low, left, right, down, along = _corners(picture.shape, x, y)
-    a, b = (np.float32(1.0) - down) * (np.float32(1.0) - along), (np.float32(1.0) - down) * along
-    c, d = down * (np.float32(1.0) - along), down * along
-    for k in range(picture.shape[2]):
-        found[k] = a * picture[top, left, k] + b * picture[top, right, k] + c * picture[low, left, k] + d * picture[low, right, k]
+    top, low, left, right, down, along = corners
+    upper = (_ONE - along) * picture[top, left, channel] + along * picture[top, right, channel]
+    lower = (_ONE - along) * picture[low, left, channel] + along * picture[low, right, channel]
+    return (_ONE - down) * upper + down * lower
 
 
 @njit(cache=True, nogil=True, fastmath=True)

@@ -31,8 +31,10 @@ from mrbokeh.renderers.base import Renderer
 
 Plane = Float32[np.ndarray, "height width"]
 Picture = Float32[np.ndarray, "height width 3"]
+Mask = Bool[np.ndarray, "height width"]
 
 _HALF = 0.5
+_NEAR_EDGE_PX, _FAR_EDGE_PX = 3, 1  # the depth of what is near has a median over 5x5 pixels
 
 
 @dataclass(frozen=True)
@@ -103,13 +105,23 @@ class Between:
         return NearAndFar(Layer(front * matte[..., None], matte, near_m), behind, far_m, NO_LIGHTS)
 
 
-def _reach_px(lens: Lens, depth_m: Plane, is_near: Bool[np.ndarray, "height width"]) -> float:
-    """How far the lens looks past the edges of what is near: half of the difference of the circles of confusion, at most."""
-    coc_px = np.asarray(lens.coc_px(depth_m, depth_m.shape[1]))
+def _reach_px(lens: Lens, depth_m: Plane, is_near: Mask) -> float:
+    """How far the lens looks past the edges of what is near: half of the difference of the circles of confusion there, at most.
+
+    Behind a near thing and before what is far, both go on as they are at the edge (see `continued`).
+    """
     if not is_near.any() or is_near.all():
         return 0.0
-    near_px, far_px = coc_px[is_near], coc_px[~is_near]
+    coc_px = np.asarray(lens.coc_px(depth_m, depth_m.shape[1]))
+    near_px, far_px = coc_px[is_near & _within(_NEAR_EDGE_PX, ~is_near)], coc_px[~is_near & _within(_FAR_EDGE_PX, is_near)]
     return 0.5 * lens.aperture.unit_radius * float(max(far_px.max() - near_px.min(), 0.0))
+
+
+def _within(distance_px: int, mask: Mask) -> Mask:
+    """No farther from the mask than that, along rows and columns."""
+    from cv2 import dilate
+
+    return np.asarray(dilate(mask.astype(np.uint8), np.ones((2 * distance_px + 1, 2 * distance_px + 1), np.uint8)) > 0)
 
 
 def _without_sharp_picture(plate: Plate, white: Layer, renderer: Renderer) -> tuple[NearAndFar, Layer]:

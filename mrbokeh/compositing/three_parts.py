@@ -59,7 +59,9 @@ def _shared(photo_rgb: Colours, near: Layer, blurred: Layer, rays: Rays, places:
 
 def _virtual_light(blurred: Layer, rays: Rays, places: Places, means: PupilMeans, free: Exact) -> ExactColours:
     """What gets past the near things: surfaces by the part of the pupil they leave and the covariance, lights one by one."""
-    own = virtual_lights(rays)
+    wanted = np.zeros(blurred.alpha.shape, np.bool_)
+    wanted.reshape(-1)[places] = True
+    own = virtual_lights(rays, wanted)
     alone, past = own.one.reshape(-1, 3)[places], own.both.reshape(-1, 3)[places]
     surfaces = free[:, None] * (blurred.rgb.reshape(-1, 3)[places] - alone)
     return surfaces + means.f_virtual - means.f[:, None] * means.virtual + past
@@ -71,8 +73,8 @@ def _far_light(
     """(far light in the photograph, the part of it that the virtual surface leaves visible)."""
     near_rgb = near.rgb.reshape(-1, 3)[places]
     surfaces = means.f_far * (free / np.maximum(means.f, _ROUND))[:, None]
-    left_over = np.full_like(near.rgb, np.nan)
-    left_over.reshape(-1, 3)[places] = photo_rgb - near_rgb - surfaces
+    left_over = np.full_like(near.alpha, np.nan)
+    left_over.reshape(-1)[places] = (photo_rgb - near_rgb - surfaces).astype(np.float32).sum(axis=1)
     bright = far_lights(rays, left_over)
     before, after = bright.one.reshape(-1, 3)[places], bright.both.reshape(-1, 3)[places]
     stays = np.clip((1.0 - share / free)[:, None] * _colour_change(means), 0.0, 1.0)

@@ -49,7 +49,8 @@ class PartsFolder:
 
     @property
     def holds_parts(self) -> bool:
-        return any(each.name != MANIFEST for each in self.path.iterdir())
+        """Finished ones: half files and signs of workers have other names."""
+        return any(each.stem.isdigit() for each in self.path.iterdir())
 
     def remove(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
