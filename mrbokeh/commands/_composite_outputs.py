@@ -28,12 +28,14 @@ def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None],
 
 def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
     """The lens that blurred, and how much."""
-    lens, flat = plate.lens, flatten(sharp)
+    lens, width_px = plate.lens, plate.rgb.shape[1]
     told = f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g} focused at {lens.focus_distance_m:.3g} m"
-    seen_m = flat.depth_m[(flat.alpha > 0.5) & np.isfinite(flat.depth_m)]
+    seen_m = np.concatenate(
+        [np.empty(0, np.float32), *(layer.depth_m[(layer.alpha > 0.5) & np.isfinite(layer.depth_m)] for layer in sharp)]
+    )
     if not len(seen_m):
         return told
-    coc_px = np.abs(lens.coc_px(np.array([seen_m.min(), np.median(seen_m), seen_m.max()]), flat.depth_m.shape[1]))
+    coc_px = np.abs(lens.coc_px(np.array([seen_m.min(), np.median(seen_m), seen_m.max()]), width_px))
     return f"{told}; put in at {seen_m.min():.3g} to {seen_m.max():.3g} m, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
 
 
