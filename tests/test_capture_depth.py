@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from capture.cli import app
+from capture.dataset.stack_writer import require_usable
 from capture.merging.merge import merge_scene
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
@@ -134,6 +135,15 @@ def test_finished_stacks_are_kept_and_stale_ones_are_not(deepened: Path, tmp_pat
     write_json(scene / "reconstruction" / "scale.json", {"metres_per_unit": 1.01})
     deepen_scene(scene)
     assert all(path.stat().st_mtime_ns != old for path, old in zip(paths, before, strict=True))
+
+
+def test_depth_of_another_focus_does_not_go_into_a_data_set(deepened: Path) -> None:
+    """As after `scale --overwrite` with another distance, which calibrates the focus anew."""
+    stack = read_focal_stack(deepened / VIEWS[0])
+    require_usable(stack)
+    moved = tuple(replace(each, focus_distance_m=1.1 * (each.focus_distance_m or 0.0)) for each in stack.slices)
+    with pytest.raises(InputError, match="run `mrbokeh capture depth`"):
+        require_usable(replace(stack, slices=moved))
 
 
 def test_a_stack_without_a_pose_keeps_its_depth_from_focus(merged: Path, truths: list[ViewTruth], tmp_path: Path) -> None:

@@ -367,7 +367,7 @@ def test_a_broken_off_video_leaves_nothing(tmp_path: Path) -> None:
 
 def test_mistakes_in_writing_are_explained(tmp_path: Path) -> None:
     picture = np.zeros((48, 64, 3), np.float32)
-    with pytest.raises(InputError, match=r"expected \.mp4, \.mov or \.mkv"):
+    with pytest.raises(InputError, match=r"expected \.mp4, \.mov, \.mkv"):
         VideoWriter(tmp_path / "clip.avi", 64, 48)
     with pytest.raises(InputError, match="halved chroma"):
         VideoWriter(tmp_path / "clip.mp4", 63, 48)

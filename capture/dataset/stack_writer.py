@@ -15,6 +15,7 @@ from capture.report.examination import examine
 from capture.report.exclusion_masks import exclusion_masks, has_fresh_exclusions, write_exclusions
 from capture.report.reblur import Reblur
 from capture.report.stack_view import StackView
+from capture.views.scene_depth import is_depth_stale
 from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.camera_rgb import VALID
 from mrbokeh.errors import InputError
@@ -46,6 +47,8 @@ def require_usable(stack: FocalStack) -> None:
     stack.lens_of(0)
     if not stack.is_metric:
         raise InputError(f"{stack.folder} has slices without a focus distance: add them to lens.toml, ingest and merge again")
+    if is_depth_stale(stack):
+        raise InputError(f"{stack.folder}: its depth was found with other focus distances than it has now: run `mrbokeh capture depth`")
 
 
 def write_stack(stack: FocalStack, out: Path, name: str, part: Part, writing: StackWriting) -> StackRecord:

@@ -70,7 +70,10 @@ def calibrate_focus(blur: BlurSamples, point_dioptres: Float[np.ndarray, " point
     count = len(start.dioptres)
     dioptres, growth = fit.meaning(values)
     told = np.bincount(blur.slices[within], minlength=count)
-    sigma = np.hypot(np.sqrt(np.diag(covariance)[-count:]), _COMMON_ERROR_PX / growth)
+    variances = np.diag(covariance)[-count:]
+    if (variances < 0.0).any() or (growth <= 0.0).any():
+        raise InputError("no focus distances explain how the blur of the slices grows with depth: is the scale of the poses right?")
+    sigma = np.hypot(np.sqrt(variances), _COMMON_ERROR_PX / growth)
     return FocusFit(dioptres, growth, sigma, told)
 
 

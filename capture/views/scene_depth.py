@@ -4,7 +4,7 @@ Needs merged stacks, poses and their scale. The first pass's picture and depth a
 starts from, so that a run again with other settings, or an interrupted one, gives the same.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -144,5 +144,15 @@ def depth_record(stack: FocalStack, known: SceneKnowledge, neighbours: Sequence[
         "neighbours": list(neighbours),
         "camera_from_world": np.round(pose, 9).tolist(),
         "nearest_point_m": round(float(points_m.min(initial=np.inf)), 9),
-        "focus_distances_m": [None if each is None else round(each, 9) for each in stack.focus_distances_m],
+        "focus_distances_m": _focus_of(stack),
     }
+
+
+def is_depth_stale(stack: FocalStack) -> bool:
+    """Whether the focus was calibrated anew since the stack's dense depth was found, as another scale does it."""
+    record = stack.metadata.get(DEPTH_SOURCE)
+    return isinstance(record, Mapping) and record["focus_distances_m"] != _focus_of(stack)
+
+
+def _focus_of(stack: FocalStack) -> list[float | None]:
+    return [None if each is None else round(each, 9) for each in stack.focus_distances_m]

@@ -17,13 +17,16 @@ from mrbokeh.plate import Plate
 
 def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None], *, all_slices: bool) -> None:
     """read: the files that the command reads. Raises InputError where a file would be lost, or cannot be what is asked for."""
-    require_suffix(out, ("",) if all_slices else (".exr", *INTEGER_SUFFIXES), "--out, a folder," if all_slices else "--out")
     for path, name in ((result.save_layer, "--save-layer"), (result.deep_out, "--deep-out")):
         if path is not None:
             require_suffix(path, (".exr",), name)
-    require_safe_outputs((out, result.save_layer, result.deep_out), read, result.overwrite)
     if result.deep_out is not None and all_slices:
         raise InputError("--deep-out writes the layers of one picture: leave --all-slices out, for they are the same in every slice")
+    if all_slices and out.suffix:
+        raise InputError(f"--all-slices writes a focal stack: expected the name of a folder, got --out {out}")
+    if not all_slices:
+        require_suffix(out, (".exr", *INTEGER_SUFFIXES), "--out")
+    require_safe_outputs((out, result.save_layer, result.deep_out), read, result.overwrite)
 
 
 def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
