@@ -1,10 +1,13 @@
-"""The loops of mrbokeh.slice_islands, compiled: a grid of square cells lies over the frame; runs are those of slice_sorting."""
+"""The loops of mrbokeh.slice_islands, compiled: a grid of square cells lies over the frame; runs are those of slice_sorting.
+
+So little work that other threads need not be let in meanwhile, as nogil would: to get back among them takes longer.
+"""
 
 import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def mark_cells(cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.ndarray, width: int) -> None:
     """Set the cells (rows, columns) in which pixels of runs (R, 2) lie to -1."""
     for r in range(len(runs)):
@@ -12,7 +15,7 @@ def mark_cells(cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.nda
         cells[y // cell_px, x // cell_px : (x + runs[r, 1] - runs[r, 0] - 1) // cell_px + 1] = -1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def number_islands(cells: np.ndarray) -> int:
     """Number marked cells from 1 on, those that touch at a side or a corner alike; how many numbers there are."""
     rows, columns = cells.shape
@@ -33,7 +36,7 @@ def number_islands(cells: np.ndarray) -> int:
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def islands_of_runs(boxes: np.ndarray, cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.ndarray, width: int) -> np.ndarray:
     """(R,) which island, from 0 on, each run belongs to; widens boxes (islands, 4: first and end row, first and end column) by them."""
     islands = np.empty(len(runs), np.int32)
@@ -46,7 +49,7 @@ def islands_of_runs(boxes: np.ndarray, cells: np.ndarray, cell_px: int, runs: np
     return islands
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def join_islands(boxes: np.ndarray, reach: int, pixels_per_spread: int) -> np.ndarray:
     """(islands,) which other island, or itself, each is joined with, where one window for both costs less than two; boxes are widened."""
     joined = np.arange(len(boxes))
@@ -68,6 +71,6 @@ def join_islands(boxes: np.ndarray, reach: int, pixels_per_spread: int) -> np.nd
     return joined
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _area(box: np.ndarray, reach: int) -> int:
     return (box[1] - box[0] + 2 * reach) * (box[3] - box[2] + 2 * reach)

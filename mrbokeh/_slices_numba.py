@@ -18,13 +18,16 @@ def cover(
     values: np.ndarray,
     coc_px: np.ndarray,
     sharp_px: np.float32,
+    first_place: int,
+    end_place: int,
 ) -> None:
     """Let pixels of values (N, C) take what they cover from what is free (H W); shown (N,) is what was free at their places before.
+    Those from one place to another, so that bands of the frame can be worked through side by side.
 
     crossing (N,): the rest, where they lie behind the focus and the nearest so far (nearest_px, (H W), not above 0) in front of it.
     """
     one, nothing = np.float32(1.0), np.float32(0.0)
-    for i in range(len(places)):
+    for i in range(np.searchsorted(places, first_place), np.searchsorted(places, end_place)):
         place, coverage = places[i], values[i, 3]
         shown[i] = free[place]
         crossing[i] = one - free[place] if coc_px[i] > sharp_px and nearest_px[place] < -sharp_px else nothing
@@ -60,7 +63,7 @@ def runs_of_slices(
     return runs[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def extent(runs: np.ndarray, places: np.ndarray, width: int) -> tuple[int, int, int, int]:
     """First and end row, first and end column of runs (R, 2), at least one."""
     left, right = width, 0
@@ -95,6 +98,10 @@ def place_light(
         if y < 0 or y >= rows or first >= end:
             continue
         to, coc_px_there, source = light[y, max(0, x) :], light_coc_px[y, max(0, x) :], values[first:end]
+        if channels == 4 and _is_free(to[: len(source)].reshape(-1), source.reshape(-1)):
+            coc_px_there[: len(source)] = coc_px[first:end]
+            _put_all(to[: len(source)].reshape(-1), source.reshape(-1), shares[first:end])
+            continue
         for i in range(len(source)):
             if to[i, 3] > 0.0:
                 waiting.append(first + i)
@@ -106,6 +113,23 @@ def place_light(
     for i in range(len(waiting)):
         late[i, 0], late[i, 1] = waiting[i], waiting[i] + 1
     return late
+
+
+@njit(cache=True, nogil=True)
+def _is_free(light: np.ndarray, values: np.ndarray) -> bool:
+    """Whether all these pixels of four channels cover something, and their places are empty."""
+    least, most = np.float32(np.inf), np.float32(0.0)
+    for i in range(3, len(values), 4):
+        least, most = min(least, values[i]), max(most, light[i])
+    return least > np.float32(0.0) and most == np.float32(0.0)
+
+
+@njit(cache=True, nogil=True)
+def _put_all(light: np.ndarray, values: np.ndarray, shares: np.ndarray) -> None:
+    """Pixels of four channels times their shares, without a branch so that it vectorises."""
+    for i in range(len(shares)):
+        for c in range(4):
+            light[4 * i + c] = values[4 * i + c] * shares[i]
 
 
 @njit(cache=True, nogil=True)

@@ -14,11 +14,12 @@ from mrbokeh.sheets import Pixels
 from mrbokeh.slice_islands import islands
 from mrbokeh.slice_sorting import Part, Shares, Window, sorted_slices, window_of
 from mrbokeh.spreading import Frame
-from mrbokeh.workers import ahead, cores
+from mrbokeh.workers import ahead, cores, in_bands
 from mrbokeh.zeroed_memory import ZeroedMemory
 
 _LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add
+_BAND_PIXELS = 1 << 16
 _FEW_PIXELS = 1 << 20
 _MANY_PIXELS = 1 << 22
 _SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
@@ -130,7 +131,7 @@ def _in_turn(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px
     if len(sheets) == 1:
         yield from cut([np.ones_like(sheets[0].coc_px)])
         return
-    seen, crossing = (_shown_by_depth if by_depth else _shown_in_order)(sheets, slicing.size)
+    seen, crossing = _shown_by_depth(sheets, slicing.size) if by_depth else _shown_in_order(sheets, slicing)
     yield from merge(cut(crossing), cut(seen), key=itemgetter(0))
     yield from cut([1.0 - shown - across for shown, across in zip(seen, crossing, strict=True)])
 
@@ -142,14 +143,19 @@ def _range_px(sheets: Sequence[Pixels], pixels: int) -> tuple[float, float]:
     return float(min([*in_focus, *(coc_px.min() for coc_px in used)])), float(max([*in_focus, *(coc_px.max() for coc_px in used)]))
 
 
-def _shown_in_order(sheets: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
+def _shown_in_order(sheets: Sequence[Pixels], slicing: Slicing) -> tuple[list[Shares], list[Shares]]:
     """How much of each pixel the sheets listed before leave uncovered, and how much hides behind one on the other side of the focus."""
     from mrbokeh._slices_numba import cover
 
-    free, nearest_px = np.ones(size[0] * size[1], np.float32), np.zeros(size[0] * size[1], np.float32)
+    pixels = slicing.size[0] * slicing.size[1]
+    free, nearest_px = np.ones(pixels, np.float32), np.zeros(pixels, np.float32)
     shown, crossing = ([np.empty_like(sheet.coc_px) for sheet in sheets] for _ in range(2))
-    for each, across, sheet in zip(shown, crossing, sheets, strict=True):
-        cover(each, across, free, nearest_px, sheet.places, sheet.values, sheet.coc_px, _SHARP_PX)
+
+    def cover_band(first: int, end: int) -> None:
+        for each, across, sheet in zip(shown, crossing, sheets, strict=True):
+            cover(each, across, free, nearest_px, sheet.places, sheet.values, sheet.coc_px, _SHARP_PX, first, end)
+
+    in_bands(slicing.pool, pixels, _BAND_PIXELS, cover_band)
     return shown, crossing
 
 

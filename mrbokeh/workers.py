@@ -50,7 +50,7 @@ def ahead(pool: Executor, work: Callable[[Any], _Result], tasks: Iterable[Any], 
 
 
 class CallingThread(Executor):
-    """An executor without threads: work is done when it is submitted."""
+    """An executor without threads: work is done when it is submitted, and what is mapped at once."""
 
     def submit(self, fn: Callable[..., _Result], /, *args: Any, **kwargs: Any) -> "Future[_Result]":
         future: Future[_Result] = Future()
@@ -59,3 +59,12 @@ class CallingThread(Executor):
         except Exception as error:  # kept for whoever asks for the result, as any executor does
             future.set_exception(error)
         return future
+
+    def map(
+        self,
+        fn: Callable[..., _Result],
+        *iterables: Iterable[Any],
+        timeout: float | None = None,  # noqa: ARG002
+        chunksize: int = 1,  # noqa: ARG002
+    ) -> Iterator[_Result]:
+        return iter([fn(*each) for each in zip(*iterables, strict=False)])

@@ -6,10 +6,13 @@ import numpy as np
 
 
 class ZeroedMemory:
-    """Zeroed arrays for several threads; whoever takes one gives it back as zeros."""
+    """Zeroed arrays for several threads; whoever takes one gives it back as zeros.
 
-    def __init__(self) -> None:
-        self._lock = Lock()
+    most_bytes: what is larger than this is let go as soon as it is given back.
+    """
+
+    def __init__(self, most_bytes: int | float = np.inf) -> None:
+        self._lock, self._most_bytes = Lock(), most_bytes
         self._arrays: list[np.ndarray] = []
 
     def take(self, elements: int, dtype: type) -> np.ndarray:
@@ -23,5 +26,6 @@ class ZeroedMemory:
 
     def give_back(self, array: np.ndarray) -> None:
         """An array that holds zeros again."""
-        with self._lock:
-            self._arrays.append(array)
+        if array.nbytes <= self._most_bytes:
+            with self._lock:
+                self._arrays.append(array)

@@ -321,7 +321,7 @@ def test_parts_hold_all_light_once_and_are_as_small_as_can_be(step: int, margin:
     """Rows 8 to 150 of 211 columns of tiles: every lit tile is in the part of its column of `step` px, parts of a column lie
     more than two margins apart, and each begins and ends with light on all four sides."""
     occupied = np.random.default_rng(step).uniform(size=(19, 27)) < lit
-    parts = _polygon_bands.parts_of(occupied, 8, 150, 211, step, margin)
+    parts = _polygon_bands.parts_of(occupied, 8, 150, 211, step, margin).tolist()
     pixels = np.kron(occupied, np.ones((8, 8), bool))[:150, :211]
     pixels[:8] = False
     held = np.zeros(pixels.shape, int)

@@ -6,15 +6,16 @@ from itertools import pairwise
 from threading import Lock
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
-from mrbokeh.renderers._polygon_differences_numba import settle, spread_part
+from mrbokeh.renderers._polygon_differences_numba import settle, spread_parts
 from mrbokeh.renderers._polygon_halves import halves_of
 from mrbokeh.renderers._polygon_light import NO_HIGHLIGHTS, SurveyedLight
 from mrbokeh.renderers._polygon_memory import laid_out, ring_elements, ring_of, scratch_of
 from mrbokeh.renderers._polygon_ring_numba import Picture, Target
-from mrbokeh.renderers._polygon_survey_numba import TILE_PX, find_parts
+from mrbokeh.renderers._polygon_survey_numba import TILE_PX
 from mrbokeh.renderers._polygon_tables import ApertureTables
+from mrbokeh.renderers._polygon_tiles_numba import find_parts
 from mrbokeh.zeroed_memory import ZeroedMemory
 
 BAND_ROWS = 384
@@ -32,25 +33,22 @@ _LEAST_ROWS = 64
 
 @dataclass(frozen=True)
 class Band:
-    """Rows top..bottom of a picture: parts of equal width of it that hold light, as (first row, end row, left, right)."""
+    """Rows top..bottom of a picture: parts of equal width of it that hold light, each first row, end row, left, right."""
 
     top: int
     bottom: int
-    parts: tuple[tuple[int, int, int, int], ...]
+    parts: Int64[np.ndarray, "parts 4"]
 
 
 def bands_of(light: SurveyedLight, margin: int, bytes_per_cell: int) -> list[Band]:
-    height, width = light.coc_px.shape
-    occupied = np.any(light.sums > 0, axis=2)
-    rows = np.flatnonzero(occupied.any(axis=1)) * TILE_PX
-    first, end = int(rows[0]), min(int(rows[-1]) + TILE_PX, height)
+    (height, width), tiles = light.coc_px.shape, light.tiles
+    first, end = tiles.first * TILE_PX, min(tiles.end * TILE_PX, height)
     least = _LEAST_ROWS if height * width > FEW_PIXELS else height
     count = max((end - first) // max(BAND_ROWS, 2 * margin), min(2, (end - first) // least), 1)
-    cuts = first + np.rint(np.linspace(0, (end - first) / TILE_PX, count + 1)).astype(int) * TILE_PX
-    cuts[-1] = end
-    sparse = occupied.mean() < SPARSE
+    cuts = [first + round(k * (end - first) / TILE_PX / count) * TILE_PX for k in range(count)]
+    sparse = tiles.lit < SPARSE * tiles.occupied.size
     step = max(SPARSE_PART_PX, 2 * margin) if sparse else _part_width(width, margin, bytes_per_cell)
-    return [Band(int(top), int(bottom), parts_of(occupied, int(top), int(bottom), width, step, margin)) for top, bottom in pairwise(cuts)]
+    return [Band(top, bottom, parts_of(tiles.occupied, top, bottom, width, step, margin)) for top, bottom in pairwise([*cuts, end])]
 
 
 def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
@@ -60,12 +58,11 @@ def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
 
 def parts_of(
     occupied: Bool[np.ndarray, "rows columns"], top: int, bottom: int, width: int, step: int, margin: int
-) -> tuple[tuple[int, int, int, int], ...]:
+) -> Int64[np.ndarray, "parts 4"]:
     """Column by column, `step` px wide, and within one apart where light of one does not reach that of the other."""
     first, end = top // TILE_PX, -(-bottom // TILE_PX)
     parts = np.empty((-(-width // step) * (end - first), 4), np.int64)
-    count = find_parts(occupied, (top, bottom), width, step, margin, parts)
-    return tuple((above, below, left, right) for above, below, left, right in parts[:count].tolist())
+    return parts[: find_parts(occupied, (top, bottom), width, step, margin, parts)]
 
 
 @dataclass(frozen=True)
@@ -99,8 +96,8 @@ class Workshop:
         out = np.zeros(light.values.shape, np.float32)
         flat, nonnegative = out.reshape(len(out), -1), light.least >= 0.0
         bands, margin = [], 0
-        if light.sums.any():
-            margin = self.tables.margin_px(light.largest_px)
+        if light.tiles.lit:
+            margin = self.tables.margin_px(light.tiles.largest_px)
             bands = bands_of(light, margin, (len(self.tables.planes) + 1) * 4 * np.dtype(self.dtype).itemsize)
         edges = [(band.top, band.bottom) for band in bands] if len(bands) > 1 else [(0, len(out))]
         strays = np.zeros((len(edges), 2, margin if len(bands) > 1 else 0, flat.shape[1]), np.float32)
@@ -119,7 +116,7 @@ class Workshop:
 
     def _spread_bands(self, picture: Picture, bands: list[tuple[Band, Target]], margin: int) -> None:
         waiting, lock = iter(bands), Lock()
-        width = max((right - left for band, _ in bands for _, _, left, right in band.parts), default=0)
+        width = max((int((band.parts[:, 3] - band.parts[:, 2]).max()) for band, _ in bands), default=0)
         tables = self.tables
 
         def work() -> None:
@@ -132,8 +129,7 @@ class Workshop:
                 if piece is None:
                     break
                 band, target = piece
-                for first, end, left, right in band.parts:
-                    spread_part(picture, corners, tables.sums, tables.exact, ring._replace(left=left), scratch, target, first, end, right)
+                spread_parts(picture, corners, tables.sums, tables.exact, ring, scratch, target, band.parts)
             self.memory.give_back(planes)
 
         list(self.pool.map(lambda _: work(), range(min(self.threads, len(bands)))))

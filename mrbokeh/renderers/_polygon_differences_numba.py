@@ -12,7 +12,19 @@ from mrbokeh.renderers._polygon_sums_numba import add_row, cut_negative, finish_
 
 
 @compiled
-def spread_part(
+def spread_parts(
+    picture: Picture, corners: Corners, sums: Sums, exact: Exact, ring: Ring, scratch: Scratch, target: Target, parts: np.ndarray
+) -> None:
+    """Add the spread light of parts (N, 4) of a picture, each first row, end row, left, right, to the target, whose band holds the
+    rows. The ring is empty before and after."""
+    for k in range(parts.shape[0]):
+        first, end, left, right = parts[k, 0], parts[k, 1], parts[k, 2], parts[k, 3]
+        here = Ring(ring.planes, ring.plane_elements, ring.light_plane, ring.rows, ring.stride, ring.margin, left)
+        _spread_part(picture, corners, sums, exact, here, scratch, target, first, end, right)
+
+
+@compiled
+def _spread_part(
     picture: Picture,
     corners: Corners,
     sums: Sums,
@@ -24,10 +36,6 @@ def spread_part(
     end: int,
     right: int,
 ) -> None:
-    """Add the spread light of rows first..end, columns ring.left..right of a picture to the target, whose band holds the rows.
-
-    The ring is empty before and after.
-    """
     reach = ring.margin
     blurred, lit = (end + reach, first - reach - 1), (end + reach, first - reach - 1)
     scratch.sums[:] = 0.0

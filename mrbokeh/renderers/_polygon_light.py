@@ -2,6 +2,8 @@
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -10,6 +12,19 @@ from mrbokeh.errors import InputError
 
 NO_HIGHLIGHTS = np.zeros((0, 0), np.float32)
 _ROWS_AT_ONCE = 24
+_TILES_AT_ONCE = 256
+
+
+class Tiles(NamedTuple):
+    """Which tiles hold light and how many do, the first row of such and the end; the largest diameter; the strongest value of a
+    channel over the mean of its darkest tile that is not empty, the worst of all channels."""
+
+    occupied: Bool[np.ndarray, "rows columns"]
+    lit: int
+    first: int
+    end: int
+    largest_px: float
+    contrast: float
 
 
 @dataclass(frozen=True)
@@ -46,42 +61,38 @@ class SurveyedLight:
         list(pool.map(look, each))
         return cls(values, coc_px, sums, peaks, largest_px, least.min(axis=0), is_full)
 
-    @property
-    def largest_px(self) -> float:
-        largest = float(self.largest_of_tile_px.max(initial=0.0))
-        if not np.isfinite(largest):
+    @cached_property
+    def tiles(self) -> Tiles:
+        from mrbokeh.renderers._polygon_tiles_numba import look_over
+
+        occupied, work = np.empty(self.largest_of_tile_px.shape, np.bool_), np.empty((2, self.sums.shape[2]), np.float32)
+        lit, first, end, largest_px, contrast = look_over(self.sums, self.peaks, self.largest_of_tile_px, occupied, *work)
+        if not largest_px < np.inf:
             raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
-        return largest
+        return Tiles(occupied, lit, first, end, largest_px, contrast)
 
     @property
     def pixels(self) -> int:
         """In tiles that are not empty."""
         from mrbokeh.renderers._polygon_survey_numba import TILE_PX
 
-        return int(np.any(self.sums > 0, axis=2).sum()) * TILE_PX**2
-
-    @property
-    def contrast(self) -> float:
-        """The strongest value of a channel over the mean of its darkest tile that is not empty; the worst of all channels."""
-        from mrbokeh.renderers._polygon_survey_numba import TILE_PX
-
-        darkest = np.where(self.sums > 0, self.sums, np.inf).min(axis=(0, 1)) / TILE_PX**2
-        return float((self.peaks.max(axis=(0, 1)) / darkest).max(initial=0.0))
+        return self.tiles.lit * TILE_PX**2
 
     def highlights(self, from_px: float, pool: Executor) -> Float32[np.ndarray, "_ _"]:
         """How much of each pixel is spread by its exact kernel; empty if there is no highlight."""
-        from mrbokeh.renderers._polygon_survey_numba import HIGHLIGHT, find_highlights
+        from mrbokeh.renderers._polygon_survey_numba import find_highlights
+        from mrbokeh.renderers._polygon_tiles_numba import find_suspects, integrate
 
-        suspect = ((self.peaks > HIGHLIGHT * self.sums).any(axis=2)) & (self.largest_of_tile_px > from_px)
-        if not suspect.any():
+        rows, columns, channels = self.sums.shape
+        suspects = np.empty((self.tiles.lit, 2), np.int64)
+        count = find_suspects(self.sums, self.peaks, self.largest_of_tile_px, from_px, suspects)
+        if count == 0:
             return NO_HIGHLIGHTS
-        integral = np.zeros((suspect.shape[0] + 1, suspect.shape[1] + 1, self.sums.shape[2]))
-        integral[1:, 1:] = self.sums.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)
-        share = np.zeros(self.coc_px.shape, np.float32)
-        tiles = np.argwhere(suspect)
-        pieces = np.array_split(tiles, -(-len(tiles) // 256))
-        list(pool.map(lambda piece: find_highlights(self.values, self.coc_px, piece, integral, from_px, share), pieces))
-        return share if share.any() else NO_HIGHLIGHTS
+        integral, share = np.empty((rows + 1, columns + 1, channels)), np.zeros(self.coc_px.shape, np.float32)
+        integrate(self.sums, integral)
+        pieces = [suspects[first : min(first + _TILES_AT_ONCE, count)] for first in range(0, count, _TILES_AT_ONCE)]
+        found = pool.map(lambda piece: find_highlights(self.values, self.coc_px, piece, integral, from_px, share), pieces)
+        return share if any(list(found)) else NO_HIGHLIGHTS
 
     def group(self, first: int) -> "SurveyedLight":
         """Four channels, the last ones filled up with zeros."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 from mrbokeh.renderers._polygon_aim_numba import CHUNK_PX
+from mrbokeh.renderers._polygon_places_numba import lay_out
 from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, BLOCK_ROWS, GUARD, Corners, Ring, Scratch
 from mrbokeh.renderers._polygon_tables import ApertureTables
 
@@ -18,30 +19,11 @@ def ring_elements(tables: ApertureTables, margin: int, width: int) -> int:
 
 
 def laid_out(tables: ApertureTables, ring: Ring) -> Corners:
-    """Lines count forwards here; crossing 0 of a corner that is turned lies one line on, one step back."""
-    corners, crossed = tables.corners, tables.crossed
-    column_and_row = 4 * np.array([1, ring.stride])
-    steps, places = crossed.steps @ column_and_row, crossed.places @ column_and_row
-    return Corners(
-        slope=corners.slope.astype(ring.planes.dtype),
-        shift=corners.shift.astype(ring.planes.dtype),
-        origin=corners.origin.astype(ring.planes.dtype),
-        curvature=corners.curvature.astype(ring.planes.dtype),
-        before=crossed.before,
-        after=crossed.after,
-        step=np.where(crossed.turned, -steps, steps),
-        turned=crossed.turned.astype(np.float64),
-        plane=crossed.plane * ring.plane_elements - (crossed.turned * steps).sum(axis=1),
-        place=places,
-        below=places.max(axis=1) + 4 * ring.stride,
-        weight=crossed.weight,
-        level=crossed.level,
-        steep=crossed.steep,
-        area=corners.area[0],
-        area_offset=corners.area[1],
-        growth=corners.growth,
-        extent=tables.extent,
-    )
+    """The corners with steps and places for this ring."""
+    crossed, count = tables.crossed, len(tables.crossed.plane)
+    step, place, plane, below = (np.empty(shape, np.int64) for shape in ((count, 2), (count, 4), count, count))
+    lay_out(crossed.steps, crossed.places, crossed.turned, crossed.plane, (ring.stride, ring.plane_elements), (step, place, plane, below))
+    return tables.corners_in(ring.planes.dtype)._replace(step=step, place=place, plane=plane, below=below)
 
 
 def scratch_of(tables: ApertureTables, ring: Ring) -> Scratch:

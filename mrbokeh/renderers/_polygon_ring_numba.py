@@ -74,15 +74,16 @@ class Sums(NamedTuple):
 class Exact(NamedTuple):
     """Kernels that are splatted whole.
 
-    lower, rise: taps of kernels of small diameters, in pairs of neighbours, and what to add to them to reach those of the next
-    level; `per_px` levels to a pixel, from 1 px on, `levels` behind the focus and then as many in front. place (pairs, 2): row,
-    counted from -radius on, and 4 times the column, counted from the pixel. start: with which pair each level begins, and the end.
+    lower, rise: taps of kernels of small diameters, in groups of neighbours, and what to add to them to reach those of the next
+    level; `per_px` levels to a pixel, from 1 px on, `levels` behind the focus and then as many in front. row, column
+    (groups,): counted from -radius on, and 4 times counted from the pixel. start: with which group each level begins, and the end.
     from_px, to_px: between these diameters the sums take over. vertices, starts, weights, unit_radius: the aperture itself.
     """
 
     lower: np.ndarray
     rise: np.ndarray
-    place: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
     start: np.ndarray
     levels: int
     radius: int

@@ -130,13 +130,15 @@ def _raise_diameters(line: np.ndarray, coc_px: np.ndarray, channels: int, larges
 @compiled
 def find_highlights(
     values: np.ndarray, coc_px: np.ndarray, suspects: np.ndarray, integral: np.ndarray, from_px: float, share: np.ndarray
-) -> None:
+) -> bool:
     """Set share (H, W) of the pixels in suspect tiles (row, column): how much of each is spread by its exact kernel.
 
     A pixel's window is the square of four radii around it. integral (tile rows + 1, tile columns + 1, C): of the sums.
     Only smooth functions of what lies in the window count, so that nothing pops and moved pictures give moved results.
+    Returns whether there are any.
     """
     height, width, channels = values.shape
+    is_any = False
     for suspect in range(suspects.shape[0]):
         for y in range(suspects[suspect, 0] * TILE_PX, min((suspects[suspect, 0] + 1) * TILE_PX, height)):
             for x in range(suspects[suspect, 1] * TILE_PX, min((suspects[suspect, 1] + 1) * TILE_PX, width)):
@@ -146,6 +148,8 @@ def find_highlights(
                         if values[y, x, c] != 0:
                             ratio = max(ratio, _share_of_window(values, integral, y, x, c, int(abs(coc_px[y, x]))))
                     share[y, x] = min(max(ratio / HIGHLIGHT - 1.0, 0.0), 1.0)
+                    is_any = is_any or share[y, x] > 0
+    return is_any
 
 
 @compiled
@@ -166,30 +170,3 @@ def _share_of_window(values: np.ndarray, integral: np.ndarray, y: int, x: int, c
         for i in range(left, right):
             total += abs(values[j, i, c])
     return float(value / total)
-
-
-@compiled
-def find_parts(occupied: np.ndarray, rows: tuple[int, int], width: int, step: int, margin: int, parts: np.ndarray) -> int:
-    """Set parts (N, 4) to the first and end row, first and end column, in pixels, of what holds light; how many there are.
-
-    occupied: tiles. rows: first and end. Each column of `step` pixels is cut where nothing is for more than two margins.
-    """
-    count = 0
-    for start in range(0, width, step):
-        end, before, last = min(start + step, width), count, -1
-        for row in range(rows[0] // TILE_PX, -(-rows[1] // TILE_PX)):
-            first_tile, end_tile = width, 0
-            for column in range(start // TILE_PX, -(-end // TILE_PX)):
-                if occupied[row, column]:
-                    first_tile, end_tile = min(first_tile, column), column + 1
-            if end_tile == 0:
-                continue
-            if last < 0 or (row - last) * TILE_PX > 2 * margin:
-                parts[count, 0], parts[count, 2], parts[count, 3] = row, first_tile, end_tile
-                count += 1
-            parts[count - 1, 1], last = row + 1, row
-            parts[count - 1, 2], parts[count - 1, 3] = min(parts[count - 1, 2], first_tile), max(parts[count - 1, 3], end_tile)
-        for i in range(before, count):
-            parts[i, 0], parts[i, 1] = max(parts[i, 0] * TILE_PX, rows[0]), min(parts[i, 1] * TILE_PX, rows[1])
-            parts[i, 2], parts[i, 3] = max(parts[i, 2] * TILE_PX, start), min(parts[i, 3] * TILE_PX, end)
-    return count

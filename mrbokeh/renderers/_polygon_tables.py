@@ -1,7 +1,6 @@
 """Tables of polygon_differences: what depends on the aperture alone."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,84 +8,15 @@ import numpy as np
 from mrbokeh.aperture import Aperture
 from mrbokeh.directional_differences import Direction, PolygonCorners, edge_profile, polygon_corners
 from mrbokeh.polygon_rectification import rectify_aperture
-from mrbokeh.renderers._polygon_ring_numba import SPARE_PX, Exact, Sums
+from mrbokeh.renderers._polygon_crossings import CrossedCorners, crossed_corners, pair_of
+from mrbokeh.renderers._polygon_ring_numba import SPARE_PX, Corners, Exact, Sums
 from mrbokeh.renderers._polygon_whole import whole_kernels
+from mrbokeh.renderers._vectors_numba import BLENDED_CELLS
 
 EDGE_STEPS = 0.75
 """By default the sums take over where the shortest edge of the outline is this many lattice steps long, ..."""
 EXACT_BELOW_PX = (8.0, 16.0)
 """... but not at smaller or larger diameters than these: the first are cheaper whole, and from the second on 5 times dearer."""
-
-
-@dataclass(frozen=True)
-class CrossedCorner:
-    """A corner whose four crossings lie at 0, step, step_after and their sum, lattice points in (x, y).
-
-    turned, turned_after: whether the two lines of that edge count backwards, from the one farther along its step.
-    """
-
-    before: int
-    after: int
-    step: Direction
-    step_after: Direction
-    plane: int
-    weight: float
-    turned: bool = False
-    turned_after: bool = False
-
-    @property
-    def kind(self) -> int:
-        """0: crossings 0 and 1 are neighbours in a row, as are 2 and 3; 1: crossings 1 and 2 are; 2: none are."""
-        if self.step == (1, 0):
-            return 0
-        return 1 if (self.step_after[0] - self.step[0], self.step_after[1] - self.step[1]) == (1, 0) else 2
-
-    @property
-    def variants(self) -> "Iterator[CrossedCorner]":
-        """The same corner with its edges named the other way round, and with lines counted backwards."""
-        other = replace(self, before=self.after, after=self.before, step=self.step_after, step_after=self.step)
-        for corner in (self, other):
-            step, step_after = ((-x, -y) for x, y in (corner.step, corner.step_after))
-            yield corner
-            yield replace(corner, step=step, turned=True)
-            yield replace(corner, step_after=step_after, turned_after=True)
-            yield replace(corner, step=step, turned=True, step_after=step_after, turned_after=True)
-
-    @property
-    def places(self) -> list[Direction]:
-        """The crossings, in pairs as their weights are stored."""
-        both = self.step[0] + self.step_after[0], self.step[1] + self.step_after[1]
-        return [(0, 0), self.step, self.step_after, both] if self.kind == 0 else [self.step, self.step_after, (0, 0), both]
-
-
-@dataclass(frozen=True)
-class CrossedCorners:
-    """CrossedCorner by CrossedCorner in arrays: steps (corners, 2, 2) and places (corners, 4, 2) in (x, y), turned (corners, 2);
-    those of kind 0 come first, up to `level`, then those of kind 1, up to `steep`."""
-
-    before: np.ndarray
-    after: np.ndarray
-    steps: np.ndarray
-    places: np.ndarray
-    plane: np.ndarray
-    weight: np.ndarray
-    turned: np.ndarray
-    level: int
-    steep: int
-
-    @classmethod
-    def of(cls, corners: list[CrossedCorner]) -> "CrossedCorners":
-        return cls(
-            before=_whole([corner.before for corner in corners]),
-            after=_whole([corner.after for corner in corners]),
-            steps=_whole([(corner.step, corner.step_after) for corner in corners]),
-            places=_whole([corner.places for corner in corners]),
-            plane=_whole([corner.plane for corner in corners]),
-            weight=np.array([corner.weight for corner in corners]),
-            turned=np.array([(corner.turned, corner.turned_after) for corner in corners]),
-            level=sum(corner.kind == 0 for corner in corners),
-            steep=sum(corner.kind <= 1 for corner in corners),
-        )
 
 
 @dataclass(frozen=True)
@@ -103,11 +33,38 @@ class ApertureTables:
     sums: Sums
     exact: Exact
     extent: float
+    _laid: dict[np.dtype, Corners] = field(default_factory=dict, repr=False, compare=False)
+
+    def corners_in(self, dtype: np.dtype) -> Corners:
+        """In a ring's precision, without steps and places, which depend on the ring."""
+        if dtype not in self._laid:
+            nowhere, corners, crossed = np.empty(0, np.int64), self.corners, self.crossed
+            self._laid[dtype] = Corners(
+                slope=corners.slope.astype(dtype),
+                shift=corners.shift.astype(dtype),
+                origin=corners.origin.astype(dtype),
+                curvature=corners.curvature.astype(dtype),
+                before=crossed.before,
+                after=crossed.after,
+                step=nowhere,
+                turned=crossed.turned.astype(np.float64),
+                plane=nowhere,
+                place=nowhere,
+                below=nowhere,
+                weight=crossed.weight,
+                level=crossed.level,
+                steep=crossed.steep,
+                area=corners.area[0],
+                area_offset=corners.area[1],
+                growth=corners.growth,
+                extent=self.extent,
+            )
+        return self._laid[dtype]
 
     def margin_px(self, largest_px: float) -> int:
         """How far the light of a pixel of this diameter is splatted, at most."""
         grown = np.sqrt(0.25 * largest_px**2 + max(self.corners.growth, 0.0))
-        return max(int(np.ceil(grown * self.extent)) + SPARE_PX, self.exact.radius + 1)
+        return max(int(np.ceil(grown * self.extent)) + SPARE_PX, self.exact.radius + BLENDED_CELLS)
 
 
 def tables_of(aperture: Aperture, directions: tuple[Direction, ...], max_edges: int, exact_below_px: float | None) -> ApertureTables:
@@ -115,31 +72,13 @@ def tables_of(aperture: Aperture, directions: tuple[Direction, ...], max_edges: 
     corners = polygon_corners(rectified, directions)
     planes: dict[tuple[Direction, Direction], int] = {}
     for before, after in zip(corners.before, corners.after, strict=True):
-        planes.setdefault(_pair(corners, before, after), len(planes))
+        planes.setdefault(pair_of(corners, before, after), len(planes))
     if exact_below_px is None:
         exact_below_px = float(np.clip(2.0 * EDGE_STEPS / corners.shortest, *EXACT_BELOW_PX))
     exact = whole_kernels(aperture, exact_below_px)
     return ApertureTables(
-        corners, _crossed(corners, planes), planes, _sums(planes), exact, max(aperture.unit_radius, rectified.unit_radius)
+        corners, crossed_corners(corners, planes), planes, _sums(planes), exact, max(aperture.unit_radius, rectified.unit_radius)
     )
-
-
-def _crossed(corners: PolygonCorners, planes: dict[tuple[Direction, Direction], int]) -> CrossedCorners:
-    """Corners with as many neighbouring crossings as they have, the best kinds first."""
-    found = []
-    for before, after, weight in zip(corners.before, corners.after, corners.weight, strict=True):
-        first, second = corners.direction[before], corners.direction[after]
-        det = int(first[0] * second[1] - first[1] * second[0])
-        step, step_after = (det * second[0], det * second[1]), (-det * first[0], -det * first[1])
-        pair = _pair(corners, before, after)
-        corner = CrossedCorner(before, after, step, step_after, planes[pair], weight if pair == (first, second) else -weight)
-        found.append(min(corner.variants, key=lambda each: each.kind))
-    return CrossedCorners.of(sorted(found, key=lambda corner: corner.kind))
-
-
-def _pair(corners: PolygonCorners, before: int, after: int) -> tuple[Direction, Direction]:
-    first, second = sorted((corners.direction[before], corners.direction[after]))
-    return first, second
 
 
 def _sums(planes: dict[tuple[Direction, Direction], int]) -> Sums:

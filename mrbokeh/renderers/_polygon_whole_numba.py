@@ -6,7 +6,7 @@ import numpy as np
 
 from mrbokeh._polygon_coverage_numba import fill_psf
 from mrbokeh.renderers._polygon_ring_numba import ALIASED_ROWS, APART_PX, Exact, Ring, Scratch, compiled
-from mrbokeh.renderers._vectors_numba import add_to_cell, add_to_two_cells, blend_onto_two_cells, scaled
+from mrbokeh.renderers._vectors_numba import BLENDED_CELLS, add_to_cell, add_to_two_cells, blend_onto_cells, scaled
 
 
 @compiled
@@ -27,13 +27,13 @@ def keep(values: np.ndarray, ring: Ring, row: int, y: int, x: int) -> None:
 @compiled
 def splat_small(values: np.ndarray, coc_px: np.ndarray, exact: Exact, ring: Ring, scratch: Scratch, row: int, y: int, count: int) -> None:
     """The pixels of row y that scratch.small names, each the share of its light in scratch.small_share, by whole kernels."""
-    plane = ring.light_plane * ring.plane_elements
+    plane, flat = ring.light_plane * ring.plane_elements, values.reshape(-1)
     for j in range(scratch.rows.shape[0]):
         scratch.rows[j] = plane + _cell(ring, row + j - exact.radius, 0)
     for start in range(min(APART_PX, count)):
         for i in range(start, count, APART_PX):
             x = np.int64(scratch.small[i])
-            value = scaled(values.reshape(-1), 4 * (y * values.shape[1] + x), ring.planes.dtype.type(scratch.small_share[i]))
+            value = scaled(flat, 4 * (y * values.shape[1] + x), ring.planes.dtype.type(scratch.small_share[i]))
             _splat_small(coc_px[y, x], exact, ring, scratch.rows, 4 * x, value)
 
 
@@ -46,9 +46,9 @@ def _splat_small(
     level = min(int(at), exact.levels - 1)
     upper = at - np.float32(level)
     table = level if diameter_px > 0 else level + exact.levels
-    for pair in range(exact.start[table], exact.start[table + 1]):
-        cell = rows[exact.place[pair, 0]] + exact.place[pair, 1] + element
-        blend_onto_two_cells(ring.planes, cell, exact.lower, exact.rise, 2 * pair, upper, value)
+    for group in range(np.uint64(exact.start[table]), np.uint64(exact.start[table + 1])):
+        cell = rows[exact.row[group]] + exact.column[group] + element
+        blend_onto_cells(ring.planes, cell, exact.lower, exact.rise, BLENDED_CELLS * group, upper, value)
 
 
 @compiled

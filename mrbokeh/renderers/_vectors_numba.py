@@ -94,9 +94,12 @@ def _scaled(typing_context: Any, values: Any, at: Any, gain: Any) -> Lowering:
     return signature, generate
 
 
+BLENDED_CELLS = 4
+
+
 @intrinsic
-def _blend_onto_two_cells(typing_context: Any, array: Any, at: Any, lower: Any, rise: Any, first: Any, upper: Any, value: Any) -> Lowering:
-    """Neighbouring cells: array[at + 4 k : at + 4 k + 4] += (lower[first + k] + upper * rise[first + k]) * value for k = 0, 1.
+def _blend_onto_cells(typing_context: Any, array: Any, at: Any, lower: Any, rise: Any, first: Any, upper: Any, value: Any) -> Lowering:
+    """BLENDED_CELLS neighbouring cells: array[at + 4 k : at + 4 k + 4] += (lower[first + k] + upper * rise[first + k]) * value.
 
     lower, rise: flat, single precision, as `upper` is; for the rest see `_adding_to`.
     """
@@ -104,11 +107,12 @@ def _blend_onto_two_cells(typing_context: Any, array: Any, at: Any, lower: Any, 
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
         data, lower, rise = (data_of(context, builder, signature.args[k], arguments[k]) for k in (0, 2, 3))
-        low, more = (load_vector(builder, each, arguments[4], ir.FloatType(), 2, 4) for each in (lower, rise))
-        weights = builder.fadd(low, builder.fmul(filled(builder, arguments[5], 2), more, flags=("contract",)), flags=("contract",))
+        low, more = (load_vector(builder, each, arguments[4], ir.FloatType(), BLENDED_CELLS, 4) for each in (lower, rise))
+        added = builder.fmul(filled(builder, arguments[5], BLENDED_CELLS), more, flags=("contract",))
+        weights = builder.fadd(low, added, flags=("contract",))
         real = context.get_value_type(array.dtype)
         if real != ir.FloatType():
-            weights = builder.fpext(weights, ir.VectorType(real, 2))
+            weights = builder.fpext(weights, ir.VectorType(real, BLENDED_CELLS))
         _add_weighted(builder, data, arguments[1], weights, arguments[6], array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
@@ -144,7 +148,7 @@ def _one_by_one(typing_context: Any) -> Lowering:
 # Compiled code calls them without the typing context, which type checkers cannot know.
 add_to_cell: Any = _adding_to(1)
 add_to_two_cells: Any = _adding_to(2)
-blend_onto_two_cells: Any = _blend_onto_two_cells
+blend_onto_cells: Any = _blend_onto_cells
 scaled: Any = _scaled
 fetch: Any = _fetch
 one_by_one: Any = _one_by_one

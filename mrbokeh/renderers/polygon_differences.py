@@ -120,12 +120,12 @@ class PolygonDifferences:
         threads = self.threads or cores()
         with workers(coc_px.size, threads) as pool:
             light = SurveyedLight.of(values, coc_px, pool)
-            if light.largest_px <= 1.0:
+            if light.tiles.largest_px <= 1.0:
                 return values.copy()
             tables = self.tables_of(aperture)
             share = light.highlights(tables.exact.from_px, pool) if self.exact_highlights else NO_HIGHLIGHTS
             double = self.precision == "double" or (
-                self.precision == "auto" and light.contrast * light.pixels**0.5 > _SINGLE_PRECISION * 2e6**0.5
+                self.precision == "auto" and light.tiles.contrast * light.pixels**0.5 > _SINGLE_PRECISION * 2e6**0.5
             )
             dtype = np.float64 if double else np.float32
             workshop = Workshop(tables, dtype, pool, threads, self._memory, self.halve_from_px)
