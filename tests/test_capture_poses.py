@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from capture.commands import poses
-from capture.views import colmap_process
+from capture.views import colmap, colmap_process
 from capture.views.colmap import PoseSettings, find_picture_poses, find_scene_poses
 from capture.views.colmap_job import ColmapJob, ColmapPicture, camera_model_for, job_from_json, job_to_json
 from capture.views.colmap_matches import failure_message, median_parallax_deg, weak_model_message
@@ -19,7 +19,7 @@ from capture.views.colmap_pictures import common_exposure_stops, picture_cameras
 from capture.views.colmap_process import run_colmap
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import write_sparse_model
-from mrbokeh.atomic_files import write_json
+from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError, MissingExtraError
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
@@ -77,6 +77,20 @@ def test_two_terms_of_distortion_need_five_pictures_of_a_camera() -> None:
     assert camera_model_for([0], "RADIAL") == "RADIAL"
 
 
+@pytest.mark.parametrize(("asked", "fewest_terms"), [("auto", True), ("SIMPLE_RADIAL", False)])
+def test_terms_of_distortion_that_were_asked_for_are_not_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: str, fewest_terms: bool
+) -> None:
+    for name in ("a", "b"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((30, 40, 3), np.uint8))
+    nothing_found = {"pictures": 2, "pairs": 1, "good_pairs": 0, "forward": 0.0, "low_parallax": 0.0}
+    monkeypatch.setattr(colmap, "run_colmap", lambda *_: nothing_found)
+    with pytest.raises(InputError, match="0 of 1 pairs"):
+        find_picture_poses(tmp_path, tmp_path / "out", PoseSettings(camera_model=asked))
+    job = job_from_json(read_json(tmp_path / "out" / "colmap_job.json", "the job"))
+    assert (job.camera_model, job.fewest_terms) == ("SIMPLE_RADIAL", fewest_terms)
+
+
 def test_pictures_of_all_views_have_one_exposure(tmp_path: Path) -> None:
     """Half of the pixels at 0.02 and half at 0.08: the median of all, 0.05, becomes 0.18, by log2(3.6) stops."""
     stacks = [stack_in(tmp_path / "a", 0.02), stack_in(tmp_path / "b", 0.08)]
@@ -92,7 +106,7 @@ def test_pictures_of_all_views_have_one_exposure(tmp_path: Path) -> None:
 def test_jobs_survive_json_and_know_what_features_depend_on() -> None:
     job = ColmapJob((ColmapPicture("a", "a.png", "00", 0),), ((100.0, 32.0, 24.0),))
     assert job_from_json(job_to_json(job)) == job
-    assert replace(job, mapper="global", threads=2).features_key() == job.features_key()
+    assert replace(job, mapper="global", threads=2, fewest_terms=False).features_key() == job.features_key()
     assert replace(job, seed=1).features_key() != job.features_key()
 
 

@@ -81,7 +81,8 @@ def find_picture_poses(images: Path | str, out: Path | str, settings: PoseSettin
 def _common(settings: PoseSettings, cameras: Sequence[int]) -> dict[str, Any]:
     names = ("mapper", "max_image_size_px", "seed", "threads")
     common = {name: getattr(settings, name) for name in names}
-    return common | {"camera_model": camera_model_for(cameras, settings.camera_model)}
+    chosen = camera_model_for(cameras, settings.camera_model)
+    return common | {"camera_model": chosen, "fewest_terms": settings.camera_model == "auto"}
 
 
 def _kept(folder: Path, settings: PoseSettings) -> bool:

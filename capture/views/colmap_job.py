@@ -26,6 +26,7 @@ class ColmapPicture:
 class ColmapJob:
     """Pictures, cameras and settings.
 
+    fewest_terms: leave out terms of distortion that the pictures do not bear out, once the poses are found.
     cameras: for each camera the prior (focal length, principal point x, y) in px of the pictures, or None to take what the
       files' Exif tells.
     pictures_folder: of the pictures, relative to the folder of the reconstruction or absolute.
@@ -35,6 +36,7 @@ class ColmapJob:
     cameras: tuple[tuple[float, float, float] | None, ...]
     pictures_folder: str = "images"
     camera_model: str = "RADIAL"
+    fewest_terms: bool = True
     mapper: str = "incremental"
     max_image_size_px: int = 1600
     seed: int = 0
@@ -47,7 +49,7 @@ class ColmapJob:
     def features_key(self) -> dict[str, Any]:
         """What the features and matches depend on: where it differs, the database is of no use."""
         document = job_to_json(self)
-        return {key: value for key, value in document.items() if key not in ("mapper", "threads")}
+        return {key: value for key, value in document.items() if key not in ("mapper", "threads", "fewest_terms")}
 
 
 def job_to_json(job: ColmapJob) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def _view(name: str, image: Any) -> SparseView:
 
 
 def _camera(camera: Any, pose: np.ndarray) -> tuple[Camera, Distortion]:
-    """SIMPLE_RADIAL has f, cx, cy, k; RADIAL f, cx, cy, k1, k2. COLMAP's pixel centres lie where ours do."""
+    """SIMPLE_PINHOLE has f, cx, cy; SIMPLE_RADIAL also k; RADIAL k1, k2. COLMAP's pixel centres lie where ours do."""
     focal, cx, cy, *terms = (float(value) for value in camera.params)
-    k1, k2 = (*terms, 0.0)[:2]
+    k1, k2 = (*terms, 0.0, 0.0)[:2]
     return Camera(camera.width, camera.height, (focal, focal), (cx, cy), pose), (k1, k2)

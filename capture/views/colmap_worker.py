@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pycolmap
 
 from capture.views.colmap_job import ColmapJob, job_from_json
 from capture.views.colmap_matches import match_statistics
 from capture.views.colmap_model import sparse_model_of
+from capture.views.robust_adjustment import adjusted
 from capture.views.sparse_model_file import write_sparse_model
 from mrbokeh.atomic_files import read_json
 
@@ -27,9 +27,6 @@ MODEL_FOLDER = "sparse"
 
 _FEWEST_VIEWS = 2
 _PAIRS_AT_ONCE = 40
-_CAUCHY_95 = 2.385
-_MEDIAN_OF_RAYLEIGH = 1.1774  # of the length of an error whose two parts are normal with a deviation of 1
-_LEAST_LOSS_SCALE_PX = 0.05
 
 
 def run_job(folder: Path) -> None:
@@ -43,7 +40,7 @@ def run_job(folder: Path) -> None:
         _tell(failure=match_statistics(folder / DATABASE_NAME))
         return
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    refine_robustly(largest)
+    largest = adjusted(largest, job.fewest_terms)
     largest.write(str(folder / MODEL_FOLDER))
     write_sparse_model(folder, sparse_model_of(largest, job.pictures))
     _tell(stage="done", done=largest.num_reg_images(), total=len(job.pictures))
@@ -132,22 +129,6 @@ def find_models(folder: Path, job: ColmapJob) -> dict[int, Any]:
     shutil.rmtree(output)
     output.mkdir()
     return dict(models)
-
-
-def refine_robustly(model: Any) -> None:
-    """Bundle adjustment with Cauchy's loss, 95 % efficient for normal errors: 2.385 sigma (Holland and Welsch 1977).
-
-    COLMAP's own last adjustment is least squares over all matches within 4 px, in which a few wrong ones outweigh thousands of
-    good ones at 0.06 px: it left the focal length of a traced scene 0.25 % off, this leaves 0.01 %.
-    """
-    sigma_px = float(np.median([point.error for point in model.points3D.values()])) / _MEDIAN_OF_RAYLEIGH
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = max(_CAUCHY_95 * sigma_px, _LEAST_LOSS_SCALE_PX)
-    solver = options.ceres.solver_options
-    solver.num_threads, solver.max_num_iterations, solver.function_tolerance = 1, 300, 1e-7
-    pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()
 
 
 def _tell(**message: Any) -> None:
