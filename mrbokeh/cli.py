@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.interrupts import INTERRUPTED
 
 # Where a module can be missing because its extra was not installed.
 EXTRA_OF_MODULE = {
@@ -28,10 +29,6 @@ EXTRA_OF_MODULE = {
     "onnxscript": "train",
     "aiohttp": "viewfinder",
 }
-
-
-INTERRUPTED = 130
-"""Exit code of what was stopped by Ctrl-C, as shells have it."""
 
 
 class SubCommand(NamedTuple):

@@ -1,5 +1,7 @@
-"""Pictures and layers to and from scene-linear float32: HDR as it is, EXR from the primaries that it states, PNG, TIFF and JPEG
+"""Pictures and layers to and from scene-linear float32: HDR as it is, EXR from the primaries that it states, PNG, TIFF, JPEG and WebP
 through a stated encoding.
+
+WebP is read only: it keeps 8 bits, mostly lossily. HEIC is not read: what decodes it from Python brings x265 (GPL) or must be built.
 
 Files are written without stating primaries: EXR takes Rec.709 where none are stated, and kernels and maps of numbers have none.
 """
@@ -16,12 +18,19 @@ from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.exr_primaries import in_rec709, stated_primaries
 from mrbokeh.layer import Layer
+from mrbokeh.png_chunks import without_chatter
+from mrbokeh.quiet_opencv import quiet_opencv
 from mrbokeh.sound_values import require_depth_ahead
 from mrbokeh.srgb_codes import srgb_codes
 
 Encoding = Literal["srgb", "linear"]
 
 INTEGER_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+"""Of what is read and written; the others are read only."""
+ENCODED_SUFFIXES = (*INTEGER_SUFFIXES, ".webp")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+HEIF_ADVICE = "HEIC is not read: convert it to PNG or TIFF of 16 bits, or to JPEG"
+_HEIF_BY = "by `heif-convert IN.heic OUT.png` (libheif), `magick IN.heic OUT.png`, or on a Mac `sips -s format jpeg IN.heic --out OUT.jpg`"
 LINEAR_SUFFIXES = (".exr", ".hdr")
 _DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z")
 _LONE_DEPTH_NAMES = (*_DEPTH_NAMES, "Y")
@@ -31,7 +40,7 @@ _INTEGER_RANGE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
     """A picture as scene-linear Rec.709 (H, W, 3); transparent pictures lose their alpha (see `read_layer`).
 
-    encoding: what the numbers of an integer file (PNG, TIFF, JPEG) mean; EXR, HDR and float TIFF are linear already. EXR of other
+    encoding: what the numbers of an integer file (PNG, TIFF, JPEG, WebP) mean; EXR, HDR and float TIFF are linear already. EXR of other
     primaries (ACES, the camera RGB of focal stacks) is converted; `read_camera_rgb` gives what is stored.
     """
     return _read_rgba(Path(path), encoding)[..., :3]
@@ -59,7 +68,7 @@ def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR fi
     instead: what the error advises then.
     """
     path = Path(path)
-    if path.is_file() and path.suffix.lower() in INTEGER_SUFFIXES and _decode(path).dtype.kind != "f":
+    if path.is_file() and path.suffix.lower() in ENCODED_SUFFIXES and _decode(path).dtype.kind != "f":
         raise InputError(
             f"{path}: expected scene-linear values (EXR, HDR or float TIFF), but it stores {_decode(path).dtype} made for display, without "
             f"highlights: {instead}"
@@ -123,9 +132,11 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
     if suffix == ".exr":
         layer = read_layer(path)
         return np.dstack([layer.rgb, layer.alpha])
-    if suffix not in INTEGER_SUFFIXES + LINEAR_SUFFIXES:
+    if suffix in HEIF_SUFFIXES:
+        raise InputError(f"{path}: {HEIF_ADVICE}, such as {_HEIF_BY}")
+    if suffix not in ENCODED_SUFFIXES + LINEAR_SUFFIXES:
         raise InputError(
-            f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}"
+            f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + ENCODED_SUFFIXES)}, not {suffix or 'a file without suffix'}"
         )
     pixels = _decode(path)
     if pixels.dtype.kind == "f":
@@ -140,7 +151,7 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
 
 
 def stored_pixels(path: Path) -> np.ndarray:
-    """The numbers of a PNG, TIFF, JPEG or HDR file as they are stored: (H, W) or (H, W, 3 or 4) with blue first.
+    """The numbers of a PNG, TIFF, JPEG, WebP or HDR file as they are stored: (H, W) or (H, W, 3 or 4) with blue first.
 
     Raises InputError where the file is empty or damaged.
     """
@@ -149,7 +160,9 @@ def stored_pixels(path: Path) -> np.ndarray:
     data = np.fromfile(path, np.uint8)
     if not data.size:
         raise InputError(f"{path} is empty: copy or render it again")
-    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    sound = without_chatter(data)
+    with quiet_opencv():
+        pixels = None if sound is None else cv2.imdecode(sound, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f"{path} cannot be read as a picture: it is damaged or not what its suffix says")
     return np.asarray(pixels)

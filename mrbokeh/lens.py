@@ -20,6 +20,8 @@ class Lens:
       normal of the sensor through the lens); inf is allowed.
     tilt_rad: (x, y), how far the lens's axis leans from the camera's to the right and downwards, as on a tilt lens or a
       view camera; the sensor stays. With (0, y > 0) what is lower in the picture is in focus nearer to the camera.
+    sensor_width_mm: along the rows of the picture; sensor_height_mm: the other side, which nothing is computed from: it says which
+      way up the sensor is meant, for photographs taken the other way up (`mrbokeh.held_lens`), or None.
     petzval_radius_mm: radius of curvature of the surface in focus; positive bends it towards the camera away from the axis
       (as an uncorrected lens does, about 1.5 focal lengths), negative away from it, inf is flat.
     """
@@ -31,6 +33,7 @@ class Lens:
     aperture: Aperture = field(default_factory=Aperture.disc)
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     petzval_radius_mm: float = float("inf")
+    sensor_height_mm: float | None = None
 
     def __post_init__(self) -> None:
         sizes = (self.focal_length_mm, self.f_number, self.sensor_width_mm)
@@ -39,6 +42,8 @@ class Lens:
                 f"a lens needs positive focal_length_mm, f_number and sensor_width_mm, but came with "
                 f"{self.focal_length_mm}, {self.f_number}, {self.sensor_width_mm}"
             )
+        if self.sensor_height_mm is not None and not 0.0 < self.sensor_height_mm < np.inf:
+            raise InputError(f"sensor_height_mm must be a positive length or left out, got {self.sensor_height_mm}")
         if not self.focus_distance_m * MM_PER_M > self.focal_length_mm:
             raise InputError(
                 f"a lens of {self.focal_length_mm} mm cannot focus at {self.focus_distance_m} m: "

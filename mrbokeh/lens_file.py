@@ -6,7 +6,10 @@
                   "levels": 1, "points": [[0, 0], [1, 0], [0, 1]], "path": "M0 0 L1 0 L0 1 Z", "squeeze": 1.0, "cat_eye": 0.0,
                   "spherical_aberration": 0.0, "axial_chromatic": [0, 0, 0], "lateral_chromatic": [0, 0, 0]}}
 
-focus_distance_m null is infinity, petzval_radius_mm null a flat field. The aperture's shape is one of
+focus_distance_m null is infinity, petzval_radius_mm null a flat field. sensor_width_mm is that of the camera held level, as data
+sheets have it; where EXIF turned a photograph upright, the lens is turned with it (`mrbokeh.held_lens`). "sensor_height_mm" may be
+stated too: then the longer side lies along the longer side of any photograph, and 24 by 36 mm is a lens described for upright ones.
+The aperture's shape is one of
     disc      round
     polygon   blades, curvature
     ring      inner
@@ -34,7 +37,7 @@ from mrbokeh.lens_file_values import Values, read_transmission
 FORMAT = "mrbokeh-lens"
 VERSION = 1
 
-_OPTIONAL = {"format", "version", "tilt_deg", "petzval_radius_mm"}
+_OPTIONAL = {"format", "version", "sensor_height_mm", "tilt_deg", "petzval_radius_mm"}
 _REQUIRED = {"focal_length_mm", "f_number", "focus_distance_m", "sensor_width_mm", "aperture"}
 _MODIFIERS = {"cat_eye", "spherical_aberration", "axial_chromatic", "lateral_chromatic"}
 _OF_SHAPES = {"shape", "blades", "curvature", "rotation_deg", "inner", "image", "levels", "points", "path", "squeeze"}
@@ -61,6 +64,8 @@ def lens_to_json(lens: Lens) -> dict[str, Any]:
         "focus_distance_m": None if np.isinf(lens.focus_distance_m) else lens.focus_distance_m,
         "sensor_width_mm": lens.sensor_width_mm,
     }
+    if lens.sensor_height_mm is not None:
+        document["sensor_height_mm"] = lens.sensor_height_mm
     if any(lens.tilt_rad):
         document["tilt_deg"] = np.degrees(lens.tilt_rad).tolist()
     if np.isfinite(lens.petzval_radius_mm):
@@ -83,6 +88,7 @@ def lens_from_json(document: dict[str, Any], where: str = "lens", folder: Path |
             _aperture_from_json(document["aperture"], where, Path(folder)),
             (float(np.radians(tilt_x_deg)), float(np.radians(tilt_y_deg))),
             values.number("petzval_radius_mm", default=np.inf, null=np.inf),
+            None if document.get("sensor_height_mm") is None else values.number("sensor_height_mm"),
         )
     except InputError as error:
         raise error if str(error).startswith(where) else InputError(f"{where}: {error}") from None

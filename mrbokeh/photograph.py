@@ -4,6 +4,7 @@ RAW files are developed by the package `capture`, which is found by its name as 
 extra of that name; so does the metadata of JPEG and TIFF. Without it a picture that is no RAW is read, and tells nothing.
 """
 
+import logging
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +15,7 @@ from jaxtyping import Float32
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
 
+_log = logging.getLogger(__name__)
 _READER = "capture.photos.photograph"
 
 
@@ -21,7 +23,8 @@ _READER = "capture.photos.photograph"
 class Photograph:
     """rgb: (H, W, 3) linear Rec.709, upright. None is what the file does not tell.
 
-    sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens.
+    sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens. quarter_turns: counter-clockwise, that brought
+    the stored picture upright. cut_from_px: width and height of the whole that this is a part of, or None where it is the whole.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -31,6 +34,8 @@ class Photograph:
     sensor_width_mm: float | None = None
     exposure_time_s: float | None = None
     iso: float | None = None
+    quarter_turns: int = 0
+    cut_from_px: tuple[int, int] | None = None
 
     def lens(self, path: Path, focus_m: float | None = None) -> Lens:
         """The lens with a round opening. focus_m takes the place of the file's own focus. Raises InputError where parts are unknown."""
@@ -47,9 +52,23 @@ class Photograph:
                 f"{path} does not tell its lens (unknown: {', '.join(missing)}): give --lens LENS.json (see `mrbokeh lens new`)"
                 + (" or --focus METRES" if missing == ["focus distance"] else "")
             )
+        if self.cut_from_px is not None:
+            _log.warning(
+                f"{self.cut_told(path)}: {self.sensor_width_mm:.3g} mm of the sensor are taken along its width; if it was made smaller "
+                f"too, give --lens with the sensor width of what is left"
+            )
         return Lens(self.focal_length_mm, self.f_number, focus, self.sensor_width_mm)
+
+    def cut_told(self, path: Path) -> str:
+        """In words, of a picture that is not the whole; its middle is taken to be that of the whole."""
+        assert self.cut_from_px is not None
+        height_px, width_px = self.rgb.shape[:2]
+        return f"{path} of {width_px}x{height_px} px was cut out of {self.cut_from_px[0]}x{self.cut_from_px[1]} px, as its EXIF tells"
 
 
 def read_photograph(path: Path | str) -> Photograph:
-    """A RAW file, JPEG, TIFF, PNG, EXR or HDR. Raises InputError where it cannot be read, MissingExtraError for RAW without the extra."""
+    """A RAW file, JPEG, TIFF, PNG, WebP, EXR or HDR.
+
+    Raises InputError where it cannot be read, MissingExtraError for RAW without the extra.
+    """
     return import_module(_READER).read_photograph(Path(path))

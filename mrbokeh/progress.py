@@ -1,18 +1,75 @@
-"""Progress bars with the time left, the same everywhere; silent where nobody watches (no terminal)."""
+"""Progress with the time left, the same everywhere: bars on a terminal, else a plain line now and then, as it suits a log."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import TypeVar
+from datetime import timedelta
+from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 Item = TypeVar("Item")
+
+LINE_EVERY_S, LINE_EVERY_SHARE = 10.0, 0.05
+"""The longer of the two, the second of the time so far: a night of training is no thousand lines."""
+WORTH_A_LINE_S = 2.0
+"""What took less ends without a line: a command that is done at once leaves no log of its parts."""
+
+
+class PlainLines(Progress):
+    """Rich's tasks, told in lines: the first after LINE_EVERY_S, the last where a task is complete or the block ends."""
+
+    def __init__(self, console: Console, **settings: Any) -> None:
+        super().__init__(console=console, auto_refresh=False, **settings)
+        self._told: dict[TaskID, tuple[float, float]] = {}
+        self._ended: set[TaskID] = set()
+
+    def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
+        task = super().add_task(description, *args, **fields)
+        self._told[task] = self.get_time(), -1.0
+        return task
+
+    def advance(self, task_id: TaskID, advance: int | float = 1) -> None:
+        super().advance(task_id, advance)
+        self._tell(task_id)
+
+    def update(self, task_id: TaskID, **changed: Any) -> None:
+        super().update(task_id, **changed)
+        self._tell(task_id)
+
+    def start(self) -> None:
+        """Nothing is drawn."""
+
+    def stop(self) -> None:
+        for task in self.task_ids:
+            self._tell(task, last=True)
+
+    def _tell(self, task_id: TaskID, last: bool = False) -> None:
+        with self._lock:
+            task, now, (told_at, told) = self._tasks[task_id], self.get_time(), self._told[task_id]
+            began = now if task.start_time is None else task.start_time
+            due = now - told_at >= max(LINE_EVERY_S, LINE_EVERY_SHARE * (now - began))
+            # Where nobody knows the end, rich calls everything finished.
+            ended = last or (bool(task.total) and task.finished and task_id not in self._ended)
+            ended = ended and now - began >= WORTH_A_LINE_S
+            if task.completed == told or not (due or ended):
+                return
+            self._told[task_id] = now, task.completed
+            self._ended |= {task_id} if ended else set()
+        self.console.print(_line(task, now - began), markup=False, highlight=False, soft_wrap=True)
+
+
+def _line(task: Task, took_s: float) -> str:
+    """slices: 3 of 12, 0:01:30, about 0:04:30 left"""
+    line = f"{task.description}: {task.completed:.0f}{f' of {task.total:.0f}' if task.total else ''}, {timedelta(seconds=round(took_s))}"
+    if not task.total or not 0 < task.completed < task.total:
+        return line
+    return f"{line}, about {timedelta(seconds=round(took_s / task.completed * (task.total - task.completed)))} left"
 
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """A block in which `add_task` and `advance` of rich draw bars on standard error."""
+    """A block in which `add_task` and `advance` of rich draw bars on standard error, or tell how far they are."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -22,7 +79,7 @@ def progress_bars() -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console) if console.is_terminal else PlainLines(console) as progress:
         yield progress
 
 

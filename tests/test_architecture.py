@@ -40,7 +40,7 @@ ROWS = (
     ("video_frames", "video_audio"),
     ("video_encodings", "video_decoding"),
     ("video_color", "_video_frames_numba"),
-    ("capture_bundle",),
+    ("capture_bundle", "held_lens"),
     ("lens_file", "camera_file", "charuco.", "photograph"),
     ("lens_distortion.",),
     ("lens_file_values",),
@@ -73,9 +73,9 @@ ROWS = (
     ("aperture_shapes",),
     ("psf", "_polygon_coverage_numba", "psf_bank"),
     ("nested_grid", "proportional_grid", "psf_axis", "level_plane"),
-    ("layer", "camera", "color", "image_metrics", "field_position"),
+    ("layer", "camera", "color", "image_metrics", "field_position", "png_chunks", "quiet_opencv", "cut_out"),
     ("html_page",),
-    ("atomic_files", "progress", "workers", "zeroed_memory", "torch_device", "gphoto2_library", "sound_values"),
+    ("atomic_files", "progress", "interrupts", "workers", "zeroed_memory", "torch_device", "gphoto2_library", "sound_values"),
     ("errors",),
 )
 ALLOWED_ACROSS = {

@@ -31,6 +31,24 @@ def test_damaged_files_are_named_and_the_rest_goes_on(shoot: Path, tmp_path: Pat
     assert {each["source"].split("/")[-1] for each in stack.metadata["skipped"]} == set(reasons)
 
 
+def test_a_jpeg_beside_a_broken_raw_is_not_dropped_without_a_word(shoot: Path, tmp_path: Path) -> None:
+    """Beside a good one it is what everybody expects; also when the stack was made before."""
+    import pyexiv2
+
+    for name in ("IMG_9.jpg", "IMG_10.jpg"):
+        write_image(shoot / name, np.full((72, 96, 3), 0.3, np.float32))
+    (shoot / "IMG_10.dng").write_bytes((shoot / "IMG_10.dng").read_bytes()[:3000])
+    for _ in range(2):
+        report = ingest([shoot], tmp_path / "scene")
+        reasons = {each.path.name: each.reason for each in report.skipped}
+        assert reasons["IMG_9.jpg"] == "the same shot as IMG_9.dng, which is RAW"
+        assert "IMG_10.dng, which is RAW but cannot be used: copy IMG_10.dng again, or move it elsewhere" in reasons["IMG_10.jpg"]
+    (shoot / "IMG_10.dng").rename(tmp_path / "IMG_10.dng")
+    with pyexiv2.Image(str(shoot / "IMG_10.jpg")) as image:
+        image.modify_exif({"Exif.Image.Model": "Simulated Bayer Camera"})
+    assert "IMG_10.jpg" in sources(only_stack(ingest([shoot], tmp_path / "scene")))
+
+
 def test_nothing_usable_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "shoot").mkdir()
     with pytest.raises(InputError, match="found none"):

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import capture.stacks.stack_ingest
+from capture.cli import app
 from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.slice_files import find_slices
@@ -36,6 +38,23 @@ def test_a_rerun_keeps_everything_and_a_merged_stack_too(shoot: Path, tmp_path: 
     assert report.stacks[0].kept == 0
     assert not only_stack(report).merged
     assert all(path.stat().st_mtime_ns > before[path] for path in (stack.folder / "slices").iterdir())
+
+
+def test_the_whole_way_is_made_again_only_when_asked_to(shoot: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+
+    def processed(*more: str) -> tuple[str, dict[str, int]]:
+        done = CliRunner().invoke(app, ["process", str(shoot), "--out", str(scene), *more], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        return " ".join(done.output.split()), {each.name: each.stat().st_mtime_ns for each in scene.rglob("*.exr")}
+
+    said, first = processed()
+    assert "is there already" not in said and {"all_in_focus.exr", "depth.exr", "exclusion.exr", "00.exr"} <= set(first)
+    said, again = processed()
+    assert "scene is there already: what is finished is kept" in said and "(--overwrite makes all of it again)" in said
+    assert again == first
+    said, anew = processed("--overwrite")
+    assert "is there already" not in said and anew.keys() == first.keys() and all(anew[name] > first[name] for name in first)
 
 
 def test_only_what_changed_is_made_again(shoot: Path, tmp_path: Path) -> None:

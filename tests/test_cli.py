@@ -100,9 +100,9 @@ def test_lens_and_render_from_end_to_end(tmp_path: Path) -> None:
     small_layer(layer)
     assert mrbokeh("lens", "new", lens, "--focal-length", 50, "--f-number", 2, "--focus", 1, "--blades", 5).returncode == 0
     assert mrbokeh("lens", "show", lens, "--out", tmp_path / "lens.png").returncode == 0
-    coc = mrbokeh("lens", "coc", lens, 0.5, 1, "inf", "--width", 32).stdout
+    coc = mrbokeh("lens", "coc", lens, 0.5, 1, "inf", "--image-width", 32).stdout
     assert "0.5 m: -" in coc and "1 m: +0.00 px" in coc and "inf m: +" in coc
-    done = mrbokeh("render", "--layer", layer, "--lens", lens, "--out", out, "--focus-distance-m", 0.4, "--alpha-out")
+    done = mrbokeh("render", "--layer", layer, "--lens", lens, "--out", out, "--focus", 0.4, "--alpha-out")
     assert done.returncode == 0, done.stderr
     blurred, sharp = read_layer(out), read_layer(layer)
     assert blurred.alpha.sum() == pytest.approx(sharp.alpha.sum(), rel=2e-3)  # half float

@@ -338,7 +338,7 @@ def test_facts_of_exif(tmp_path: Path) -> None:
 def test_facts_that_are_missing(tmp_path: Path) -> None:
     bare = read_facts(exif_file(tmp_path / "bare.jpg", {0x829D: 0.0}), (60, 40))
     assert bare == PhotoFacts()
-    with pytest.raises(InputError, match=r"give --focal-length-mm, --sensor-width-mm$"):
+    with pytest.raises(InputError, match=r"give --focal-length, --sensor-width$"):
         bare.given(f_number=2.0).require("bare.jpg")
     with pytest.raises(InputError, match="--f-number above 0"):
         bare.given(f_number=-1.0)
@@ -368,8 +368,8 @@ def test_the_command_writes_a_lens_and_its_evidence(tmp_path: Path) -> None:
     Image.fromarray(photograph(HEPTAGON)).save(photo, exif=exif, quality=92, subsampling=0)
     given = ["match", str(photo), "--out", str(out), "--evidence", str(evidence), "--depth-m", f"{lit_depth_m(1)}"]
     lacking = CliRunner().invoke(app, given)
-    assert isinstance(lacking.exception, InputError) and "give --sensor-width-mm" in str(lacking.exception)
-    result = CliRunner().invoke(app, [*given, "--sensor-width-mm", "14"])
+    assert isinstance(lacking.exception, InputError) and "give --sensor-width" in str(lacking.exception)
+    result = CliRunner().invoke(app, [*given, "--sensor-width", "14"])
     assert result.exit_code == 0, result.exception
     lens = read_lens(out)
     assert (lens.focal_length_mm, lens.f_number, lens.sensor_width_mm) == (50.0, 1.8, 14.0)
@@ -379,7 +379,7 @@ def test_the_command_writes_a_lens_and_its_evidence(tmp_path: Path) -> None:
     assert "blades" in result.stdout and "+-" in result.stdout
     picture = cv2.imread(str(evidence))
     assert picture is not None and picture.std() > 10.0
-    again = CliRunner().invoke(app, [*given, "--sensor-width-mm", "14"])
+    again = CliRunner().invoke(app, [*given, "--sensor-width", "14"])
     assert isinstance(again.exception, InputError) and "--overwrite" in str(again.exception)
 
 

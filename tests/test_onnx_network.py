@@ -147,6 +147,17 @@ def test_another_lens_is_refused(network: OnnxNetwork, name: str, value: float) 
         network.render([card(1.0)], replace(LENS, **{name: value}))
 
 
+def test_the_trained_lens_may_be_held_upright(network: OnnxNetwork) -> None:
+    """Two thirds of the sensor over two thirds of the pixels: the same circles of confusion."""
+    long_mm = LENS.sensor_width_mm
+    upright = replace(LENS, sensor_width_mm=long_mm * 2 / 3, sensor_height_mm=long_mm)
+    whole = card(3.0)
+    cut = Layer(whole.rgb[:, 16:80], whole.alpha[:, 16:80], whole.depth_m[:, 16:80])
+    assert np.allclose(network.render([cut], upright).alpha, network.render([whole], LENS).alpha[:, 16:80], atol=1e-4)
+    with pytest.raises(InputError, match="sensor_width_mm"):
+        network.render([cut], replace(upright, sensor_height_mm=1.5 * long_mm))
+
+
 def test_another_focus_is_welcome(network: OnnxNetwork) -> None:
     """Focused on the card, it stays sharp (up to the floor of the kernel, as above)."""
     layer = card(5.0)

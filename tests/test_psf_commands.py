@@ -155,8 +155,8 @@ PAIR = "60 2 1.5 20\n-60 5 1 20\n0 5 0 12\n60 2 1.5 20\n-60 0 1 20\n"
 def test_a_physical_lens_is_what_its_options_say(tmp_path: Path) -> None:
     """Each option of the command line arrives as its namesake of the constructor: same settings, same kernels."""
     (tmp_path / "pair.dat").write_text(PAIR)
-    options = ("--prescription", tmp_path / "pair.dat", "--focus-distance-m", 3, "--f-number", 8, "--sensor-width-mm", 24)
-    depths = ("--nearest-m", 1, "--farthest-m", 20, "--image-width-px", 300, "--no-vignetting")
+    options = ("--prescription", tmp_path / "pair.dat", "--focus", 3, "--f-number", 8, "--sensor-width", 24)
+    depths = ("--near", 1, "--far", 20, "--image-width", 300, "--no-vignetting")
     run("psf", "physical", *options, *depths, "--counts", "3,3", "--rays", 1 << 12, "--out", tmp_path / "bank")
     bank = read_bank(tmp_path / "bank")
     model = PhysicalLens(
@@ -171,7 +171,7 @@ def test_a_physical_lens_is_what_its_options_say(tmp_path: Path) -> None:
 
 
 def test_a_medium_is_what_its_options_say(tmp_path: Path) -> None:
-    options = ("--density-per-m", 0.4, "--anisotropy", 0.5, "--focal-px", 60, "--farthest-m", 2, "--counts", 3)
+    options = ("--density-per-m", 0.4, "--anisotropy", 0.5, "--focal-px", 60, "--far", 2, "--counts", 3)
     run("psf", "volume", *options, "--rays", 1000, "--out", tmp_path / "bank")
     bank = read_bank(tmp_path / "bank")
     assert [bank.settings[key] for key in ("density_per_m", "anisotropy", "focal_px")] == [0.4, 0.5, 60.0] and bank.axes[0].high == 2.0
@@ -250,16 +250,16 @@ MISTAKES = {
     "counts in words": (["psf", "simple", "--counts", "many"], "--counts as whole numbers"),
     "too many counts": (["psf", "simple", "--counts", "3,3"], "a count for each"),
     "a diameter below 0": (["psf", "simple", "--diameter", "-3"], "positive number"),
-    "a focus for a model without": (["psf", "simple", "--focus-distance-m", "3"], "--focus-distance-m does nothing"),
+    "a focus for a model without": (["psf", "simple", "--focus", "3"], "--focus does nothing"),
     "vignetting of a thin lens": (["psf", "combined", "--no-vignetting"], "--vignetting does nothing"),
     "two grids": (["psf", "combined", "--cells", "9", "--counts", "3,3"], "either --counts"),
     "no cells": (["psf", "combined", "--cells", "0"], "at least one cell"),
     "too open": (["psf", "physical", "--f-number", "2"], "opens to f/4 only"),
-    "too near a focus": (["psf", "physical", "--focus-distance-m", "0.01"], "cannot focus at 0.01 m"),
-    "no sensor": (["psf", "physical", "--sensor-width-mm", "0"], "width and height in mm must be a positive"),
-    "no width": (["psf", "physical", "--image-width-px", "-5"], "width in pixels must be a positive"),
-    "depths in the wrong order": (["psf", "physical", "--nearest-m", "9", "--farthest-m", "3"], "low before high"),
-    "a depth in the lens": (["psf", "physical", "--nearest-m", "0.001"], "depths in front of the lens"),
+    "too near a focus": (["psf", "physical", "--focus", "0.01"], "cannot focus at 0.01 m"),
+    "no sensor": (["psf", "physical", "--sensor-width", "0"], "width and height in mm must be a positive"),
+    "no width": (["psf", "physical", "--image-width", "-5"], "width in pixels must be a positive"),
+    "depths in the wrong order": (["psf", "physical", "--near", "9", "--far", "3"], "low before high"),
+    "a depth in the lens": (["psf", "physical", "--near", "0.001"], "depths in front of the lens"),
     "no such prescription": (["psf", "physical", "--prescription", "none.dat"], "none.dat"),
     "less than no rays": (["psf", "simple", "--rays", "-1"], "number of rays"),
     "no bank": (["export", "none"], "expected a bank of PSFs"),

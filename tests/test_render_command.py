@@ -80,7 +80,7 @@ def test_focus_on_a_pixel_and_at_its_distance_are_the_same(folder: Path) -> None
     write_exr(folder / "z.exr", ExrPart({"Z": np.broadcast_to(np.linspace(1.0, 4.0, WIDTH, dtype=np.float32), (HEIGHT, WIDTH)).copy()}))
     distance_m = read_exr(folder / "z.exr")[0].channels["Z"][5, 20]
     at_pixel = read_image(run(folder, *PICTURE, "--focus-at", "20,5", out="a.exr"))
-    at_distance = read_image(run(folder, *PICTURE, "--focus-distance-m", repr(float(distance_m)), out="b.exr"))
+    at_distance = read_image(run(folder, *PICTURE, "--focus", repr(float(distance_m)), out="b.exr"))
     np.testing.assert_array_equal(at_pixel, at_distance)
     assert np.abs(at_pixel - read_image(run(folder, *PICTURE))).max() > 0.05
 
@@ -134,11 +134,11 @@ MISTAKES = {
     ),
     "negative f-number": (lambda f: spoil_lens(f, f_number=-1.8), (), "f_number"),
     "focus nearer than the focal length": (lambda f: spoil_lens(f, focus_distance_m=0.04), (), "cannot focus"),
-    "focus by option nearer than the focal length": (lambda _: None, ("--focus-distance-m", "0.01"), "cannot focus"),
+    "focus by option nearer than the focal length": (lambda _: None, ("--focus", "0.01"), "cannot focus"),
     "focus outside": (lambda _: None, ("--focus-at", "480,10"), "cannot focus at"),
     "focus on the background": (lambda _: None, ("--focus-at", "40,10"), "finite|background"),
     "focus in words": (lambda _: None, ("--focus-at", "middle"), "expected X,Y"),
-    "focus twice": (lambda _: None, ("--focus-at", "4,4", "--focus-distance-m", "1"), "not both"),
+    "focus twice": (lambda _: None, ("--focus-at", "4,4", "--focus", "1"), "not both"),
     "no lens": (lambda f: (f / "lens.json").unlink(), (), "lens"),
     "an unknown method": (lambda _: None, ("--method", "magic"), "expected a renderer"),
     "a missing picture": (lambda f: (f / "aif.exr").unlink(), (), "aif.exr"),

@@ -90,7 +90,7 @@ def test_several_distances_become_a_focal_stack_with_a_sheet(files: dict[str, Pa
 
 
 def test_a_focus_pull_is_a_film(files: dict[str, Path]) -> None:
-    film = run(files, "pull.mkv", "--focus", "1:2:5", "--frame-rate", 10)
+    film = run(files, "pull.mkv", "--focus", "1:2:5", "--rate", 10)
     frames = list(read_frames(film))
     assert [each.time_s for each in frames] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-3)
     for index, focus_m in ((0, 1.0), (4, 2.0)):

@@ -41,13 +41,15 @@ def dataset_command(
     from capture.dataset.stack_writer import StackWriting
     from capture.dataset.writer import DatasetPlan, write_dataset
     from capture.report.reblur import Reblur
+    from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.renderers.choose import make_renderer
 
     if not scenes:
         raise InputError("expected the folders of scenes, got none: mrbokeh capture dataset SCENE... --out DATASET --licence TEXT")
     writing = StackWriting(copy, coc_maps, Reblur(make_renderer(renderer)))
     plan = DatasetPlan(licence_text(licence), tuple(test or ()), test_share, seed, radiance_scale, writing)
-    dataset = write_dataset(scenes, out, plan, overwrite)
+    with kept_when_interrupted(f"finished stacks are kept in {out}", overwrite):
+        dataset = write_dataset(scenes, out, plan, overwrite)
     train, held_out = len(dataset.records("train")), len(dataset.records("test"))
     typer.echo(
         f"{out}: {train} stacks to train on, {held_out} to test on; largest circle of confusion {dataset.largest_coc_px:.1f} px "

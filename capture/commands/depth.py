@@ -29,9 +29,12 @@ def depth_command(
 ) -> None:
     from capture.views.dense_depth import DenseSettings
     from capture.views.scene_depth import SceneDepthSettings, deepen_scene
+    from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.stack_pictures import SHEET_NAME
 
-    result = deepen_scene(scene, SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device)))
+    settings = SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device))
+    with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
+        result = deepen_scene(scene, settings)
     for stack in result.stacks:
         typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
     if result.left_out:

@@ -43,11 +43,13 @@ def ingest_command(
     from capture.stacks.ingest import IngestSettings, ingest
     from capture.stacks.ingest_table import print_report
     from capture.stacks.stack_ingest import Development
+    from mrbokeh.interrupts import kept_when_interrupted
 
     if group not in list(Grouping):
         raise InputError(f"--group must be one of {', '.join(Grouping)}, got {group!r}")
     development = Development(parse_white_balance(white_balance), half_size, max_width)
-    report = ingest(photographs, out, IngestSettings(Grouping(group), development, sidecar, overwrite))
+    with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
+        report = ingest(photographs, out, IngestSettings(Grouping(group), development, sidecar, overwrite))
     print_report(report, Console())
 
 

@@ -39,6 +39,7 @@ def matchmove_command(
     from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
     from mrbokeh.camera_track.formats import format_of_name, write_track
     from mrbokeh.charuco.board_file import read_board
+    from mrbokeh.interrupts import kept_when_interrupted
 
     if not clip.is_file():
         raise InputError(f"expected a video at {clip}, but {'it is a folder' if clip.is_dir() else 'there is none'}")
@@ -56,7 +57,9 @@ def matchmove_command(
         None if ruler is None else parse_ruler(ruler),
         None if distance is None else parse_frame_distance(distance),
     )
-    made = matchmove_clip(clip, work or out.with_name(f"{out.stem}_matchmove"), settings)
+    folder = work or out.with_name(f"{out.stem}_matchmove")
+    with kept_when_interrupted(f"keyframes and COLMAP's files, as far as they are finished, are kept in {folder}", overwrite):
+        made = matchmove_clip(clip, folder, settings)
     missing = write_track(out, made.track)
     told_by = next((name for name, told in (("board", board), ("ruler", ruler), ("distance", distance)) if told), None)
     scale = "scale arbitrary" if told_by is None else f"in metres, by the {told_by}"

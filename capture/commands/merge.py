@@ -25,8 +25,11 @@ def merge_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="merge again what is merged already")] = False,
 ) -> None:
     from capture.merging.merge import merge_scene
+    from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.stack_pictures import SHEET_NAME
 
-    for stack in merge_scene(scene, overwrite, registration):
+    with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
+        stacks = merge_scene(scene, overwrite, registration)
+    for stack in stacks:
         depth = "depth in metres" if stack.is_metric else "focus distances unknown: depth is the index of the sharpest slice, not metres"
         typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {SHEET_NAME}")

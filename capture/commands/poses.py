@@ -1,5 +1,6 @@
 """`mrbokeh capture poses`: where the cameras stood."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -35,14 +36,17 @@ def poses_command(
 ) -> None:
     from capture.views.colmap import PoseSettings, find_picture_poses, find_scene_poses
     from capture.views.colmap_matches import median_parallax_deg
+    from mrbokeh.interrupts import kept_when_interrupted
 
     settings = PoseSettings(mapper, camera_model, cameras, max_image_size, seed, threads, overwrite)
     if scene is not None and images is None and out is None:
-        model, where = find_scene_poses(scene, settings), scene / "reconstruction"
+        where, find = scene / "reconstruction", partial(find_scene_poses, scene)
     elif scene is None and images is not None and out is not None:
-        model, where = find_picture_poses(images, out, settings), out
+        where, find = out, partial(find_picture_poses, images, out)
     else:
         raise InputError("expected either a SCENE, or --images DIR together with --out DIR: see `mrbokeh capture poses --help`")
+    with kept_when_interrupted(f"COLMAP's finished stages are kept in {where}", overwrite):
+        model = find(settings)
     placed, total = len(model.views), len(model.views) + len(model.left_out)
     typer.echo(
         f"{where}: {placed} of {total} viewpoints placed, {len(model.points)} points, reprojection error "

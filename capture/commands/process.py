@@ -7,7 +7,8 @@ import typer
 
 HELP = "\n\n".join(
     (
-        "Run ingest, merge, poses, scale, depth and report one after the other. Finished stages are kept, an interrupted one goes on. "
+        "Run ingest, merge, poses, scale, depth and report one after the other. What is finished in SCENE is kept, an interrupted "
+        "stage goes on, and only the pages of the report are written anew each time; --overwrite makes everything again. "
         "With one viewpoint, or where camera poses cannot be found, depth comes from focus alone, and the report says so.",
         "Example:  mrbokeh capture process shoot/ --out scene/",
         "Example:  mrbokeh capture process shoot/ --out scene/ --board 8x6 --square-mm 30 --marker-mm 22 --strict",
@@ -25,6 +26,7 @@ def process_command(
     marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
     distance: Annotated[str | None, typer.Option(metavar="VIEW_A,VIEW_B,METRES", help="between two camera centres")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 1 when a gate of the report fails")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="make all stages again, from the photographs on")] = False,
 ) -> None:
     from capture.commands.depth import depth_command
     from capture.commands.ingest import ingest_command
@@ -32,6 +34,7 @@ def process_command(
     from capture.commands.poses import poses_command
     from capture.commands.report import report_command
     from capture.commands.scale import scale_command
+    from capture.stacks.session import FILE_NAME as SESSION_NAME
     from capture.views.board_options import board_from_options
     from capture.views.scale_distance import parse_distance
     from mrbokeh.errors import InputError
@@ -41,17 +44,19 @@ def process_command(
         parse_distance(distance)
     if board is not None:
         board_from_options(board, square_mm, marker_mm, "DICT_4X4_50")
-    ingest_command(photographs, out, sidecar=sidecar, max_width=max_width)
-    merge_command(out)
+    if (out / SESSION_NAME).exists() and not overwrite:
+        typer.echo(f"{out} is there already: what is finished is kept, the rest goes on (--overwrite makes all of it again)")
+    ingest_command(photographs, out, sidecar=sidecar, max_width=max_width, overwrite=overwrite)
+    merge_command(out, overwrite=overwrite)
     if len(find_focal_stacks(out)) < 2:
         typer.echo("one viewpoint: depth comes from focus alone (photograph five or more for depth from several views)")
     else:
         try:
-            poses_command(out)
+            poses_command(out, overwrite=overwrite)
         except InputError as error:
             unused = " (--board and --distance are not used)" if board or distance else ""
             typer.echo(f"no camera poses, so depth comes from focus alone{unused}: {error}")
         else:
-            scale_command(out, board=board, square_mm=square_mm, marker_mm=marker_mm, distance=distance)
-            depth_command(out)
-    report_command(out, strict=strict)
+            scale_command(out, board=board, square_mm=square_mm, marker_mm=marker_mm, distance=distance, overwrite=overwrite)
+            depth_command(out, overwrite=overwrite)
+    report_command(out, strict=strict, overwrite=overwrite)

@@ -14,7 +14,7 @@ HELP = "\n\n".join(
         "Writes SCENE/report.html (one file, pictures and 3D view inside), SCENE/report.json with the same numbers, and each stack's "
         "exclusion.exr. What is not there yet (poses, scale, depth in metres) is named as absent.",
         "What was found of a stack is kept in STACK/report and used again while the stack, --width and --renderer stay the same: an "
-        "interrupted report goes on where it stopped.",
+        "interrupted report goes on where it stopped. The pages are written anew each time; --overwrite examines everything again.",
         "Example:  mrbokeh capture report scene/",
         "Example:  mrbokeh capture report scene/ --strict && mrbokeh train fit scene/",
     )
@@ -31,15 +31,17 @@ def report_command(
     from capture.report.reblur import Reblur
     from capture.report.scene_page import HTML_NAME
     from capture.report.scene_report import report_scene
+    from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.renderers.choose import make_renderer
 
     if not scene.is_dir():
         raise InputError(f"expected a folder with focal stacks, but {scene} is none")
-    report = report_scene(scene, Reblur(make_renderer(renderer), _named(renderer)), width, overwrite=overwrite)
+    with kept_when_interrupted(f"what was found of finished stacks is kept in {scene}", overwrite):
+        report = report_scene(scene, Reblur(make_renderer(renderer), _named(renderer)), width, overwrite=overwrite)
     for each in report.failures:
         typer.echo(f"failed: {each.where}: {each.name}: {each.measured} (wanted: {each.limit})")
     reused = sum(each.reused for each in report.stacks)
-    before = f" ({reused} of {len(report.stacks)} stacks were examined before)" if reused else ""
+    before = f" ({reused} of {len(report.stacks)} stacks were examined before; --overwrite examines them again)" if reused else ""
     typer.echo(f"{scene / HTML_NAME}: {len(report.gates)} gates, {len(report.failures)} failed{before}")
     if strict and report.failures:
         raise typer.Exit(1)

@@ -1,5 +1,6 @@
 """`mrbokeh capture shoot`: a focus bracket with a tethered camera."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -72,6 +73,7 @@ def shoot_command(
     from capture.tether.shoot import shoot
     from capture.tether.shoot_arguments import parse_seconds, parse_spot, parse_target, steps_between
     from capture.tether.shoot_options import ShootOptions, Surroundings
+    from mrbokeh.interrupts import kept_when_interrupted
 
     planned = read_plan(plan)
     given = read_focus_steps(focus_steps) if focus_steps is not None else steps_between(planned, near_steps, far_steps, home)
@@ -80,18 +82,13 @@ def shoot_command(
         raise InputError("what the steps mean is both given and to be measured: leave --target out, or the others")
     settings = CameraSettings(parse_seconds(exposure_time), iso, f_number, white_balance)
     driver = open_named(camera, planned, timeout_s=timeout, focus_level=focus_level, reverse_focus=reverse_focus)
-    try:
+    with kept_when_interrupted(f"what was shot is kept in {out}", overwrite), closing(driver):
         if live:
             watch(driver, parse_spot(spot))
         if targets:
             given = measured(driver, targets, out, home=home, backlash=backlash, settle=settle, step=sweep_step, again=overwrite)
         options = ShootOptions(settings, given, by_hand, backlash, settle, parse_spot(spot), check, planned_distances, overwrite)
         log = shoot(planned, driver, out, options, Surroundings(say=typer.echo))
-    except KeyboardInterrupt:
-        typer.echo(f"stopped: what was shot is kept in {out}, the same command goes on")
-        raise typer.Exit(130) from None
-    finally:
-        driver.close()
     typer.echo(f"{len(log.slices)} slices in {out}. Next: mrbokeh capture ingest {out} --out SCENE")
 
 

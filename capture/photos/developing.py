@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from capture.photos.decoded_photo import DecodedPhoto, Photosites
 from capture.photos.raw import RAW_SUFFIXES, decode_raw
 from capture.photos.saturation import dilated, resized_share
-from mrbokeh.image_io import INTEGER_SUFFIXES, read_image
+from mrbokeh.image_io import ENCODED_SUFFIXES, read_image
 
 _LARGEST_HALF = 65504.0
 _FULL = 1.0 - 1e-6
@@ -20,11 +20,11 @@ def is_raw(path: Path) -> bool:
 
 
 def stored_as_half(path: Path) -> bool:
-    """Half is enough for 8-bit JPEG: its steps are 0.9 % near white and more below, those of half 0.1 % at most.
+    """Half is enough for 8-bit JPEG and WebP: their steps are 0.9 % near white and more below, those of half 0.1 % at most.
 
     14-bit RAW and 16-bit files have finer steps near white (0.006 %) than half (0.05 %), so they are kept as float.
     """
-    return path.suffix.lower() in (".jpg", ".jpeg")
+    return path.suffix.lower() in (".jpg", ".jpeg", ".webp")
 
 
 def develop(
@@ -32,7 +32,7 @@ def develop(
 ) -> DecodedPhoto:
     """A photograph in linear light, the way up in which it is stored (EXIF orientation is not applied).
 
-    RAW through `decode_raw` in camera RGB; PNG, TIFF and JPEG as sRGB, EXR and HDR as they are, both in Rec.709. Smaller
+    RAW through `decode_raw` in camera RGB; PNG, TIFF, JPEG and WebP as sRGB, EXR and HDR as they are, both in Rec.709. Smaller
     sizes are area averages of light, and of the share that is saturated.
     """
     if is_raw(path):
@@ -47,7 +47,7 @@ def develop(
 def _picture(path: Path) -> DecodedPhoto:
     rgb = read_image(path)
     height, width = rgb.shape[:2]
-    if path.suffix.lower() in INTEGER_SUFFIXES:
+    if path.suffix.lower() in ENCODED_SUFFIXES:
         full = np.any(rgb >= _FULL, axis=-1)
         return DecodedPhoto(rgb, None, dilated(full).astype(np.float32), Photosites(width, height, int(np.count_nonzero(full))))
     finite = np.isfinite(rgb)

@@ -9,7 +9,7 @@ from capture.photos.exiftool_metadata import read_with_exiftool
 from capture.photos.focus_metadata import Tags, number
 from capture.photos.focus_tags import read_focus
 from capture.photos.photo_metadata import PhotoMetadata, parse_time
-from capture.photos.sensor_metadata import read_sensor
+from capture.photos.sensor_metadata import read_sensor, stated_size_px
 
 _NO_MESSAGES = 4
 
@@ -72,6 +72,7 @@ def metadata_from_tags(tags: Tags) -> PhotoMetadata:
         focus=read_focus(tags),
         sensor=read_sensor(tags, focal_length_mm, size_px),
         orientation=int(orientation) if orientation else None,
+        taken_size_px=stated_size_px(tags),
     )
 
 

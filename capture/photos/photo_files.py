@@ -8,17 +8,18 @@ from pathlib import Path
 from capture.photos.raw import RAW_SUFFIXES
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME as STACK_FILE_NAME
-from mrbokeh.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES
+from mrbokeh.image_io import ENCODED_SUFFIXES, HEIF_ADVICE, HEIF_SUFFIXES, LINEAR_SUFFIXES
 
-PHOTO_SUFFIXES = (*RAW_SUFFIXES, *INTEGER_SUFFIXES, *LINEAR_SUFFIXES)
+PHOTO_SUFFIXES = (*RAW_SUFFIXES, *ENCODED_SUFFIXES, *LINEAR_SUFFIXES)
 
 
 @dataclass(frozen=True)
 class SkippedFile:
-    """A file that was left out, and why, in words."""
+    """A file that was left out, and why, in words. raw: taken in its place, or None."""
 
     path: Path
     reason: str
+    raw: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ def find_photos(given: Sequence[Path], scene: Path) -> tuple[list[PhotoFolder], 
         elif path.suffix.lower() in PHOTO_SUFFIXES:
             found.setdefault(path, path.parent)
         else:
-            skipped.append(SkippedFile(path, f"not a photograph by its suffix {path.suffix or '(none)'}"))
+            unknown = f"not a photograph by its suffix {path.suffix or '(none)'}"
+            skipped.append(SkippedFile(path, HEIF_ADVICE if path.suffix.lower() in HEIF_SUFFIXES else unknown))
     folders: dict[Path, list[Path]] = {}
     for path in sorted(found, key=natural_key):
         folders.setdefault(path.parent, []).append(path)
@@ -71,22 +73,24 @@ def find_photos(given: Sequence[Path], scene: Path) -> tuple[list[PhotoFolder], 
 def _photos_under(top: Path, scene: Path) -> tuple[list[Path], list[SkippedFile]]:
     """Photographs below a folder, without hidden files, our own scene and other focal stacks' folders.
 
-    Beside photographs, EXR and HDR files are taken for somebody's results and left out.
+    Beside photographs, EXR and HDR files are taken for somebody's results and left out. HEIC is found, but cannot be read.
     """
-    candidates = [path for path in top.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()]
+    candidates = [path for path in top.rglob("*") if path.suffix.lower() in (*PHOTO_SUFFIXES, *HEIF_SUFFIXES) and path.is_file()]
     stacks = {path.parent for path in top.rglob(STACK_FILE_NAME)} | {scene}
     visible = [path for path in candidates if not any(part.startswith(".") for part in path.relative_to(top).parts)]
-    photos = [path for path in visible if not stacks.intersection(path.parents)]
+    ours = [path for path in visible if not stacks.intersection(path.parents)]
+    photos = [path for path in ours if path.suffix.lower() in PHOTO_SUFFIXES]
+    unread = [SkippedFile(path, HEIF_ADVICE) for path in sorted(set(ours) - set(photos))]
     results = [path for path in photos if path.suffix.lower() in LINEAR_SUFFIXES]
     if len(results) == len(photos):
-        return photos, []
+        return photos, unread
     reason = "EXR and HDR files are left out where there are photographs too; name it to take it all the same"
-    return [path for path in photos if path not in results], [SkippedFile(path, reason) for path in sorted(results)]
+    return [path for path in photos if path not in results], [*unread, *(SkippedFile(path, reason) for path in sorted(results))]
 
 
 def _raw_before_jpeg(paths: list[Path]) -> tuple[list[Path], list[SkippedFile]]:
     """Cameras store RAW and JPEG of the same shot side by side; the JPEG is left out."""
-    raw_stems = {path.stem: path.name for path in paths if path.suffix.lower() in RAW_SUFFIXES}
-    doubles = {path for path in paths if path.suffix.lower() not in RAW_SUFFIXES and path.stem in raw_stems}
-    skipped = [SkippedFile(path, f"the same shot as {raw_stems[path.stem]}, which is RAW") for path in sorted(doubles)]
+    raw = {path.stem: path for path in paths if path.suffix.lower() in RAW_SUFFIXES}
+    doubles = {path for path in paths if path.suffix.lower() not in RAW_SUFFIXES and path.stem in raw}
+    skipped = [SkippedFile(path, f"the same shot as {raw[path.stem].name}, which is RAW", raw[path.stem]) for path in sorted(doubles)]
     return [path for path in paths if path not in doubles], skipped

@@ -30,6 +30,7 @@ class StatedExposure:
 class PhotoMetadata:
     """The shooting data of one photograph; None is unknown.
 
+    taken_size_px: width and height of the picture that the camera took, as it states them; what is cut or resized has others.
     orientation: the EXIF tag (1 is upright), which nobody applies here.
     lens_position: where the focus drive of the lens stood, in the maker's steps (Nikon Z), finer than its distances.
     hiatus_mm: distance between the principal planes of the lens, which no file states.
@@ -45,6 +46,7 @@ class PhotoMetadata:
     focus: FocusReading | None = None
     sensor: SensorReading | None = None
     orientation: int | None = None
+    taken_size_px: tuple[int, int] | None = None
     lens_position: int | None = None
     hiatus_mm: float = 0.0
 

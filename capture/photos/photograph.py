@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from capture.photos.developing import develop
+from capture.photos.developing import develop, is_raw
 from capture.photos.metadata import read_metadata
 from capture.photos.photo_metadata import PhotoMetadata
 from mrbokeh.color import convert
+from mrbokeh.cut_out import cut_from_px
 from mrbokeh.photograph import Photograph
 
 # EXIF 2.3, tag Orientation: quarter turns counter-clockwise that bring the stored picture upright, and whether it is mirrored first.
@@ -24,6 +25,8 @@ def read_photograph(path: Path) -> Photograph:
     sensor_width_mm = _sensor_width_mm(metadata, decoded.photosites.width, decoded.photosites.height)
     if sensor_width_mm is not None and turns % 2:
         sensor_width_mm *= stored_height_px / stored_width_px
+    # A camera set to another shape cuts its JPEG only, and RAW has margins.
+    whole_px = None if is_raw(path) else cut_from_px((stored_width_px, stored_height_px), metadata.taken_size_px)
     return Photograph(
         upright(rgb, turns, mirrored),
         metadata.focal_length_mm,
@@ -32,6 +35,8 @@ def read_photograph(path: Path) -> Photograph:
         sensor_width_mm,
         metadata.exposure_time_s,
         metadata.iso,
+        turns,
+        whole_px[::-1] if whole_px is not None and turns % 2 else whole_px,
     )
 
 

@@ -17,10 +17,10 @@ def read_sensor(tags: Tags, focal_length_mm: float | None, stored_size_px: tuple
 
     stored_size_px: (width, height) of the file, for tags that speak of the whole frame where EXIF does not state its size.
     """
-    size_px = _stated_size_px(tags) or stored_size_px
+    size_px = stated_size_px(tags) or stored_size_px
     readers: tuple[Callable[[], SensorReading | None], ...] = (
-        lambda: _focal_plane_resolution(tags, _stated_size_px(tags)),
-        lambda: _nikon_pixel_size(tags, _stated_size_px(tags)),
+        lambda: _focal_plane_resolution(tags, stated_size_px(tags)),
+        lambda: _nikon_pixel_size(tags, stated_size_px(tags)),
         lambda: _canon_focal_plane(tags, size_px),
         lambda: sensor_of_model(tags.get("Exif.Image.Make"), tags.get("Exif.Image.Model"), size_px),
         lambda: _film_equivalent(tags, focal_length_mm, size_px),
@@ -33,7 +33,7 @@ def _is_plausible(reading: SensorReading, size_px: tuple[int, int] | None) -> bo
     return size_px is None or _PLAUSIBLE_WIDTH_MM[0] < reading.pitch_mm * size_px[0] < _PLAUSIBLE_WIDTH_MM[1]
 
 
-def _stated_size_px(tags: Tags) -> tuple[int, int] | None:
+def stated_size_px(tags: Tags) -> tuple[int, int] | None:
     """Width and height of the picture that the camera took. A reduced DNG states it as OriginalDefaultFinalSize."""
     original = tags.get("Exif.Image.OriginalDefaultFinalSize", "").split()
     if len(original) == 2:

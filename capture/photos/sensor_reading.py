@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
+from mrbokeh.cut_out import as_it_lies, is_same_shape
+
 # A RAW shows a few pixels more than the JPEG of its camera; a picture that differs by more was resized or cut.
 _MARGIN = 0.05
-_SAME_ASPECT = 0.01
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,7 @@ class SensorReading:
         """
         if self.full_size_px is None:
             return self.pitch_mm * width_px
-        upright = (width_px < height_px) != (self.full_size_px[0] < self.full_size_px[1])
-        full_width, full_height = self.full_size_px[::-1] if upright else self.full_size_px
+        full_width, full_height = as_it_lies(self.full_size_px, (width_px, height_px))
         resized = abs(width_px / full_width - 1.0) > _MARGIN
-        same_shape = abs(width_px / height_px * full_height / full_width - 1.0) < _SAME_ASPECT
+        same_shape = is_same_shape((width_px, height_px), (full_width, full_height))
         return self.pitch_mm * (full_width if resized and same_shape else width_px)

@@ -6,7 +6,7 @@ SCENE/session.json: the white balance and the exposure that all stacks share.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from capture.photos.developing import is_raw
@@ -54,6 +54,7 @@ def ingest(given: Sequence[Path], scene: Path, settings: IngestSettings | None =
         with told_when_full(scene):
             session = open_session(scene, groups, settings.development.white_balance, overwrite=settings.overwrite)
             reports = [ingest_group(group, session, settings, lambda: progress.advance(developing)) for group in groups]
+    skipped = _without_their_raw(skipped, reports)
     if not any(report.stack for report in reports):
         raise InputError(_nothing_usable(given, [*skipped, *(each for report in reports for each in report.skipped)]))
     return IngestReport(tuple(reports), tuple(skipped))
@@ -98,9 +99,20 @@ def _with_another_reference(work: StackWork) -> StackWork:
     return again
 
 
+def _without_their_raw(skipped: Sequence[SkippedFile], reports: Sequence[StackReport]) -> list[SkippedFile]:
+    """A picture beside RAW that turned out to be unusable might be wanted after all: it is not taken, but it is said."""
+    unusable = {each.path.resolve() for report in reports for each in report.skipped}
+    return [
+        replace(each, reason=f"{each.reason} but cannot be used: copy {each.raw.name} again, or move it elsewhere to take this one")
+        if each.raw is not None and each.raw.resolve() in unusable
+        else each
+        for each in skipped
+    ]
+
+
 def _nothing_usable(given: Sequence[Path], skipped: Sequence[SkippedFile]) -> str:
     where = ", ".join(str(each) for each in given)
     if not skipped:
-        return f"expected photographs (RAW, JPEG, PNG, TIFF, EXR) in {where}, but found none"
+        return f"expected photographs (RAW, JPEG, PNG, TIFF, WebP, EXR) in {where}, but found none"
     reasons = "; ".join(f"{each.path.name}: {each.reason}" for each in skipped[:5])
     return f"none of the {len(skipped)} files in {where} could be used: {reasons}{' ...' if len(skipped) > 5 else ''}"

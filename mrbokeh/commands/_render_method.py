@@ -20,7 +20,7 @@ def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) ->
 def focused(lens: Lens, sharp: dict[str, Layer], focus_distance_m: float | None, focus_at: str | None) -> Lens:
     """The lens at the distance that was asked for, or focused on what is frontmost at a pixel."""
     if focus_distance_m is not None and focus_at is not None:
-        raise InputError("give either --focus-distance-m or --focus-at, not both")
+        raise InputError("give either --focus or --focus-at, not both")
     if focus_distance_m is not None:
         return lens.focused_at(focus_distance_m)
     if focus_at is None:

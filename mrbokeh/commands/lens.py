@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from mrbokeh.commands._former_names import formerly
 from mrbokeh.commands.lens_fit import fit
 from mrbokeh.commands.lens_match import match
 from mrbokeh.commands.lens_pictures import export, show
@@ -35,8 +36,11 @@ def new(
     focus: Annotated[float, typer.Option(help="Focus distance from the lens in metres; inf is allowed.")],
     sensor_width: Annotated[
         float,
-        typer.Option(help="Width in mm of the sensor as the picture lies: 36 for full frame (24 held upright), 23.5 for APS-C (15.6)."),
+        typer.Option(help="Width in mm of the sensor with the camera held level: 36 for full frame, 23.5 for APS-C."),
     ] = 36.0,
+    sensor_height: Annotated[
+        float | None, typer.Option(help="Its height in mm, where the lens is described for upright pictures: 24 by 36.")
+    ] = None,
     shape: Annotated[
         str, typer.Option(help=f"Shape of the opening: {', '.join(SHAPES)}. (disc where none is given, polygon where --blades is.)")
     ] = "",
@@ -73,6 +77,7 @@ def new(
         "f_number": f_number,
         "focus_distance_m": focus,
         "sensor_width_mm": sensor_width,
+        "sensor_height_mm": sensor_height,
         "tilt_deg": list(tilt),
         "petzval_radius_mm": petzval_radius,
         "aperture": {
@@ -100,15 +105,15 @@ def _shape_of(shape: str, given: dict[str, Any]) -> dict[str, Any]:
     return {"shape": shape, **given}
 
 
-@app.command()
+@app.command(cls=formerly(width="--image-width"))
 def coc(
     lens: Annotated[Path, typer.Argument(help="Lens file.")],
     depths: Annotated[list[float], typer.Argument(help="Depths in metres.")],
-    width: Annotated[int, typer.Option(help="Image width in pixels.")] = 1920,
+    width: Annotated[int, typer.Option("--image-width", help="Image width in pixels.")] = 1920,
 ) -> None:
     """Print the circle of confusion (diameter, pixels; negative in front of the focus) at some depths, on the axis.
 
-    Example: mrbokeh lens coc lens.json 0.5 1 2 inf --width 1920
+    Example: mrbokeh lens coc lens.json 0.5 1 2 inf --image-width 1920
     """
     from mrbokeh.lens_file import read_lens
 
@@ -119,5 +124,18 @@ def coc(
         typer.echo(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px")
 
 
+_FORMER_NAMES: dict[Any, dict[str, str]] = {
+    psf: {
+        "focus_distance_m": "--focus",
+        "sensor_width_mm": "--sensor-width",
+        "sensor_height_mm": "--sensor-height",
+        "image_width_px": "--image-width",
+        "nearest_m": "--near",
+        "farthest_m": "--far",
+    },
+    show: {"width": "--image-width"},
+    match: {"focus_distance_m": "--focus", "focal_length_mm": "--focal-length", "sensor_width_mm": "--sensor-width"},
+}
+
 for command in (psf, spreadlets, show, export, fit, match):
-    app.command()(command)
+    app.command(cls=formerly(**_FORMER_NAMES.get(command, {})))(command)

@@ -11,15 +11,17 @@ _SIDES = {"behind": 1, "front": -1}
 
 
 def match(
-    photo: Annotated[Path, typer.Argument(help="A photograph with out-of-focus lights: JPEG, TIFF, PNG, EXR or HDR.")],
+    photo: Annotated[Path, typer.Argument(help="A photograph with out-of-focus lights: JPEG, TIFF, PNG, WebP, EXR or HDR.")],
     out: Annotated[Path, typer.Option(help="The lens file to write, e.g. lens.json.")],
     evidence: Annotated[Path | None, typer.Option(help="A picture to write of what was found (.png, .pdf or .svg).")] = None,
     side: Annotated[str, typer.Option(help="Where the lights are: behind the focus, or in front.")] = "behind",
     depth_m: Annotated[float | None, typer.Option(help="Depth of the lights in metres; inf is allowed.")] = None,
-    focus_distance_m: Annotated[float | None, typer.Option(help="Focus distance from the lens in metres (else of the metadata).")] = None,
-    focal_length_mm: Annotated[float | None, typer.Option(help="Focal length (else of the metadata).")] = None,
+    focus_distance_m: Annotated[
+        float | None, typer.Option("--focus", help="Focus distance from the lens in metres (else of the metadata).")
+    ] = None,
+    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", help="Focal length in mm (else of the metadata).")] = None,
     f_number: Annotated[float | None, typer.Option(help="Stated f-number (else of the metadata).")] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option(help="Sensor width (else of the metadata).")] = None,
+    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", help="Sensor width in mm (else of the metadata).")] = None,
     encoding: Annotated[str, typer.Option(help="What integers of the file mean: srgb or linear.")] = "srgb",
     overwrite: Annotated[bool, typer.Option(help="Replace OUT and EVIDENCE where they exist.")] = False,
 ) -> None:
@@ -31,7 +33,7 @@ def match(
     Example: mrbokeh lens match night.jpg --out lens.json --evidence lens.png
     """
     from mrbokeh.atomic_files import atomic_path, refuse_existing
-    from mrbokeh.image_io import INTEGER_SUFFIXES, read_image
+    from mrbokeh.image_io import ENCODED_SUFFIXES, read_image
     from mrbokeh.lens_file import write_lens
     from mrbokeh.lens_matching.lens_match import match_lens
     from mrbokeh.lens_matching.match_picture import draw_match
@@ -46,7 +48,7 @@ def match(
         focal_length_mm=focal_length_mm, f_number=f_number, sensor_width_mm=sensor_width_mm, focus_distance_m=focus_distance_m
     )
     facts.require(photo)
-    largest = 1.0 if photo.suffix.lower() in INTEGER_SUFFIXES else float("inf")
+    largest = 1.0 if photo.suffix.lower() in ENCODED_SUFFIXES else float("inf")
     found = match_lens(rgb, facts, side=_SIDES[side], depth_m=depth_m, largest_value=largest)
     write_lens(out, found.lens)
     typer.echo(as_text(table_of(found)))

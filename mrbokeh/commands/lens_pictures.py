@@ -11,7 +11,7 @@ from mrbokeh.errors import InputError
 def show(
     lens: Annotated[Path, typer.Argument(help="Lens file, or the folder of a bank of PSFs.")],
     out: Annotated[Path, typer.Option(help="The picture to write (.png, .pdf or .svg).")],
-    width: Annotated[int, typer.Option(min=16, help="Image width in pixels (of a lens file).")] = 1920,
+    width: Annotated[int, typer.Option("--image-width", min=16, help="Image width in pixels (of a lens file).")] = 1920,
     overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
 ) -> None:
     """Draw the blur of a lens: its kernels over diameter and field, its outlines and low-rank error, and blur over depth.

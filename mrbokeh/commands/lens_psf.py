@@ -18,13 +18,21 @@ def psf(
     prescription: Annotated[
         Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")
     ] = None,
-    focus_distance_m: Annotated[float | None, typer.Option(help="Where the lens is focused, inf is allowed (physical; else 2 m).")] = None,
+    focus_distance_m: Annotated[
+        float | None, typer.Option("--focus", help="Where the lens is focused in metres, inf is allowed (physical; else 2 m).")
+    ] = None,
     f_number: Annotated[float | None, typer.Option(help="Closes the iris to this f-number (physical; open without).")] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option(help="Sensor width (physical; else 36).")] = None,
-    sensor_height_mm: Annotated[float | None, typer.Option(help="Sensor height (physical; else two thirds of the width).")] = None,
-    image_width_px: Annotated[int | None, typer.Option(help="Width of the pictures to blur (physical; else 1024).")] = None,
-    nearest_m: Annotated[float | None, typer.Option(help="Nearest depth of the bank (physical; else 0.5).")] = None,
-    farthest_m: Annotated[float | None, typer.Option(help="Farthest depth of the bank (physical: else 100; volume: else 5).")] = None,
+    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", help="Sensor width in mm (physical; else 36).")] = None,
+    sensor_height_mm: Annotated[
+        float | None, typer.Option("--sensor-height", help="Sensor height in mm (physical; else two thirds of the width).")
+    ] = None,
+    image_width_px: Annotated[
+        int | None, typer.Option("--image-width", help="Width in px of the pictures to blur (physical; else 1024).")
+    ] = None,
+    nearest_m: Annotated[float | None, typer.Option("--near", help="Nearest depth of the bank in metres (physical; else 0.5).")] = None,
+    farthest_m: Annotated[
+        float | None, typer.Option("--far", help="Farthest depth of the bank in metres (physical: else 100; volume: else 5).")
+    ] = None,
     vignetting: Annotated[
         bool | None,
         typer.Option("--vignetting/--no-vignetting", help="Whether kernels darken off the axis (physical; else they do)."),
@@ -49,9 +57,10 @@ def psf(
 
     Example: mrbokeh lens psf combined --out combined_bank --diameter 128 --motion 128
 
-    Example: mrbokeh lens psf physical --prescription dgauss.50mm.dat --focus-distance-m 1.5 --f-number 2.8 --sensor-width-mm 23.5
-    --image-width-px 1920 --counts 40,40 --out double_gauss
+    Example: mrbokeh lens psf physical --prescription dgauss.50mm.dat --focus 1.5 --f-number 2.8 --sensor-width 23.5
+    --image-width 1920 --counts 40,40 --out double_gauss
     """
+    from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.psf_models.build import build_bank
     from mrbokeh.psf_models.choose import ModelOptions, choose_model
 
@@ -76,7 +85,8 @@ def psf(
         cells=cells,
         device=device or None,
     )
-    bank = build_bank(choose_model(model, options), out, rays, seed, overwrite=overwrite)
+    with kept_when_interrupted(f"finished kernels are kept in {out}", overwrite):
+        bank = build_bank(choose_model(model, options), out, rays, seed, overwrite=overwrite)
     typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px")
 
 
@@ -106,11 +116,13 @@ def spreadlets(
     """
     import numpy as np
 
+    from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.psf_bank_file import SPREADLETS
     from mrbokeh.spreadlets import Sparsification
     from mrbokeh.spreadlets_build import build_spreadlets
 
     settings = Sparsification(points_per_px=points_per_px, lloyd_steps=lloyd_steps, annealing_steps=annealing_steps, seed=seed)
-    made = build_spreadlets(bank, settings, overwrite)
+    with kept_when_interrupted(f"finished kernels are kept in {bank}", overwrite):
+        made = build_spreadlets(bank, settings, overwrite)
     most = int(np.diff(made.starts).max())
     typer.echo(f"wrote {bank / SPREADLETS}: {len(made.points)} points of {len(made)} kernels, up to {most} each")

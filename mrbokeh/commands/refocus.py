@@ -44,6 +44,7 @@ def refocus(
     from mrbokeh.atomic_files import require_safe_outputs
     from mrbokeh.focal_stack import read_focal_stack, write_focal_stack, write_merged
     from mrbokeh.image_io import require_suffix
+    from mrbokeh.interrupts import kept_when_interrupted
 
     if out.resolve() == stack.resolve():
         raise InputError("--out must be another folder than the stack's own")
@@ -54,7 +55,8 @@ def refocus(
     way = _way(source, f_number, lens, renderer, residuals)
     _make_room(out, overwrite)
     settings = {"stack": str(stack.resolve()), "f_number": f_number, "lens": str(lens), "renderer": renderer, "residuals": residuals}
-    slices = _write_slices(way, distances_m, out, settings, overwrite)
+    with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
+        slices = _write_slices(way, distances_m, out, settings, overwrite)
     write_merged(out, source.all_in_focus(), source.focus_index(), source.depth_confidence(), source.depth_m())
     made = FocalStack(
         out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata={"refocused": settings}

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.commands._former_names import formerly
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.renderers.choose import DEFAULT
@@ -12,7 +13,7 @@ from mrbokeh.renderers.choose import DEFAULT
 app = typer.Typer(add_completion=False)
 
 
-@app.command()
+@app.command(cls=formerly(focus_distance_m="--focus"))
 def render(
     lens: Annotated[Path, typer.Option(help="Lens file (LENS.json), see `mrbokeh lens new`.")],
     out: Annotated[Path, typer.Option(help="Where the result goes: .exr, or .png, .tif, .jpg (over black).")],
@@ -37,7 +38,9 @@ def render(
     psf: Annotated[
         Path | None, typer.Option(help="Bank of PSFs in place of the opening, for polygon, low-rank, laplacian, scatter.")
     ] = None,
-    focus_distance_m: Annotated[float | None, typer.Option(help="Focus distance in place of the lens file's; inf is allowed.")] = None,
+    focus_distance_m: Annotated[
+        float | None, typer.Option("--focus", help="Focus distance in metres in place of the lens file's; inf is allowed.")
+    ] = None,
     focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None,
     srgb: Annotated[bool, typer.Option("--srgb", help="--rgb holds integers encoded as sRGB (highlights are lost).")] = False,
     alpha_out: Annotated[bool, typer.Option("--alpha-out", help="Write A, Z and all extra channels of the layers beside R, G, B.")] = False,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mrbokeh.atomic_files import refuse_existing, require_safe_outputs
+from mrbokeh.commands._former_names import formerly
 from mrbokeh.errors import InputError
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def track(
     typer.echo(_told(tracked, out))
 
 
-@app.command("convert")
+@app.command("convert", cls=formerly(frame_rate="--rate"))
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A track: .json, .chan, .jsonl, transforms.json or a folder of COLMAP.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; the suffix says in which format.")],
@@ -82,7 +83,9 @@ def convert(
     out_up: Annotated[str | None, typer.Option(metavar="AXIS", help="Which axis is to be up in OUT.")] = None,
     rotation_order: RotationOption = "ZXY",
     sensor_width: Annotated[float | None, typer.Option(min=0.1, metavar="MM", help="Of OpenTrackIO samples that do not tell it.")] = None,
-    frame_rate: Annotated[float | None, typer.Option(min=0.001, help="Gives frames the times of their numbers.")] = None,
+    frame_rate: Annotated[
+        float | None, typer.Option("--rate", min=0.001, help="Frames per second: gives frames the times of their numbers.")
+    ] = None,
     frame_offset: Annotated[int, typer.Option(help="Added to every frame number.")] = 0,
     metric: Annotated[
         bool | None, typer.Option("--metric/--no-metric", help="Whether lengths are metres, where the file leaves it open.")

@@ -7,6 +7,7 @@ import numpy as np
 import typer
 from jaxtyping import Float32
 
+from mrbokeh.commands._former_names import formerly
 from mrbokeh.depth_sources.depth_settings import DepthSettings, parse_known, parse_near_far, parse_stereo
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
@@ -15,7 +16,7 @@ from mrbokeh.transferring import SharpPhotograph
 app = typer.Typer(add_completion=False)
 
 
-@app.command()
+@app.command(cls=formerly(frame_rate="--rate"))
 def transfer(
     photo: Annotated[Path, typer.Argument(help="All-in-focus photograph; of a phone's JPEG with depth the sharp original is taken.")],
     lens: Annotated[Path, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network.")],
@@ -46,7 +47,7 @@ def transfer(
         bool, typer.Option("--same-view", help="Give the lens PHOTO's field of view (from its Exif), keep its f-number.")
     ] = False,
     highlights: Annotated[float, typer.Option(min=0.0, help="Take what is clipped to be so many stops brighter. 0: as stored.")] = 0.0,
-    frame_rate: Annotated[float, typer.Option(min=1.0, help="Of a film.")] = 25.0,
+    frame_rate: Annotated[float, typer.Option("--rate", min=1.0, help="Frames per second of a film.")] = 25.0,
     sheet: Annotated[Path | None, typer.Option(help="Also write a contact sheet of all distances (.png).")] = None,
     save_depth: Annotated[Path | None, typer.Option(help="Also write the depth that was used (.exr).")] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace files that exist.")] = False,
@@ -58,6 +59,7 @@ def transfer(
     Example: mrbokeh transfer aif.png --depth midas.onnx --disparity 0.5:inf --lens lens.json --focus 0.5:inf:48 --out pull.mp4
     """
     from mrbokeh.commands._transfer_outputs import check_out, write_blurred, write_sheet
+    from mrbokeh.held_lens import lens_as_held
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.transferring import open_sharp, seen_like, with_recovered_highlights
 
@@ -73,7 +75,8 @@ def transfer(
     given, blurs = lens_and_renderer(lens, renderer)
     assert given is not None
     sharp = open_sharp(photo, depth, settings)
-    chosen = seen_like(given, sharp.photograph, photo) if same_view else given
+    held = lens_as_held(given, sharp.photograph, photo)
+    chosen = seen_like(held, sharp.photograph, photo) if same_view else held
     distances_m = _distances(chosen, sharp, focus, focus_at)
     check_out(out, len(distances_m))
     rgb = sharp.photograph.rgb if highlights == 0.0 else with_recovered_highlights(sharp.photograph.rgb, highlights)

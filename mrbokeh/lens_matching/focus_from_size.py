@@ -29,7 +29,7 @@ def effective_f_number(lens: Lens, coc_px: float, depth_m: float, image_width_px
     if expected_px * coc_px <= 0.0:
         raise InputError(
             f"lights at {depth_m:g} m are {'behind' if expected_px > 0 else 'in front of'} a focus at {lens.focus_distance_m:g} m, but "
-            f"discs of the other side were asked for: check --depth-m, --focus-distance-m and --side"
+            f"discs of the other side were asked for: check --depth-m, --focus and --side"
         )
     return lens.f_number * expected_px / coc_px
 

@@ -6,15 +6,22 @@ from typing import Any
 
 import numpy as np
 
+from mrbokeh.cut_out import cut_from_px
 from mrbokeh.errors import InputError
 from mrbokeh.film_plane import lens_distance_m
 
 _EXIF_IFD = 0x8769
 _F_NUMBER, _SUBJECT_DISTANCE, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x829D, 0x9206, 0x920A, 0xA405
-_PIXEL_WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA20E, 0xA210
+_PIXEL_WIDTH, _PIXEL_HEIGHT, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 _FULL_FRAME_DIAGONAL_MM = float(np.hypot(36.0, 24.0))
 _INFINITELY_FAR = 0xFFFFFFFF
+_OPTIONS = {
+    "focal_length_mm": "--focal-length",
+    "f_number": "--f-number",
+    "sensor_width_mm": "--sensor-width",
+    "focus_distance_m": "--focus",
+}
 
 
 @dataclass(frozen=True)
@@ -30,7 +37,7 @@ class PhotoFacts:
         """With what the user states in place of what the file does."""
         for name, value in values.items():
             if value is not None and not value > 0.0:
-                raise InputError(f"expected --{name.replace('_', '-')} above 0, got {value:g}")
+                raise InputError(f"expected {_OPTIONS[name]} above 0, got {value:g}")
         return PhotoFacts(
             **{each.name: getattr(self, each.name) if values.get(each.name) is None else values[each.name] for each in fields(self)}
         )
@@ -38,7 +45,7 @@ class PhotoFacts:
     def require(self, where: Path | str) -> None:
         """Everything but the focus distance."""
         names = ("focal_length_mm", "f_number", "sensor_width_mm")
-        missing = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is None]
+        missing = [_OPTIONS[name] for name in names if getattr(self, name) is None]
         if missing:
             raise InputError(f"{where}: its metadata do not tell all that a lens needs: give {', '.join(missing)}")
 
@@ -79,12 +86,19 @@ def positive_rational(value: Any) -> float | None:
     return number if np.isfinite(number) and number > 0.0 else None
 
 
+def _pixels(value: Any) -> int:
+    number = positive_rational(value)
+    return 0 if number is None or np.isinf(number) else int(number)
+
+
 def _sensor_width_mm(tags: dict[int, Any], focal_length_mm: float | None, size_px: tuple[int, int]) -> float | None:
     resolution, unit = positive_rational(tags.get(_PLANE_RESOLUTION)), _MM_PER_UNIT.get(tags.get(_PLANE_UNIT, 2))
-    pixels = positive_rational(tags.get(_PIXEL_WIDTH)) or float(size_px[0])
+    stated_px = _pixels(tags.get(_PIXEL_WIDTH)), _pixels(tags.get(_PIXEL_HEIGHT))
+    cut_px = cut_from_px(size_px, stated_px)
+    pixels = float(size_px[0] if cut_px else stated_px[0] or size_px[0])
     if resolution is not None and unit is not None and 1.0 < pixels / resolution * unit < 100.0:
         return pixels / resolution * unit
     film_mm = positive_rational(tags.get(_FOCAL_LENGTH_35MM))
     if film_mm is None or focal_length_mm is None:
         return None
-    return _FULL_FRAME_DIAGONAL_MM * focal_length_mm / film_mm * size_px[0] / float(np.hypot(*size_px))
+    return _FULL_FRAME_DIAGONAL_MM * focal_length_mm / film_mm * size_px[0] / float(np.hypot(*(cut_px or size_px)))

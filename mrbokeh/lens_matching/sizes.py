@@ -71,7 +71,7 @@ def size_facts(
         return made(stated.f_number, None, facts.focus_distance_m, None, True, _lights_at(stated, side * diameter, image_width_px))
     far_m = focus_from_size(stated, diameter, np.inf, image_width_px) if side > 0 else np.inf
     bound = f"at most {far_m:.3g} m, which the lens file holds (lights far away)" if side > 0 else "the lens file holds infinity"
-    return made(stated.f_number, None, far_m, None, False, f"focus unknown, {bound}: give --depth-m or --focus-distance-m")
+    return made(stated.f_number, None, far_m, None, False, f"focus unknown, {bound}: give --depth-m or --focus")
 
 
 def _with_error(value: Callable[[float], float], at: float, error: float) -> tuple[float, float]:

@@ -88,7 +88,16 @@ _MODELS: dict[str, tuple[Callable[[ModelOptions], PsfModel], frozenset[str]]] = 
     "volume": (_volume, frozenset(_VOLUME)),
     "stylized": (_stylized, frozenset({"image", "diameter_px", "counts", "device"})),
 }
-_FLAGS = {"diameter_px": "--diameter", "motion_px": "--motion"}
+_FLAGS = {
+    "diameter_px": "--diameter",
+    "motion_px": "--motion",
+    "focus_distance_m": "--focus",
+    "sensor_width_mm": "--sensor-width",
+    "sensor_height_mm": "--sensor-height",
+    "image_width_px": "--image-width",
+    "nearest_m": "--near",
+    "farthest_m": "--far",
+}
 MODEL_NAMES = tuple(_MODELS)
 
 

@@ -118,8 +118,11 @@ class OnnxNetwork:
         return Layer(np.maximum(rgb, 0) * reached[..., None], alpha * reached, layer.depth_m)
 
     def _require_trained_lens(self, lens: Lens) -> None:
-        for name in ("focal_length_mm", "f_number", "sensor_width_mm"):
+        for name in ("focal_length_mm", "f_number"):
             self._require_trained(name, getattr(lens, name))
+        # Held upright, the width of the sensor lies along the height of the picture.
+        upright = (lens.sensor_height_mm or 0.0) > lens.sensor_width_mm
+        self._require_trained("sensor_width_mm", lens.sensor_height_mm if upright and lens.sensor_height_mm else lens.sensor_width_mm)
 
     def _require_trained(self, name: str, got: float) -> None:
         """One value of a lens: within the range of the data where it is an input, else that of the lens it was trained for."""

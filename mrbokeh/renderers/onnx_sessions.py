@@ -3,6 +3,7 @@
 Spinning is off: threads that wait in a busy loop take the cores that rendering, or another network, needs.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
 PROVIDERS = {"tensorrt": "TensorrtExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider"}
 CPU = "CPUExecutionProvider"
 _PACKAGES = {"tensorrt": "onnxruntime-gpu and TensorRT", "cuda": "onnxruntime-gpu", "openvino": "onnxruntime-openvino"}
+# As onnxruntime 1.20 to 1.31 say it: core/graph/model.cc and model_load_utils.h.
+_NEWER_IR = re.compile(r"IR version: (\d+), max supported IR version: (\d+)")
+_NEWER_OPSET = re.compile(r"Opset (\d+) is under development.*till opset (\d+)", re.DOTALL)
 
 
 def open_session(path: Path, threads: int = 0, providers: Sequence[str] | None = None) -> "onnxruntime.InferenceSession":
@@ -32,7 +36,7 @@ def open_session(path: Path, threads: int = 0, providers: Sequence[str] | None =
     try:
         return onnxruntime.InferenceSession(str(path), _options(threads), providers=chosen)
     except Exception as error:  # onnxruntime has no common base class for "this is not a model"
-        raise InputError(f"{path} cannot be opened as an ONNX network: {str(error)[:200]}") from None
+        raise InputError(_unopened(path, str(error))) from None
 
 
 def provider_of(session: "onnxruntime.InferenceSession") -> str:
@@ -42,6 +46,19 @@ def provider_of(session: "onnxruntime.InferenceSession") -> str:
     """
     first = session.get_providers()[0]
     return next((name for name, full in PROVIDERS.items() if full == first), "cpu")
+
+
+def _unopened(path: Path, reason: str) -> str:
+    """In ONNX Runtime's words, but where the file is newer than it."""
+    import onnxruntime
+
+    for newer, what in ((_NEWER_IR, "IR version"), (_NEWER_OPSET, "opset")):
+        if found := newer.search(reason):
+            return (
+                f"{path} is of ONNX {what} {found[1]}, but ONNX Runtime {onnxruntime.__version__} reads up to {found[2]}: install a newer "
+                f"onnxruntime, or export it again, by `mrbokeh train export` or with a lower opset_version (and ir_version) elsewhere"
+            )
+    return f"{path} cannot be opened as an ONNX network: {reason[:200]}"
 
 
 def _chosen(wanted: Sequence[str] | None, available: Sequence[str]) -> list[Any]:

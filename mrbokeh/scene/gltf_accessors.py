@@ -62,7 +62,7 @@ class GltfFile:
             encoded = _read_uri(image.uri, self.path)
         pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None:
-            raise InputError(f"{self.path.name}: image {index} ({image.mimeType}) cannot be decoded: export it as PNG or JPEG")
+            raise InputError(f"{self.path}: image {index} ({image.mimeType}) cannot be decoded: export it as PNG or JPEG")
         if pixels.ndim == 2:
             pixels = np.repeat(pixels[..., None], 3, axis=2)
         order = cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
@@ -74,7 +74,7 @@ class GltfFile:
         stride = view.byteStride or width * dtype.itemsize
         start = (view.byteOffset or 0) + offset
         if start + (count - 1) * stride + width * dtype.itemsize > len(self.buffers[view.buffer]):
-            raise InputError(f"{self.path.name}: a buffer view reaches past the end of its buffer: the file is cut short or damaged")
+            raise InputError(f"{self.path}: a buffer view reaches past the end of its buffer: the file is cut short or damaged")
         strided = np.ndarray((count, width), dtype, self.buffers[view.buffer], start, (stride, dtype.itemsize))
         return np.array(strided)
 
@@ -100,10 +100,10 @@ def open_gltf(path: str | Path) -> GltfFile:
     except InputError:
         raise
     except Exception as reason:  # pygltflib lets through whatever struct, json and dataclasses_json raise
-        raise InputError(f"{path.name} is not a readable glTF 2.0 file ({reason}): export it again as .glb") from reason
+        raise InputError(f"{path} is not a readable glTF 2.0 file ({reason}): export it again as .glb") from reason
     missing = sorted(set(gltf.extensionsRequired or ()) - _READABLE_EXTENSIONS)
     if missing:
-        raise InputError(f"{path.name} requires {', '.join(missing)}, which is not supported: export it without compression or extensions")
+        raise InputError(f"{path} requires {', '.join(missing)}, which is not supported: export it without compression or extensions")
     return GltfFile(path, gltf, buffers)
 
 
@@ -112,5 +112,5 @@ def _read_uri(uri: str, beside: Path) -> bytes:
         return base64.b64decode(uri.split(",", 1)[1])
     target = beside.parent / unquote(uri)
     if not target.is_file():
-        raise InputError(f"{beside.name} refers to {uri}, which is not beside it: keep the files together or export as .glb")
+        raise InputError(f"{beside} refers to {uri}, which is not beside it: keep the files together or export as .glb")
     return target.read_bytes()

@@ -74,7 +74,7 @@ def _chosen_animation(file: GltfFile, animation: str | int | None) -> Any:
     names = list(animation_durations_s(file))
     number = names.index(animation) if animation in names else animation
     if not isinstance(number, int) or not 0 <= number < len(animations):
-        raise InputError(f"{file.path.name} has the animations {names}, not {animation!r}: choose one of them")
+        raise InputError(f"{file.path} has the animations {names}, not {animation!r}: choose one of them")
     return animations[number]
 
 

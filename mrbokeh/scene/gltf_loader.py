@@ -50,7 +50,7 @@ class GltfAsset:
             meshes += self._meshes(number, poses, world_from_node)
             lights += _lights(self._file, number, transform)
         if not meshes and not lights:
-            raise InputError(f"{self._file.path.name}: expected triangles, found none in its scene: export a mesh")
+            raise InputError(f"{self._file.path}: expected triangles, found none in its scene: export a mesh")
         return Scene(tuple(meshes), tuple(lights)).transformed(WORLD_FROM_GLTF)
 
     @cached_property
@@ -85,7 +85,7 @@ def _world_from_node(file: GltfFile, poses: list[NodePose]) -> dict[int, Float[n
     while waiting:
         number, world_from_parent = waiting.pop()
         if number in world_from_node:
-            raise InputError(f"{file.path.name}: node {number} has two parents: the file is damaged, export it again")
+            raise InputError(f"{file.path}: node {number} has two parents: the file is damaged, export it again")
         world_from_node[number] = world_from_parent @ poses[number].parent_from_node
         waiting += [(child, world_from_node[number]) for child in reversed(gltf.nodes[number].children or ())]
     return world_from_node
@@ -95,7 +95,7 @@ def _world_from_joints(file: GltfFile, skin: int, world_from_node: dict[int, Flo
     joints = file.gltf.skins[skin]
     missing = [joint for joint in joints.joints if joint not in world_from_node]
     if missing:
-        raise InputError(f"{file.path.name}: the joints {missing} of a skin are not in its scene: export skeleton and mesh together")
+        raise InputError(f"{file.path}: the joints {missing} of a skin are not in its scene: export skeleton and mesh together")
     world_from_joint = np.stack([world_from_node[joint] for joint in joints.joints])
     if joints.inverseBindMatrices is None:
         return world_from_joint

@@ -74,7 +74,7 @@ def read_primitive(file: GltfFile, primitive: Any, morph_weights: Float[np.ndarr
 
     positions, normals = morphed("POSITION"), morphed("NORMAL")
     if positions is None:
-        raise InputError(f"{file.path.name}: a mesh has no positions: export it again without mesh compression")
+        raise InputError(f"{file.path}: a mesh has no positions: export it again without mesh compression")
     uvs = [uv for uv in (read("TEXCOORD_0"), read("TEXCOORD_1")) if uv is not None]
     colors = read("COLOR_0")
     if colors is not None and colors.shape[1] == 3:

@@ -1,0 +1,94 @@
+"""Progress where nobody watches: plain lines now and then, and one at the end of what took long."""
+
+import io
+from collections.abc import Iterator
+
+import pytest
+from rich.console import Console
+
+from mrbokeh import progress
+from mrbokeh.progress import PlainLines, track
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def said(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """What progress tells a file, with the time of the clock."""
+    log = io.StringIO()
+    monkeypatch.setattr(progress, "PlainLines", lambda console: PlainLines(console, get_time=clock))
+    monkeypatch.setattr(progress, "Console", lambda **_: Console(file=log, force_terminal=False, width=40))
+    return log
+
+
+def slow(clock: Clock, count: int, each_s: float) -> Iterator[int]:
+    for number in range(count):
+        clock.now_s += each_s
+        yield number
+
+
+def test_lines_come_every_ten_seconds_and_at_the_end(clock: Clock, said: io.StringIO) -> None:
+    """12 items of 4 s: lines at the first item beyond 10 s each time, and at 48 s."""
+    assert list(track(slow(clock, 12, 4.0), "shooting", 12)) == list(range(12))
+    assert said.getvalue().splitlines() == [
+        "shooting: 3 of 12, 0:00:12, about 0:00:36 left",
+        "shooting: 6 of 12, 0:00:24, about 0:00:24 left",
+        "shooting: 9 of 12, 0:00:36, about 0:00:12 left",
+        "shooting: 12 of 12, 0:00:48",
+    ]
+
+
+def test_long_work_is_told_less_and_less_often(clock: Clock, said: io.StringIO) -> None:
+    """An hour in seconds: ten lines in the first 100 s, and one for each twentieth of the time from 200 s on, 1.05^n."""
+    list(track(slow(clock, 3600, 1.0), "train", 3600))
+    lines = said.getvalue().splitlines()
+    assert sum(int(line.split()[1]) <= 100 for line in lines) == 10
+    assert 60 < len(lines) < 85
+
+
+@pytest.mark.parametrize(("total", "lines"), [(0, ["frames: 4, 0:00:08"]), (2, ["frames: 2 of 2, 0:00:04", "frames: 4 of 2, 0:00:08"])])
+def test_a_wrong_total_is_no_flood_of_lines(clock: Clock, said: io.StringIO, total: int, lines: list[str]) -> None:
+    """Clips that state no number of frames give 0, others too few: the stated end, where there is one, and the last."""
+    list(track(slow(clock, 4, 2.0), "frames", total))
+    assert said.getvalue().splitlines() == lines
+
+
+def test_what_is_done_at_once_leaves_no_line(clock: Clock, said: io.StringIO) -> None:
+    list(track(slow(clock, 5, 0.1), "kernels", 5))
+    list(track([], "nothing"))
+    assert said.getvalue() == ""
+
+
+def test_what_is_broken_off_says_how_far_it_was(clock: Clock, said: io.StringIO) -> None:
+    for number in track(slow(clock, 5, 3.0), "slices", 5):
+        if number == 1:
+            break
+    assert said.getvalue().splitlines() == ["slices: 1 of 5, 0:00:06, about 0:00:24 left"]
+
+
+def test_counts_that_are_set_and_totals_that_come_later(clock: Clock, said: io.StringIO) -> None:
+    """As COLMAP's stages are shown; and a number that nobody knows the end of."""
+    with progress.progress_bars() as bars:
+        features, frames = bars.add_task("features", total=None), bars.add_task("frames", total=None)
+        clock.now_s += 11.0
+        bars.update(features, completed=4, total=8)
+        bars.update(features, completed=4, total=8)
+        bars.advance(frames)
+        clock.now_s += 1.0
+        bars.update(features, completed=8)
+    assert said.getvalue().splitlines() == [
+        "features: 4 of 8, 0:00:11, about 0:00:11 left",
+        "frames: 1, 0:00:11",
+        "features: 8 of 8, 0:00:12",
+    ]
