@@ -121,7 +121,7 @@ def _is_free(light: np.ndarray, values: np.ndarray) -> bool:
     least, most = np.float32(np.inf), np.float32(0.0)
     for i in range(3, len(values), 4):
         least, most = min(least, values[i]), max(most, light[i])
-    return least > np.float32(0.0) and most == np.float32(0.0)
+    return bool(least > 0.0 and most == 0.0)
 
 
 @njit(cache=True, nogil=True)

@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.exr_primaries import known_primaries
 
 REC709_LINEAR = "Linear Rec.709 (sRGB)"
 """What everything here is in, as the Academy's configurations name it; many others know it by the alias lin_rec709_srgb."""
-AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
-"""CIE x, y of red, green, blue and white of ACEScg (S-2014-004), to be stated in an EXR header."""
 BUILT_IN = {"aces": "studio-config-latest", "aces-cg": "cg-config-latest"}
 _OURS = (REC709_LINEAR, "lin_rec709_srgb", "lin_rec709", "lin_srgb", "Utility - Linear - sRGB", "Linear Rec.709")
 _NAMED = 5
@@ -108,6 +107,16 @@ class NamedSpace:
         """Whether twice the light is twice the number, as in ACEScg and unlike in camera curves and on displays."""
         once = np.array([[[0.05, 0.2, 0.3]]], np.float32)
         return bool(np.allclose(self.from_rec709(2 * once), 2 * self.from_rec709(once), rtol=1e-4))
+
+    @property
+    def primaries(self) -> tuple[float, ...] | None:
+        """CIE x, y of red, green, blue and white, to be stated in an EXR header.
+
+        None of a space that is not linear, or whose primaries are none of those in `mrbokeh.exr_primaries`.
+        """
+        if not self.is_linear:
+            return None
+        return known_primaries(self.to_rec709(np.eye(3, dtype=np.float32)[None])[0].T.astype(np.float64))
 
     def to_rec709(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
         """Numbers of this space as linear Rec.709."""

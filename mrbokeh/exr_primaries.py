@@ -17,10 +17,21 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 BT2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 """The same of ITU-R BT.2020, which holds nearly all colours of real things."""
 
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+"""The same of ACES2065-1 (SMPTE ST 2065-1)."""
+
+AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+"""The same of ACEScg (S-2014-004)."""
+
+P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+"""The same of SMPTE RP 431-2 with the white of displays."""
+
 # Cone responses that the Bradford transform scales (Lam 1985; CIE 160:2004).
 _CONES_FROM_XYZ = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 # Programs write D65 with four to six digits.
 _SAME_XY = 1e-4
+# Digits with which configurations of colour spaces state their matrices.
+_SAME_MATRIX = 1e-3
 # Of real colour spaces it is below 10; three primaries on one line, rounded to float32, have 1e6 and more.
 _LARGEST_CONDITION = 1e4
 
@@ -66,6 +77,14 @@ def rec709_from_chromaticities(chromaticities: Sequence[float]) -> Float64[np.nd
         return None
     adapted = np.linalg.solve(_CONES_FROM_XYZ, (ours / theirs)[:, None] * _CONES_FROM_XYZ)
     return rec709_from_XYZ @ adapted @ XYZ_from_rgb
+
+
+def known_primaries(rec709_from_rgb: Float64[np.ndarray, "3 3"]) -> tuple[float, ...] | None:
+    """Those of the public standards whose way to linear Rec.709 this matrix is; None where it is that of none of them."""
+    for primaries in (REC709, BT2020, AP0, AP1, P3_D65):
+        if np.abs(_known(rec709_from_chromaticities(primaries)) - rec709_from_rgb).max() < _SAME_MATRIX:
+            return primaries
+    return None
 
 
 def _xyz_matrix(xy: Float[np.ndarray, "4 2"]) -> Float64[np.ndarray, "3 3"] | None:

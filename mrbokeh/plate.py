@@ -12,9 +12,11 @@ from mrbokeh.depth_sources.depth_settings import DepthSettings
 from mrbokeh.depth_sources.open_depth import open_depth
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
+from mrbokeh.held_lens import lens_as_held
 from mrbokeh.image_io import read_image
 from mrbokeh.lens import Lens
 from mrbokeh.photograph import read_photograph
+from mrbokeh.plate_alpha import is_straight, read_alpha
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class Plate:
 
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
+    alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -31,6 +34,7 @@ class Plate:
     camera: Camera
     sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None
     near_alpha: Float32[np.ndarray, "height width"] | None = None
+    alpha: Float32[np.ndarray, "height width"] | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -70,15 +74,21 @@ def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = 
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}")
     photograph = read_photograph(photo)
-    if lens is None:
-        lens = photograph.lens(photo, focus_m)
+    lens = photograph.lens(photo, focus_m) if lens is None else lens_as_held(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
-    return plate_of(photograph.rgb, focused)
+    return with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.quarter_turns))
 
 
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
     """A picture through the pinhole of its lens, which looks at its middle."""
     return Plate(rgb, depth_m, lens, _pinhole(lens, rgb))
+
+
+def with_own_alpha(plate: Plate, path: Path, alpha: Float32[np.ndarray, "height width"] | None) -> Plate:
+    """The plate as its file stores it, with that file's alpha; colour is multiplied by it where it is stored straight."""
+    if alpha is None:
+        return replace(plate, alpha=None)
+    return replace(plate, rgb=plate.rgb * alpha[..., None] if is_straight(path) else plate.rgb, alpha=alpha)
 
 
 def bundle_plate(bundle: CaptureBundle, lens: Lens | None = None, focus_m: float | None = None) -> Plate:

@@ -2,7 +2,8 @@
 
 FOLDER: a set by `python -m datasets_scripts.mixed_reality FOLDER`; without one, cards of 320x214 px. PSNR in linear light clipped to
 [0, 1]: of the frame, of the blurred region of object and occluders together, and of what the object touches. Yardsticks: the
-blurred object cut by the sharp visibility mask, and the blurred object over everything. Then times: a 24-megapixel photograph and
+blurred object cut by the sharp visibility mask, and the blurred object over everything. --rims: only between, of round openings, with
+near things in depth so many pixels too wide, depth taken as it is and rims moved. Then times: a 24-megapixel photograph and
 frames of 1080p, object and near things within a box of a tenth of the frame.
 """
 
@@ -14,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.compositing.choose import MODES
+from mrbokeh.compositing.choose import MODES, insertion_of
+from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.plate import Plate, plate_of
@@ -23,10 +25,14 @@ from tests.machine import machine_line, memory_line
 from tests.mixed_reality_cases import BASELINES, MixedCase, card_cases, traced_cases
 
 COLUMNS = (*BASELINES, *(mode for mode in MODES if mode != "front"))
+RIMS_PX = (0, 1, 2, -1, -2)
 REGIONS = ("frame", "object and occluders", "object")
 
 
 def main() -> None:
+    if "--rims" in sys.argv:
+        print_rims(traced_cases(Path(sys.argv[1])))
+        return
     folders = [Path(each) for each in sys.argv[1:] if not each.startswith("--")]
     print_table(traced_cases(folders[0]) if folders else card_cases(320, 214, ("disc", "blades7", "heart"), 400))
     if "--fast" not in sys.argv:
@@ -56,6 +62,24 @@ def print_table(cases: Iterator[MixedCase]) -> None:
     print(
         f"least gain over the better yardstick (frame): {min(gains):.1f} dB; untouched pixels are the plate's in all {len(rows)} pictures"
     )
+
+
+def print_rims(cases: Iterator[MixedCase]) -> None:
+    """Frame PSNR per picture: as it is, and with rims moved."""
+    renderer, found = PolygonDifferences(), []
+    print(f"| picture | {' | '.join(f'{by_px:+d} px' for by_px in RIMS_PX)} |\n|---|{'---|' * len(RIMS_PX)}")
+    for case in cases:
+        if ", disc, " not in case.name:
+            continue
+        ways = [insertion_of("between", exact_depth=exact) for exact in (True, False)]
+        plates = [case.with_near_wider_by(by_px).plate for by_px in RIMS_PX]
+        found.append([[psnr(way.insert(plate, [case.virtual], renderer).rgb, case.truth) for way in ways] for plate in plates])
+        print(_pairs(case.name, np.array(found[-1])))
+    print(_pairs("mean", np.mean(found, axis=0)))
+
+
+def _pairs(name: str, values: np.ndarray) -> str:
+    return f"| {name} | {' | '.join(f'{kept:.1f} / {moved:.1f}' for kept, moved in values)} |"
 
 
 def print_times(width: int, height: int, repeats: int) -> None:

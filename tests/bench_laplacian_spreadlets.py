@@ -25,7 +25,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
 from tests.machine import machine_line, memory_line
 
-REPEATS = 3
+REPEATS = 9
 SIZE = (540, 960)
 DISC = Aperture.disc()
 

@@ -39,6 +39,9 @@ VARIANTS = {
     "one cell of motion": replace(ALL, motion_step_px=np.inf),
     "neither merging nor sparse statistics": replace(ALL, merge=False, sparse_statistics=False),
     "merging alone": replace(ALL, sparse_statistics=False),
+    "parts are not merged": replace(ALL, part_tolerance=0.0),
+    "buckets alone, as in the paper, are merged": replace(ALL, part_tolerance=0.0, faint=0.0),
+    "one part without merging and sparse statistics": replace(ALL, pupil_parts=1, shutter_parts=1, merge=False, sparse_statistics=False),
     "sparse statistics alone": replace(ALL, merge=False),
     "every sample weighs (no evening out)": replace(ALL, enough=np.inf),
     "Gaussian, sheared recursive, 2 passes": replace(ALL, screen_filter="sheared"),
@@ -49,6 +52,15 @@ VARIANTS = {
         ALL, screen_filter="sheared", recursive_passes=1, enough=np.inf, merge=False, sparse_statistics=False
     ),
 }
+
+OF_SETS = (
+    "all improvements",
+    "neither merging nor sparse statistics",
+    "parts are not merged",
+    "buckets alone, as in the paper, are merged",
+    "pupil and shutter in one part",
+    "one part without merging and sparse statistics",
+)
 
 
 def scenes(size_px: int) -> dict[str, list[Plane]]:
@@ -114,7 +126,7 @@ def _set(folder: Path) -> None:
         f"{folder.name}, {samples.per_pixel:.0f} spp (dB linear / displayed): raw {linear_db[0]:.1f} / {shown_db[0]:.1f}, "
         f"best non-local means {linear_db[1]:.1f} / {shown_db[1]:.1f}"
     )
-    for variant in ("all improvements", "neither merging nor sparse statistics", "pupil and shutter in one part"):
+    for variant in OF_SETS:
         method = LayeredReconstruction(VARIANTS[variant])
         rgb, counts = method.reconstruct_counted(samples, lens)
         displayed = linear_to_srgb(np.clip(rgb, 0, 1))

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from datasets_scripts.card_scene import lens_of_radius, truth
@@ -13,6 +14,7 @@ from datasets_scripts.truth_shapes import lens_shape
 from mrbokeh.aperture import Aperture
 from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.between import Between
+from mrbokeh.compositing.near_and_far import continued
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.exr_io import read_exr
 from mrbokeh.image_io import read_image, read_layer
@@ -45,7 +47,7 @@ class MixedCase:
 
     def union(self, renderer: Renderer) -> np.ndarray:
         """The blurred region of the object and of what is nearer than it."""
-        scene = Between().cut(self.plate, [self.virtual])
+        scene = Between(true_rims=False).cut(self.plate, [self.virtual], renderer)
         blurred = [renderer.render([layer], self.plate.lens).alpha > _LEAST for layer in (scene.near, self.virtual)]
         return blurred[0] | blurred[1]
 
@@ -53,9 +55,26 @@ class MixedCase:
         """The blurred region of the object alone: no other pixel can be wrong."""
         return renderer.render([self.virtual], self.plate.lens).alpha > _LEAST
 
+    def with_near_wider_by(self, by_px: int) -> "MixedCase":
+        """Depth in which what is nearer than the object is wider by so many pixels all around (below 0: narrower)."""
+        depth_m = self.plate.depth_m
+        assert depth_m is not None
+        near = depth_m < self.virtual.depth_m[self.virtual.alpha > 0].min() / 1.03
+        return replace(self, plate=replace(self.plate, depth_m=wider(depth_m, near, by_px)))
+
     def measure(self, inserted: Inserted, union: np.ndarray, touched: np.ndarray) -> tuple[float, float, float]:
         """PSNR, linear and clipped to [0, 1], of the frame, of the union and of what the object touches."""
         return psnr(inserted.rgb, self.truth), psnr(inserted.rgb, self.truth, mask=union), psnr(inserted.rgb, self.truth, mask=touched)
+
+
+def wider(depth_m: np.ndarray, near: np.ndarray, by_px: int) -> np.ndarray:
+    """What is near grows (or shrinks, below 0); what is gained has the depth of the nearest pixel that has it."""
+    kernel = np.ones((2 * abs(by_px) + 1,) * 2, np.uint8)
+    now = (cv2.dilate if by_px > 0 else cv2.erode)(near.astype(np.uint8), kernel) > 0
+    wrong = depth_m.copy()
+    wrong[now & ~near] = continued(depth_m, near)[now & ~near]
+    wrong[near & ~now] = continued(depth_m, ~near)[near & ~now]
+    return wrong
 
 
 def traced_cases(folder: Path) -> Iterator[MixedCase]:

@@ -253,7 +253,7 @@ def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) ->
     assert code == 1 and "--overwrite" in told
     code, told = run("convert", tmp_path / "track.json", tmp_path / "track.chan", "--frame-offset", 1001)
     assert code == 0 and "lacks: times" in told and "16 frames, 1001 to 1016" in told
-    code, told = run("convert", tmp_path / "track.chan", tmp_path / "back.json", "--size", "320x180", "--frame-rate", 24, "--out-up", "-z")
+    code, told = run("convert", tmp_path / "track.chan", tmp_path / "back.json", "--size", "320x180", "--rate", 24, "--out-up", "-z")
     assert code == 0
     one, other = read_track(tmp_path / "track.json"), read_track(tmp_path / "back.json")
     assert (one.up, other.up) == ("-z", "-z") and other.at(1016).time_s == pytest.approx(1016 / 24)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mrbokeh.color import linear_to_srgb
-from mrbokeh.color_management import AP1, REC709_LINEAR, ColorConversion, open_config, rec709_name
+from mrbokeh.color_management import REC709_LINEAR, ColorConversion, open_config, rec709_name
 from mrbokeh.errors import InputError, MissingExtraError
-from mrbokeh.exr_primaries import rec709_from_chromaticities
+from mrbokeh.exr_primaries import AP1, rec709_from_chromaticities
 
 ocio = pytest.importorskip("PyOpenColorIO")
 

@@ -12,6 +12,7 @@ from mrbokeh.camera import Camera
 from mrbokeh.commands.composite import app
 from mrbokeh.demo.plan import DATA
 from mrbokeh.errors import InputError
+from mrbokeh.exr_io import read_exr
 from mrbokeh.exr_layers.composite_exr import read_composite_exr
 from mrbokeh.exr_layers.deep_layers import DeepSurfaces
 from mrbokeh.exr_layers.deep_out import write_deep_exr
@@ -210,6 +211,8 @@ def test_spaces_of_opencolorio_come_in_and_go_out(files: Path) -> None:
     pytest.importorskip("PyOpenColorIO")
     write_image(files / "red.exr", np.full((HEIGHT, WIDTH, 3), [1.0, 0.0, 0.0], np.float32), half=False)
     out = put_in(files, "--output-space", "ACEScg", photo="red.exr")
-    assert out[5, 5, 0] == pytest.approx(0.6131, abs=2e-3)
+    (written,) = (path for path in files.glob("out*.exr"))
+    assert read_exr(written)[0].stacked("RGB")[5, 5, 0] == pytest.approx(0.6131, abs=2e-3)
+    np.testing.assert_allclose(out[5, 5], [1.0, 0.0, 0.0], atol=2e-3)  # its header says what it is
     back = put_in(files, "--input-space", "ACEScg", photo="red.exr")
     assert back[5, 5, 0] == pytest.approx(1.705, abs=5e-3) and back[5, 5, 1] < -0.1

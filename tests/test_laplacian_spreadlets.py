@@ -1,5 +1,5 @@
 from dataclasses import replace
-from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +12,9 @@ from mrbokeh.lens import Lens
 from mrbokeh.light_field_samples import LightFieldSamples
 from mrbokeh.psf_bank import Axis, PsfBank
 from mrbokeh.renderers._laplacian_bank import Place, turned_kernel
-from mrbokeh.renderers._laplacian_sums import add_light, is_even, splat, splat_plainly
+from mrbokeh.renderers._laplacian_lamps import lamps_among, lamps_among_plainly
+from mrbokeh.renderers._laplacian_layout import FOUR, Laid, Window, gains_for
+from mrbokeh.renderers._laplacian_sums import _Splatting, splat, splat_plainly
 from mrbokeh.renderers._laplacian_tables import (
     LEVELS_PER_OCTAVE,
     SPARSE,
@@ -183,18 +185,140 @@ def test_levels_are_the_nearest_powers() -> None:
     np.testing.assert_allclose(found[clear], 24.0 * 2.0 ** (np.rint(exact[clear]) / LEVELS_PER_OCTAVE), rtol=1e-12)
 
 
-def test_single_precision_is_taken_where_it_is_as_good() -> None:
-    """Even light comes back to 1e-5 of the mean (1e-4 is allowed); amid it a lamp of 1000 and all is in double precision."""
-    values, coc_px = picture(17, (192, 192)), slope_px(30.0, 50.0, (192, 192))
-    single, double = LaplacianSpreadlets(), LaplacianSpreadlets()
-    object.__setattr__(double, "_add_light", partial(add_light, is_precise=True))
-    assert is_even(values)
-    found, exact = (each.spread(values, coc_px, DISC) for each in (single, double))
-    np.testing.assert_allclose(found, exact, atol=1e-5 * values.mean())
-    assert np.any(found != exact)
-    values[90, 100, :3] = 1000.0
-    assert not is_even(values)
-    np.testing.assert_array_equal(single.spread(values, coc_px, DISC), double.spread(values, coc_px, DISC))
+def in_double(renderer: LaplacianSpreadlets) -> LaplacianSpreadlets:
+    """The same kernels and the same lamps, but every sum of Laplacians in double precision."""
+    twin = replace(renderer)
+    object.__setattr__(twin, "_tables", renderer._tables)
+    add_light = twin._add_light
+
+    def add_in_double(out: np.ndarray, *task: object, largest: object = None, taps: tuple | None = None) -> None:  # noqa: ARG001
+        add_light(out, *task)
+        if taps is not None:
+            add_light(out, task[0], *taps, None, task[4])
+
+    object.__setattr__(twin, "_add_light", add_in_double)
+    return twin
+
+
+def dim_but_for_lamps(size: tuple[int, int], lamp: float) -> np.ndarray:
+    """Colour about 0.01 beside a coverage of 1, as at night, and one lamp in a thousand pixels."""
+    values = 0.01 * picture(17, size)
+    values[..., 3] = 1.0
+    values[np.random.default_rng(18).uniform(size=size) < 1e-3, :3] = lamp
+    return values
+
+
+LIGHTS = {
+    "patches": lambda: picture(17, (192, 192)),
+    "even": lambda: np.ones((192, 192, 4), np.float32),
+    "night": lambda: dim_but_for_lamps((192, 192), 50.0),
+}
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_whole_numbers_are_as_good_as_double_precision(name: str) -> None:
+    """To 1e-5 of what each channel is without lamps and the rounding of the result; coverage far brighter than colour costs nothing."""
+    values, coc_px = LIGHTS[name](), slope_px(30.0, 50.0, (192, 192))
+    whole = LaplacianSpreadlets()
+    found, exact = (each.spread(values, coc_px, DISC) for each in (whole, in_double(whole)))
+    typical = np.median(values, axis=(0, 1))
+    assert np.all(np.abs(found - exact) <= 1e-5 * typical + 2.0**-22 * np.abs(exact))
+    np.testing.assert_allclose(found.sum(axis=(0, 1), dtype=np.float64), exact.sum(axis=(0, 1), dtype=np.float64), rtol=3e-6)
+    assert np.any(found != exact), "else the twin is no twin"
+
+
+def test_light_that_is_no_number_goes_no_other_way_than_before() -> None:
+    """Whole numbers cannot hold it: sums in double precision say so."""
+    values, coc_px = picture(19), slope_px(30.0, 50.0)
+    values[40, 50, 1] = np.nan
+    found = LaplacianSpreadlets().spread(values, coc_px, DISC)
+    assert np.isnan(found[40, 50, 1])
+    assert np.isfinite(found[..., 0]).all()
+
+
+def sums_in_whole_numbers(values: np.ndarray, cells: np.ndarray, kernels: list, ends: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """Whole numbers, over their gains, in strips that end there; and the plain sums."""
+    points = joined_points([by_rows(each) for each in kernels])
+    size, margin = cells.shape, points.reach_px
+    window = Window(-margin, -margin, size[0] + 2 * margin, size[1] + 2 * margin)
+    gains = gains_for(np.abs(values).max(axis=(0, 1)), points)
+    splatting = _Splatting(values, cells, Laid.out(points, window.width, np.int32), window, gains)
+    reals, plain = np.zeros((*window[2:], FOUR), np.float32), np.zeros((*window[2:], FOUR))
+    for first, end in pairwise((0, *ends, window.height)):
+        splatting.fill(reals, first, end)
+    splat_plainly(plain, values, cells, points, window[:2])
+    return reals.astype(np.float64), plain, gains
+
+
+def test_whole_numbers_agree_with_the_plain_twin_and_sum_to_nothing() -> None:
+    """Each pixel's points sum to 0, so all sums do, to the last bit, wherever strips end; a point is off by one rounding, 126 of them
+    by less than 20 units."""
+    rng = np.random.default_rng(20)
+    kernels = [sparsify(DISC.rasterize(size).kernel, UNRELAXED) for size in (26.0, 29.0)]
+    cells = np.repeat(rng.integers(-1, 2, (60, 12)), 5, axis=1).astype(np.int32)
+    values = (rng.uniform(size=(*cells.shape, 4)) * (1.0, 0.01, 30.0, 1.0)).astype(np.float32)
+    found, plain, gains = sums_in_whole_numbers(values, cells, kernels, (31, 70))
+    again, _, _ = sums_in_whole_numbers(values, cells, kernels, ())
+    np.testing.assert_array_equal(found, again)
+    assert np.all(np.abs(found - plain) * gains < 20.0 + 2.0**-23 * np.abs(plain) * gains)
+    assert np.abs(plain * gains).max() > 1e6, "else 20 units were no small error"
+
+
+def test_no_light_is_too_much_for_whole_numbers() -> None:
+    """The worst there is: every pixel around one takes the kernel and the sign that add most to it."""
+    kernels = [whole_laplacian(DISC.rasterize(size).kernel) for size in (5.0, 9.0, 13.0)]
+    points = joined_points([by_rows(each) for each in kernels])
+    reach, best = points.reach_px, {}
+    for cell in range(3):
+        for n in range(points.starts[cell], points.starts[cell + 1]):
+            place, weight = tuple(points.xy[n]), points.weights[n]
+            if abs(weight) > abs(best.get(place, (0, 0.0))[1]):
+                best[place] = cell, weight
+    side = 2 * reach + 1
+    values, cells = np.zeros((side, side, 4), np.float32), np.full((side, side), -1, np.int32)
+    for (x, y), (cell, weight) in best.items():
+        cells[reach - y, reach - x], values[reach - y, reach - x] = cell, 0.9999 * np.sign(weight)
+    found, plain, gains = sums_in_whole_numbers(values, cells, kernels, ())
+    middle = plain[2 * reach, 2 * reach, 0]
+    assert middle == pytest.approx(0.9999 * sum(abs(weight) for _, weight in best.values()))
+    assert 2.0**29 <= middle * gains[0] < 2.0**31
+    assert found[2 * reach, 2 * reach, 0] == pytest.approx(middle, rel=1e-6)
+
+
+def test_rounding_of_an_even_area_does_not_add_up() -> None:
+    """Dithers spread evenly: those of any 100 x 100 pixels leave at most a few of 10 000; all alike would leave thousands."""
+    from mrbokeh.renderers._laplacian_splat_numba import dither_of
+
+    dithers = np.array([[dither_of(x, y) for x in range(100)] for y in range(700, 800)])
+    assert np.abs(dithers).max() <= 0.5
+    for product in (0.1, 0.35, 0.5, 0.77):
+        assert abs(np.rint(product + dithers).sum() - product * dithers.size) < 10.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_lamps_agree_with_their_plain_twin(share: float) -> None:
+    """A share of the pixels is dense or has no code, some of those too bright; lone bright pixels and a channel of its own scale."""
+    rng = np.random.default_rng(21)
+    values = rng.uniform(0.2, 1.0, (90, 150, 3)).astype(np.float32) * np.float32([1.0, 0.01, -300.0])
+    values[rng.uniform(size=(90, 150)) < 2e-3] *= 100.0
+    codes = np.where(rng.uniform(size=(90, 150)) < share, rng.integers(-1, 2, (90, 150)), rng.integers(2, 5, (90, 150))).astype(np.int32)
+    sparse = np.array([False, False, True, True, True])
+    found, plain = lamps_among(values, codes, sparse), lamps_among_plainly(values, codes, sparse)
+    np.testing.assert_array_equal(found.found, plain.found)
+    assert 0 < found.found.sum() < 0.03 * found.found.size
+    assert np.all(found.largest >= plain.largest)
+    assert np.all(found.largest <= 33.0 * np.abs(values).mean(axis=(0, 1)))
+
+
+def test_lamps_cost_no_likeness_elsewhere() -> None:
+    """A lamp of 1e5 leaves the rest of the picture as it was, but for its disc."""
+    values, coc_px = picture(22, (192, 192)), np.full((192, 192), 42.0, np.float32)
+    renderer = LaplacianSpreadlets()
+    before = renderer.spread(values, coc_px, DISC)
+    values[96, 96, :3] = 1e5
+    after = renderer.spread(values, coc_px, DISC)
+    far = np.hypot(*(np.indices((192, 192)) - 96)) > 24.0
+    np.testing.assert_allclose(after[far], before[far], atol=2e-3, err_msg="the pixel's own light is gone from its surroundings")
 
 
 def test_by_name_and_by_mistake() -> None:

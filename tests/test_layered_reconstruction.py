@@ -124,6 +124,24 @@ def test_a_small_lamp_lies_where_it_is_within_its_pixel(at_px: float) -> None:
     assert (rgb[..., 0].sum(axis=0) * x).sum() / rgb[..., 0].sum() == pytest.approx(at_px, abs=0.15)
 
 
+def test_parts_that_are_never_alike_are_all_there() -> None:
+    """With next to no tolerance everything of a tile is in parts: the same picture as without any merging of parts."""
+    np.testing.assert_allclose(picture(FENCE, 4, Settings(part_tolerance=1e-9)), picture(FENCE, 4, Settings(part_tolerance=0.0)), atol=1e-6)
+
+
+def test_parts_are_merged_where_that_shows_least() -> None:
+    """Bars hide a texture: in one part 9 dB are lost (the test below). With merged parts at most one of them is; coarse pixels alone,
+    which an endless tolerance leaves, lie between."""
+    exact, samples = known_truth(HIDDEN_BY_BARS), sample_planes(HIDDEN_BY_BARS, SIZE_PX, 16)
+    whole = LayeredReconstruction(Settings(pupil_parts=1, shutter_parts=1)).reconstruct(samples, LENS).rgb
+    all_parts, merged, coarse = (
+        LayeredReconstruction(Settings(part_tolerance=tolerance)).reconstruct(samples, LENS).rgb
+        for tolerance in (0.0, Settings().part_tolerance, 1e9)
+    )
+    assert psnr(merged, exact) > psnr(all_parts, exact) - 1.0
+    assert psnr(merged, exact) > psnr(coarse, exact) > psnr(whole, exact) + 1.0
+
+
 @pytest.mark.parametrize(("parts", "gain_db"), [(2, 5.0), (4, 9.0)])
 def test_what_a_fence_hides_depends_on_the_place_in_the_pupil(parts: int, gain_db: float) -> None:
     """A texture 9 px out of focus behind bars 14 px out of focus, on the same side: each place of the pupil sees other pieces of it.
@@ -176,6 +194,8 @@ def test_a_wider_spatial_filter_blurs() -> None:
         {"screen_filter": "box"},
         {"merge_tolerance": 1.0},
         {"bandwidth": -1.0},
+        {"faint": 1.0},
+        {"part_tolerance": -0.1},
         {"pupil_parts": 0},
         {"shutter_parts": 17},
     ],

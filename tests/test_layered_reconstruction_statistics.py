@@ -24,7 +24,7 @@ def one_tile(slopes: np.ndarray, bucket: np.ndarray | None = None, cells_x: int 
     starts[0] = 0
     where = np.zeros(count, np.int32) if bucket is None else bucket.astype(np.int32)
     empty = np.zeros((count, 5), np.float32), slopes.astype(np.float32), np.zeros((count, 3), np.float32)
-    return Light(*empty, where, starts, 1, 32, cells_x, cells, depths, WINDOW, 1.0)
+    return Light(*empty, where, starts, 1, 32, cells_x, cells, depths, WINDOW, 1.0, 1.0)
 
 
 def choice_of(settings: Settings, every: int) -> Choice:
@@ -113,7 +113,7 @@ def test_xorshift_is_marsaglias() -> None:
 def test_sparse_statistics_take_one_of_every_so_many() -> None:
     slopes = np.column_stack([np.arange(1000) // 100, np.zeros((1000, 2))]).astype(np.float32)
     light = one_tile(slopes)
-    _, sums = rows_of_tile(0, light, choice_of(FULL, 10), no_places(light))
+    _, sums, _ = rows_of_tile(0, light, choice_of(FULL, 10), no_places(light))
     assert sums[0, 0] == 100 and sums[0, 1] == 10 * sum(range(10)), "stratified: ten from every hundred"
 
 
@@ -123,7 +123,7 @@ def test_a_bucket_that_no_chosen_sample_saw_is_summed_over_all() -> None:
     bucket[[17, 500, 501]] = 7
     slopes = np.column_stack([bucket, np.zeros((1000, 2))])
     light = one_tile(slopes, bucket)
-    buckets, sums = rows_of_tile(0, light, choice_of(FULL, 100), no_places(light))
+    buckets, sums, _ = rows_of_tile(0, light, choice_of(FULL, 100), no_places(light))
     assert buckets.tolist() == [0, 7]
     assert sums[1, 1] / sums[1, 0] == 7.0 and 0.03 <= sums[1, 0] <= 2
 
@@ -142,6 +142,32 @@ def test_motions_at_one_depth_become_partitions_and_every_bucket_has_its_place()
     assert [partitions.gaps[depth] for depth in (0, 10, 30)] == [-1, 3, 5]
     place[touched] = -1
     assert (place == -1).all()
+
+
+@pytest.mark.parametrize(("radius_px", "light", "is_faint"), [(20.0, 1.0, True), (20.0, 100.0, False), (0.0, 1.0, False)])
+def test_what_can_hardly_be_seen_has_no_partition(radius_px: float, light: float, is_faint: bool) -> None:
+    """3 of 1000 samples, at one a pixel, moving by 20 px: spread over a disc of 20 px they hide 0.2 % of what is behind, over their
+    path alone an eighth, and as lamps of 100 they add 0.2 of the light of all. A faint one joins the partition of its slopes, not the
+    one just in front of it, and leaves that partition's filter alone."""
+    few = np.arange(1000) % 400 == 7
+    slopes = np.column_stack([np.where(few, radius_px, -9.0), np.where(few, 20.0, 0.0), np.zeros(1000)])
+    slopes[:300] = (19.0, 20.0, 0.0)
+    slopes[few] = (radius_px, 20.0, 0.0)
+    bucket = np.where(np.arange(1000) < 300, 30, 5)
+    bucket[few] = 8
+    values = np.where(few, light, 1.0)[:, None].repeat(3, 1).astype(np.float32)
+    tile = one_tile(slopes, bucket)._replace(values=values)
+    partitions, _, populated = partitions_of_tile(0, tile, choice_of(Settings(), 1), place := no_places(tile))
+    assert populated == 3 and len(partitions.sums) == (2 if is_faint else 3)
+    assert place[8] == 2 and place[30] == (2 if is_faint else 4)
+    assert partitions.sums[-1, 0] == (np.arange(1000) < 300).sum() - few[:300].sum()
+
+
+def test_where_all_can_hardly_be_seen_nothing_is_faint() -> None:
+    slopes = np.tile([30.0, 0.0, 0.0], (2, 1))
+    light = one_tile(slopes, np.array([3, 9]))
+    partitions, _, _ = partitions_of_tile(0, light, choice_of(Settings(), 1), no_places(light))
+    assert len(partitions.sums) >= 1 and partitions.sums[:, 0].sum() == 2
 
 
 def test_cells_of_motion_have_the_side_asked_for() -> None:

@@ -64,7 +64,7 @@ def test_composite_and_video_share_what_they_can() -> None:
     one, other = ({each.name: each for each in typer.main.get_command(each.app).params} for each in (composite, video))
     shared = {"layer", "objects", "scene", "camera", "mode", "matte", "near_distance", "scene_renderer", "samples", "catch", "distortion"}
     shared |= {"match_grey", "match_exposure", "match_white", "match_black", "vignetting", "grain", "light_wrap", "seed", "grey_value"}
-    shared |= {"input_space", "output_space", "ocio", "overwrite"}
+    shared |= {"input_space", "output_space", "ocio", "overwrite", "plate_exposure"}
     assert shared <= one.keys() & other.keys()
     assert all(one[name].help == other[name].help for name in shared)  # type: ignore[attr-defined]
     assert {name for name in shared if one[name].default != other[name].default} == {"scene_renderer"}

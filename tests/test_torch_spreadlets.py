@@ -21,7 +21,8 @@ from mrbokeh.psf_bank import Axis, PsfBank
 from mrbokeh.psf_models.build import build_bank
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.renderers._laplacian_bank import BankTables, Place
-from mrbokeh.renderers._laplacian_sums import add_light, splat_plainly, window_of
+from mrbokeh.renderers._laplacian_layout import window_of
+from mrbokeh.renderers._laplacian_sums import add_light, splat_plainly
 from mrbokeh.renderers._laplacian_tables import Points, by_rows, joined_points, taps_of
 from mrbokeh.renderers._laplacian_tables import stands_out as stands_out_compiled
 from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
@@ -301,7 +302,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from mrbokeh.aperture import Aperture
-from mrbokeh.renderers._laplacian_sums import window_of
+from mrbokeh.renderers._laplacian_layout import window_of
 from mrbokeh.renderers._laplacian_tables import by_rows, joined_points, taps_of
 from mrbokeh.renderers.torch_spreadlets._points import table_of
 from mrbokeh.renderers.torch_spreadlets._splat import splat_in_chunks

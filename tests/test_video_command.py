@@ -269,8 +269,36 @@ def test_exposures_that_pictures_state_are_matched_frame_by_frame(clip: Path, tm
         assert found == pytest.approx([0.4, 0.2, 0.1], rel=2e-3)
         run(tmp_path / f"taken.%d.{suffix}", *options, "--frames", "1:", "--out", tmp_path / f"{suffix}.later.%d.exr")
         assert float(read_image(tmp_path / f"{suffix}.later.2.exr")[16, 24, 0]) == pytest.approx(0.1, rel=2e-3)
-    with pytest.raises(InputError, match="--match-exposure needs a photograph that states how it was taken"):
+    with pytest.raises(InputError, match=r"--match-exposure needs a photograph that states how it was taken .* give --plate-exposure"):
         run(clip, *options[2:], "--out", tmp_path / "no.mkv")
+
+
+@pytest.mark.usefixtures("settings")
+def test_the_exposure_of_a_video_is_stated_by_the_user(clip: Path, tmp_path: Path) -> None:
+    """A panorama of 1/100 s, ISO 200, f/2.8; a clip of 1/50 s at ISO 400 shows its light 4 times as bright, in every frame."""
+    alpha = np.ones((64, 96), np.float32)
+    write_layer(tmp_path / "grey.exr", Layer(np.full((64, 96, 3), 0.1, np.float32), alpha, 2 * alpha), half=False)
+    panorama, lens = photo_with_exif(tmp_path / "panorama.jpg", 0.01), tmp_path / "lens.json"
+    options = ["--lens", lens, "--layer", tmp_path / "grey.exr", "--match-exposure", panorama, "--plate-exposure"]
+    run(clip, *options, "1/50,400,2.8", "--frames", "0:3", "--out", tmp_path / "out.%d.exr")
+    assert [float(read_image(tmp_path / f"out.{i}.exr")[32, 48, 0]) for i in range(3)] == pytest.approx([0.4] * 3, rel=2e-3)
+    with pytest.raises(InputError, match=r"expected an exposure as SECONDS,ISO,F-NUMBER, .* got '1/50,400'"):
+        run(clip, *options, "1/50,400", "--out", tmp_path / "no.mkv")
+    with pytest.raises(InputError, match="give both"):
+        run(clip, *options[:4], *options[-1:], "1/50,400,2.8", "--out", tmp_path / "no.mkv")
+
+
+def test_alpha_of_a_clip_is_said_to_be_left_out(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    """Numbered EXR, and ProRes 4444; opaque clips say nothing."""
+    half = np.full((64, 96), 0.5, np.float32)
+    write_exr(tmp_path / "in.0.exr", ExrPart(dict.fromkeys("RGBA", half)))
+    with VideoWriter(tmp_path / "in.mov", 96, 64, encoding="prores4444-alpha") as writer:
+        writer.write(np.repeat(half[..., None], 4, axis=2), 0.0)
+    for source, more in (("in.%d.exr", ("--rate", "25")), ("in.mov", ())):
+        assert f"warning: the alpha of {tmp_path / source} is left out" in run(
+            tmp_path / source, *more, *settings, "--out", tmp_path / f"{source[-3:]}.%d.png"
+        )
+    assert "warning" not in run(clip, *settings, "--frames", "0:1", "--out", tmp_path / "opaque.%d.png")
 
 
 @pytest.mark.usefixtures("settings")

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from mrbokeh.commands.video import app
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.exr_primaries import AP1
 from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
@@ -104,9 +105,14 @@ def test_a_virtual_layer_keeps_its_coverage_through_a_curve(tmp_path: Path, sett
     clip = clip_of_codes(tmp_path / "clip.mkv", 0.3)
     words = [*settings, "--input-space", "ARRI LogC4", "--virtual-only"]
     run(clip, *words, "--output-space", "ACEScg", "--out", tmp_path / "cg.%d.exr")
+    (part,) = read_exr(tmp_path / "cg.1.exr")
+    stored = part.stacked("RGB")
+    np.testing.assert_allclose(stored[30, 35], 0.5 * np.array(RED_IN_AP1), atol=5e-4)
+    np.testing.assert_allclose(stored[30, 52], 0.25 * np.array(RED_IN_AP1), atol=5e-4)
+    np.testing.assert_allclose(part.attributes["chromaticities"], AP1, atol=1e-6)
     layer = read_layer(tmp_path / "cg.1.exr")
-    np.testing.assert_allclose(layer.rgb[30, 35], 0.5 * np.array(RED_IN_AP1), atol=5e-4)
-    np.testing.assert_allclose(layer.rgb[30, 52], 0.25 * np.array(RED_IN_AP1), atol=5e-4)
+    np.testing.assert_allclose(layer.rgb[30, 35], [0.5, 0.0, 0.0], atol=1e-3)
+    assert np.isfinite(layer.depth_m[30, 35])
     run(clip, *words, "--output-space", "ACEScct", "--out", tmp_path / "cct.%d.exr")
     curved = read_layer(tmp_path / "cct.1.exr")
     np.testing.assert_allclose(curved.rgb[30, 52], 0.5 * curved.rgb[30, 35], atol=5e-4)

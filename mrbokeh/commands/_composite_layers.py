@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mrbokeh.camera import Camera
 from mrbokeh.capture_bundle import CaptureBundle
@@ -13,6 +15,9 @@ from mrbokeh.layer import Layer
 from mrbokeh.plate import Plate
 from mrbokeh.staging.scene_description import SceneDescription
 
+if TYPE_CHECKING:
+    from mrbokeh.exr_layers.deep_samples import DeepSamples
+
 LayersFor = Callable[[Plate], list[Layer]]
 """The same scene for every plate of one view: sharp layers, front first."""
 
@@ -21,23 +26,40 @@ def layers_by(
     virtual: VirtualOptions, standing: ObjectOptions, rendering: RenderingOptions, first: Plate, bundle: CaptureBundle | None
 ) -> LayersFor:
     """first: the plate on whose pixel the object stands. Raises InputError where there is nothing to put in."""
-    still = [*_file_layers(virtual.layer or (), virtual.object_names), *(bundle.layers if bundle else ())]
+    files = _FileLayers.of(virtual.layer or (), virtual.object_names)
+    still = [*files.flat, *(bundle.layers if bundle else ())]
     rendered = []
     if standing.object_ is not None:
         rendered.append(_object_layers(standing.object_, standing, rendering, first))
     if virtual.scene is not None:
         rendered.append(_scene_layers(virtual.scene, virtual.camera, rendering))
-    if not still and not rendered:
+    if not still and not rendered and not files.deep:
         raise InputError("nothing to put into the photograph: give --object OBJ.glb, --scene SCENE.toml or --layer RGBAZ.exr")
-    return lambda plate: [*still, *(layer for make in rendered for layer in make(plate))]
+    return lambda plate: files.among([*still, *(layer for make in rendered for layer in make(plate))])
 
 
-def _file_layers(paths: Sequence[Path], object_names: tuple[str, ...]) -> list[Layer]:
-    """Layers of EXR files, front first."""
-    from mrbokeh.shots.layer_sources import layer_sequence
+@dataclass(frozen=True)
+class _FileLayers:
+    """Of EXR files. flat: front first; deep: which find their places by depth."""
 
-    sequences = [layer_sequence(path, object_names) for path in paths]
-    return [layer for sequence in sequences for layer in sequence.layers(sequence.frames[0])]
+    flat: Sequence[Layer]
+    deep: "Sequence[DeepSamples]"
+
+    @classmethod
+    def of(cls, paths: Sequence[Path], object_names: tuple[str, ...]) -> "_FileLayers":
+        from mrbokeh.shots.layer_sources import layer_sequence
+
+        sequences = [layer_sequence(path, object_names) for path in paths]
+        flat = [layer for each in sequences if not each.is_deep for layer in each.layers(each.frames[0])]
+        return cls(flat, [each.samples(each.frames[0]) for each in sequences if each.is_deep])
+
+    def among(self, layers: list[Layer]) -> list[Layer]:
+        """The deep ones among others, front first."""
+        if not self.deep:
+            return layers
+        from mrbokeh.exr_layers.deep_interleaved import interleaved
+
+        return interleaved(self.deep, layers)
 
 
 def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate) -> LayersFor:

@@ -52,6 +52,15 @@ class PlateOptions(shared.NearOptions):
     depth_scale: Annotated[
         float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.", rich_help_panel=PLATE)
     ] = None
+    exact_depth: Annotated[
+        bool,
+        typer.Option(
+            "--exact-depth",
+            help="Depth is exact at rims, as of a render. By default between and rerender move the rims of near things, where a stack "
+            "has an all-in-focus picture, to where the photograph shows them.",
+            rich_help_panel=PLATE,
+        ),
+    ] = False
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from mrbokeh.errors import InputError
 from mrbokeh.image_io import INTEGER_SUFFIXES, require_suffix
 from mrbokeh.layer import Layer, flatten
 from mrbokeh.plate import Plate
+from mrbokeh.plate_alpha import HOLDING_ALPHA, alpha_with
 
 
 def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None], *, all_slices: bool) -> None:
@@ -58,14 +59,19 @@ def write_results(
 
 def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions) -> None:
     """With an output space the picture alone; else linear Rec.709 with its layers, or sRGB."""
-    from mrbokeh.image_io import write_image
+    from mrbokeh.finished_picture import write_finished
 
-    if colour.of_result is not None:
-        write_image(out, colour.of_result.from_rec709(inserted.rgb), "linear")
-    elif out.suffix.lower() == ".exr":
+    if out.suffix.lower() == ".exr" and colour.of_result is None:
         _write_layers(out, inserted, plate, flatten(sharp))
     else:
-        write_image(out, inserted.rgb)
+        write_finished(out, inserted.rgb, alpha_with(plate.alpha, inserted.virtual.alpha), colour.of_result)
+
+
+def alpha_lost(out: Path, plate: Plate) -> str | None:
+    """What to tell where the plate's alpha cannot be kept."""
+    if plate.alpha is None or out.suffix.lower() in HOLDING_ALPHA:
+        return None
+    return f"the plate has alpha, which {out.suffix} cannot hold: what it does not cover is black in {out} (write .png, .tif or .exr)"
 
 
 def _write_layers(out: Path, inserted: Inserted, plate: Plate, sharp: Layer) -> None:
@@ -75,8 +81,9 @@ def _write_layers(out: Path, inserted: Inserted, plate: Plate, sharp: Layer) -> 
     scene_m = np.full(sharp.depth_m.shape, np.inf, np.float32) if plate.depth_m is None else plate.depth_m
     depth_m = np.where(sharp.alpha > 0.5, np.minimum(sharp.depth_m, scene_m), scene_m).astype(np.float32)
     coc_px = plate.lens.coc_px(depth_m, depth_m.shape[1]).astype(np.float32)
+    alpha = alpha_with(plate.alpha, inserted.virtual.alpha)
     layers = {"virtual": _bare(inserted.virtual), "sharp": _bare(sharp)}
-    write_composite_exr(out, CompositeLayers(inserted.rgb, None, depth_m, layers, inserted.virtual.alpha, coc_px))
+    write_composite_exr(out, CompositeLayers(inserted.rgb, alpha, depth_m, layers, inserted.virtual.alpha, coc_px))
 
 
 def _bare(layer: Layer) -> Layer:

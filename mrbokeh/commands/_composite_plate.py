@@ -11,7 +11,7 @@ from mrbokeh.depth_sources.depth_settings import DepthSettings, parse_near_far
 from mrbokeh.errors import InputError
 from mrbokeh.lens import Lens
 from mrbokeh.picture_sources.stored_numbers import read_numbers
-from mrbokeh.plate import Plate, bundle_plate, open_plate, with_depth, with_matte
+from mrbokeh.plate import Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
 
 
 def plate_by(
@@ -44,4 +44,4 @@ def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:
     stored = read_numbers(photo)
     if stored.shape != plate.rgb.shape:
         raise InputError(f"--input-space takes {photo} as it is stored, but it is to be turned: turn it first")
-    return replace(plate, rgb=space.to_rec709(stored))
+    return with_own_alpha(replace(plate, rgb=space.to_rec709(stored)), photo, plate.alpha)

@@ -44,8 +44,8 @@ class VirtualOptions:
         list[Path] | None,
         typer.Option(
             metavar="RGBAZ.exr",
-            help="All-in-focus virtual layer: EXR with R, G, B, A (linear, premultiplied) and Z in metres, deep EXR too, of a clip also "
-            "layer.%04d.exr; may be given several times, front first.",
+            help="All-in-focus virtual layer: EXR with R, G, B, A (linear, premultiplied) and Z in metres, of a clip also "
+            "layer.%04d.exr; may be given several times, front first. Deep EXR goes among all others by depth.",
             rich_help_panel=VIRTUAL,
         ),
     ] = None

@@ -29,6 +29,14 @@ class LookGroup:
             rich_help_panel=LOOK,
         ),
     ] = None
+    plate_exposure: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SECONDS,ISO,F",
+            help="Exposure of the plate for --match-exposure, such as 1/50,400,2.8, where its file states none: any video.",
+            rich_help_panel=LOOK,
+        ),
+    ] = None
     match_white: Annotated[
         float | None, typer.Option(metavar="KELVIN", help="Light that the plate was balanced for.", rich_help_panel=LOOK)
     ] = None
@@ -51,4 +59,4 @@ class LookGroup:
         from mrbokeh.plate_look.look_options import LookOptions
 
         matched = (self.match_grey, self.grey_value, self.match_exposure, self.match_white, self.match_black)
-        return LookOptions(*matched, self.vignetting, self.grain, self.light_wrap, self.seed)
+        return LookOptions(*matched, self.vignetting, self.grain, self.light_wrap, self.seed, self.plate_exposure)

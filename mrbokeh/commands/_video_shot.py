@@ -16,7 +16,7 @@ from mrbokeh.renderers.choose import BY_NAME
 from mrbokeh.shots.clip_look import ClipLook
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.frame_sources import CameraFile, DepthFiles, FocusPulled, MatteFiles
-from mrbokeh.shots.layer_sources import LayerFiles
+from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
 from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.video_target import VideoTarget
@@ -42,7 +42,7 @@ def recipe_of(
     files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
     return CompositeRecipe(
         lens=lens.resolve(),
-        layers=(*files, *_scene_layers(source, virtual, rendering)),
+        layers=sources_by_depth(files, _scene_layers(source, virtual, rendering)),
         renderer=_renderer(blur.renderer),
         mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
         camera=_camera(source, virtual),

@@ -43,7 +43,7 @@ def composite(
     """
     from mrbokeh.capture_bundle import is_bundle, read_bundle
     from mrbokeh.commands._composite_layers import layers_by
-    from mrbokeh.commands._composite_outputs import blur_told, check_outputs, write_results
+    from mrbokeh.commands._composite_outputs import alpha_lost, blur_told, check_outputs, write_results
     from mrbokeh.commands._composite_plate import best_mode, plate_by
     from mrbokeh.compositing.choose import insertion_of
     from mrbokeh.plate_look.finishing import finished
@@ -58,7 +58,7 @@ def composite(
     plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
-    insertion = insertion_of(mode, taken.near_distance)
+    insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)
     if taken.all_slices:
         _into_all_slices(photo, out, layers_for, insertion, renderer, lens)
         return
@@ -69,6 +69,8 @@ def composite(
     with working("blurring (the first time on a machine it takes a minute to compile)"):
         inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
     write_results(out, inserted, plate, sharp, colour, result)
+    if lost := alpha_lost(out, plate):
+        typer.echo(f"warning: {lost}", err=True)
     typer.echo(f"wrote {out} ({mode}; {blur_told(plate, sharp)})")
 
 

@@ -10,6 +10,7 @@ from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands._video_shot import parse_frames as parse_frames
 from mrbokeh.commands._video_shot import recipe_of, shot_of, target_of
 from mrbokeh.picture_sources.choose import open_source
+from mrbokeh.picture_sources.clip_alpha import has_alpha
 from mrbokeh.progress import progress_bars
 from mrbokeh.shots.crew import Crew, OneProcess
 from mrbokeh.shots.dask_crew import DaskCrew
@@ -53,6 +54,8 @@ def video(
     shot = shot_of(source, recipe, target, taken.frames, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
     _try_first_frame(shot)
+    if has_alpha(source, shot.start):
+        typer.echo(f"warning: the alpha of {clip} is left out: its pictures are taken as opaque", err=True)
     note = _made(shot, _crew(work, len(shot.segments)), result.overwrite)
     frames = shot.stop - shot.start
     typer.echo(f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})")

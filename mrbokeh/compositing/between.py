@@ -22,6 +22,7 @@ from mrbokeh.compositing.clean_colours import clean_colours
 from mrbokeh.compositing.near_and_far import NO_LIGHTS, NearAndFar, continued, cut_in_two, nearer_than
 from mrbokeh.compositing.pupil_shares import Rays
 from mrbokeh.compositing.three_parts import put_together
+from mrbokeh.compositing.true_rims import TrueRims
 from mrbokeh.compositing.virtual_surface import shows_anything, virtual_depth_m
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer, clear, flatten
@@ -30,7 +31,6 @@ from mrbokeh.plate import Plate
 from mrbokeh.renderers.base import Renderer
 
 Plane = Float32[np.ndarray, "height width"]
-Picture = Float32[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]
 
 _HALF = 0.5
@@ -42,13 +42,15 @@ class Between:
     """tolerance: by what share of its depth a photographed surface must be nearer to hide the virtual one (see occlusion_matte).
 
     pupil_points: rays per pixel where near and virtual rims meet. near_depth_m: distance of what a user's matte (Plate.near_alpha)
-    holds, for photographs without depth.
+    holds, for photographs without depth. true_rims: whether rims of near things move to where the photograph shows them
+    (mrbokeh.compositing.true_rims), or are exact in the depth already.
     Any Renderer will do; only its kernels' shares of the pupil are taken from the opening of the plate's lens.
     """
 
     tolerance: float = 0.03
     pupil_points: int = 64
     near_depth_m: float | None = None
+    true_rims: bool = True
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         same_size(plate, layers)
@@ -60,21 +62,21 @@ class Between:
         scene, near = self._scene(plate, depth_m, renderer)
         return put_together(plate, near, blurred, Rays.of(scene, sharp, depth_m, plate.lens, self.pupil_points))
 
-    def cut(self, plate: Plate, layers: Sequence[Layer]) -> NearAndFar:
+    def cut(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> NearAndFar:
         """The sharp scene of a plate cut in two by the layers, one of which shows something."""
         depth_m = virtual_depth_m(flatten([replace(layer, extra={}) for layer in layers]))
-        matte = self._matte(plate, depth_m)
         if plate.sharp_rgb is None:
             raise InputError("to cut the scene in two its all-in-focus picture is needed: give a focal stack")
-        return self._cut(plate, plate.sharp_rgb, matte, self._near_depth_m(plate, matte))
+        plate, matte = self._on_true_rims(plate, self._matte(plate, depth_m), renderer)
+        return self._cut(plate, matte, self._near_depth_m(plate, matte))
 
     def _scene(self, plate: Plate, depth_m: Plane, renderer: Renderer) -> tuple[NearAndFar, Layer]:
         """The scene cut in two, and its near part as the lens sees it."""
-        matte = self._matte(plate, depth_m)
+        plate, matte = self._on_true_rims(plate, self._matte(plate, depth_m), renderer)
         near_m = self._near_depth_m(plate, matte)
         if plate.sharp_rgb is None:
             return _without_sharp_picture(plate, Layer(np.repeat(matte[..., None], 3, axis=2), matte, near_m), renderer)
-        scene = self._cut(plate, plate.sharp_rgb, matte, near_m)
+        scene = self._cut(plate, matte, near_m)
         return scene, renderer.render([scene.near], plate.lens) if scene.near.alpha.any() else clear(*matte.shape)
 
     def _matte(self, plate: Plate, depth_m: Plane) -> Plane:
@@ -88,6 +90,13 @@ class Between:
             )
         return nearer_than(plate.depth_m, depth_m, self.tolerance).astype(np.float32)
 
+    def _on_true_rims(self, plate: Plate, matte: Plane, renderer: Renderer) -> tuple[Plate, Plane]:
+        """Plate and matte; a user's matte stays as it is."""
+        if not self.true_rims or plate.near_alpha is not None:
+            return plate, matte
+        better, near = TrueRims(self._cut_by_depth, renderer, self.tolerance).found(plate, matte > _HALF)
+        return better, matte if better is plate else near.astype(np.float32)
+
     def _near_depth_m(self, plate: Plate, matte: Plane) -> Plane:
         """Depth of the near things, continued to all places."""
         if self.near_depth_m is not None:
@@ -96,13 +105,18 @@ class Between:
             raise InputError("a matte of what is near needs its distance: give depth, or the distance in metres (near_depth_m)")
         return continued(plate.depth_m, matte > _HALF)
 
-    def _cut(self, plate: Plate, sharp_rgb: Picture, matte: Plane, near_m: Plane) -> NearAndFar:
+    def _cut(self, plate: Plate, matte: Plane, near_m: Plane) -> NearAndFar:
+        """near_m: of what a user's matte holds."""
+        assert plate.sharp_rgb is not None
         if plate.near_alpha is None and plate.depth_m is not None:
-            is_near = matte > _HALF
-            return cut_in_two(sharp_rgb, plate.depth_m, is_near, _reach_px(plate.lens, plate.depth_m, is_near), self.tolerance)
-        front, behind = clean_colours(sharp_rgb, matte)
+            return self._cut_by_depth(plate, matte > _HALF)
+        front, behind = clean_colours(plate.sharp_rgb, matte)
         far_m = None if plate.depth_m is None else continued(plate.depth_m, matte <= _HALF)
         return NearAndFar(Layer(front * matte[..., None], matte, near_m), behind, far_m, NO_LIGHTS)
+
+    def _cut_by_depth(self, plate: Plate, is_near: Mask) -> NearAndFar:
+        assert plate.sharp_rgb is not None and plate.depth_m is not None
+        return cut_in_two(plate.sharp_rgb, plate.depth_m, is_near, _reach_px(plate.lens, plate.depth_m, is_near), self.tolerance)
 
 
 def _reach_px(lens: Lens, depth_m: Plane, is_near: Mask) -> float:

@@ -22,12 +22,15 @@ picture and layers blurred together."""
 DEFAULT_MODE = "over"
 
 
-def insertion_of(mode: str, near_m: float | None = None) -> Insertion:
-    """near_m: how far what a user's matte shows is, for the mode between. Raises InputError where there is no mode of that name."""
+def insertion_of(mode: str, near_m: float | None = None, *, exact_depth: bool = False) -> Insertion:
+    """near_m: how far what a user's matte shows is, for the mode between. exact_depth: rims stay where the depth has them.
+
+    Raises InputError where there is no mode of that name.
+    """
     if mode not in MODES:
         raise InputError(f"expected a mode out of {', '.join(MODES)}, got {mode!r}")
-    if near_m is None:
-        return MODES[mode]
-    if mode != "between":
+    if near_m is not None and mode != "between":
         raise InputError(f"the distance of what the matte shows is for the mode between, got the mode {mode}: leave it out")
-    return InTouchedBox(Between(near_depth_m=near_m))
+    if mode == "between":
+        return InTouchedBox(Between(near_depth_m=near_m, true_rims=not exact_depth))
+    return InTouchedBox(Rerendered(true_rims=not exact_depth)) if mode == "rerender" else MODES[mode]

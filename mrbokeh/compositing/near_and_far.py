@@ -50,6 +50,14 @@ class NearAndFar:
     far_depth_m: Plane | None
     lights: Lights
 
+    @property
+    def far(self) -> Layer:
+        """What is far as one opaque layer, its lights in it; for photographs with depth."""
+        assert self.far_depth_m is not None
+        layer = Layer(self.far_rgb.copy(), np.ones_like(self.far_depth_m), self.far_depth_m)
+        layer.rgb.reshape(-1, 3)[self.lights.places] += self.lights.rgb
+        return layer
+
 
 def nearer_than(depth_m: Plane, virtual_depth_m: Plane, tolerance: float) -> Mask:
     """Where the photographed surface lies before the virtual one by more than a share `tolerance` of its depth."""
@@ -108,13 +116,13 @@ def _parted(rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance
     far = np.where(in_front[..., None], continued(rgb, ~near), rgb)
     is_far = behind.coc_px > -0.5 * step_px
     far.reshape(-1, 3)[behind.places[is_far]] = behind.values[is_far, :3]
-    smooth = _without_edge(depth_m, tolerance)
+    smooth = without_edge(depth_m, tolerance)
     np.multiply(values, near[..., None], out=near_values, where=smooth[..., None])
     np.copyto(far, rgb, where=(smooth & ~near)[..., None])
     return near_values, far
 
 
-def _without_edge(depth_m: Plane, tolerance: float) -> Mask:
+def without_edge(depth_m: Plane, tolerance: float) -> Mask:
     """Where depth changes by no more than twice the tolerance (a share of it) among the pixels around."""
     from cv2 import dilate, erode
 

@@ -17,13 +17,14 @@ from mrbokeh.renderers.base import Renderer
 
 @dataclass(frozen=True)
 class Rerendered:
-    """What virtual light reaches is taken from the new picture, the rest from the photograph. tolerance: see `Between`.
+    """What virtual light reaches is taken from the new picture, the rest from the photograph. tolerance, true_rims: see `Between`.
 
     Simpler than `Between` and the same for any lens, but touched pixels show how well the picture is blurred anew, and coverages of
     near and virtual rims are multiplied.
     """
 
     tolerance: float = 0.03
+    true_rims: bool = True
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         same_size(plate, layers)
@@ -33,11 +34,9 @@ class Rerendered:
             )
         if not any(shows_anything(layer) for layer in layers):
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
-        scene = Between(self.tolerance).cut(plate, layers)
+        scene = Between(self.tolerance, true_rims=self.true_rims).cut(plate, layers, renderer)
         near = [scene.near] if scene.near.alpha.any() else []
-        far = Layer(scene.far_rgb, np.ones_like(plate.depth_m), plate.depth_m if scene.far_depth_m is None else scene.far_depth_m)
-        far.rgb.reshape(-1, 3)[scene.lights.places] += scene.lights.rgb
-        picture = renderer.render([*near, *layers, far], plate.lens)
+        picture = renderer.render([*near, *layers, scene.far], plate.lens)
         virtual = renderer.render(layers, plate.lens)
         free = 1.0 - renderer.render(near, plate.lens).alpha if near else np.ones_like(virtual.alpha)
         seen = Layer(virtual.rgb * free[..., None], virtual.alpha * free, virtual.depth_m)

@@ -17,6 +17,7 @@ What lies where:
     deep_samples        DeepSamples: a deep picture as flat lists of samples
     deep_tidy           samples sorted, volumes split and merged; the plain twin of the compiled flattening
     deep_layers         DeepSurfaces, DeepSlices: a deep picture as layers
+    deep_interleaved    deep pictures among flat layers, by depth
     deep_out            sharp layers as a deep EXR
     sequence            ExrSequence: numbered files, their gaps, layers of a frame
     composite_exr       CompositeLayers: our own layered EXR

@@ -42,7 +42,11 @@ class DeepSurfaces:
 
     def layers(self, path: Path | str) -> list[Layer]:
         """Front first; layers in which nothing is are left out."""
-        return _full(peeled(DeepSamples.read(path, self.part, self.metres_per_unit), self.surfaces, self.apart))
+        return _full(peeled(self.samples(path), self.surfaces, self.apart))
+
+    def samples(self, path: Path | str) -> DeepSamples:
+        """As they are in the file, in metres."""
+        return DeepSamples.read(path, self.part, self.metres_per_unit)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from mrbokeh.errors import InputError
 from mrbokeh.exr_layers.deep_layers import DeepSurfaces
-from mrbokeh.exr_layers.deep_samples import is_deep
+from mrbokeh.exr_layers.deep_samples import DeepSamples, is_deep
 from mrbokeh.exr_layers.flat_render import FlatRender
 from mrbokeh.exr_layers.reader import LayerReader
 from mrbokeh.layer import Layer
@@ -75,6 +75,17 @@ class ExrSequence:
     def layers(self, frame: int) -> list[Layer]:
         """Sharp layers of a frame, front first."""
         return self.reader.layers(self.path_of(frame))
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether its samples can be put among other layers by depth."""
+        return isinstance(self.reader, DeepSurfaces)
+
+    def samples(self, frame: int) -> DeepSamples:
+        """Of a deep frame. Raises InputError where the files are flat."""
+        if not isinstance(self.reader, DeepSurfaces):
+            raise InputError(f"expected deep pictures, but {self.path_of(frame)} is read as flat: take its layers")
+        return self.reader.samples(self.path_of(frame))
 
 
 def _reader_for(path: Path) -> LayerReader:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,15 @@ class Exposure:
         for name, value in vars(self).items():
             if not (0.0 < value < float("inf")):
                 raise InputError(f"expected {name} of an exposure above 0, got {value:g}")
+
+    @classmethod
+    def parse(cls, text: str) -> "Exposure":
+        """ "SECONDS,ISO,F-NUMBER" as a user types it; seconds may be a fraction. Raises InputError."""
+        try:
+            time_s, iso, f_number = (float(Fraction(part.strip())) for part in text.split(","))
+        except (ValueError, ZeroDivisionError):
+            raise InputError(f"expected an exposure as SECONDS,ISO,F-NUMBER, such as 1/50,400,2.8, got {text!r}") from None
+        return cls(time_s, iso, f_number)
 
     @property
     def brightness(self) -> float:

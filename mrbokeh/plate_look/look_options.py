@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from mrbokeh.errors import InputError
 from mrbokeh.plate_look.black_level import darkest_black, picked_black
 from mrbokeh.plate_look.colour_match import ColourMatch, Triple, triple_of
-from mrbokeh.plate_look.exposure_match import matched_exposure
+from mrbokeh.plate_look.exposure_match import Exposure, matched_exposure
 from mrbokeh.plate_look.finishing import Finishing
 from mrbokeh.plate_look.grain import Grain, measured_grain, measured_grain_of_pair
 from mrbokeh.plate_look.grain_file import read_grain
@@ -30,8 +30,9 @@ class LookOptions:
     """Texts as typed; None or "off" leaves a step out.
 
     match_grey: "X,Y[,RADIUS]" of a card; grey_value: its reflectance, or what the renderer gives it. match_exposure: the photograph that
-    the virtual light was taken from. match_white_k: the temperature that the plate was balanced for. match_black: "auto" or "X,Y[,RADIUS]".
-    vignetting: "auto" (lensfun), "K1,K2,K3" or a picture of an even surface. grain: "auto" or a grain file. light_wrap: "STRENGTH[,SIGMA]".
+    the virtual light was taken from; plate_exposure: "SECONDS,ISO,F-NUMBER" of the plate, in place of what it states. match_white_k: the
+    temperature that the plate was balanced for. match_black: "auto" or "X,Y[,RADIUS]". vignetting: "auto" (lensfun), "K1,K2,K3" or a
+    picture of an even surface. grain: "auto" or a grain file. light_wrap: "STRENGTH[,SIGMA]".
     """
 
     match_grey: str | None = None
@@ -43,6 +44,7 @@ class LookOptions:
     grain: str | None = None
     light_wrap: str | None = None
     seed: int = 0
+    plate_exposure: str | None = None
 
 
 def finishing_of(options: LookOptions, plate_rgb: Picture, photo: Path | None = None, next_rgb: Picture | None = None) -> Finishing:
@@ -67,11 +69,23 @@ def _colour(options: LookOptions, plate_rgb: Picture, photo: Path | None, vignet
         return grey_card_match(plate_rgb, box, rendered=options.grey_value, black=black, falloff=falloff)
     gain = np.ones(3)
     if options.match_exposure is not None:
-        exposure = stated_exposure(_required(photo, "--match-exposure"))
-        gain = gain * matched_exposure(exposure, stated_exposure(options.match_exposure)).gain
+        gain = gain * matched_exposure(_plate_exposure(options, photo), stated_exposure(options.match_exposure)).gain
+    elif options.plate_exposure is not None:
+        raise InputError("--plate-exposure is for --match-exposure PHOTO, which it is compared with: give both")
     if options.match_white_k is not None:
         gain = gain * white_balance_gain(options.match_white_k)
     return ColourMatch(triple_of(gain), black)
+
+
+def _plate_exposure(options: LookOptions, photo: Path | None) -> Exposure:
+    if options.plate_exposure is not None:
+        return Exposure.parse(options.plate_exposure)
+    if photo is None:
+        raise InputError(
+            "--match-exposure needs a photograph that states how it was taken (Exif; an EXR header), but this plate is in no such file: "
+            "give --plate-exposure SECONDS,ISO,F-NUMBER"
+        )
+    return stated_exposure(photo)
 
 
 def _black(text: str | None, plate_rgb: Picture) -> Triple:

@@ -23,7 +23,7 @@ class ClipLook:
     """Description of a Finisher: options as typed, and the clip whose frames `start` and the next are measured, by every worker alike.
 
     Exposures are those that numbered pictures state, each its own: a camera that steps its exposure from frame to frame takes the
-    virtual light with it. first_number: of the clip's frame 0. space: of the clip's numbers.
+    virtual light with it. One that the user states is that of all frames. first_number: of the clip's frame 0. space: of its numbers.
     """
 
     options: LookOptions
@@ -43,7 +43,7 @@ class ClipLook:
         stop = min(self.start + 2, len(source.times_s))
         first, *rest = (frame.rgb for frame in source.frames(self.start, stop, threads))
         finishing = finishing_of(self.options, first, source.file_of(self.start), rest[0] if rest else None)
-        if self.options.match_exposure is None:
+        if self.options.match_exposure is None or self.options.plate_exposure is not None:
             return _Look(finishing)
         return _ExposedLook(finishing, self._exposures(source))
 

@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mrbokeh.errors import InputError
+from mrbokeh.exr_layers.deep_interleaved import interleaved
+from mrbokeh.exr_layers.deep_layers import DeepSurfaces
+from mrbokeh.exr_layers.deep_samples import DeepSamples
 from mrbokeh.exr_layers.object_split import ObjectSplit
 from mrbokeh.exr_layers.sequence import ExrSequence
 from mrbokeh.layer import Layer
-from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
+from mrbokeh.shots.hooks import CameraSource, Description, LayerSource, Moment
 from mrbokeh.shots.kept import Kept
 
 
@@ -35,6 +38,53 @@ def layer_sequence(path: Path, objects: tuple[str, ...] = ()) -> ExrSequence:
     return ExrSequence.of(path, ObjectSplit(objects=objects, with_rest=False) if objects else None)
 
 
+@dataclass(frozen=True)
+class AmongDeep:
+    """Description of deep files, stills or numbered, and of other layers that their samples go among by depth."""
+
+    deep: tuple[Path, ...]
+    others: tuple[Description[LayerSource], ...] = ()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return (*self.deep, *(path for each in self.others for path in each.files))
+
+    def opened(self, threads: int) -> LayerSource:
+        return _OpenedAmong([layer_sequence(path) for path in self.deep], [each.opened(threads) for each in self.others])
+
+
+def sources_by_depth(files: Sequence[LayerFiles], others: Sequence[Description[LayerSource]]) -> tuple[Description[LayerSource], ...]:
+    """Descriptions in the order given, unless some of the files are deep: those go among all the rest."""
+    deep = [each.path for each in files if not each.objects and layer_sequence(each.path).is_deep]
+    rest = (*(each for each in files if each.path not in deep), *others)
+    return (AmongDeep(tuple(deep), rest),) if deep else rest
+
+
+class _OpenedAmong:
+    def __init__(self, deep: Sequence[ExrSequence], others: Sequence[LayerSource]) -> None:
+        self._deep, self._others = deep, others
+        self._read, self._put = [Kept(_samples) for _ in deep], Kept(interleaved)
+
+    def layers_at(self, moment: Moment, cameras: CameraSource | None) -> Sequence[Layer]:
+        samples = []
+        for sequence, read in zip(self._deep, self._read, strict=True):
+            path = sequence.path_of(moment.number)
+            samples.append(read(sequence, str(path)))
+            _require_size(path, (samples[-1].width_px, samples[-1].height_px), moment)
+        return self._put(samples, [layer for each in self._others for layer in each.layers_at(moment, cameras)])
+
+
+def _samples(sequence: ExrSequence, path: str) -> DeepSamples:
+    assert isinstance(sequence.reader, DeepSurfaces)
+    return sequence.reader.samples(path)
+
+
+def _require_size(path: Path, size_px: tuple[int, int], moment: Moment) -> None:
+    if size_px != moment.size_px:
+        sizes = f"{path} is {size_px[0]}x{size_px[1]} px but the clip is {moment.size_px[0]}x{moment.size_px[1]} px"
+        raise InputError(f"{sizes}: render the layer in the size of the clip")
+
+
 class _OpenedFiles:
     def __init__(self, sequence: ExrSequence) -> None:
         self._sequence = sequence
@@ -44,7 +94,5 @@ class _OpenedFiles:
         path = self._sequence.path_of(moment.number)
         layers = self._read(str(path))
         for layer in layers:
-            if (layer.width_px, layer.height_px) != moment.size_px:
-                sizes = f"{path} is {layer.width_px}x{layer.height_px} px but the clip is {moment.size_px[0]}x{moment.size_px[1]} px"
-                raise InputError(f"{sizes}: render the layer in the size of the clip")
+            _require_size(path, (layer.width_px, layer.height_px), moment)
         return layers

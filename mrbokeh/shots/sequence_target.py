@@ -2,17 +2,18 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mrbokeh.atomic_files import write_json
 from mrbokeh.color_management import NamedSpace
 from mrbokeh.errors import InputError
-from mrbokeh.image_io import INTEGER_SUFFIXES, write_image, write_layer
+from mrbokeh.exr_io import write_exr
+from mrbokeh.finished_picture import exr_part, in_named_space, write_finished
+from mrbokeh.image_io import INTEGER_SUFFIXES, write_layer
 from mrbokeh.layer import Layer
 from mrbokeh.picture_sources.numbered_files import numbered
 from mrbokeh.shots.frame_maker import Picture
-from mrbokeh.shots.result_space import in_space
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import PartSink, Shot
 
@@ -72,8 +73,10 @@ class _Sink:
 
     def write(self, picture: Picture, index: int, time_s: float) -> None:  # noqa: ARG002
         path, space = self.target.file(index), self.target.space
-        stored = in_space(picture, space)
-        if isinstance(stored, Layer):
-            write_layer(path, stored)
+        if not isinstance(picture, Layer):
+            write_finished(path, picture, None, space)
+        elif space is None:
+            write_layer(path, picture)
         else:
-            write_image(path, stored, "srgb" if space is None else "linear")
+            part = exr_part(in_named_space(picture.rgb, picture.alpha, space), picture.alpha, space)
+            write_exr(path, replace(part, channels={**part.channels, "Z": picture.depth_m}))

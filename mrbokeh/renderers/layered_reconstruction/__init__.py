@@ -2,17 +2,19 @@
 
 Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/layered_reconstruction.md derives the filter.
 
-1. Samples are sorted into tiles, depth buckets and cells of motion; buckets of a tile with like filters become one partition.
+1. Samples are sorted into tiles, depth buckets and cells of motion; buckets of a tile with like filters become one partition, and
+   those that can hardly be seen join one.
 2. Mean and variance of the blur and of the motion of a partition give its sheared filter.
 3. The samples around the tile are reprojected to the middle of pupil and shutter along the partition's slopes. Those of the
    partition add colour and opacity, those behind it lower the opacity, for they were seen through it.
 4. A filter over the screen spreads what the reprojection took together, part by part of pupil and shutter.
-5. Partitions are composited front to back, for each part on its own; the picture is the mean of the parts.
+5. Partitions are composited front to back, for each part on its own; the picture is the mean of the parts. Where parts make no
+   difference, as pixels four times as large show, they are merged.
 """
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float32
@@ -78,7 +80,8 @@ class LayeredReconstruction:
         if all_sharp(layers, lens):
             return flat
         samples, values, coc_px, margin = sample_layers(layers, lens, self.per_pixel, self.seed, self.threads)
-        spread, _ = self._reconstructed(samples, values, coc_px, lens.aperture, shared_out=False)
+        without_noise = replace(self, settings=replace(self.settings, part_tolerance=0.0))  # nothing hides what merged parts leave out
+        spread, _ = without_noise._reconstructed(samples, values, coc_px, lens.aperture, shared_out=False)
         inside = np.ascontiguousarray(spread[margin : margin + flat.height_px, margin : margin + flat.width_px])
         extra, start = {}, 4
         for name, plane in layers[0].extra.items():
@@ -138,7 +141,7 @@ class LayeredReconstruction:
         return Choice(
             every, self.seed, chosen.merge, chosen.merge_tolerance, chosen.sigma_x_px, chosen.bandwidth, _KINDS[chosen.screen_filter],
             chosen.support, chosen.recursive_passes, alpha, chosen.tap_distance, chosen.enough, shared_out,
-            chosen.parts[1],
+            chosen.parts[1], *((chosen.part_tolerance, chosen.faint) if chosen.merge else (0.0, 0.0)),
         )  # fmt: skip
 
     def _each(self, run: Callable[[np.ndarray], None], tiles: int) -> None:

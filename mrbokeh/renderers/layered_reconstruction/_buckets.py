@@ -38,7 +38,8 @@ def motion_cells(motion_px: Float32[np.ndarray, "samples 2"], settings: Settings
     if not settings.motion or not np.isfinite(settings.motion_step_px):
         return np.zeros(len(motion_px), np.int32), 1, 1
     most = np.float32(settings.motion_step_px * 32)
-    at = np.rint(np.clip(motion_px, -most, most) / np.float32(settings.motion_step_px)).astype(np.int32)
-    at -= at.min(axis=0)
-    across, down = (at.max(axis=0) + 1).tolist()
-    return at[:, 1] * np.int32(across) + at[:, 0], across, across * down
+    # Axis by axis: extremes of both at once take numpy ten times as long.
+    x, y = (np.rint(np.clip(each, -most, most) / np.float32(settings.motion_step_px)).astype(np.int32) for each in motion_px.T)
+    x, y = x - x.min(), y - y.min()
+    across, down = int(x.max()) + 1, int(y.max()) + 1
+    return y * np.int32(across) + x, across, across * down

@@ -76,6 +76,17 @@ def extents(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: 
 
 
 @njit(cache=True, nogil=True)
+def spread_px(sums: np.ndarray, window: np.ndarray, sigma_x_px: float) -> tuple[float, float]:
+    """Standard deviations of the blur of the mean sample along its axes, the longer first."""
+    r, m_x, m_y = sums[1] / sums[0], sums[3] / sums[0], sums[4] / sums[0]
+    out_xx = sigma_x_px**2 + r * r * window[0] + window[3] * m_x * m_x
+    out_xy = r * r * window[1] + window[3] * m_x * m_y
+    out_yy = sigma_x_px**2 + r * r * window[2] + window[3] * m_y * m_y
+    sigma_u, sigma_v, _ = axes(out_xx, out_xy, out_yy)
+    return sigma_u, sigma_v
+
+
+@njit(cache=True, nogil=True)
 def slope_distance(one: np.ndarray, other: np.ndarray, window: np.ndarray, sigma_x_px: float) -> float:
     """By how much reprojection along the mean slopes of the other goes wrong for the mean sample of one, in units of its own blur."""
     r, m_x, m_y = one[1] / one[0], one[3] / one[0], one[4] / one[0]

@@ -1,9 +1,11 @@
 """How the buckets of a tile become partitions, and to which of them any sample belongs."""
 
+import math
+
 import numpy as np
 from numba import njit
 
-from mrbokeh.renderers.layered_reconstruction._filter_numba import extents, slope_distance
+from mrbokeh.renderers.layered_reconstruction._filter_numba import extents, slope_distance, spread_px
 from mrbokeh.renderers.layered_reconstruction._statistics_numba import rows_of_tile
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions
 
@@ -34,11 +36,16 @@ def fits(row: np.ndarray, first: np.ndarray, both: np.ndarray, widest: np.ndarra
 
 
 @njit(cache=True, nogil=True)
-def merged_rows(rows: np.ndarray, light: Light, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
-    """Sweep the sums (R, SUMS) of buckets front to back. Returns the partition of each (R,) and the sums of partitions (P, SUMS)."""
+def merged_rows(rows: np.ndarray, faint: np.ndarray, light: Light, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+    """Sweep the sums (R, SUMS) of buckets front to back. Returns the partition of each (R,) and the sums of partitions (P, SUMS).
+
+    faint: (R,) those that join the partition of the nearest slopes in the end and have no say in its filter.
+    """
     merged, own, count = np.zeros_like(rows), np.zeros(len(rows), np.int64), 0
     widest, first = np.zeros((len(rows), 2)), np.zeros(len(rows), np.int64)
     for row in range(len(rows)):
+        if faint[row]:
+            continue
         joins = count
         if choice.merge:
             for j in range(count - 1, max(-1, count - 1 - LOOK_BACK), -1):
@@ -52,18 +59,51 @@ def merged_rows(rows: np.ndarray, light: Light, choice: Choice) -> tuple[np.ndar
         merged[joins] += rows[row]
         one_u, one_v = extents(rows[row], light.window, choice.sigma_x_px, choice.bandwidth)
         widest[joins, 0], widest[joins, 1] = max(widest[joins, 0], one_u), max(widest[joins, 1], one_v)
+    for row in range(len(rows)):
+        if faint[row]:
+            own[row] = nearest(rows[row], merged[:count], light, choice)
     return own, merged[:count]
+
+
+@njit(cache=True, nogil=True)
+def nearest(row: np.ndarray, partitions: np.ndarray, light: Light, choice: Choice) -> int:
+    """The partition by whose slopes the mean sample of a bucket goes least wrong; the first of several."""
+    best, least = 0, np.inf
+    for j in range(len(partitions)):
+        distance = slope_distance(row, partitions[j], light.window, choice.sigma_x_px)
+        if distance < least:
+            best, least = j, distance
+    return best
+
+
+@njit(cache=True, nogil=True)
+def faint_rows(rows: np.ndarray, held: np.ndarray, light: Light, choice: Choice) -> np.ndarray:
+    """Which buckets (R,) can hardly be seen: spread over the area of their filter, their samples hide no more than the share
+    choice.faint of what is there, nor are they brighter than that share of the mean of the tile and the blocks around it.
+
+    The area is that of an even disc of the same second moments. Where all are faint none is.
+    """
+    faint = np.zeros(len(rows), np.bool_)
+    if choice.faint > 0.0:
+        typical = (held[:, 2].sum() / held[:, 0].sum()) ** 2
+        for row in range(len(rows)):
+            sigma_u, sigma_v = spread_px(rows[row], light.window, choice.sigma_x_px)
+            most = choice.faint * light.per_pixel * 4.0 * math.pi * sigma_u * sigma_v
+            faint[row] = held[row, 0] <= most and held[row, 1] <= most * typical
+    return faint if not faint.all() else np.zeros(len(rows), np.bool_)
 
 
 @njit(cache=True, nogil=True)
 def partitions_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarray) -> tuple[Partitions, np.ndarray, int]:
     """Also the buckets whose place (B,) is to be -1 again for the next tile, as it must come, and how many buckets are populated."""
-    buckets, rows = rows_of_tile(tile, light, choice, place)
-    own, merged = merged_rows(rows, light, choice)
+    buckets, rows, held = rows_of_tile(tile, light, choice, place)
+    faint = faint_rows(rows, held, light, choice)
+    own, merged = merged_rows(rows, faint, light, choice)
     first = np.full(len(merged), light.depths, np.int64)
     for row in range(len(buckets)):
         place[buckets[row]] = 2 * own[row]
-        first[own[row]] = min(first[own[row]], buckets[row] // light.cells)
+        if not faint[row]:
+            first[own[row]] = min(first[own[row]], buckets[row] // light.cells)
     gaps = np.full(light.depths, -1, np.int64)
     for j in range(len(merged)):
         gaps[first[j] :] = 2 * j + 1

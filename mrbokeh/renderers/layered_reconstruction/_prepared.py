@@ -30,8 +30,9 @@ def prepared(
     gather(order, *rays, values, bucket, settings.motion, geometry, slopes, sorted_values, sorted_bucket)
     reach = float(np.abs(samples.lens_uv).max())
     return Light(
-        geometry, slopes, sorted_values, sorted_bucket, starts, columns, settings.tile_px, across, cells, buckets, _window(samples), reach
-    )
+        geometry, slopes, sorted_values, sorted_bucket, starts, columns, settings.tile_px, across, cells, buckets, _window(samples), reach,
+        samples.per_pixel,
+    )  # fmt: skip
 
 
 def _window(samples: LightFieldSamples) -> Float64[np.ndarray, "4"]:

@@ -51,39 +51,46 @@ def add_block(
 ) -> None:
     """The samples from first to end. sharp: each counts for the pixel it is in; else it is shared out among the four nearest."""
     height, width, channels = planes.shape
-    channels -= 3
+    flat, across, step_x, zero = planes.reshape(-1), np.uint64(width * channels), np.uint64(channels), np.uint64(0)
+    to_opacity, to_weight, to_count = np.uint64(channels - 3), np.uint64(channels - 2), np.uint64(channels - 1)
     a, b_x, b_y = np.float32(slope.a), np.float32(slope.b_x), np.float32(slope.b_y)
     off_x, off_y = np.float32(left), np.float32(top)
     if not sharp:
         off_x, off_y, width, height = off_x + np.float32(0.5), off_y + np.float32(0.5), width - 1, height - 1
-    geometry, bucket, values, of, gaps, cells = light.geometry, light.bucket, light.values, partitions.place, partitions.gaps, light.cells
     own, before = 2 * j, (partitions.first[j] - BESIDE_DEPTHS) * light.cells
-    for i in range(first, end):
-        if bucket[i] < before:
+    geometry, buckets, values = light.geometry[first:end], light.bucket[first:end], light.values[first:end]
+    for i in range(end - first):
+        if buckets[i] < before:
             continue
         x = geometry[i, 0] - a * geometry[i, 2] - b_x * geometry[i, 4] - off_x
         y = geometry[i, 1] - a * geometry[i, 3] - b_y * geometry[i, 4] - off_y
         if not (np.float32(0.0) <= x < width and np.float32(0.0) <= y < height):
             continue
-        at = of[bucket[i]]
+        bucket = np.uint64(buckets[i])
+        at = partitions.place[bucket]
         if at < 0:
-            at = gaps[bucket[i] // cells]
+            at = partitions.gaps[bucket // np.uint64(light.cells)]
         column, row = int(x), int(y)
-        if sharp:
-            right, below, taps = np.float32(0.0), np.float32(0.0), 1
-        else:
+        # Without signs the compiler has no negative indices to look for, which would take it as long as all the rest.
+        place = np.uint64(row) * across + np.uint64(column * channels)
+        right, below, taps = np.float32(0.0), np.float32(0.0), 1
+        if not sharp:
             right, below, taps = x - np.float32(column), y - np.float32(row), 4
-        for tap in range(taps):
-            dx, dy = tap & 1, tap >> 1
-            share = (right if dx else np.float32(1.0) - right) * (below if dy else np.float32(1.0) - below)
-            py, px = row + dy, column + dx
-            planes[py, px, channels + 2] += share
-            if at >= own:
-                planes[py, px, channels + 1] += share
+        one, other = np.float32(1.0) - right, np.float32(1.0) - below
+        if at < own:
+            for tap in range(taps):
+                share = (right if tap & 1 else one) * (below if tap >> 1 else other)
+                flat[place + (step_x if tap & 1 else zero) + (across if tap >> 1 else zero) + to_count] += share
+        else:
+            for tap in range(taps):
+                share = (right if tap & 1 else one) * (below if tap >> 1 else other)
+                to = place + (step_x if tap & 1 else zero) + (across if tap >> 1 else zero)
+                flat[to + to_count] += share
+                flat[to + to_weight] += share
                 if at == own:
-                    planes[py, px, channels] += share
-                    for c in range(channels):
-                        planes[py, px, c] += share * values[i, c]
+                    for c in range(channels - 3):
+                        flat[to + np.uint64(c)] += share * values[i, c]
+                    flat[to + to_opacity] += share
 
 
 @njit(cache=True, nogil=True)

@@ -41,10 +41,13 @@ def along_line(out: np.ndarray, planes: np.ndarray, offsets: np.ndarray, weights
     """Fill out (h, w, C) with the mean of planes (h + 2 guard_y, w + 2 guard_x, C) along a segment."""
     height, width, channels = out.shape
     out[:] = 0.0
+    from_flat, to_flat = planes.reshape(-1), out.reshape(-1)
+    length, across = np.uint64(width * channels), np.uint64(planes.shape[1] * channels)
     for k in range(len(weights)):
         weight = weights[k]
-        first = (guard_x + offsets[k, 0]) * channels
-        for y in range(height):
-            line, to = planes[y + guard_y + offsets[k, 1]].ravel()[first:], out[y].ravel()
-            for n in range(width * channels):
-                to[n] += weight * line[n]
+        line = np.uint64(guard_y + offsets[k, 1]) * across + np.uint64((guard_x + offsets[k, 0]) * channels)
+        to = np.uint64(0)
+        for _ in range(height):
+            for n in range(length):
+                to_flat[to + n] += weight * from_flat[line + n]
+            line, to = line + across, to + length

@@ -25,7 +25,12 @@ class Settings:
       samples from elsewhere.
     sigma_x_px: the spatial filter, at least that of a pixel (0.289); larger hides streaks and loses sharpness (Fig. 9).
     sparse_statistics: statistics from one sample in 3 x spp, picked stratified in Morton order; else from all.
-    merge: put buckets together whose common filter is at most the share merge_tolerance narrower than that of any of them.
+    merge: put buckets together whose common filter is at most the share merge_tolerance narrower than that of any of them (the paper
+      has 0.1), and, beyond the paper, what the next two say.
+    faint: buckets that can hide no more than this share of what lies behind them, and are no brighter, join the partition of the
+      nearest slopes; 0 for none.
+    part_tolerance: parts of pupil and shutter are filtered on their own only where what they add to the whole has more detail, as a
+      share of what is there, than pixels of 4 px can hold; 0 for everywhere. Of samples; layers are always rendered in parts.
     screen_filter: "windows" (not the paper's: pupil and shutter in their true shapes), or a Gaussian in their place: "sheared"
       (recursive along x, Eq. 9 and 10), "texture" (mip map, anisotropic, four taps), "texture_one_tap", "direct" (slow).
     recursive_passes: of Eq. 10, which share the variance; 1 is the paper's double exponential, more come nearer to a Gaussian.
@@ -46,7 +51,9 @@ class Settings:
     sigma_x_px: float = 0.33
     sparse_statistics: bool = True
     merge: bool = True
-    merge_tolerance: float = 0.1
+    merge_tolerance: float = 0.07
+    faint: float = 0.01
+    part_tolerance: float = 0.0125
     screen_filter: ScreenFilter = "windows"
     recursive_passes: int = 2
     tap_distance: float = 0.33
@@ -75,6 +82,11 @@ class Settings:
             raise InputError(
                 f"merge_tolerance, energy and tap_distance are shares from 0 to below 1 (energy above 0), "
                 f"got {self.merge_tolerance}, {self.energy}, {self.tap_distance}"
+            )
+        if not (0 <= self.faint < 1 and self.part_tolerance >= 0):
+            raise InputError(
+                f"faint is a share from 0 to below 1 and part_tolerance at least 0 (0 merges nothing), "
+                f"got {self.faint}, {self.part_tolerance}"
             )
         if not (self.bandwidth >= 0 and self.support >= 1 and self.recursive_passes >= 1):
             raise InputError(

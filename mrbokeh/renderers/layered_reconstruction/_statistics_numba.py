@@ -1,5 +1,6 @@
 """Sums over the samples of a tile for each bucket it holds, from all samples or a sparse stratified choice."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -39,8 +40,9 @@ def seeded(seed: int, tile: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def rows_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Buckets (R,), in rising order, and sums (R, SUMS) of all that the tile and the blocks around it hold.
+def rows_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Buckets (R,), in rising order, and sums (R, SUMS) of all that the tile and the blocks around it hold; of the same samples, all of
+    them, the number, the light and its root (R, 3).
 
     place: (B,) of -1; afterwards not, for these buckets. What none of the chosen samples saw is summed over all samples, and what
     only the blocks around hold over those: a lamp must not vanish by chance, nor where its light leaves a tile's corner.
@@ -61,7 +63,12 @@ def rows_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarray) -> 
     count = rows.used[0]
     rows.sums[known:count] /= choice.every
     order = np.argsort(rows.buckets[:count])
-    return rows.buckets[:count][order], rows.sums[:count][order]
+    held = np.zeros((count, 3))
+    if choice.faint > 0.0:
+        add_light(held, rows, first, end, light)
+        for block in beside:
+            add_light(held, rows, light.starts[block], light.starts[block + 1], light)
+    return rows.buckets[:count][order], rows.sums[:count][order], held[order]
 
 
 @njit(cache=True, nogil=True)
@@ -102,6 +109,19 @@ def add_sample(rows: Rows, bucket: int, slope: np.ndarray) -> None:
     row[5] += m_x * m_x
     row[6] += m_x * m_y
     row[7] += m_y * m_y
+
+
+@njit(cache=True, nogil=True)
+def add_light(held: np.ndarray, rows: Rows, first: int, end: int, light: Light) -> None:
+    """Count all samples from first to end for their buckets, and add their light, the largest of their channels."""
+    for i in range(first, end):
+        most = np.float32(0.0)
+        for c in range(light.values.shape[1]):
+            most = max(most, abs(light.values[i, c]))
+        row = rows.place[light.bucket[i]]
+        held[row, 0] += 1.0
+        held[row, 1] += most
+        held[row, 2] += math.sqrt(most)
 
 
 @njit(cache=True, nogil=True)

@@ -15,7 +15,7 @@ class Light(NamedTuple):
     geometry: (N, 5) x, y, u, v, t - 1/2. slopes: (N, 3) half the signed circle of confusion, motion x and y. values: (N, C).
     bucket: (N,) depth bucket times `cells` plus cell of motion. starts: of each sixteenth of a tile, and the end.
     columns: of tiles. tile_px: side of a tile. cells_x: of motion, along x; cells: of both axes together.
-    window: second moments uu, uv, vv of the pupil and tt of the shutter, as the samples fill them.
+    window: second moments uu, uv, vv of the pupil and tt of the shutter, as the samples fill them. per_pixel: samples.
     """
 
     geometry: np.ndarray
@@ -30,12 +30,13 @@ class Light(NamedTuple):
     depths: int
     window: np.ndarray
     pupil_radius: float
+    per_pixel: float
 
 
 class Choice(NamedTuple):
     """Numbers of Settings. every: one sample of so many makes the statistics. kind: of the screen filter. alpha: of Eq. 3.
 
-    times: stretches of the shutter that are composited on their own.
+    times: stretches of the shutter that are composited on their own. part_tolerance: 0 where parts are never merged.
     """
 
     every: int
@@ -52,6 +53,8 @@ class Choice(NamedTuple):
     enough: float
     shared_out: bool
     times: int
+    part_tolerance: float
+    faint: float
 
 
 class Slope(NamedTuple):
@@ -84,3 +87,20 @@ class Partitions(NamedTuple):
     first: np.ndarray
     place: np.ndarray
     gaps: np.ndarray
+
+
+class WindowLayer(NamedTuple):
+    """A partition around a tile, reprojected and not yet filtered: planes (h + 2 guard_y + 2 guard, w + 2 guard_x + 2 guard, C + 2) of
+    colour, opacity and weight.
+
+    scale: radius in px of the pupil's picture, negative in front of the focus. length_x, length_y: the segment of the shutter in px.
+    guard_x, guard_y: bands around the tile that the segment needs. guard: beyond them, that of the pupil.
+    """
+
+    planes: np.ndarray
+    scale: float
+    length_x: float
+    length_y: float
+    guard_x: int
+    guard_y: int
+    guard: int

@@ -40,14 +40,19 @@ def add_strip(out: np.ndarray, prefix: np.ndarray, one: float, other: float, wei
     start, end = guard_x + 0.5 + min(one, other), guard_x + 0.5 + max(one, other)
     start_px, end_px = int(math.floor(start)), int(math.floor(end))
     s, e = start - start_px, end - end_px
-    length = width * channels
-    for y in range(height):
-        # Rows as one run of numbers, pixel by pixel: all channels of a row in one loop that the compiler makes vectors of.
-        line, to = prefix[y + guard_y + row].ravel(), out[y].ravel()
-        left, left_on = line[start_px * channels :][:length], line[(start_px + 1) * channels :][:length]
-        right, right_on = line[end_px * channels :][:length], line[(end_px + 1) * channels :][:length]
+    # Rows as one run of numbers, pixel by pixel: all channels of a row in one loop that the compiler makes vectors of, which it does
+    # for indices without a sign. Views of rows would take longer than what is done with short ones.
+    from_flat, to_flat, step = prefix.reshape(-1), out.reshape(-1), np.uint64(channels)
+    length, across = np.uint64(width * channels), np.uint64(prefix.shape[1] * channels)
+    left, right = np.uint64(start_px * channels), np.uint64(end_px * channels)
+    line = np.uint64(guard_y + row) * across
+    to = np.uint64(0)
+    for _ in range(height):
         for k in range(length):
-            to[k] += gain * ((right[k] + e * (right_on[k] - right[k])) - (left[k] + s * (left_on[k] - left[k])))
+            begin, stop = line + left + k, line + right + k
+            before = from_flat[begin] + s * (from_flat[begin + step] - from_flat[begin])
+            to_flat[to + k] += gain * ((from_flat[stop] + e * (from_flat[stop + step] - from_flat[stop])) - before)
+        line, to = line + across, to + length
 
 
 @njit(cache=True, nogil=True)

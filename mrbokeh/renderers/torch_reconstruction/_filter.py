@@ -82,6 +82,13 @@ def extents(sums: Sums, window: Window, sigma_x_px: float, bandwidth: float) -> 
     return sigma_u, sigma_v
 
 
+def spread_px(sums: Sums, window: Window, sigma_x_px: float) -> tuple[Number, Number]:
+    """Standard deviations of the blur of the mean sample along its axes, the longer first."""
+    r, m_x, m_y = (sums[..., k] / sums[..., 0] for k in (1, 3, 4))
+    sigma_u, sigma_v, _ = axes(_blur(r, m_x, m_y, window, sigma_x_px)[0])
+    return sigma_u, sigma_v
+
+
 def slope_distance(one: Sums, other: Sums, window: Window, sigma_x_px: float) -> Number:
     """By how much reprojection along the mean slopes of the other goes wrong for the mean sample of one, in units of its own blur."""
     r, m_x, m_y = (one[..., k] / one[..., 0] for k in (1, 3, 4))

@@ -110,12 +110,21 @@ def batches(jobs: Jobs, jobs_at_once: int) -> Iterator[tuple[int, int]]:
         begin, before = end, int(ends[end - 1])
 
 
-def groups(jobs: Jobs, first: int, end: int, tile_px: int, pixels_at_once: int) -> Iterator[tuple[Int64[np.ndarray, " group"], int]]:
-    """Of the jobs from first to end, those that share a guard band, with it, and no more than so many pixels of windows together."""
-    band = np.searchsorted(GUARDS_PX, jobs.host_guard[first:end].max(axis=1))
+def jobs_in(jobs: Jobs, tiles: Int64[np.ndarray, " tiles"]) -> Int64[np.ndarray, " jobs"]:
+    """All jobs of these tiles, which must rise."""
+    ends = np.cumsum(jobs.host_counts)
+    return np.concatenate([np.arange(ends[tile] - jobs.host_counts[tile], ends[tile]) for tile in tiles.tolist()])
+
+
+def groups(
+    jobs: Jobs, some: Int64[np.ndarray, " jobs"], tile_px: int, pixels_at_once: int
+) -> Iterator[tuple[Int64[np.ndarray, " group"], int]]:
+    """Of some jobs, those that share a guard band, with it, and no more than so many pixels of windows together."""
+    widest = jobs.host_guard[some].max(axis=1)
+    band = np.searchsorted(GUARDS_PX, widest)
     for which in np.unique(band).tolist():
-        guard = GUARDS_PX[which] if which < len(GUARDS_PX) else int(jobs.host_guard[first:end].max())
-        members = first + np.nonzero(band == which)[0]
+        guard = GUARDS_PX[which] if which < len(GUARDS_PX) else int(widest.max())
+        members = some[band == which]
         at_once = max(1, pixels_at_once // (tile_px + 2 * guard) ** 2)
         for begin in range(0, len(members), at_once):
             yield members[begin : begin + at_once], guard

@@ -39,6 +39,7 @@ class TileLight:
     beside: Int64[Tensor, "buckets 10"]
     window: Float64[Tensor, "4"]
     pupil_radius: float
+    per_pixel: float
     most_in_tile: int
     most_in_block: int
 
@@ -71,7 +72,7 @@ def tile_light(samples: DeviceSamples, settings: Settings) -> TileLight:
     slopes = torch.cat([0.5 * samples.coc_px[:, None], samples.motion_px * float(settings.motion)], dim=1)[order]
     return TileLight(
         width_px, height_px, tile_px, geometry, slopes, samples.values[order], (code // per_block).long(), starts, bucket[order],
-        held_depth, beside, _window(samples), reach, int(in_tile), int(in_block),
+        held_depth, beside, _window(samples), reach, samples.per_pixel, int(in_tile), int(in_block),
     )  # fmt: skip
 
 

@@ -1,14 +1,15 @@
 """Rows of a tile join partitions, and every bucket finds its place among them."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from mrbokeh.renderers.layered_reconstruction._partitions_numba import LOOK_BACK, WIDEST_PX
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
-from mrbokeh.renderers.torch_reconstruction._filter import extents
+from mrbokeh.renderers.torch_reconstruction._filter import extents, slope_distance, spread_px
 from mrbokeh.renderers.torch_reconstruction._light import TileLight
 from mrbokeh.renderers.torch_reconstruction._statistics import Rows
 from mrbokeh.renderers.torch_reconstruction._sweep import sweep_row_by_row
@@ -32,15 +33,52 @@ class Partitions:
 
 
 def partitions_of(rows: Rows, light: TileLight, settings: Settings) -> Partitions:
-    own, counts = merged_rows(rows, light.window, settings)
+    faint = faint_rows(rows, light, settings)
+    seen = torch.nonzero(~faint)[:, 0]
+    own_rows = {name: getattr(rows, name)[seen] for name in ("sums", "light", "tile", "bucket")}
+    first = torch.searchsorted(own_rows["tile"], torch.arange(len(rows.first), device=seen.device))
+    swept, counts = merged_rows(replace(rows, first=first, **own_rows), light.window, settings)
     before = torch.cumsum(counts, 0) - counts
-    of = before[rows.tile] + own
+    of = before[rows.tile[seen]] + swept
     tile = torch.repeat_interleave(counts)
-    sums = torch.zeros((len(tile), 8), dtype=torch.float64, device=of.device).index_add_(0, of, rows.sums)
-    depth = light.depth[rows.bucket]
+    sums = torch.zeros((len(tile), 8), dtype=torch.float64, device=of.device).index_add_(0, of, rows.sums[seen])
+    own = torch.empty_like(rows.tile)
+    own[seen] = swept
+    own[faint] = _by_slopes(rows, torch.nonzero(faint)[:, 0], sums, counts, light, settings)
+    depth = light.depth[rows.bucket[seen]]
     nearest = torch.full_like(tile, torch.iinfo(torch.int64).max).scatter_reduce_(0, of, depth, "amin")
     rank = torch.arange(len(tile), device=of.device) - before[tile]
     return Partitions(sums, tile, rank, nearest, _places(rows, own, tile, nearest, light), counts)
+
+
+def faint_rows(rows: Rows, light: TileLight, settings: Settings) -> Bool[Tensor, " rows"]:
+    """Which rows can hardly be seen, spread over the area of their filter; none of a tile where all are."""
+    if not (settings.merge and settings.faint > 0.0):
+        return torch.zeros_like(rows.tile, dtype=torch.bool)
+    tiles = len(rows.first) - 1
+    of_tiles = rows.light.new_zeros((tiles, 3)).index_add_(0, rows.tile, rows.light)
+    typical = (of_tiles[:, 2] / of_tiles[:, 0]) ** 2
+    sigma_u, sigma_v = spread_px(rows.sums, light.window, settings.sigma_x_px)
+    most = settings.faint * light.per_pixel * 4.0 * math.pi * sigma_u * sigma_v
+    faint = (rows.light[:, 0] <= most) & (rows.light[:, 1] <= most * typical[rows.tile])
+    any_seen = torch.zeros(tiles, dtype=torch.int64, device=faint.device).index_add_(0, rows.tile, (~faint).long()) > 0
+    return faint & any_seen[rows.tile]
+
+
+def _by_slopes(
+    rows: Rows,
+    faint: Int64[Tensor, " faint"],
+    sums: Float64[Tensor, "partitions 8"],
+    counts: Int64[Tensor, " tiles"],
+    light: TileLight,
+    settings: Settings,
+) -> Int64[Tensor, " faint"]:
+    """The partition of its tile by whose slopes the mean sample of each of these rows goes least wrong."""
+    tile, rank = rows.tile[faint], torch.arange(int(counts.max()), device=faint.device)
+    of = ((torch.cumsum(counts, 0) - counts)[tile][:, None] + rank).clamp(max=len(sums) - 1)
+    one = rows.sums[faint][:, None].expand(*of.shape, -1)
+    distance = slope_distance(one, sums[of], light.window, settings.sigma_x_px)
+    return torch.where(rank < counts[tile][:, None], distance, torch.inf).argmin(dim=1)
 
 
 def merged_rows(rows: Rows, window: Float64[Tensor, "4"], settings: Settings) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " tiles"]]:

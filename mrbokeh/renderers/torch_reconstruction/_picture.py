@@ -1,22 +1,25 @@
 """Samples on a device become a picture on the device."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.layer import Layer, opaque
 from mrbokeh.lens import Lens
 from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.renderers.layered_reconstruction._parts_numba import COARSE_PX
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
-from mrbokeh.renderers.torch_reconstruction._compositing import composited, own_means, put_together
+from mrbokeh.renderers.torch_reconstruction._compositing import Tiles, composited, own_means, put_together
 from mrbokeh.renderers.torch_reconstruction._filter import sheared_slopes
-from mrbokeh.renderers.torch_reconstruction._jobs import Jobs, batches, groups, jobs_of, task_of
+from mrbokeh.renderers.torch_reconstruction._jobs import Jobs, Task, batches, groups, jobs_in, jobs_of, task_of
 from mrbokeh.renderers.torch_reconstruction._light import TileLight, tile_light
 from mrbokeh.renderers.torch_reconstruction._merging import partitions_of
+from mrbokeh.renderers.torch_reconstruction._parts import coarse_inside, fine, ratio_of, scaled_by_coarse, too_detailed
 from mrbokeh.renderers.torch_reconstruction._reprojection import reprojected
 from mrbokeh.renderers.torch_reconstruction._samples import DeviceSamples
 from mrbokeh.renderers.torch_reconstruction._screen import ScreenFilter
@@ -85,33 +88,63 @@ class TorchReconstruction:
 
     def _composited(self, light: TileLight, jobs: Jobs, screen: ScreenFilter) -> Float32[Tensor, "height width channels"]:
         at_once = AT_ONCE[light.values.device.type][2] // light.tile_px**2 // len(screen.shares)
-        starts = np.cumsum([0, *jobs.host_counts]).tolist()
+        merges = self.settings.merge and self.settings.part_tolerance > 0.0 and len(screen.shares) > 1
         tiles, left = [], []
         for begin, end in batches(jobs, at_once):
-            layers = self._filtered(light, jobs, screen, starts[begin], starts[end])
-            done = composited(layers, jobs.host_counts[begin:end], screen.shares)
+            every = np.arange(begin, end)
+            done = self._in_merged_parts(light, jobs, screen, every) if merges else self._in_parts(light, jobs, screen, every)
             tiles.append(done[0])
             left.append(done[1])
         picture = put_together(torch.cat(tiles), light)
         unseen = put_together(torch.cat(left)[:, None], light) >= _UNSEEN
         return torch.where(unseen, own_means(light), picture) if bool(unseen.any()) else picture.contiguous()
 
-    def _filtered(
-        self, light: TileLight, jobs: Jobs, screen: ScreenFilter, first: int, end: int
-    ) -> Float32[Tensor, "jobs planes parts side side"]:
-        """Colour, opacity and weight of some jobs over their tiles, for each part; alone in a tile, a job hides nothing and is whole."""
+    def _in_parts(self, light: TileLight, jobs: Jobs, screen: ScreenFilter, tiles: Int64[np.ndarray, " tiles"]) -> tuple[Tiles, Tensor]:
+        """Pictures of tiles and what is left of each pixel; alone in a tile, a job hides nothing and is whole."""
+        counts, members = jobs.host_counts[tiles], jobs_in(jobs, tiles)
+        layers = light.values.new_zeros((max(1, len(members)), light.values.shape[1] + 2, len(screen.shares), *(light.tile_px,) * 2))
+        is_one_of_many = np.repeat(counts, counts) > 1
+        for in_parts in (False, True):
+            for to, planes, task, guard in self._planes(light, jobs, members, np.nonzero(is_one_of_many == in_parts)[0]):
+                layers[to] = screen.filtered(planes, jobs, task, guard, in_parts)
+        return composited(layers, counts, screen.shares)
+
+    def _in_merged_parts(
+        self, light: TileLight, jobs: Jobs, screen: ScreenFilter, tiles: Int64[np.ndarray, " tiles"]
+    ) -> tuple[Tiles, Tensor]:
+        """The same, in parts only where these make a difference."""
+        counts, members, coarse_px = jobs.host_counts[tiles], jobs_in(jobs, tiles), light.tile_px // COARSE_PX
+        planes_and = max(1, len(members)), light.values.shape[1] + 2
+        whole = light.values.new_zeros((*planes_and, 1, *(light.tile_px,) * 2))
+        alike, apart = (light.values.new_zeros((*planes_and, parts, *(coarse_px,) * 2)) for parts in (1, len(screen.shares)))
+        for to, planes, task, guard in self._planes(light, jobs, members, np.arange(len(members))):
+            whole[to] = screen.filtered(planes, jobs, task, guard, False)
+            alike[to] = screen.filtered_coarse(planes, jobs, task, guard, False)
+            apart[to] = screen.filtered_coarse(planes, jobs, task, guard, True)
+        picture, left = composited(whole, counts, [1.0])
+        without, within = composited(alike, counts, [1.0])[0], composited(apart, counts, screen.shares)[0]
+        inside = coarse_inside(light, torch.from_numpy(tiles).to(picture.device))
+        is_many = torch.from_numpy(counts > 1).to(picture.device)[:, None, None]
+        ratio = torch.where(is_many[..., None], ratio_of(without, within), 1.0)
+        box = too_detailed(without, within, inside, self.settings.part_tolerance) & is_many
+        picture = scaled_by_coarse(picture, ratio, inside)
+        which = torch.nonzero(box.any(dim=2).any(dim=1))[:, 0]
+        if len(which):
+            in_parts, parts_left = self._in_parts(light, jobs, screen, tiles[which.cpu().numpy()])
+            there = fine(box[which])
+            picture[which] = torch.where(there[:, None], in_parts, picture[which])
+            left[which] = torch.where(there, parts_left, left[which])
+        return picture, left
+
+    def _planes(
+        self, light: TileLight, jobs: Jobs, members: Int64[np.ndarray, " members"], some: Int64[np.ndarray, " some"]
+    ) -> Iterator[tuple[Int64[Tensor, " group"], Tensor, Task, int]]:
+        """Of some of these jobs, in groups of one guard band: their places among them, reprojected planes, what they are, the band."""
         pairs, pixels, _ = AT_ONCE[light.values.device.type]
-        side = light.tile_px
-        layers = light.values.new_zeros((max(1, end - first), light.values.shape[1] + 2, len(screen.shares), side, side))
-        is_one_of_many = np.repeat(jobs.host_counts, jobs.host_counts) > 1
-        for together, guard in groups(jobs, first, end, side, pixels):
-            for in_parts in (False, True):
-                members = together[is_one_of_many[together] == in_parts]
-                if len(members):
-                    task = task_of(jobs, light, members, guard)
-                    planes = reprojected(jobs, light, task, self.settings.enough, pairs)
-                    layers[task.job - first] = screen.filtered(planes, jobs, task, guard, in_parts)
-        return layers
+        for together, guard in groups(jobs, members[some], light.tile_px, pixels):
+            task = task_of(jobs, light, together, guard)
+            to = torch.from_numpy(np.searchsorted(members, together)).to(task.job.device)
+            yield to, reprojected(jobs, light, task, self.settings.enough, pairs), task, guard
 
 
 def _nearest_depth_m(samples: DeviceSamples) -> Float32[Tensor, "height width"]:

@@ -11,9 +11,11 @@ from itertools import pairwise
 import torch
 from jaxtyping import Complex128, Float32, Int64
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
+from mrbokeh.renderers.layered_reconstruction._parts_numba import COARSE_PX
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
 from mrbokeh.renderers.torch_reconstruction._filter import Slopes, Spread, screen_covariance
 from mrbokeh.renderers.torch_reconstruction._gaussians import direct_kernels, gaussian_guards, less_pixel, recursive_rows, sheared_kernels
@@ -54,17 +56,36 @@ class ScreenFilter:
         slopes = Slopes(*(each[task.job] for each in jobs.slopes))
         values = planes.permute(0, 3, 1, 2)
         size = transform_size(task.side + _BEYOND)
-        offset = torch.arange(size, device=planes.device)
-        offset = torch.where(offset > size // 2, offset - size, offset)
+        offset = _offsets(size, planes.device)
         if self.settings.screen_filter == "sheared":
             values = recursive_rows(values, self._covariance(slopes), task, jobs.guard[task.job], self.settings.recursive_passes)
         spectrum = torch.fft.rfft2(values.double(), s=(size, size))
         tile = slice(guard, task.side - guard)
-        parts = [
-            torch.fft.irfft(torch.fft.ifft(spectrum * kernel.conj()[:, None], dim=-2)[..., tile, :], n=size)[..., tile].float()
-            for kernel in self._spectra(slopes, jobs.guard[task.job], offset, in_parts)
-        ]
-        return torch.stack(parts, dim=2)
+        return _met(spectrum, self._spectra(slopes, jobs.guard[task.job], offset, in_parts), tile, size)
+
+    def filtered_coarse(
+        self, planes: Float32[Tensor, "group side side planes"], jobs: Jobs, task: Task, guard: int, in_parts: bool
+    ) -> Float32[Tensor, "group planes parts coarse coarse"]:
+        """The same in pixels COARSE_PX as large."""
+        slopes = Slopes(*(each[task.job] for each in jobs.slopes))
+        slopes = slopes._replace(r=slopes.r / COARSE_PX, m_x=slopes.m_x / COARSE_PX, m_y=slopes.m_y / COARSE_PX)
+        wider = -guard % COARSE_PX
+        values = pad(self._smoothed(planes.permute(0, 3, 1, 2)), (wider,) * 4)
+        small, guard = avg_pool2d(values, COARSE_PX), (guard + wider) // COARSE_PX
+        size = transform_size(small.shape[-1] + _BEYOND)
+        spectrum = torch.fft.rfft2(small.double(), s=(size, size))
+        offset, tile = _offsets(size, planes.device), slice(guard, small.shape[-1] - guard)
+        return _met(spectrum, self._windows(slopes, offset, in_parts), tile, size)
+
+    def _smoothed(self, values: Float32[Tensor, "group planes side side"]) -> Float32[Tensor, "group planes side side"]:
+        """By what the spatial filter has beyond a pixel."""
+        side = values.shape[-1]
+        size = transform_size(side + _BEYOND)
+        rest = rest_kernel(self.settings.sigma_x_px, _offsets(size, values.device))
+        if rest is None:
+            return values
+        spectrum = torch.fft.rfft2(values.double(), s=(size, size)) * torch.fft.rfft2(rest).conj()
+        return torch.fft.irfft2(spectrum, s=(size, size))[..., :side, :side].float()
 
     def _spectra(
         self, slopes: Slopes, guard: Int64[Tensor, "group 2"], offset: Int64[Tensor, " size"], in_parts: bool
@@ -74,17 +95,38 @@ class ScreenFilter:
             make = sheared_kernels if self.settings.screen_filter == "sheared" else direct_kernels
             yield torch.fft.rfft2(make(self._covariance(slopes), guard, offset))
             return
-        cells, times = (self.cells, self.times) if in_parts else ([self.whole], 1)
+        rest = rest_kernel(self.settings.sigma_x_px, offset)
+        for window in self._windows(slopes, offset, in_parts):
+            yield window if rest is None else window * torch.fft.rfft2(rest)
+
+    def _windows(self, slopes: Slopes, offset: Int64[Tensor, " size"], in_parts: bool) -> Iterator[Complex128[Tensor, "group size half"]]:
+        """Of pupil and shutter in their true shapes."""
+        cells, times = (self.cells, self.times) if in_parts or self.whole is None else ([self.whole], 1)
         borders = [time / times - 0.5 for time in range(times + 1)]
         lines = [torch.fft.rfft2(line_kernels(slopes, offset, begin, end)) for begin, end in pairwise(borders)]
-        rest = rest_kernel(self.settings.sigma_x_px, offset)
         for cell in cells:
             pupil = torch.fft.rfft2(pupil_kernels(slopes, cell, offset))
             for line in lines:
-                yield line * pupil if rest is None else line * pupil * torch.fft.rfft2(rest)
+                yield line * pupil
 
     def _covariance(self, slopes: Slopes) -> Spread:
         return less_pixel(screen_covariance(slopes, self.window, self.settings.sigma_x_px))
+
+
+def _offsets(size: int, device: torch.device) -> Int64[Tensor, " size"]:
+    offset = torch.arange(size, device=device)
+    return torch.where(offset > size // 2, offset - size, offset)
+
+
+def _met(
+    spectrum: Complex128[Tensor, "group planes size half"], kernels: Iterator[Complex128[Tensor, "group size half"]], tile: slice, size: int
+) -> Float32[Tensor, "group planes parts tile tile"]:
+    """What of the products with each kernel lies on the tile."""
+    parts = [
+        torch.fft.irfft(torch.fft.ifft(spectrum * kernel.conj()[:, None], dim=-2)[..., tile, :], n=size)[..., tile].float()
+        for kernel in kernels
+    ]
+    return torch.stack(parts, dim=2)
 
 
 def transform_size(least: int) -> int:

@@ -1,5 +1,6 @@
 """Sums over the samples of each tile and bucket, from all samples or a sparse stratified choice in Morton order."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,10 +21,12 @@ class Rows:
     """Buckets that a tile or its surroundings hold, tile by tile, in the order of buckets.
 
     sums: (R, 8). tile, bucket: (R,). first: (T + 1,) the first row of each tile, and the end. place: (T, U) the row of every
-    bucket of a tile, -1 where it holds none.
+    bucket of a tile, -1 where it holds none. light: (R, 3) number, light and its root of all samples of the tile and the blocks
+    around it.
     """
 
     sums: Float64[Tensor, "rows 8"]
+    light: Float64[Tensor, "rows 3"]
     tile: Int64[Tensor, " rows"]
     bucket: Int64[Tensor, " rows"]
     first: Int64[Tensor, " tiles_and_end"]
@@ -52,7 +55,16 @@ def tile_rows(light: TileLight, every: int, seed: int) -> Rows:
     sums /= torch.where(kind.view(-1)[held] == _CHOSEN, 1, every)[:, None]
     tile = held // buckets
     first = torch.searchsorted(tile, torch.arange(tiles + 1, device=cell.device))
-    return Rows(sums, tile, held % buckets, first, place)
+    return Rows(sums, _light_of_rows(light, place, len(held)), tile, held % buckets, first, place)
+
+
+def _light_of_rows(light: TileLight, place: Int64[Tensor, "tiles buckets"], rows: int) -> Float64[Tensor, "rows 3"]:
+    most = light.values.abs().amax(dim=1)
+    of_samples = torch.stack([torch.ones_like(most), most, torch.sqrt(most)], dim=1).double()
+    sums = of_samples.new_zeros((rows, 3))
+    for sample, tile, _ in _touched(light, torch.arange(len(most), device=most.device)):
+        sums.index_add_(0, place[tile, light.bucket[sample]], of_samples[sample])
+    return sums
 
 
 def chosen_samples(light: TileLight, every: int, seed: int) -> Int64[Tensor, " chosen"]:
@@ -125,15 +137,21 @@ def _unchosen(
     light: TileLight, sample: Int64[Tensor, " needed"], kind: Int8[Tensor, "tiles buckets"]
 ) -> list[tuple[Int64[Tensor, " some"], Int64[Tensor, " some"]]]:
     """Of these samples, those that count for their own tile and for those beside, above or below, and across the corner, each with it."""
+    found = []
+    for some, tile, outside in _touched(light, sample):
+        which = torch.nonzero(kind[tile, light.bucket[some]] == (_OUTSIDE if outside else _WITHIN))[:, 0]
+        found.append((some[which], tile[which]))
+    return found
+
+
+def _touched(light: TileLight, sample: Int64[Tensor, " samples"]) -> Iterator[tuple[Int64[Tensor, " some"], Int64[Tensor, " some"], bool]]:
+    """Samples with the tile they lie in, then those of them whose block touches a tile beside, above or below, or across the corner,
+    with that tile; and whether it is another."""
     x, y = place_of(light.block[sample], light.columns)
     step_x, step_y = (at % 4 // 3 - (3 - at % 4) // 3 for at in (x, y))
-    found = []
     for with_x, with_y in ((0, 0), (1, 0), (0, 1), (1, 1)):
         column, row = x // 4 + with_x * step_x, y // 4 + with_y * step_y
         there = (column >= 0) & (column < light.columns) & (row >= 0) & (row < light.rows)
         there &= ((step_x != 0) | (with_x == 0)) & ((step_y != 0) | (with_y == 0))
-        tile = torch.where(there, row * light.columns + column, 0)
-        there &= kind[tile, light.bucket[sample]] == (_OUTSIDE if with_x or with_y else _WITHIN)
         which = torch.nonzero(there)[:, 0]
-        found.append((sample[which], tile[which]))
-    return found
+        yield sample[which], (row * light.columns + column)[which], bool(with_x or with_y)

@@ -12,7 +12,7 @@ from mrbokeh.errors import InputError
 from mrbokeh.laplacian_integration import fast_width
 from mrbokeh.psf_bank import PsfBank
 from mrbokeh.renderers._laplacian_bank import BankTables
-from mrbokeh.renderers._laplacian_sums import FAR_FIELD_PX, Window
+from mrbokeh.renderers._laplacian_layout import FAR_FIELD_PX, Window
 from mrbokeh.renderers.torch_spreadlets._cells import BankCells, stands_out
 from mrbokeh.renderers.torch_spreadlets._integration import integrate
 from mrbokeh.renderers.torch_spreadlets._points import BankPoints, PointTable

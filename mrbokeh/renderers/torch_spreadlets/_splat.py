@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 
 from mrbokeh.errors import InputError
-from mrbokeh.renderers._laplacian_sums import Window
+from mrbokeh.renderers._laplacian_layout import Window
 from mrbokeh.renderers.torch_spreadlets._points import PointTable
 from mrbokeh.torch_device import has_triton
 

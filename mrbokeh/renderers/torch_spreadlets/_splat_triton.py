@@ -9,7 +9,7 @@ import triton.language as tl
 from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
-from mrbokeh.renderers._laplacian_sums import Window
+from mrbokeh.renderers._laplacian_layout import Window
 from mrbokeh.renderers.torch_spreadlets._points import PointTable
 
 _PIXELS, _SEGMENT = 64, 128

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float32, Int32
 
 from mrbokeh.errors import InputError
-from mrbokeh.renderers._laplacian_sums import window_of
+from mrbokeh.renderers._laplacian_layout import window_of
 from mrbokeh.renderers._laplacian_tables import Points
 from mrbokeh.renderers.torch_spreadlets._integration import integrate
 from mrbokeh.renderers.torch_spreadlets._points import table_of

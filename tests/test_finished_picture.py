@@ -1,0 +1,148 @@
+"""Finished pictures: alpha of the plate carried through `mrbokeh composite`, and colour spaces stated in EXR headers."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mrbokeh.color import linear_to_srgb
+from mrbokeh.color_management import NamedSpace
+from mrbokeh.commands.composite import app
+from mrbokeh.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.exr_primaries import AP0, AP1, BT2020, P3_D65, REC709, known_primaries, rec709_from_chromaticities
+from mrbokeh.finished_picture import write_finished
+from mrbokeh.image_io import read_image, read_layer, write_layer
+from mrbokeh.layer import Layer
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import write_lens
+from mrbokeh.plate_alpha import alpha_with, read_alpha
+
+SIZE = (24, 36)
+COLOUR = np.array([0.4, 0.2, 0.1], np.float32)
+STEP = 1.5 / 65535
+
+
+def half_covered(columns: int = 12) -> np.ndarray:
+    """0.5 in the left third, 0 in the middle, 1 at the right."""
+    alpha = np.full(SIZE, 0.5, np.float32)
+    alpha[:, columns : 2 * columns], alpha[:, 2 * columns :] = 0.0, 1.0
+    return alpha
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A plate of one colour with alpha, as EXR (premultiplied) and PNG (straight), and an opaque card over its upper rows."""
+    alpha = half_covered()
+    rgb = (alpha[..., None] * COLOUR).astype(np.float32)
+    write_exr(tmp_path / "plate.exr", ExrPart({name: rgb[..., i] for i, name in enumerate("RGB")} | {"A": alpha}))
+    codes = np.round(np.dstack([np.broadcast_to(linear_to_srgb(COLOUR)[::-1], (*SIZE, 3)), alpha]) * 65535).astype(np.uint16)
+    assert cv2.imwrite(str(tmp_path / "plate.png"), codes)
+    cover = np.zeros(SIZE, np.float32)
+    cover[:12] = 1.0
+    card = Layer(np.repeat(0.8 * cover[..., None], 3, axis=2), cover, np.where(cover > 0, 2.0, np.inf).astype(np.float32))
+    write_layer(tmp_path / "card.exr", card, half=False)
+    write_lens(tmp_path / "lens.json", Lens(50.0, 8.0, 2.0, 36.0))
+    return tmp_path
+
+
+def stored(path: Path) -> np.ndarray:
+    """Blue first, as OpenCV reads it."""
+    codes = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert codes is not None
+    return np.asarray(codes)
+
+
+def put_in(files: Path, plate: str, out: str, *words: str) -> str:
+    arguments = [str(files / plate), "--layer", str(files / "card.exr"), "--lens", str(files / "lens.json"), "--out", str(files / out)]
+    result = CliRunner().invoke(app, [*arguments, *words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("plate", ["plate.exr", "plate.png"])
+def test_exr_holds_the_alpha_of_the_plate_under_the_card(files: Path, plate: str) -> None:
+    assert "warning" not in put_in(files, plate, "out.exr")
+    found = read_layer(files / "out.exr")
+    np.testing.assert_allclose(found.alpha[14:], half_covered()[14:], atol=1e-3)
+    np.testing.assert_allclose(found.alpha[:10], 1.0, atol=1e-3)
+    np.testing.assert_allclose(found.rgb[14:], (half_covered()[..., None] * COLOUR)[14:], atol=1e-3)
+    np.testing.assert_allclose(found.rgb[:10], 0.8, atol=1e-3)
+
+
+@pytest.mark.parametrize("plate", ["plate.exr", "plate.png"])
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_png_and_tiff_hold_straight_colour(files: Path, plate: str, suffix: str) -> None:
+    put_in(files, plate, f"out.{suffix}")
+    codes, alpha = stored(files / f"out.{suffix}"), read_alpha(files / f"out.{suffix}")
+    assert codes.dtype == np.uint16 and codes.shape == (*SIZE, 4)
+    np.testing.assert_allclose(codes[14:, ..., 3] / 65535, half_covered()[14:], atol=STEP)
+    np.testing.assert_allclose(codes[16, 4, 2::-1] / 65535, linear_to_srgb(COLOUR), atol=1e-4)  # half covered, not darker
+    assert not codes[16, 18, :3].any()
+    assert alpha is not None
+    np.testing.assert_allclose(alpha, codes[..., 3] / 65535, atol=1e-6)
+
+
+def test_jpeg_says_that_alpha_is_lost(files: Path) -> None:
+    assert "the plate has alpha, which .jpg cannot hold" in put_in(files, "plate.png", "out.jpg")
+    found = read_image(files / "out.jpg")
+    assert found[18, 18].max() < 0.01 and found[18, 4, 0] == pytest.approx(0.2, abs=0.02)
+
+
+def test_an_opaque_plate_stays_without_alpha(files: Path) -> None:
+    write_exr(files / "opaque.exr", ExrPart(dict.fromkeys("RGBA", np.ones(SIZE, np.float32))))
+    put_in(files, "opaque.exr", "out.png")
+    assert stored(files / "out.png").shape == (*SIZE, 3)
+    assert read_alpha(files / "opaque.exr") is None and read_alpha(files / "out.png") is None
+
+
+def test_alpha_turns_with_the_picture(files: Path) -> None:
+    turned = read_alpha(files / "plate.png", quarter_turns=1)
+    assert turned is not None and turned.shape == SIZE[::-1]
+    np.testing.assert_allclose(turned[0, :], half_covered()[:, -1], atol=STEP)  # counter-clockwise: the right side comes up
+
+
+def test_coverage_adds_up() -> None:
+    """0.25 of virtual light before a plate of 0.5: 0.25 + 0.75 * 0.5."""
+    plate = np.full((1, 1), 0.5, np.float32)
+    assert alpha_with(plate, np.full((1, 1), 0.25, np.float32)) == pytest.approx(0.625)
+    assert alpha_with(None, plate) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "primaries"),
+    [("ACEScg", AP1), ("ACES2065-1", AP0), ("Linear Rec.2020", BT2020), ("Linear P3-D65", P3_D65), ("Linear Rec.709 (sRGB)", REC709)],
+)
+def test_the_header_states_the_primaries_of_the_space(files: Path, name: str, primaries: tuple[float, ...]) -> None:
+    """By `mrbokeh composite`: read as any EXR it is the same light again."""
+    pytest.importorskip("PyOpenColorIO")
+    put_in(files, "plate.exr", "plain.exr")
+    put_in(files, "plate.exr", "out.exr", "--output-space", name)
+    (part,) = read_exr(files / "out.exr")
+    assert part.attributes["chromaticities"] == pytest.approx(primaries, abs=1e-6)
+    assert sorted(part.channels) == ["A", "B", "G", "R"]
+    np.testing.assert_allclose(read_image(files / "out.exr"), read_image(files / "plain.exr"), atol=2e-3)
+
+
+def test_unknown_primaries_and_curves_are_not_stated(tmp_path: Path) -> None:
+    pytest.importorskip("PyOpenColorIO")
+    for name in ("Linear ARRI Wide Gamut 3", "ARRI LogC4"):
+        write_finished(tmp_path / "a.exr", np.full((4, 4, 3), 0.2, np.float32), None, NamedSpace(name))
+        assert "chromaticities" not in read_exr(tmp_path / "a.exr")[0].attributes
+
+
+def test_primaries_are_known_by_their_matrix() -> None:
+    for primaries in (AP0, AP1, BT2020, P3_D65, REC709):
+        matrix = rec709_from_chromaticities(primaries)
+        assert matrix is not None and known_primaries(matrix) == primaries
+    assert known_primaries(np.diag([1.0, 1.0, 0.9])) is None
+
+
+def test_curves_are_for_straight_colour(tmp_path: Path) -> None:
+    """A half-covered grey: its straight value goes through the curve."""
+    pytest.importorskip("PyOpenColorIO")
+    alpha, space = np.full((2, 2), 0.5, np.float32), NamedSpace("ARRI LogC4")
+    write_finished(tmp_path / "a.exr", np.full((2, 2, 3), 0.1, np.float32), alpha, space)
+    expected = 0.5 * space.from_rec709(np.full((1, 1, 3), 0.2, np.float32))[0, 0]
+    np.testing.assert_allclose(read_exr(tmp_path / "a.exr")[0].stacked("RGB")[0, 0], expected, atol=1e-3)
