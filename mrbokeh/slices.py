@@ -20,6 +20,7 @@ from mrbokeh.zeroed_memory import ZeroedMemory
 _LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add
 _BAND_PIXELS = 1 << 16
+_FEWEST_PIXELS = 1 << 19
 _FEW_PIXELS = 1 << 20
 _MANY_PIXELS = 1 << 22
 _SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
@@ -48,8 +49,11 @@ class Slicing:
 
     @property
     def at_once(self) -> int:
-        """Pieces under way or waiting to be claimed: few where each keeps all cores busy by itself, one where memory counts."""
+        """Pieces under way or waiting to be claimed: many where memory does not count, so that nobody waits for a large one whose turn
+        it is; few where each keeps all cores busy by itself; else one."""
         pixels = self.size[0] * self.size[1]
+        if pixels <= _FEWEST_PIXELS:
+            return 5 * cores()
         return cores() + 2 if pixels <= _FEW_PIXELS else 2 if pixels <= _MANY_PIXELS else 1
 
     def spread_piece(self, piece: tuple[Sequence[Part], int]) -> list[tuple[Channels, Window]]:
