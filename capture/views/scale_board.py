@@ -75,22 +75,21 @@ def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDete
             f"and found {len(corners)} corners seen by two or more, but {FEWEST_CORNERS} are needed: check --board, --dictionary and "
             f"that the board is sharp in the all-in-focus pictures"
         )
-    triangulated = np.array(
-        [triangulate([model.views[v] for v in seen.views[seen.corners == c]], seen.xy_px[seen.corners == c]) for c in corners]
-    )
-    start = umeyama(board.corners_m[corners], triangulated)
+    start, _ = _from_triangulated(model, board, seen)
     fit, sigma = _fit_to_pixels(model, board, seen, start)
     wrong = _wrong(_residuals_px(model, board, seen, fit))
-    if wrong.any() and len(np.unique(seen.corners[~wrong])) >= FEWEST_CORNERS:
-        seen = seen.only(~wrong)
+    right = seen.only(~wrong)
+    right = right.only(_seen_twice(right))
+    if wrong.any() and len(np.unique(right.corners)) >= FEWEST_CORNERS:
+        seen = right
         fit, sigma = _fit_to_pixels(model, board, seen, fit)
-    off_m = (triangulated - start(board.corners_m[corners])) / start.scale
+    start, residual_mm = _from_triangulated(model, board, seen)
     facts = {
-        "corners": len(corners),
+        "corners": len(np.unique(seen.corners)),
         "detections": len(seen.corners),
         "views": len(np.unique(seen.views)),
         "residual_px": float(np.sqrt(np.mean(np.sum(_residuals_px(model, board, seen, fit) ** 2, axis=1)))),
-        "residual_mm": float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))) * MM_PER_M),
+        "residual_mm": residual_mm,
         "uncertainty_of_corners": sigma,
         "metres_per_unit_of_triangulated_corners": 1.0 / start.scale,
     }
@@ -110,6 +109,17 @@ def _wrong(residuals_px: Float[np.ndarray, "seen 2"]) -> np.ndarray:
     """Beyond five standard deviations of what is usual here: corners that something half covers lie a pixel or so off."""
     off_px = np.linalg.norm(residuals_px, axis=1)
     return off_px > max(_WRONG_SIGMAS * float(np.median(off_px)) / _MEDIAN_OF_RAYLEIGH, _LEAST_WRONG_PX)
+
+
+def _from_triangulated(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> tuple[Similarity, float]:
+    """From the board to the model by points in space, and how far these lie off, root mean square, in mm."""
+    corners = np.unique(seen.corners)
+    points = np.array(
+        [triangulate([model.views[v] for v in seen.views[seen.corners == c]], seen.xy_px[seen.corners == c]) for c in corners]
+    )
+    found = umeyama(board.corners_m[corners], points)
+    off_m = (points - found(board.corners_m[corners])) / found.scale
+    return found, float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))) * MM_PER_M)
 
 
 def _seen_twice(seen: BoardDetections) -> np.ndarray:

@@ -18,7 +18,6 @@ from mrbokeh.workers import cores
 from mrbokeh.zeroed_memory import ZeroedMemory
 
 _LEAST_ROWS, _STRIPS_PER_CORE = 64, 2  # pixels beside two strips are looked at by both
-_MOST_KEPT_BYTES = 1 << 27
 
 Sums = Float[np.ndarray, "rows columns channels"]
 Values = Float32[np.ndarray, "height width channels"]
@@ -38,7 +37,7 @@ def add_light(
     """Add the light of all pixels that have a cell (>= 0) to out; integration None: the points are taps of kernels.
 
     What points reach beyond the picture is summed, too: a Laplacian that is cut off is that of another picture. memory: kept
-    from call to call where there is not too much of it; to get it anew takes as long as to integrate. Points of Laplacians are
+    from call to call; to get it anew takes as long as to integrate. Points of Laplacians are
     summed in double precision; if it is known that no light of a channel is larger than `largest`, without sign, in whole numbers,
     which become single precision. taps: cells and points of other pixels to splat as they are.
     """
@@ -92,8 +91,7 @@ def _add_four(
     elif integration == "pyramid":
         sums[:] = integrate_by_pyramid(sums)
     list(pool.map(empty, *zip(*strips, strict=True)))
-    if held.nbytes <= _MOST_KEPT_BYTES:
-        memory.give_back(held)
+    memory.give_back(held)
 
 
 class _Splatting(NamedTuple):

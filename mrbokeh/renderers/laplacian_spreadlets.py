@@ -37,6 +37,8 @@ from mrbokeh.renderers._laplacian_tables import DENSE, KernelTables, Points, kin
 from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlets
 from mrbokeh.zeroed_memory import ZeroedMemory
 
+_MOST_KEPT_BYTES = 1 << 27
+
 
 @dataclass(frozen=True)
 class LaplacianSpreadlets:
@@ -178,7 +180,7 @@ class LaplacianSpreadlets:
 
 def _adder_on(device: str) -> Callable[..., None]:
     if not device:
-        return partial(add_light, memory=ZeroedMemory())
+        return partial(add_light, memory=ZeroedMemory(most_bytes=_MOST_KEPT_BYTES))
     from mrbokeh.renderers.torch_spreadlets._sums import add_light_on
 
     return add_light_on(device)
