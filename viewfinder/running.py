@@ -21,6 +21,7 @@ from viewfinder.frames import OutputFrame
 from viewfinder.lens_book import LensBook
 from viewfinder.live_compositor import LiveCompositor, Moment
 from viewfinder.live_controls import LiveControls
+from viewfinder.malloc_arenas import keep_few_arenas
 from viewfinder.pipeline import FrameSink, Pipeline
 from viewfinder.scenery import Scenery
 from viewfinder.server.access import Access
@@ -77,6 +78,7 @@ class Viewfinder:
 @contextmanager
 def running(parts: Parts) -> Iterator[Viewfinder]:
     """Everything but the server."""
+    keep_few_arenas()
     with ExitStack() as closing:
         smoothed = None if parts.tracker is None else SmoothedTracker(parts.tracker, parts.smoothing)
         manual = ManualFocus()
