@@ -124,8 +124,8 @@ def gegl_row(own_ms: float) -> None:
         def run(*operation: str) -> float:
             return milliseconds(lambda: subprocess.run(["gegl", source, "-o", target, "--", *operation], check=True, capture_output=True))
 
-        nop_ms = statistics.median(run("gegl:nop") for _ in range(3))
-        took_ms = statistics.median(run("gegl:lens-blur", f"radius={GEGL_RADIUS_PX}") for _ in range(3)) - nop_ms
+        nop_ms = statistics.median(run("gegl:nop") for _ in range(REPEATS))
+        took_ms = statistics.median(run("gegl:lens-blur", f"radius={GEGL_RADIUS_PX}") for _ in range(REPEATS)) - nop_ms
     print(f"{name:<68} {took_ms:8.0f} ms  {took_ms / own_ms:5.1f} times ours at 128 px ({own_ms:.1f} ms)")
 
 
