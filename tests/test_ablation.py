@@ -178,7 +178,7 @@ def test_a_stopped_table_goes_on(scene: Path, small_base: Path, tmp_path: Path, 
     arguments += ["--settings", str(small_base), "--threads", "1"]
     monkeypatch.setattr(train, "fit", counting(stop_at=2))
     stopped = CliRunner().invoke(app, ["ablate", *arguments])
-    assert stopped.exit_code == 130 and "go on" in stopped.output
+    assert stopped.exit_code == 130 and "goes on" in stopped.output
     assert (tmp_path / "table_1.csv").read_text().count("\n") == 2
     monkeypatch.setattr(train, "fit", counting(stop_at=0))
     ablate(*arguments[:-2])

@@ -75,11 +75,12 @@ def ablate_command(
 
 
 def _run(planned: "Sequence[PlannedRun]", out: Path, tables: "tuple[TableName, ...]", shared: "Ablation", lpips: object) -> None:
+    from mrbokeh.interrupts import kept_when_interrupted
     from training.ablation.report import Report
     from training.ablation.runs import result_of
 
     report = Report(out, tables, planned, _command_line())
-    try:
+    with kept_when_interrupted(f"finished runs are kept in {out}"):
         for number, each in enumerate(planned, 1):
             result = result_of(each, lpips)  # type: ignore[arg-type]
             typer.echo(
@@ -87,9 +88,6 @@ def _run(planned: "Sequence[PlannedRun]", out: Path, tables: "tuple[TableName, .
                 f"{result.measures['ssim']:.4f}, {result.steps} steps in {result.seconds:.0f} s"
             )
             report.write()
-    except KeyboardInterrupt:
-        typer.echo(f"stopped; what is finished is kept in {out}, run the same command again to go on", err=True)
-        raise typer.Exit(130) from None
     report.write_sheets(shared.device)
     typer.echo(f"written to {out}: results.html, results.md, {', '.join(report.table_files())}")
 

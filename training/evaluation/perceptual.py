@@ -12,6 +12,7 @@ from jaxtyping import Float32
 
 from mrbokeh.color import linear_to_srgb
 from mrbokeh.errors import InputError
+from mrbokeh.renderers.onnx_sessions import open_session
 
 Image = Float32[np.ndarray, "height width 3"]
 NOT_MEASURED = "LPIPS is not measured: no weights are shipped (see --lpips)."
@@ -21,14 +22,9 @@ class OnnxPerceptualDistance:
     """Distance of two linear pictures by a network (.onnx) that takes two (1, 3, H, W) sRGB pictures in [-1, 1] and gives one number."""
 
     def __init__(self, path: Path) -> None:
-        import onnxruntime
-
         if not path.is_file() or path.suffix.lower() != ".onnx":
             raise InputError(f"expected the weights of LPIPS as an .onnx file, got {path}: export them from the package lpips")
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime has no common base class for "this is not a model"
-            raise InputError(f"{path} cannot be opened as an ONNX network: {str(error)[:200]}") from None
+        self._session = open_session(path, providers=["cpu"])
         self._inputs = [each.name for each in self._session.get_inputs()]
         if len(self._inputs) != 2:
             raise InputError(f"expected {path} to take two pictures, but it takes {self._inputs}: export LPIPS with its two inputs")
