@@ -90,6 +90,21 @@ def test_unknown_focus_and_lens_are_found_with_wrong_points_among_them() -> None
     assert (np.abs(fit.dioptres - FOCUS) < 3 * fit.sigma_dioptre).all()
 
 
+def test_a_focus_that_was_called_infinity_is_looked_for() -> None:
+    """Truly 2 m, all points nearer than 1.4 m. From 0 dioptres they all seem too blurred to measure, and a fit alone stays there."""
+    points = POINTS[POINTS > 0.7]
+    stated, sigma = np.append(FOCUS[:-1], 1e-3), np.append(np.full(9, 0.05), 0.5)
+    blur = blur_samples(points, GROWTH, wrong=0.1)
+    fit = calibrate_focus(blur, points, FocusStart(stated, GROWTH, sigma, (9,)))
+    np.testing.assert_allclose(fit.dioptres, FOCUS, atol=0.01)
+    blindly = calibrate_focus(blur, points, FocusStart(stated, GROWTH, sigma))
+    assert abs(blindly.dioptres[9] - FOCUS[9]) > 0.1
+    others = blur.slices != 9
+    lacking = BlurSamples(blur.slices[others], blur.points[others], blur.diameter_px[others])
+    fit = calibrate_focus(lacking, points, FocusStart(stated, GROWTH, sigma, (9,)))
+    assert fit.dioptres[9] == pytest.approx(1e-3, abs=1e-6) and fit.sigma_dioptre[9] == pytest.approx(0.5, rel=0.05)
+
+
 def test_a_slice_of_which_nothing_is_known_stays_as_stated() -> None:
     blur = blur_samples(POINTS, GROWTH)
     others = blur.slices != 4

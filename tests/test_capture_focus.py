@@ -24,8 +24,13 @@ from mrbokeh.lens import Lens
         # Between 4 m and infinity the middle in dioptres is at 8 m.
         ({"Exif.CanonFi.FocusDistanceUpper": "65535", "Exif.CanonFi.FocusDistanceLower": "400"}, 8.0),
         ({"Exif.CanonFi.FocusDistanceUpper": "400", "Exif.CanonFi.FocusDistanceLower": "0"}, 4.0),
+        ({"Exif.CanonFi.FocusDistanceUpper": "65535", "Exif.CanonFi.FocusDistanceLower": "0"}, math.inf),
+        # exiv2 takes these numbers for signed ones.
+        ({"Exif.CanonFi.FocusDistanceUpper": "-1", "Exif.CanonFi.FocusDistanceLower": "-1"}, math.inf),
+        ({"Exif.CanonFi.FocusDistanceUpper": "-25536", "Exif.CanonFi.FocusDistanceLower": "-25536"}, 400.0),
         ({"Exif.CanonSi.SubjectDistance": "0"}, None),
         ({"Exif.CanonSi.SubjectDistance": "65535"}, math.inf),
+        ({"Exif.CanonSi.SubjectDistance": "-1"}, math.inf),
         ({"Exif.CanonSi.SubjectDistance": "150", "Exif.Image.Model": "Canon EOS 20D"}, 1.5),
         # EXIF goes before the maker's number, of which models differ in the unit.
         ({"Exif.CanonSi.SubjectDistance": "1503", "Exif.Photo.SubjectDistance": "1503/1000"}, 1.503),
@@ -54,6 +59,7 @@ def test_focus_tags_and_their_sentinels(tags: dict[str, str], expected_m: float 
     assert (None if reading is None else reading.distance_m) == (None if expected_m is None else pytest.approx(expected_m, rel=1e-9))
     if reading is not None:
         assert reading.nearest_m <= reading.distance_m <= reading.farthest_m
+        assert reading.is_sentinel == math.isinf(reading.distance_m), "no tag states infinity but by a sentinel"
 
 
 @pytest.mark.parametrize("focus_m", [0.1, 0.3, 1.0, 30.0, math.inf])

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import stat
+import struct
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 import capture.photos.metadata
 from capture.photos.exifread_metadata import read_tags_with_exifread
 from capture.photos.exiftool_metadata import metadata_from_exiftool, read_with_exiftool
-from capture.photos.metadata import metadata_from_tags, read_metadata
+from capture.photos.metadata import metadata_from_tags, read_metadata, read_tags
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sensor_metadata import read_sensor
 from tests.made_photographs import make_raw_photo, scene_rgb
@@ -66,6 +67,23 @@ def test_sensor_width_of_real_cameras(shared_data: Path, name: str, size_px: tup
     sensor = read_metadata(shared_data / name).sensor
     assert sensor is not None
     assert sensor.width_mm(*size_px) == pytest.approx(width_mm, rel=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("upper_lower_cm", "distance_m"),
+    # Its other tag, CanonSi.SubjectDistance, says 0, which is unknown.
+    [((65535, 65535), math.inf), ((65535, 0), math.inf), ((0, 0), None), ((65535, 400), 8.0)],
+)
+def test_sentinels_in_a_real_maker_note(
+    shared_data: Path, tmp_path: Path, upper_lower_cm: tuple[int, int], distance_m: float | None
+) -> None:
+    """Infinity by 655.35 m is a sentinel unless a nearest distance comes with it."""
+    data, stated = (shared_data / "exif" / "canon_450d_4.6m.jpg").read_bytes(), struct.pack("<HH", 484, 446)
+    assert data.count(stated) == 1
+    (tmp_path / "changed.jpg").write_bytes(data.replace(stated, struct.pack("<HH", *upper_lower_cm)))
+    focus = metadata_from_tags(read_tags(tmp_path / "changed.jpg")).focus
+    assert (None if focus is None else focus.distance_m) == (None if distance_m is None else pytest.approx(distance_m))
+    assert focus is None or focus.is_sentinel == (distance_m == math.inf)
 
 
 def test_time_and_models_of_a_real_file(shared_data: Path) -> None:
@@ -186,5 +204,10 @@ def test_exiftool_sentinels() -> None:
     assert distance_m(FocusDistanceLower=4, FocusDistanceUpper=655.35) == pytest.approx(8.0)
     assert distance_m(FocusDistance=1.5, LensPositionAbsolute=-3, Make="NIKON CORPORATION") == math.inf
     assert distance_m(FocusDistance=1.5, LensPositionAbsolute=5210, Make="NIKON CORPORATION") == 1.5
+    lens_drive = metadata_from_exiftool({"FocusDistance": 1.5, "LensPositionAbsolute": -3, "Make": "NIKON CORPORATION"}).focus
+    assert lens_drive is not None and not lens_drive.is_sentinel, "where the drive stands is measured"
+    for sentinel in ({"SubjectDistance": 4294967295}, {"FocusDistanceLower": 655.35, "FocusDistanceUpper": 655.35}):
+        focus = metadata_from_exiftool(sentinel).focus
+        assert focus is not None and focus.is_sentinel and focus.distance_m == math.inf
     # In CRW files exiftool reads mm as cm and finds no lower end: no word at all is better.
     assert distance_m(FocusDistanceLower=0, FocusDistanceUpper=6.88) is None

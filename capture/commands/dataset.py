@@ -40,13 +40,12 @@ def dataset_command(
         return
     from capture.dataset.stack_writer import StackWriting
     from capture.dataset.writer import DatasetPlan, write_dataset
-    from capture.report.reblur import Reblur
+    from capture.report.reblur import reblur_by
     from mrbokeh.interrupts import kept_when_interrupted
-    from mrbokeh.renderers.choose import make_renderer
 
     if not scenes:
         raise InputError("expected the folders of scenes, got none: mrbokeh capture dataset SCENE... --out DATASET --licence TEXT")
-    writing = StackWriting(copy, coc_maps, Reblur(make_renderer(renderer)))
+    writing = StackWriting(copy, coc_maps, reblur_by(renderer))
     plan = DatasetPlan(licence_text(licence), tuple(test or ()), test_share, seed, radiance_scale, writing)
     with kept_when_interrupted(f"finished stacks are kept in {out}", overwrite):
         dataset = write_dataset(scenes, out, plan, overwrite)

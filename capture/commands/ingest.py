@@ -15,8 +15,8 @@ HELP = "\n\n".join(
         "--group time or --group focus. Slices are ordered by focus distance, nearest first, where all distances are known, "
         "else by file name. Pictures are not rotated.",
         "What metadata lacks is read from a lens.toml (lens) and a focus.csv (file,focus_distance_m,nearest_m,farthest_m) beside "
-        "the photographs. Unusable files are named and skipped; slices that "
-        "are there already are kept.",
+        "the photographs. Infinity that a camera states by a sentinel (0xFFFFFFFF, 655.35 m) is a value to start from, said and not "
+        "trusted; a focus.csv overrides it. Unusable files are named and skipped; slices that are there already are kept.",
         "Example:  mrbokeh capture ingest shoot/ --out scene/",
         "Example:  mrbokeh capture ingest a.NEF b.NEF c.NEF --out scene/ --sidecar lens.toml --max-width 1500",
     )

@@ -28,16 +28,15 @@ def report_command(
     width: Annotated[int, typer.Option(min=64, help="wider pictures are judged at this width, in pixels; blur is then smaller too")] = 960,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
-    from capture.report.reblur import Reblur
+    from capture.report.reblur import reblur_by
     from capture.report.scene_page import HTML_NAME
     from capture.report.scene_report import report_scene
     from mrbokeh.interrupts import kept_when_interrupted
-    from mrbokeh.renderers.choose import make_renderer
 
     if not scene.is_dir():
         raise InputError(f"expected a folder with focal stacks, but {scene} is none")
     with kept_when_interrupted(f"what was found of finished stacks is kept in {scene}", overwrite):
-        report = report_scene(scene, Reblur(make_renderer(renderer), _named(renderer)), width, overwrite=overwrite)
+        report = report_scene(scene, reblur_by(renderer), width, overwrite=overwrite)
     for each in report.failures:
         typer.echo(f"failed: {each.where}: {each.name}: {each.measured} (wanted: {each.limit})")
     reused = sum(each.reused for each in report.stacks)
@@ -45,9 +44,3 @@ def report_command(
     typer.echo(f"{scene / HTML_NAME}: {len(report.gates)} gates, {len(report.failures)} failed{before}")
     if strict and report.failures:
         raise typer.Exit(1)
-
-
-def _named(renderer: str) -> str:
-    """The renderer's name; a network that was trained further is another one."""
-    path = Path(renderer)
-    return f"{path.resolve()}, {path.stat().st_mtime_ns}" if path.suffix.lower() == ".onnx" else renderer

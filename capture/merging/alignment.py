@@ -5,7 +5,7 @@ together give the similarities. The breathing of the lens is the prior: it says 
 holds, and is kept as it is where the camera did not move.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import reduce
 
 import numpy as np
@@ -39,16 +39,18 @@ def register_stack(
     count: int,
     prior_scales: Sequence[float] | None = None,
     read_valid: Callable[[int], Valid] | None = None,
+    unknown_scales: Collection[int] = (),
 ) -> Registration:
     """Register slices 0 to count - 1, neighbours in focus being neighbours in order.
 
     read_rgb: gives slice i; one picture is held at a time.
     prior_scales: expected magnification of each slice (image distances of the thin lens), where the lens is known.
     read_valid: where slice i has data that is not saturated; None is everywhere. Raises InputError where sizes differ.
+    unknown_scales: slices whose prior is a guess (infinity by a sentinel), which pictures override.
     """
     matches, size_px = _matched(read_rgb, count, prior_scales, read_valid)
     scales = {pair: scale_of(match.target_from_source) for pair, match in matches.items() if match.tracks is not None}
-    breathing = breathing_of(count, scales, prior_scales)
+    breathing = breathing_of(count, scales, prior_scales, unknown_scales)
     held = {pair: tracks for pair, match in matches.items() if (tracks := match.tracks) and breathing.allows(pair, scales[pair])}
     linked = with_links(count, held, matches, breathing, size_px)
     first_from_slice = joint_similarities(count, linked, size_px)

@@ -1,6 +1,6 @@
 """Focus breathing: how much larger each slice shows the scene than the first one does."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,18 +37,36 @@ class Breathing:
         return bool(abs(measured_scale / self.scale(*pair) - 1.0) <= self.largest_departure)
 
 
-def breathing_of(count: int, measured: Mapping[Pair, float], lens_scales: Sequence[float] | None) -> Breathing:
+def breathing_of(
+    count: int, measured: Mapping[Pair, float], lens_scales: Sequence[float] | None, unknown: Collection[int] = ()
+) -> Breathing:
     """The lens's own breathing where most pairs agree with it, else one smooth curve over the slices.
 
     measured: scale of target_from_source of pairs (target, source).
     lens_scales: image distances of the slices; None where the lens or its focus is unknown. Lenses with internal focusing
       breathe otherwise than the thin lens.
+    unknown: slices whose scale is the lens's at infinity because nobody knows their focus; pictures tell it between there and the
+      farthest known focus.
     """
     if lens_scales is not None:
-        lens = Breathing(tuple(float(scale / lens_scales[0]) for scale in lens_scales), "lens")
-        if not measured or np.median([abs(scale / lens.scale(*pair) - 1.0) for pair, scale in measured.items()]) <= LARGEST_DEPARTURE:
+        scales = _told_by_pictures(lens_scales, unknown, measured)
+        lens = Breathing(tuple(float(scale / scales[0]) for scale in scales), "lens")
+        known = {pair: scale for pair, scale in measured.items() if not set(pair) & set(unknown)}
+        if not known or np.median([abs(scale / lens.scale(*pair) - 1.0) for pair, scale in known.items()]) <= LARGEST_DEPARTURE:
             return lens
     return _fitted(_abscissae(count, lens_scales), measured)
+
+
+def _told_by_pictures(lens_scales: Sequence[float], unknown: Collection[int], measured: Mapping[Pair, float]) -> list[float]:
+    """One after the other, by the median of the pairs with slices that are known or told before; where there are none, as given."""
+    scales = {index: float(scale) for index, scale in enumerate(lens_scales) if index not in unknown}
+    least_known = min(scales.values(), default=np.inf)
+    for index in sorted(unknown):
+        pairs = ((target, source, ratio) for (target, source), ratio in measured.items() if index in (target, source))
+        found = [ratio * scales[s] if t == index else scales[t] / ratio for t, s, ratio in pairs if {t, s} - {index} <= scales.keys()]
+        if found:
+            scales[index] = float(np.clip(np.median(found), lens_scales[index], max(lens_scales[index], least_known)))
+    return [scales.get(index, float(scale)) for index, scale in enumerate(lens_scales)]
 
 
 def _abscissae(count: int, lens_scales: Sequence[float] | None) -> Float[np.ndarray, " slices"]:

@@ -21,6 +21,7 @@ from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
 from capture.merging.slice_optics import SliceOptics
+from capture.stacks.sentinel_focus import stated_by_sentinel
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
@@ -103,7 +104,8 @@ def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
     knows_lens = stack.lens is not None and stack.is_metric
     prior = [stack.lens_of(i).image_distance_mm for i in range(len(stack))] if knows_lens else None
     read = lru_cache(maxsize=1)(lambda index: read_slice(sources[index]))
-    return register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0)
+    unknown = np.flatnonzero(stated_by_sentinel(stack)).tolist()
+    return register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0, unknown)
 
 
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:

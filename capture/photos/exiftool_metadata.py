@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from capture.photos.focus_metadata import FocusReading
+from capture.photos.focus_metadata import FocusReading, at_infinity
 from capture.photos.focus_tags import canon_reading
 from capture.photos.photo_metadata import PhotoMetadata, parse_time
 from capture.photos.sensor_reading import SensorReading
@@ -85,7 +85,7 @@ def _lens_position(found: dict[str, Any]) -> int | None:
 def _focus(found: dict[str, Any]) -> FocusReading | None:
     """Canon's interval, EXIF, then the maker's distance in metres. Olympus' 0 is infinity, others' unknown.
 
-    Nikon's Z lenses stand at infinity where LensPositionAbsolute is 0 or less.
+    Nikon's Z lenses stand at infinity where LensPositionAbsolute is 0 or less: a measured place of the drive, no sentinel.
     """
     nearest_m, farthest_m = _positive(found, "FocusDistanceLower") or 0.0, _positive(found, "FocusDistanceUpper") or 0.0
     if nearest_m > 0.0 and farthest_m > 0.0:
@@ -105,7 +105,7 @@ def _focus(found: dict[str, Any]) -> FocusReading | None:
 def _of_distance(distance_m: float, name: str, make: str, source: str) -> FocusReading:
     """With the interval of Nikon's code, which exiftool has decoded: steps of 10^(1/40) with F lenses, of 2^(1/3072) with Z lenses."""
     if distance_m >= _INFINITE_M:
-        return FocusReading(math.inf, math.inf, math.inf, "film_plane", source)
+        return at_infinity(source)
     code = 40.0 * math.log10(distance_m / 0.01)
     coarse = name == "FocusDistance" and make.startswith("NIKON") and abs(code - round(code)) < _CODE_TOLERANCE
     half_step = 10.0 ** (0.5 / 40.0) if coarse else 1.0

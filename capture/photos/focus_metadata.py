@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from mrbokeh.film_plane import lens_distance_m
 from mrbokeh.lens import MM_PER_M
@@ -16,7 +17,10 @@ class FocusReading:
 
     origin: where the distance is counted from, "film_plane" or "lens".
     source: the tag and the number it held, as text.
+    is_sentinel: whether that number stands for no distance at all (`SentinelReading`).
     """
+
+    is_sentinel: ClassVar[bool] = False
 
     distance_m: float
     nearest_m: float
@@ -43,6 +47,19 @@ class FocusReading:
         if self.origin == "lens" or math.isinf(stated_m):
             return stated_m
         return None if focal_length_mm is None else lens_distance_m(stated_m, focal_length_mm, hiatus_mm)
+
+
+@dataclass(frozen=True)
+class SentinelReading(FocusReading):
+    """Infinity by a number that stands for it (0xFFFFFFFF, 655.35 m): cameras write it for all that lies beyond their last code, be that
+    3 m or 30 m, and where they do not know. A value to start from; the photographs of its stack bound it (`capture.stacks.sentinel_focus`).
+    """
+
+    is_sentinel: ClassVar[bool] = True
+
+
+def at_infinity(source: str) -> SentinelReading:
+    return SentinelReading(math.inf, math.inf, math.inf, "film_plane", source)
 
 
 def rational(text: str | None) -> tuple[int, int] | None:

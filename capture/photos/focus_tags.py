@@ -1,12 +1,13 @@
 """The focus distance that a photograph states: EXIF, Canon, Nikon and Olympus maker notes, XMP; and how far to trust it.
 
-Cameras count from the film plane, are coarse (Nikon: steps of 5.9 %) and use sentinels for "unknown" and "infinity".
+Cameras count from the film plane, are coarse (Nikon: steps of 5.9 %) and use sentinels: 0 for "unknown", all ones for "infinity", which
+may be anything beyond their last code (`SentinelReading`).
 """
 
 import math
 from collections.abc import Callable
 
-from capture.photos.focus_metadata import FocusReading, Tags, number, rational
+from capture.photos.focus_metadata import FocusReading, Tags, at_infinity, number, rational
 from mrbokeh.lens import MM_PER_M
 
 UINT32_MAX = 0xFFFFFFFF
@@ -22,10 +23,6 @@ def read_focus(tags: Tags) -> FocusReading | None:
     return next((reading for reader in readers if (reading := reader(tags)) is not None), None)
 
 
-def _at_infinity(source: str) -> FocusReading:
-    return FocusReading(math.inf, math.inf, math.inf, "film_plane", source)
-
-
 def _subject_distance(tags: Tags) -> FocusReading | None:
     return _rational_distance(tags, ("Exif.Photo.SubjectDistance", "Exif.Image.SubjectDistance"))
 
@@ -36,7 +33,7 @@ def _adobe(tags: Tags) -> FocusReading | None:
 
 
 def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | None:
-    """Metres as a fraction, good to half a unit of its last digit; 0 and 0/0 are unknown, 0xFFFFFFFF is infinity."""
+    """Metres as a fraction, good to half a unit of its last digit; 0 and 0/0 are unknown, 0xFFFFFFFF is a sentinel for infinity."""
     for name in names:
         parts = rational(tags.get(name))
         if parts is None or parts[0] <= 0:
@@ -44,7 +41,7 @@ def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | Non
         numerator, denominator = parts
         source = f"{name} = {tags[name]}"
         if numerator == UINT32_MAX:
-            return _at_infinity(source)
+            return at_infinity(source)
         if denominator > 0:
             return FocusReading(
                 numerator / denominator, (numerator - 0.5) / denominator, (numerator + 0.5) / denominator, "film_plane", source
@@ -54,20 +51,30 @@ def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | Non
 
 def _canon_interval(tags: Tags) -> FocusReading | None:
     """Canon file info: the farthest and the nearest distance in cm. The middle is taken in dioptres, in which blur is linear."""
-    farthest_cm = number(tags.get("Exif.CanonFi.FocusDistanceUpper")) or 0.0
-    nearest_cm = number(tags.get("Exif.CanonFi.FocusDistanceLower")) or 0.0
+    names = ("Exif.CanonFi.FocusDistanceUpper", "Exif.CanonFi.FocusDistanceLower")
+    farthest_cm, nearest_cm = (_unsigned(tags, name) for name in names)
     source = f"Exif.CanonFi.FocusDistanceLower, Upper = {nearest_cm:g}, {farthest_cm:g} cm"
     return canon_reading(nearest_cm / _CM_PER_M, farthest_cm / _CM_PER_M, source)
 
 
+def _unsigned(tags: Tags, name: str) -> float:
+    """Canon's distances are unsigned numbers of 16 bits in arrays that exiv2 reads as signed: -1 is 65535. 0 where there is none."""
+    return (number(tags.get(name)) or 0.0) % (UINT16_MAX + 1)
+
+
 def canon_reading(nearest_m: float, farthest_m: float, source: str) -> FocusReading | None:
-    """Between two distances in metres: an upper one of 0 says nothing, 655.35 is infinity, a lower one of 0 is missing."""
+    """Between two distances in metres: an upper one of 0 says nothing, 655.35 is infinity, a lower one of 0 is missing.
+
+    Infinity with a finite lower end is an interval; without one it is a sentinel.
+    """
     if farthest_m <= 0.0:
         return None
     nearest_m, farthest_m = (math.inf if each >= _CANON_INFINITY_CM / _CM_PER_M - 1e-6 else each for each in (nearest_m, farthest_m))
     nearest_m = min(nearest_m, farthest_m) if nearest_m > 0.0 else farthest_m
+    if math.isinf(nearest_m):
+        return at_infinity(source)
     middle_dioptres = 0.5 * (1.0 / nearest_m + 1.0 / farthest_m)
-    return FocusReading(1.0 / middle_dioptres if middle_dioptres else math.inf, nearest_m, farthest_m, "film_plane", source)
+    return FocusReading(1.0 / middle_dioptres, nearest_m, farthest_m, "film_plane", source)
 
 
 def _canon_shot(tags: Tags) -> FocusReading | None:
@@ -77,11 +84,11 @@ def _canon_shot(tags: Tags) -> FocusReading | None:
     (7.1 mm lens, 7.26 mm sensor) with a box of 0.2 m says 188.
     """
     name = "Exif.CanonSi.SubjectDistance"
-    value = number(tags.get(name))
-    if value is None or value <= 0:
+    value = _unsigned(tags, name)
+    if value == 0.0:
         return None
     if value >= _CANON_INFINITY_CM:
-        return _at_infinity(f"{name} = {value:g}")
+        return at_infinity(f"{name} = {value:g}")
     in_mm = tags.get("mime_type") == "image/x-canon-crw" and "PowerShot" in tags.get("Exif.Image.Model", "")
     per_m, unit = (MM_PER_M, "mm") if in_mm else (_CM_PER_M, "cm")
     return FocusReading(value / per_m, (value - 0.5) / per_m, (value + 0.5) / per_m, "film_plane", f"{name} = {value:g} {unit}")
@@ -118,12 +125,12 @@ _NIKON_CODES = (
 
 
 def _olympus(tags: Tags) -> FocusReading | None:
-    """Olympus: the numerator counts mm whatever the denominator says (E-1 writes 1, E-300 writes 10); 0xFFFFFFFF is infinity."""
+    """Olympus: the numerator counts mm whatever the denominator says (E-1 writes 1, E-300 writes 10); 0xFFFFFFFF: infinity."""
     name = "Exif.OlympusFi.FocusDistance"
     parts = rational(tags.get(name))
     if parts is None or parts[0] <= 0:
         return None
     if parts[0] == UINT32_MAX:
-        return _at_infinity(f"{name} = {tags[name]}")
+        return at_infinity(f"{name} = {tags[name]}")
     distance_m = parts[0] / MM_PER_M
     return FocusReading(distance_m, distance_m - 0.5 / MM_PER_M, distance_m + 0.5 / MM_PER_M, "film_plane", f"{name} = {tags[name]}")

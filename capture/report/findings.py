@@ -3,10 +3,14 @@
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from capture.report.focus_curve import FocusCurve
 from capture.report.focus_spacing import FocusSpacing, focus_spacing
 from capture.report.registration_drift import RegistrationDrift, registration_drift
 from capture.report.slice_fit import SliceFit
+from capture.stacks.sentinel_focus import stated_by_sentinel
+from capture.views.lens_calibration import STATED_KEY
 from mrbokeh.focal_stack import FocalStack
 
 
@@ -52,7 +56,9 @@ class StackFindings:
         """None where focus distances are not known."""
         if not self.stack.is_metric:
             return None
-        return focus_spacing([each for each in self.stack.focus_distances_m if each is not None])
+        calibrated = np.array([STATED_KEY in each.metadata for each in self.stack.slices], bool)
+        known = calibrated | ~stated_by_sentinel(self.stack)
+        return focus_spacing([each for each in self.stack.focus_distances_m if each is not None], known)
 
     @cached_property
     def drift(self) -> RegistrationDrift | None:

@@ -28,7 +28,7 @@ Mask = Bool[np.ndarray, "height width"]
 Signature = dict[str, Any]
 
 FOLDER, JSON_NAME, MOVING_NAME = "report", "found.json", "moving.png"
-VERSION = 1
+VERSION = 2
 """To be raised whenever other numbers or pictures would be found in the same stack."""
 
 

@@ -3,7 +3,6 @@
 from typing import Any
 
 from capture.photos.decoded_photo import DecodedPhoto
-from capture.photos.focus_metadata import FocusReading
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.stacks.exposure import ExposureGain
 from capture.stacks.grouping import Photo
@@ -26,7 +25,7 @@ def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> d
         "lens_model": metadata.lens_model,
         "orientation": metadata.orientation,
         "lens_position": metadata.lens_position,
-        "focus": None if metadata.focus is None else focus_record(metadata.focus, metadata),
+        "focus": focus_record(metadata),
         "white_balance": None if decoded.white_balance is None else list(decoded.white_balance),
         "exposure_gain": gain.total,
         "exposure_gain_session": gain.session,
@@ -38,15 +37,20 @@ def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> d
     }
 
 
-def focus_record(focus: FocusReading, metadata: PhotoMetadata) -> dict[str, Any]:
+def focus_record(metadata: PhotoMetadata) -> dict[str, Any] | None:
     """The focus distance as the file stated it, and counted from the lens; intervals are what the statement may stand for.
 
-    The lens's are None where its focal length is unknown or no lens of that length focuses so near.
+    The lens's are None where its focal length is unknown or no lens of that length focuses so near. sentinel: nothing is known of this
+    distance but what the rest of the stack tells (`capture.stacks.sentinel_focus`).
     """
+    focus = metadata.focus
+    if focus is None:
+        return None
     distance_m, interval_m = metadata.focus_distance_m, metadata.focus_interval_m
     return {
         "source": focus.source,
         "origin": focus.origin,
+        "sentinel": focus.is_sentinel,
         "stated_dioptre": 1.0 / focus.distance_m,
         "interval_dioptre": [1.0 / focus.farthest_m, 1.0 / focus.nearest_m],
         "hiatus_mm": metadata.hiatus_mm,

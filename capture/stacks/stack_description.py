@@ -9,6 +9,7 @@ from typing import Any
 
 from capture.photos.photo_files import SkippedFile
 from capture.stacks.grouping import Photo, in_focus_order
+from capture.stacks.sentinel_focus import bounded_focus_records
 from capture.stacks.session import CameraChoice
 from capture.stacks.slice_files import FOLDER, arrange_slices, source_record
 from capture.stacks.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
@@ -65,7 +66,8 @@ def finish_stack(name: str, work: StackWork, digest: str) -> StackReport:
     # While slices change places there is no stack.json that could promise the wrong ones.
     (work.folder / FILE_NAME).unlink(missing_ok=True)
     paths = arrange_slices(work.folder, [each.path for each in finished])
-    slices = tuple(_slice(path, each) for path, each in zip(paths, finished, strict=True))
+    focus = bounded_focus_records([each.photo.metadata for each in finished])
+    slices = tuple(_slice(*each) for each in zip(paths, finished, focus, strict=True))
     reference = reference_index([each.focus_distance_m for each in slices])
     chosen = finished[reference]
     width_px, height_px = chosen.record["size_px"]
@@ -87,9 +89,11 @@ def finish_stack(name: str, work: StackWork, digest: str) -> StackReport:
     return StackReport(name, stack, (width_px, height_px), work.kept, tuple(work.skipped), tuple(remarks))
 
 
-def _slice(path: Path, finished: FinishedSlice) -> Slice:
+def _slice(path: Path, finished: FinishedSlice, focus: dict[str, Any] | None) -> Slice:
+    """focus: as metadata and sidecar tell now, for the slice itself may be of an earlier run."""
     record = finished.record
-    metadata = {key: record["request"][key] for key in ("source", "source_size_bytes", "source_mtime_ns")} | record["metadata"]
+    source = {key: record["request"][key] for key in ("source", "source_size_bytes", "source_mtime_ns")}
+    metadata = source | record["metadata"] | {"focus": focus}
     return Slice(f"{FOLDER}/{path.name}", finished.photo.focus_distance_m, metadata=metadata)
 
 

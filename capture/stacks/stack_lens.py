@@ -67,7 +67,20 @@ def lens_remarks(photos: Sequence[Photo]) -> list[str]:
             f"no focus distance for {len(unknown)} of {len(photos)} slices ({', '.join(unknown[:4])}{' ...' if len(unknown) > 4 else ''}): "
             f"depth will be the index of the sharpest slice, in the order of the file names, not metres"
         )
-    return remarks
+    return remarks + sentinel_remarks(photos)
+
+
+def sentinel_remarks(photos: Sequence[Photo]) -> list[str]:
+    """That a camera's word for infinity is no distance, and how to give one."""
+    told = [(photo.path.name, focus.source) for photo in photos if (focus := photo.metadata.focus) is not None and focus.is_sentinel]
+    if not told:
+        return []
+    names = f"{', '.join(name for name, _ in told[:4])}{' ...' if len(told) > 4 else ''}"
+    states, taken = ("states its focus", "its distance is") if len(told) == 1 else ("state their focus", "their distances are")
+    return [
+        f"{names} {states} by a sentinel ({told[0][1]}), which cameras write for all that is far: {taken} not known, taken as infinity "
+        f"where nothing else tells, and left out where stated distances are weighed; a focus.csv overrides it"
+    ]
 
 
 def lens_text(lens: Lens | None) -> str:

@@ -35,7 +35,7 @@ class SavedShot:
             "bytes": len(self.shot.data),
             "steps": self.shot.steps,
             "stated": {
-                "focus": None if metadata.focus is None else focus_record(metadata.focus, metadata),
+                "focus": focus_record(metadata),
                 "focus_dioptre": _dioptre(metadata.focus_distance_m),
                 "focal_length_mm": metadata.focal_length_mm,
                 "f_number": metadata.f_number,

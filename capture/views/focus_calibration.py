@@ -26,15 +26,22 @@ GROWTH_SIGMA = 0.01
 _DIAMETER_SIGMA_PX = 0.1
 _COMMON_ERROR_PX = 0.06  # of all diameters of a slice alike: what the foci of a traced lab of 12 slices were off, times their growth
 _PASSES = 4
+_TRIED = 101
+_ROUGH_PX = 0.5
 
 
 @dataclass(frozen=True)
 class FocusStart:
-    """First ideas: focus dioptres of the slices, and how their growth of blur compares (a thin lens's px per dioptre, or all 1)."""
+    """First ideas: focus dioptres of the slices, and how their growth of blur compares (a thin lens's px per dioptre, or all 1).
+
+    sigma_dioptre: how far the dioptres may well be off, of all slices or of each. beyond: slices of which nothing else is known than that
+    they are focused beyond all others, so that their focus is looked for there: from too far a start the fit finds a wrong one.
+    """
 
     dioptres: Float[np.ndarray, " slices"]
     growth: Float[np.ndarray, " slices"]
-    sigma_dioptre: float = FOCUS_SIGMA_DIOPTRE
+    sigma_dioptre: float | Float[np.ndarray, " slices"] = FOCUS_SIGMA_DIOPTRE
+    beyond: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -88,9 +95,21 @@ class _Fit:
 
     def first_values(self) -> np.ndarray:
         off = np.abs(self.start.dioptres[self.slices] - self.point_dioptre) * self.start.growth[self.slices]
-        common = float(np.median(self.diameter_px / np.maximum(off, 1e-6)))
-        count = len(self.start.dioptres)
-        return np.concatenate([[np.log(common)], np.zeros(count), self.start.dioptres])
+        told = ~np.isin(self.slices, self.start.beyond)
+        common = float(np.median((self.diameter_px / np.maximum(off, 1e-6))[told if told.any() else slice(None)]))
+        dioptres = self.start.dioptres.copy()
+        for index in self.start.beyond:
+            dioptres[index] = self._looked_for(index, common)
+        return np.concatenate([[np.log(common)], np.zeros(len(dioptres)), dioptres])
+
+    def _looked_for(self, index: int, common: float) -> float:
+        """The focus between infinity and the others' that explains most samples of a slice; where it has none, that of the start."""
+        mine, others = self.slices == index, np.delete(self.start.dioptres, self.start.beyond)
+        if not mine.any() or not others.size:
+            return float(self.start.dioptres[index])
+        tried = np.linspace(0.0, others.min(), _TRIED)
+        predicted = common * self.start.growth[index] * np.abs(tried[:, None] - self.point_dioptre[mine])
+        return float(tried[np.log1p(((predicted - self.diameter_px[mine]) / _ROUGH_PX) ** 2).sum(axis=1).argmin()])
 
     def meaning(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count = len(self.start.dioptres)
@@ -126,6 +145,6 @@ class _Fit:
         matrix[rows, 1 + slices] = predicted / (1.0 + values[1 + slices])
         matrix[rows, 1 + count + slices] = growth[slices] * np.sign(off)
         matrix[rows] /= _DIAMETER_SIGMA_PX * CAUCHY_95
-        widths = np.repeat([GROWTH_SIGMA, self.start.sigma_dioptre], count) * CAUCHY_95
+        widths = np.concatenate([np.full(count, GROWTH_SIGMA), np.broadcast_to(self.start.sigma_dioptre, count)]) * CAUCHY_95
         matrix[len(slices) :, 1:] = np.diag(squared_under_cauchy_slope(self._off_priors(values)) / widths)
         return matrix

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from capture.views.focus_calibration import FocusFit, FocusStart, calibrate_focus
+from capture.stacks.sentinel_focus import stated_by_sentinel
+from capture.views.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit, FocusStart, calibrate_focus
 from capture.views.focus_calibration_blur import WINDOW_PX, Plane, measure_blur
 from capture.views.lens_calibration import (
     CalibratedFocus,
@@ -67,14 +68,21 @@ def reduced(plane: Plane, factor: int) -> Float32[np.ndarray, "reduced_height re
 
 
 def focus_start(stack: FocalStack, sample: FocusSample, metres_per_unit: float, offset_m: float, width_px: int) -> FocusStart:
-    """As stated, less the offset of the lens; where distances are unknown, the points that are sharpest in each slice."""
+    """As stated, less the offset of the lens, and hardly trusted where a sentinel stated it; where distances are unknown, the points that
+    are sharpest in each slice.
+    """
     count = len(stack)
     growth = np.ones(count)
     if stack.lens is not None:
         stated = [stack.lens.focused_at(distance) if distance else stack.lens for distance in stated_distances_m(stack)]
         growth = np.array([lens.coc_px_per_dioptre(width_px) * each.scale for lens, each in zip(stated, stack.slices, strict=True)])
     if np.isfinite(sample.focus_dioptres).all():
-        return FocusStart(1.0 / (1.0 / np.maximum(sample.focus_dioptres, 1e-3) - offset_m), growth)
+        told = np.isfinite(sample.stated_sigma)
+        # In registered pictures a thin lens's blur grows alike in all slices.
+        growth = np.where(told, growth, np.median(growth[told] if told.any() else growth))
+        sigma = np.where(told, FOCUS_SIGMA_DIOPTRE, _UNKNOWN_SIGMA_DIOPTRE)
+        beyond = tuple(np.flatnonzero(~told).tolist())
+        return FocusStart(1.0 / (1.0 / np.maximum(sample.focus_dioptres, 1e-3) - offset_m), growth, sigma, beyond)
     target, highest = 1.0 / (sample.depth * metres_per_unit), sample.peaks.highest
     known = np.unique(highest)
     if len(known) < 2:
@@ -111,11 +119,13 @@ def lens_calibrations(found: Mapping[str, StackFocus], offset_m: float) -> list[
 
 
 def _rows(members: Sequence[StackFocus]) -> tuple[CalibratedFocus, ...]:
-    """One for each stated focus, weighted by how sure each stack is; unknown ones stay apart."""
+    """One for each stated focus, weighted by how sure each stack is; unknown ones and sentinels, which state none, stay apart."""
     width_px = members[0].width_px
     alike: dict[object, list[CalibratedFocus]] = {}
     for number, each in enumerate(members):
-        columns = (each.stack.slices, stated_distances_m(each.stack), each.fit.dioptres, each.fit.px_per_dioptre, each.fit.sigma_dioptre)
+        told = zip(stated_distances_m(each.stack), stated_by_sentinel(each.stack), strict=True)
+        stated_m_of = [None if by_sentinel else stated_m for stated_m, by_sentinel in told]
+        columns = (each.stack.slices, stated_m_of, each.fit.dioptres, each.fit.px_per_dioptre, each.fit.sigma_dioptre)
         for index, (photo, stated_m, dioptre, growth, sigma) in enumerate(zip(*columns, strict=True)):
             stated = None if stated_m is None else 1.0 / stated_m
             per_dioptre = float(growth) / photo.scale * width_px / each.width_px

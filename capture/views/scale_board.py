@@ -19,7 +19,8 @@ from mrbokeh.lens import MM_PER_M
 FEWEST_CORNERS = 6
 POSES_SIGMA, POSES_SIGMA_WITH_DISTORTION = 5e-4, 1e-3
 """What errors of poses and lens leave, which the corners do not show: 0.00 to 0.04 % on traced scenes where the lens has no
-distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too.
+distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too. That is noise of the matches: 0.1 px on 500
+points of the lab's seven views leave 0.09 % root mean square beside a term of distortion that is there, and 0.06 % without one.
 """
 
 _MEDIAN_OF_RAYLEIGH = 1.1774  # of the length of an error whose two parts are normal with a deviation of 1

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from capture.stacks.sentinel_focus import stated_by_sentinel
 from capture.views.lens_calibration import stated_distances_m
 from capture.views.scale_answer import ScaleAnswer
 from capture.views.scale_robust import CAUCHY_95, deviation
@@ -35,7 +36,8 @@ _LEAST_STATED_SIGMA = 0.001
 class FocusSample:
     """Peaks of one stack. depth: of its peaks, in model units. focus_dioptres: as stated, NaN where unknown.
 
-    stated_sigma: one standard deviation of these, by the intervals that the cameras' codes stand for; 0 where nothing is known of it.
+    stated_sigma: one standard deviation of these, by the intervals that the cameras' codes stand for; 0 where nothing is known of it,
+    inf where a sentinel stands for the distance: such a slice has no say.
     """
 
     view: str
@@ -58,9 +60,13 @@ def focus_sample(model: SparseModel, view: str, stack: FocalStack) -> FocusSampl
 
 
 def stated_sigma_dioptre(stack: FocalStack) -> Float[np.ndarray, " slices"]:
-    """Of a distance that may lie anywhere in its interval: the width over the square root of 12."""
+    """Of a distance that may lie anywhere in its interval: the width over the square root of 12; inf where it is stated by a sentinel.
+
+    A sentinel's interval has a width too, but is one-sided about its infinity: that would pull all one way, however little it weighs.
+    """
     intervals = [(each.metadata.get("focus") or {}).get("lens_interval_dioptre") or (0.0, 0.0) for each in stack.slices]
-    return np.array([abs(float(upper) - float(lower)) for lower, upper in intervals]) / np.sqrt(12.0)
+    widths = np.array([abs(float(upper) - float(lower)) for lower, upper in intervals])
+    return np.where(stated_by_sentinel(stack), np.inf, widths / np.sqrt(12.0))
 
 
 @dataclass(frozen=True)
@@ -165,8 +171,9 @@ def _joined(samples: Sequence[FocusSample], offset_m: float) -> _Peaks:
         if not known.all():
             continue
         names = [stated.setdefault(round(float(each), 6), len(stated)) for each in sample.focus_dioptres]
+        told = np.where(np.isfinite(sample.stated_sigma), sample.focus_dioptres, np.nan)
         with np.errstate(divide="ignore"):
-            from_pupil = sample.peaks.dioptres(1.0 / (1.0 / sample.focus_dioptres - offset_m))
+            from_pupil = sample.peaks.dioptres(1.0 / (1.0 / told - offset_m))
             dioptre = 1.0 / (1.0 / from_pupil + offset_m)
         good = np.isfinite(dioptre) & (dioptre > 0) & (sample.depth > 0)
         dioptres.append(dioptre[good])

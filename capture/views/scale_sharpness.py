@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from mrbokeh.color import luminance
 
@@ -31,11 +31,14 @@ class SharpnessPeaks:
 
     def dioptres(self, focus_dioptres: Float[np.ndarray, " slices"]) -> Float[np.ndarray, " peaks"]:
         """Vertices of parabolas through up to three slices on either side of the highest, placed at their focus; NaN where one
-        opens upwards. As many on one side as on the other: the curve is wider than a parabola, which would pull the vertex."""
+        opens upwards. As many on one side as on the other: the curve is wider than a parabola, which would pull the vertex. Slices whose
+        focus is NaN are none of them, and what is sharpest there has no vertex."""
         vertices = np.full(len(self.points), np.nan)
         for slice_index in np.unique(self.highest):
             mine = self.highest == slice_index
-            reach = min(_REACH, slice_index, len(focus_dioptres) - 1 - slice_index)
+            reach = _reach(np.isfinite(focus_dioptres), int(slice_index))
+            if reach == 0:
+                continue
             near = np.arange(slice_index - reach, slice_index + reach + 1)
             weight = np.sqrt(1.0 + reach - np.abs(near - slice_index))
             x = focus_dioptres[near] - focus_dioptres[slice_index]
@@ -46,6 +49,12 @@ class SharpnessPeaks:
             inside = (vertex >= x.min()) & (vertex <= x.max())
             vertices[mine] = focus_dioptres[slice_index] + np.where(inside, vertex, np.nan)
         return vertices
+
+
+def _reach(known: Bool[np.ndarray, " slices"], middle: int) -> int:
+    """How many neighbours on either side are known without a gap, up to _REACH; 0 where the middle itself is not."""
+    reaches = (n for n in range(_REACH, 0, -1) if middle >= n and middle + n < len(known) and known[middle - n : middle + n + 1].all())
+    return next(reaches, 0)
 
 
 def sharpness_curves(slices: Iterable[Float32[np.ndarray, "height width 3"]], xy_px: Float[np.ndarray, "points 2"]) -> Curves:

@@ -1,0 +1,76 @@
+"""Drawn kernels blur as much as a lens does, so that slices whose focus is right are not called wrong."""
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.report.examination import STEP_PX
+from capture.report.pixel_spread import drawn_diameters_px
+from capture.report.reblur import Reblur
+from capture.report.slice_fit import Prediction, SliceFit, fit_slice
+from mrbokeh.aperture import Aperture
+from mrbokeh.renderers.scatter_reference import ScatterReference
+
+FINER = 5
+HEIGHT_PX, WIDTH_PX = 64, 96
+
+
+@pytest.mark.parametrize("aperture", [Aperture.disc(), Aperture.ring(0.5), Aperture.blades(6)])
+@pytest.mark.parametrize("coc_px", [-1.6, 2.3, 3.0, 7.7, -15.7, 16.3, 30.0])
+def test_what_is_drawn_passes_detail_as_blur_does(aperture: Aperture, coc_px: float) -> None:
+    """Along x, from waves of 50 px down to those of 3: what a kernel drawn 40 times as large (whose pixels are fine) leaves of them."""
+    frequencies = np.array([0.02, 0.05, 0.1, 0.2, 0.3])
+    drawn = float(drawn_diameters_px(np.full((1, 1), coc_px, np.float32), aperture)[0, 0])
+    assert np.sign(drawn) == np.sign(coc_px)
+    meant = left_of_waves(aperture, 40.0 * coc_px, frequencies / 40.0)
+    off, plainly_off = (np.abs(left_of_waves(aperture, each, frequencies) - meant).max() for each in (drawn, coc_px))
+    assert off < 0.07 and off <= plainly_off + 0.01
+    if coc_px == 2.3:
+        assert off < 0.6 * plainly_off
+
+
+def left_of_waves(aperture: Aperture, diameter_px: float, frequencies: np.ndarray) -> np.ndarray:
+    row = aperture.rasterize(diameter_px).kernel.sum(axis=0)
+    along = np.arange(len(row)) - len(row) // 2
+    return np.abs(np.exp(2j * np.pi * frequencies[:, None] * along) @ row)
+
+
+def test_the_order_of_diameters_stays() -> None:
+    coc_px = np.linspace(-20.0, 20.0, 4001, dtype=np.float32)[None]
+    drawn = drawn_diameters_px(coc_px, Aperture.ring(0.5))[0]
+    steps = np.diff(drawn)
+    assert (steps > 0.0).all() and steps.max() < 0.05, "no jump where 0.01 px follow on each other"
+    np.testing.assert_allclose(drawn, -drawn[::-1], atol=1e-6)
+    assert drawn_diameters_px(np.zeros((1, 1), np.float32), Aperture.disc())[0, 0] == 0.0
+
+
+def picture(finer: int) -> np.ndarray:
+    noise = np.random.default_rng(3).random((HEIGHT_PX * FINER, WIDTH_PX * FINER, 3)).astype(np.float32)
+    texture = np.clip(0.5 + 2.0 * FINER * (cv2.GaussianBlur(noise, (0, 0), 0.5 * FINER) - 0.5), 0.0, 1.0).astype(np.float32)
+    return reduced(texture, FINER // finer)
+
+
+def reduced(rgb: np.ndarray, factor: int) -> np.ndarray:
+    height, width = rgb.shape[0] // factor, rgb.shape[1] // factor
+    return np.ascontiguousarray(rgb.reshape(height, factor, width, factor, -1).mean(axis=(1, 3)), np.float32)
+
+
+def fitted(aperture: Aperture, draws: bool) -> SliceFit:
+    """A slice that is focused behind everything, 0.3 to 9 px of blur, photographed with pixels of 5 x 5 finer ones."""
+    exact = ScatterReference(threads=1)
+    coc_px = np.broadcast_to(-np.linspace(0.3, 9.0, WIDTH_PX, dtype=np.float32), (HEIGHT_PX, WIDTH_PX)).copy()
+    fine_px = FINER * np.repeat(np.repeat(coc_px, FINER, axis=0), FINER, axis=1)
+    photographed = reduced(Reblur(exact, draws=False)(picture(FINER), fine_px, aperture), FINER)
+    reblur = Reblur(exact, draws=draws)
+    predicted = (reblur(picture(1), coc_px + np.float32(step), aperture) for step in (0.0, -STEP_PX, STEP_PX))
+    counted = np.zeros(coc_px.shape, bool)
+    counted[6:-6, 6:-6] = True
+    return fit_slice(photographed, Prediction(*predicted, coc_px, STEP_PX), counted)[0]
+
+
+@pytest.mark.parametrize("aperture", [Aperture.disc(), Aperture.ring(0.5), Aperture.blades(6)])
+def test_a_slice_at_its_focus_is_found_there(aperture: Aperture) -> None:
+    """Drawn without regard to the pixels, the very same slice seems to be focused elsewhere, and blurred by another lens."""
+    right, wrong = fitted(aperture, draws=True), fitted(aperture, draws=False)
+    assert abs(right.focus_px.value) < 0.1 and abs(right.blur_gain.value) < 0.015
+    assert abs(wrong.focus_px.value) > 0.2 and abs(wrong.blur_gain.value) > 0.03
