@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from mrbokeh.atomic_files import atomic_path
 from mrbokeh.color import display_rgb8
+from mrbokeh.picture_codec import write_stored
 
 WIDEST_PX = 320
 LABEL_PX = 18
@@ -26,12 +26,7 @@ class SheetRow:
 
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow]) -> None:
     """An 8-bit PNG for people to look at; pictures wider than 320 px are made smaller."""
-    import cv2
-
-    sheet = np.concatenate([_row(each) for each in rows], axis=0)
-    data = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))[1]
-    with atomic_path(path) as temporary:
-        data.tofile(temporary)
+    write_stored(path, np.concatenate([_row(each) for each in rows], axis=0))
 
 
 def _row(row: SheetRow) -> UInt8[np.ndarray, "sheet_height sheet_width 3"]:

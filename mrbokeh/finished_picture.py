@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.atomic_files import atomic_path
 from mrbokeh.color_management import NamedSpace
 from mrbokeh.exr_io import ExrPart, write_exr
 from mrbokeh.exr_primaries import ATTRIBUTE
 from mrbokeh.image_io import write_image
+from mrbokeh.picture_codec import codes_of, even_codes, write_stored
 from mrbokeh.plate_alpha import HOLDING_ALPHA
-from mrbokeh.srgb_codes import srgb_codes
 
 Picture = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -65,12 +64,5 @@ def straight(rgb: Picture, alpha: Plane) -> Picture:
 
 def _write_with_alpha(path: Path, rgb: Picture, alpha: Plane, space: NamedSpace | None) -> None:
     """16 bit, straight."""
-    import cv2
-
-    top = np.iinfo(np.uint16).max
-    codes = srgb_codes(rgb, np.uint16) if space is None else np.round(np.clip(space.from_rec709(rgb), 0.0, 1.0) * top).astype(np.uint16)
-    coverage = np.round(np.clip(alpha, 0.0, 1.0) * top).astype(np.uint16)
-    done, data = cv2.imencode(path.suffix.lower(), np.ascontiguousarray(np.dstack([codes[..., ::-1], coverage])))
-    assert done
-    with atomic_path(path) as temporary:
-        data.tofile(temporary)
+    codes = codes_of(rgb, np.uint16, "srgb") if space is None else codes_of(space.from_rec709(rgb), np.uint16, "linear")
+    write_stored(path, np.dstack([codes, even_codes(alpha, np.uint16)]))

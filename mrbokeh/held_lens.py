@@ -4,10 +4,12 @@ A lens file speaks of the camera held level, as data sheets do. Where EXIF turne
 stated width lies along the columns, and the opening and the tilt turn too. The lens from metadata comes out alike. Where a lens file states
 sensor_height_mm, the longer side lies along the longer side of any photograph, whether EXIF tells a turn or not; one of 24 by 36 mm is
 described for upright photographs, and is left as it is for them. A network's kernels cannot be turned; only its scale is.
+
+The same holds for clips, which videos turn by their metadata and numbered photographs by EXIF.
 """
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +20,22 @@ from mrbokeh.photograph import Photograph
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class Holding:
+    """How the camera was held, as its picture tells. whole_px: (width, height) of all that it took, upright, of which the picture may be
+    a part. quarter_turns: counter-clockwise, that brought the stored picture upright.
+    """
+
+    whole_px: tuple[int, int]
+    quarter_turns: int = 0
+
+
 def lens_as_held(lens: Lens, photograph: Photograph, path: Path) -> Lens:
     """The lens for the upright picture of a photograph; says in one line what was taken where that is not plain."""
-    held = _held(lens, photograph)
-    told = _way_told(lens, held, photograph)
-    if told:
-        _log.warning(f"{path} {told}")
+    height_px, width_px = photograph.rgb.shape[:2]
+    held = lens_held(lens, Holding(photograph.cut_from_px or (width_px, height_px), photograph.quarter_turns), path)
     if photograph.cut_from_px is not None:
-        left_mm = held.sensor_width_mm * photograph.rgb.shape[1] / photograph.cut_from_px[0]
+        left_mm = held.sensor_width_mm * width_px / photograph.cut_from_px[0]
         _log.warning(
             f"{photograph.cut_told(path)}: {held.sensor_width_mm:.3g} mm of the sensor are taken along its width, as --lens says; where "
             f"that is the whole sensor, --lens has to say {left_mm:.3g} mm instead (or more, if it was made smaller too)"
@@ -33,9 +43,18 @@ def lens_as_held(lens: Lens, photograph: Photograph, path: Path) -> Lens:
     return held
 
 
-def _way_told(lens: Lens, held: Lens, photograph: Photograph) -> str:
+def lens_held(lens: Lens, holding: Holding, path: Path | None = None) -> Lens:
+    """The lens for upright pictures of a camera so held. path: of what it took, about which a line is said where that is not plain."""
+    held = _held(lens, holding)
+    told = _way_told(lens, held, holding)
+    if told and path is not None:
+        _log.warning(f"{path} {told}")
+    return held
+
+
+def _way_told(lens: Lens, held: Lens, holding: Holding) -> str:
     """Nothing where the lens stays as it is and may well be right."""
-    width_px, height_px = _whole_px(photograph)
+    width_px, height_px = holding.whole_px
     if held.sensor_width_mm != lens.sensor_width_mm:
         way = "upright" if height_px > width_px else "level"
         sides = f"{held.sensor_width_mm:.3g} mm of the sensor are taken along its width, {held.sensor_height_mm:.3g} mm along its height"
@@ -56,17 +75,11 @@ def turned_by(lens: Lens, quarters: int) -> Lens:
     return replace(lens, aperture=lens.aperture.rotated(-quarters * np.pi / 2), tilt_rad=(right_rad, down_rad))
 
 
-def _held(lens: Lens, photograph: Photograph) -> Lens:
-    width_px, height_px = _whole_px(photograph)
+def _held(lens: Lens, holding: Holding) -> Lens:
+    width_px, height_px = holding.whole_px
     is_for_upright = (lens.sensor_height_mm or 0.0) > lens.sensor_width_mm
-    held = lens if is_for_upright else turned_by(lens, photograph.quarter_turns)
-    if width_px == height_px or (lens.sensor_height_mm is None and photograph.quarter_turns % 2 == 0):
+    held = lens if is_for_upright else turned_by(lens, holding.quarter_turns)
+    if width_px == height_px or (lens.sensor_height_mm is None and holding.quarter_turns % 2 == 0):
         return held
     long_mm, long_px = max(lens.sensor_width_mm, lens.sensor_height_mm or 0.0), max(width_px, height_px)
     return replace(held, sensor_width_mm=long_mm * (width_px / long_px), sensor_height_mm=long_mm * (height_px / long_px))
-
-
-def _whole_px(photograph: Photograph) -> tuple[int, int]:
-    """Width and height of what the camera took, of which the photograph may be a part."""
-    height_px, width_px = photograph.rgb.shape[:2]
-    return photograph.cut_from_px or (width_px, height_px)

@@ -7,23 +7,17 @@ Files are written without stating primaries: EXR takes Rec.709 where none are st
 """
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.color import srgb_to_linear
+from mrbokeh.color import display_rgb8
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.exr_primaries import in_rec709, stated_primaries
 from mrbokeh.layer import Layer
-from mrbokeh.png_chunks import without_chatter
-from mrbokeh.quiet_opencv import quiet_opencv
+from mrbokeh.picture_codec import Encoding, codes_of, linear_from_codes, stored_pixels, stored_rgb, write_stored
 from mrbokeh.sound_values import require_depth_ahead
-from mrbokeh.srgb_codes import srgb_codes
-
-Encoding = Literal["srgb", "linear"]
 
 INTEGER_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 """Of what is read and written; the others are read only."""
@@ -34,7 +28,6 @@ _HEIF_BY = "by `heif-convert IN.heic OUT.png` (libheif), `magick IN.heic OUT.png
 LINEAR_SUFFIXES = (".exr", ".hdr")
 _DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z")
 _LONE_DEPTH_NAMES = (*_DEPTH_NAMES, "Y")
-_INTEGER_RANGE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
 
 def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
@@ -54,12 +47,15 @@ def require_suffix(path: Path | str, suffixes: tuple[str, ...], what: str) -> No
 
 def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
     """Write scene-linear RGB. EXR keeps it (half or float); PNG and TIFF store 16 bit, JPEG 8 bit, clipped to [0, 1]."""
-    path = Path(path)
-    if path.suffix.lower() == ".exr":
+    suffix = Path(path).suffix.lower()
+    if suffix == ".exr":
         dtype = np.float16 if half else np.float32
         write_exr(path, ExrPart({name: rgb[..., i].astype(dtype) for i, name in enumerate("RGB")}))
+    elif suffix in INTEGER_SUFFIXES:
+        integers = np.uint8 if suffix in (".jpg", ".jpeg") else np.uint16
+        write_stored(path, codes_of(np.asarray(rgb, np.float32), integers, encoding))
     else:
-        _write_integer_image(path, np.asarray(rgb, np.float32), encoding)
+        raise InputError(f"cannot write {path}: expected .exr, {', '.join(INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
 
 
 def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR first") -> Float32[np.ndarray, "height width 3"]:
@@ -68,9 +64,9 @@ def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR fi
     instead: what the error advises then.
     """
     path = Path(path)
-    if path.is_file() and path.suffix.lower() in ENCODED_SUFFIXES and _decode(path).dtype.kind != "f":
+    if path.is_file() and path.suffix.lower() in ENCODED_SUFFIXES and (stored := stored_pixels(path).dtype).kind != "f":
         raise InputError(
-            f"{path}: expected scene-linear values (EXR, HDR or float TIFF), but it stores {_decode(path).dtype} made for display, without "
+            f"{path}: expected scene-linear values (EXR, HDR or float TIFF), but it stores {stored} made for display, without "
             f"highlights: {instead}"
         )
     rgb = read_image(path)
@@ -138,70 +134,10 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
         raise InputError(
             f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + ENCODED_SUFFIXES)}, not {suffix or 'a file without suffix'}"
         )
-    pixels = _decode(path)
-    if pixels.dtype.kind == "f":
-        return pixels.astype(np.float32)
-    if pixels.dtype not in _INTEGER_RANGE:
-        raise InputError(f"{path} stores {pixels.dtype}: expected 8 or 16 bit integers or float")
-    top = np.float32(_INTEGER_RANGE[pixels.dtype])
-    if encoding != "srgb":
-        return pixels / top
-    linear = srgb_to_linear(np.arange(int(top) + 1) / top)[pixels[..., :3]]
-    return linear if pixels.shape[2] == 3 else np.dstack([linear, pixels[..., 3] / top])
-
-
-def stored_pixels(path: Path) -> np.ndarray:
-    """The numbers of a PNG, TIFF, JPEG, WebP or HDR file as they are stored: (H, W) or (H, W, 3 or 4) with blue first.
-
-    Raises InputError where the file is empty or damaged.
-    """
-    import cv2
-
-    data = np.fromfile(path, np.uint8)
-    if not data.size:
-        raise InputError(f"{path} is empty: copy or render it again")
-    sound = without_chatter(data)
-    with quiet_opencv():
-        pixels = None if sound is None else cv2.imdecode(sound, cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise InputError(f"{path} cannot be read as a picture: it is damaged or not what its suffix says")
-    return np.asarray(pixels)
-
-
-def _decode(path: Path) -> np.ndarray:
-    """The stored numbers as (H, W, 3 or 4), RGB order."""
-    pixels = stored_pixels(path)
-    if pixels.ndim == 2:
-        return np.repeat(pixels[..., None], 3, axis=2)
-    order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]
-    return np.ascontiguousarray(pixels[..., order])
-
-
-def _write_integer_image(path: Path, rgb: Float32[np.ndarray, "height width 3"], encoding: Encoding) -> None:
-    import cv2
-
-    suffix = path.suffix.lower()
-    if suffix not in INTEGER_SUFFIXES:
-        raise InputError(f"cannot write {path}: expected .exr, {', '.join(INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
-    dtype = np.uint8 if suffix in (".jpg", ".jpeg") else np.uint16
-    integers = srgb_codes(rgb, dtype) if encoding == "srgb" else _linear_codes(rgb, dtype)
-    done, data = cv2.imencode(suffix, np.ascontiguousarray(integers[..., ::-1]))
-    if not done:
-        raise InputError(f"cannot encode a picture of shape {rgb.shape} as {suffix}")
-    with atomic_path(path) as temporary:
-        data.tofile(temporary)
-
-
-def _linear_codes(rgb: Float32[np.ndarray, "height width 3"], dtype: type) -> np.ndarray:
-    return np.round(np.clip(np.nan_to_num(rgb), 0, 1) * np.iinfo(dtype).max).astype(dtype)
+    pixels = stored_rgb(path)
+    return pixels.astype(np.float32) if pixels.dtype.kind == "f" else linear_from_codes(pixels, encoding, path)
 
 
 def write_preview(path: Path | str, rgb: Float32[np.ndarray, "height width 3"], exposure_stops: float = 0.0) -> None:
     """An 8-bit tone-mapped sRGB picture for people to look at."""
-    import cv2
-
-    from mrbokeh.color import display_rgb8
-
-    data = cv2.imencode(Path(path).suffix, np.ascontiguousarray(display_rgb8(rgb, exposure_stops)[..., ::-1]))[1]
-    with atomic_path(path) as temporary:
-        data.tofile(temporary)
+    write_stored(path, display_rgb8(rgb, exposure_stops))

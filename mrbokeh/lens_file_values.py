@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from mrbokeh.errors import InputError
-from mrbokeh.image_io import stored_pixels
+from mrbokeh.picture_codec import stored_pixels
 
 
 class _Missing:

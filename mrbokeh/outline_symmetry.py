@@ -4,15 +4,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+
+from mrbokeh.outline_geometry import EXACT, Outline
 
 ALIKE = 1e-3
 """An outline counts as symmetric if its mirror image stays this close to it, in its half extents."""
-
-EXACT = 1e-9
-"""Half extents below which two points are one, and sines below which an edge has a direction."""
-
-Outline = Float64[np.ndarray, "_ 2"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,7 @@ class Sector:
 
 def sectors(shape: Outline, steps: Outline) -> Iterator[Sector]:
     """The outline unfolded from one sector of every symmetry that it shares with the directions, the largest first."""
-    from mrbokeh._polygon_rectification_numba import farthest_from_outline
+    from mrbokeh._outline_geometry_numba import farthest_from_outline
 
     def holds(element: np.ndarray) -> bool:
         if not all(np.abs(steps - step).max(axis=1).min() < EXACT for step in steps @ element.T):

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.errors import InputError
+from mrbokeh.exif_orientation import AS_STORED, quarter_turns
 from mrbokeh.lens import Lens
 
 _log = logging.getLogger(__name__)
@@ -23,8 +24,8 @@ _READER = "capture.photos.photograph"
 class Photograph:
     """rgb: (H, W, 3) linear Rec.709, upright. None is what the file does not tell.
 
-    sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens. quarter_turns: counter-clockwise, that brought
-    the stored picture upright. cut_from_px: width and height of the whole that this is a part of, or None where it is the whole.
+    sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens. orientation: EXIF's, by which the picture came
+    upright. cut_from_px: width and height of the whole that this is a part of, or None where it is the whole.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -34,8 +35,13 @@ class Photograph:
     sensor_width_mm: float | None = None
     exposure_time_s: float | None = None
     iso: float | None = None
-    quarter_turns: int = 0
+    orientation: int = AS_STORED
     cut_from_px: tuple[int, int] | None = None
+
+    @property
+    def quarter_turns(self) -> int:
+        """Counter-clockwise, that brought the stored picture upright."""
+        return quarter_turns(self.orientation)
 
     def lens(self, path: Path, focus_m: float | None = None) -> Lens:
         """The lens with a round opening. focus_m takes the place of the file's own focus. Raises InputError where parts are unknown."""

@@ -76,7 +76,7 @@ def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = 
     photograph = read_photograph(photo)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_as_held(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
-    return with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.quarter_turns))
+    return with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
 
 
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.exif_orientation import AS_STORED, upright
 from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import INTEGER_SUFFIXES, stored_pixels
+from mrbokeh.image_io import INTEGER_SUFFIXES
+from mrbokeh.picture_codec import stored_pixels
 
 HOLDING_ALPHA = (".exr", ".png", ".tif", ".tiff")
 """Suffixes of pictures in which alpha is stored."""
@@ -14,12 +16,17 @@ HOLDING_ALPHA = (".exr", ".png", ".tif", ".tiff")
 Plane = Float32[np.ndarray, "height width"]
 
 
-def read_alpha(path: Path, quarter_turns: int = 0) -> Plane | None:
-    """In [0, 1]; None where the file holds none, or is opaque everywhere. quarter_turns: counter-clockwise, that bring it upright."""
+def read_alpha(path: Path, orientation: int = AS_STORED) -> Plane | None:
+    """In [0, 1]; None where the file holds none, or is opaque everywhere. orientation: EXIF's, by which it comes upright."""
     alpha = _stored(path)
     if alpha is None or (alpha >= 1.0).all():
         return None
-    return np.ascontiguousarray(np.rot90(np.clip(alpha, 0.0, 1.0), quarter_turns))
+    return upright(np.clip(alpha, 0.0, 1.0), orientation)
+
+
+def stores_alpha(path: Path) -> bool:
+    """Whether the file holds alpha, be it opaque everywhere."""
+    return _stored(path) is not None
 
 
 def is_straight(path: Path) -> bool:
@@ -29,8 +36,11 @@ def is_straight(path: Path) -> bool:
 
 def alpha_with(plate_alpha: Plane | None, virtual_alpha: Plane) -> Plane | None:
     """Coverage of a plate with virtual light before it; None stays opaque."""
-    if plate_alpha is None:
-        return None
+    return None if plate_alpha is None else coverage_with(plate_alpha, virtual_alpha)
+
+
+def coverage_with(plate_alpha: Plane, virtual_alpha: Plane) -> Plane:
+    """Where nothing virtual is, it stays bit for bit."""
     covered = np.clip(virtual_alpha, 0.0, 1.0)
     return np.asarray(covered + (1.0 - covered) * plate_alpha, np.float32)
 

@@ -22,7 +22,8 @@ from jaxtyping import Float64
 
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
-from mrbokeh.outline_symmetry import EXACT, NO_SYMMETRY, Outline, Sector, sectors
+from mrbokeh.outline_geometry import EXACT, Outline, area, centroid, without_flat_vertices
+from mrbokeh.rectification_walks import smallest_polygon
 
 PAPER_DIRECTIONS = ((1, 0), (0, 1), (1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
 """The set D of Fig. 6: the slopes whose differenced edges have few non-zero elements."""
@@ -52,11 +53,11 @@ def rectify(
     _check(outline)
     if (ready := _already_rectified(outline, steps, max_edges)) is not None:
         return ready
-    clockwise = _area(outline) < 0.0
-    middle = _centroid(outline)
+    clockwise = area(outline) < 0.0
+    middle = centroid(outline)
     extent = float(np.abs(outline - middle).max())
-    shape = _without_flat_vertices((outline[::-1] if clockwise else outline) - middle) / extent
-    polygon = _smallest(shape, steps, max_edges, symmetry_cost)
+    shape = without_flat_vertices((outline[::-1] if clockwise else outline) - middle) / extent
+    polygon = smallest_polygon(shape, steps, max_edges, symmetry_cost)
     if polygon is None:
         raise InputError(f"no polygon of at most {max_edges} edges along {tuple(directions)} encloses the outline: allow more of either")
     polygon = middle + extent * (polygon[::-1] if clockwise else polygon)
@@ -65,7 +66,7 @@ def rectify(
 
 def area_excess(rectified: Outline, outline: Outline) -> float:
     """How much larger the rectified polygon is than its outline, as a share of the outline's area (0 = equal)."""
-    return abs(_area(rectified)) / abs(_area(outline)) - 1.0
+    return abs(area(rectified)) / abs(area(outline)) - 1.0
 
 
 def same_area_and_centroid(rectified: Outline, outline: Outline) -> Outline:
@@ -74,8 +75,8 @@ def same_area_and_centroid(rectified: Outline, outline: Outline) -> Outline:
     The enclosing polygon is too large on all sides, so a blur with it is too wide and, for lopsided shapes, off centre. Scaled
     about its centroid it keeps the directions of its edges; it then crosses the outline, as much inside as outside.
     """
-    scale = np.sqrt(abs(_area(outline)) / abs(_area(rectified)))
-    return _centroid(outline) + scale * (rectified - _centroid(rectified))
+    scale = np.sqrt(abs(area(outline)) / abs(area(rectified)))
+    return centroid(outline) + scale * (rectified - centroid(rectified))
 
 
 def rectify_aperture(aperture: Aperture, directions: Sequence[tuple[int, int]] = PAPER_DIRECTIONS, max_edges: int = 16) -> Aperture:
@@ -104,46 +105,20 @@ def _unit_steps(directions: Sequence[tuple[int, int]], max_edges: int) -> Float6
 
 
 def _check(outline: Outline) -> None:
-    from mrbokeh._polygon_rectification_numba import crosses_itself
+    from mrbokeh._outline_geometry_numba import crosses_itself
 
     if outline.ndim != 2 or outline.shape[0] < 3 or outline.shape[1] != 2 or not np.isfinite(outline).all():
         raise InputError("an outline must be (V, 2) with at least 3 vertices and finite numbers")
     extent = np.ptp(outline, axis=0).max()
-    if abs(_area(outline)) <= EXACT * extent**2:
+    if abs(area(outline)) <= EXACT * extent**2:
         raise InputError("an outline must enclose an area, but its vertices lie on a line")
-    if crosses_itself(_without_flat_vertices(outline - outline[0]) / extent):
+    if crosses_itself(without_flat_vertices(outline - outline[0]) / extent):
         raise InputError("an outline must not cross itself; split it into simple outlines first")
-
-
-def _area(outline: Outline) -> float:
-    """Signed area: positive where x turns towards y."""
-    x, y = (outline - outline[0]).T
-    return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
-
-
-def _centroid(outline: Outline) -> Float64[np.ndarray, "2"]:
-    """The centre of the enclosed area."""
-    points = outline - outline[0]
-    following = np.roll(points, -1, axis=0)
-    swept = points[:, 0] * following[:, 1] - following[:, 0] * points[:, 1]
-    return outline[0] + (swept[:, None] * (points + following)).sum(axis=0) / (3.0 * swept.sum())
-
-
-def _without_flat_vertices(outline: Outline) -> Outline:
-    """The outline without repeated vertices and those within rounding of the line between their neighbours."""
-    extent = np.ptp(outline, axis=0).max()
-    for _ in range(2):
-        outline = outline[np.hypot(*(outline - np.roll(outline, 1, axis=0)).T) > EXACT * extent]
-        step, onwards = outline - np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0) - outline
-        aside = np.abs(step[:, 0] * onwards[:, 1] - step[:, 1] * onwards[:, 0])
-        flat = (aside <= 1e-12 * extent * np.hypot(*(step + onwards).T)) & ((step * onwards).sum(axis=1) > 0.0)
-        outline = outline[~flat]
-    return outline
 
 
 def _already_rectified(outline: Outline, steps: Outline, max_edges: int) -> Outline | None:
     """A copy of the outline if its edges run along the steps and are few enough, with no more than its flat vertices left out."""
-    for candidate in (outline, _without_flat_vertices(outline)):
+    for candidate in (outline, without_flat_vertices(outline)):
         edges = np.roll(candidate, -1, axis=0) - candidate
         lengths = np.hypot(*edges.T)
         if len(candidate) > max_edges or (lengths == 0.0).any():
@@ -152,134 +127,3 @@ def _already_rectified(outline: Outline, steps: Outline, max_edges: int) -> Outl
         if (sines.min(axis=1) <= EXACT).all():
             return candidate.copy()
     return None
-
-
-def _smallest(shape: Outline, steps: Outline, max_edges: int, symmetry_cost: float) -> Outline | None:
-    """The smallest polygon of the largest symmetry that is not too dear; None where nothing closes."""
-    plain = _simple_walk(Sector(shape, len(shape), NO_SYMMETRY, (np.eye(2),)), shape, steps, max_edges)
-    if plain is None or symmetry_cost < 0.0:
-        return plain
-    for sector in sectors(shape, steps):
-        polygon = _simple_walk(sector, shape, steps, max_edges)
-        if polygon is not None and _area(polygon) <= _area(plain) + symmetry_cost * _area(shape) + EXACT:
-            return polygon
-    return plain
-
-
-def _simple_walk(sector: Sector, shape: Outline, steps: Outline, max_edges: int) -> Outline | None:
-    """The smallest polygon around `shape` of the sector's symmetry that does not cross itself.
-
-    Where two corners on either side of a narrow gap overlap, the smallest walk crosses itself; then fewer edges are tried,
-    which closes the gap. Only then the result may fail to be the smallest.
-    """
-    while max_edges >= 3:
-        lines = (_turned_walk if sector.symmetry.axis is None else _mirrored_walk)(sector, steps, max_edges // sector.symmetry.turns)
-        if len(lines) < 3:
-            return None
-        polygon = _enclosing(lines, shape)
-        if not _overlaps_itself(polygon):
-            return polygon
-        max_edges = len(lines) - 1
-    return None
-
-
-def _overlaps_itself(polygon: Outline) -> bool:
-    """Whether a polygon crosses itself. Made a little smaller first: then one that touches itself in a point does not."""
-    from mrbokeh._polygon_rectification_numba import crosses_itself
-
-    edges = np.roll(polygon, -1, axis=0) - polygon
-    return bool(crosses_itself(_corner_points(np.column_stack([polygon, edges / np.hypot(*edges.T)[:, None]]), -1e3 * EXACT)))
-
-
-def _enclosing(lines: np.ndarray, shape: Outline) -> Outline:
-    """The polygon of lines in their order, all moved outwards by as much as the shape differs from its symmetric twin."""
-    from mrbokeh._polygon_rectification_numba import farthest_from_outline
-
-    outwards, polygon = 0.0, _without_flat_vertices(_corner_points(lines, 0.0))
-    for _ in range(8):
-        missing = max(farthest_from_outline(shape, polygon, 1), farthest_from_outline(polygon, shape, -1))
-        if missing <= EXACT:
-            break
-        outwards += missing
-        polygon = _without_flat_vertices(_corner_points(lines, outwards))
-    return polygon
-
-
-def _turned_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
-    """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each of the turned parts."""
-    from mrbokeh import _polygon_rectification_numba as compiled
-
-    lines, places = compiled.touching_lines(sector.outline, 0, sector.size - 1, steps)
-    turn, count = sector.to_image[0], len(lines)
-    next_period = places + np.array([sector.size, 0])
-    lines, places = np.concatenate([lines, _turned(lines, turn)]), np.concatenate([places, next_period])
-    starts, targets, areas = compiled.corners(lines, places, count, sector.size, _swept(sector.outline))
-    walk = compiled.cheapest_turn(count, _fewest_origins(starts, targets), starts, targets, areas, most)
-    return np.concatenate([_turned(lines[walk, :4], np.linalg.matrix_power(turn, i)) for i in range(sector.symmetry.turns)])
-
-
-def _fewest_origins(starts: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Lines of which every closed walk contains one: those with a corner across one cut of the outline, for the best cut."""
-    count = len(starts) - 1
-    line = np.flatnonzero(np.diff(starts))
-    farthest = targets[starts[line + 1] - 1]
-    change = np.zeros(2 * count + 1, np.int64)
-    np.add.at(change, line, 1)
-    np.add.at(change, farthest, -1)
-    across = change.cumsum()[: 2 * count].reshape(2, count).sum(axis=0)
-    cut = int(across.argmin())
-    return line[((line <= cut) & (cut < farthest)) | (cut + count < farthest)]
-
-
-def _mirrored_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
-    """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each pair of mirrored sectors."""
-    from mrbokeh import _polygon_rectification_numba as compiled
-
-    lines, places = compiled.touching_lines(sector.outline, 0, sector.size, steps)
-    swept, (first, second) = _swept(sector.outline), sector.to_image
-    starts, targets, areas = compiled.corners(lines, places, len(lines), sector.size, swept)
-    before, beyond = _mirrored(lines, first), _mirrored(lines, second)
-    places_before, places_beyond = _mirrored_places(places, 0), _mirrored_places(places, sector.size)
-    at_first = compiled.axis_corners(before, places_before, lines, places, swept)
-    at_second = compiled.axis_corners(lines, places, beyond, places_beyond, swept)
-    walk = compiled.cheapest_sector(at_first, at_second, starts, targets, areas, most)
-    if len(walk) == 0:
-        return np.empty((0, 4))
-    back = beyond[walk[::-1], :4]
-    starts_across, ends_across = at_first[walk[0], 1] < np.inf, at_second[walk[-1], 1] < np.inf
-    period = np.concatenate([lines[walk, :4], back[int(ends_across) : len(back) - int(starts_across)]])
-    return np.concatenate([_turned(period, np.linalg.matrix_power(second @ first, i)) for i in range(sector.symmetry.turns)])
-
-
-def _mirrored(lines: np.ndarray, mirror: np.ndarray) -> np.ndarray:
-    """The mirror images of lines (x, y, dx, dy, forward, backward), with the outline to their left as before."""
-    return np.column_stack([lines[:, :2] @ mirror.T, -lines[:, 2:4] @ mirror.T, lines[:, [5, 4]]])
-
-
-def _mirrored_places(places: np.ndarray, axis: int) -> np.ndarray:
-    """Places (place, kind) of the mirror images, where the axis lies at place `axis`: what arrives leaves, and the other way round."""
-    from mrbokeh._polygon_rectification_numba import ARRIVING, LEAVING, THROUGH
-
-    kinds = places[:, 1]
-    return np.column_stack([2 * axis - places[:, 0], np.where(kinds == THROUGH, THROUGH, ARRIVING + LEAVING - kinds)])
-
-
-def _turned(lines: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    return np.column_stack([lines[:, :2] @ turn.T, lines[:, 2:4] @ turn.T, lines[:, 4:]])
-
-
-def _corner_points(lines: np.ndarray, outwards: float) -> Outline:
-    """The polygon of lines (x, y, dx, dy) in their order, all moved `outwards`, to the right of their directions."""
-    points, along = lines[:, :2] + outwards * lines[:, 3:1:-1] * [1.0, -1.0], lines[:, 2:4]
-    offset, following = np.roll(points, -1, axis=0) - points, np.roll(along, -1, axis=0)
-    ahead = _cross(offset, following) / _cross(along, following)
-    return points + ahead[:, None] * along
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _swept(outline: Outline) -> np.ndarray:
-    """(V + 1,) twice the area swept from the origin along the outline up to each vertex, and once around."""
-    return np.concatenate([[0.0], np.cumsum(_cross(outline, np.roll(outline, -1, axis=0)))])

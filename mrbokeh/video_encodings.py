@@ -33,6 +33,8 @@ class Encoding(NamedTuple):
 
 _H26X = (".mp4", ".mov", ".mkv", ".nut")
 _PRORES = {"vendor": "apl0"}
+# A keyframe each, or a part would begin with statistics other than those of the whole.
+_FFV1 = {"level": "3", "slices": "16", "slicecrc": "1", "g": "1"}
 # Without this the pictures differ from run to run by a few bits, and from processor to processor.
 _X264 = {"preset": "medium", "x264-params": "cpu-independent=1:rc-lookahead=20"}
 # One thread, or the pictures would depend on the number of cores; groups of pictures do not refer to others, so that parts can be joined.
@@ -50,16 +52,21 @@ ENCODINGS = {
     ),
     "prores422": Encoding("prores_ks", "yuv422p10le", 10, (".mov",), {"profile": "hq", **_PRORES}),
     "dnxhr-hqx": Encoding("dnxhd", "yuv422p10le", 10, (".mov", ".mxf"), {"profile": "dnxhr_hqx"}, least_px=(256, 120)),
-    # A keyframe each, or a part would begin with statistics other than those of the whole.
-    "ffv1": Encoding("ffv1", "gbrp16le", 16, (".mkv",), {"level": "3", "slices": "16", "slicecrc": "1", "g": "1"}),
+    "ffv1": Encoding("ffv1", "gbrp16le", 16, (".mkv",), _FFV1),
+    "ffv1-alpha": Encoding("ffv1", "gbrap16le", 16, (".mkv",), _FFV1, alpha=True),
 }
 _BY_SUFFIX = {".mp4": "h264", ".mov": "prores4444", ".mkv": "ffv1", ".mxf": "dnxhr-hqx"}
-WITH_ALPHA = tuple(name for name, encoding in ENCODINGS.items() if encoding.alpha)
+_BY_SUFFIX_WITH_ALPHA = {".mov": "prores4444-alpha", ".mkv": "ffv1-alpha"}
 
 
 def encoding_for(path: Path, name: str | None = None) -> Encoding:
     """The encoding of that name, or the usual one of the suffix."""
     return ENCODINGS[encoding_name(path, name)]
+
+
+def with_alpha(path: Path) -> str | None:
+    """The usual encoding of the suffix that keeps coverage, or None where there is none."""
+    return _BY_SUFFIX_WITH_ALPHA.get(Path(path).suffix.lower())
 
 
 def encoding_name(path: Path, name: str | None = None) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from mrbokeh.color import convert
+from mrbokeh.video_alpha import has_alpha
 from mrbokeh.video_color import (
     DECODE_TOP,
     ENCODE_TOP,
@@ -57,7 +58,8 @@ def _full_chroma(frame: Any, color: VideoColor, size: tuple[int, int] | None = N
 def _grey_planes(frame: Any, width: int, height: int) -> list[np.ndarray]:
     """A picture without chroma with neutral chroma; FFmpeg would take it for full range, whatever its tag says."""
     bits = frame.format.components[0].bits
-    luma = _planes(frame.reformat(width=width, height=height, format=frame.format.name), 1)[0].copy()
+    pixel_format = frame.format.name.replace("ya16be", "gray16le").replace("ya16", "gray16").replace("ya8", "gray")
+    luma = _planes(frame.reformat(width=width, height=height, format=pixel_format), 1)[0].copy()
     neutral = np.full_like(luma, 128 << (bits - 8))
     return [luma, neutral, neutral]
 
@@ -79,12 +81,16 @@ def _code_scale(
 
 
 def _rgb_codes(frame: Any, size: tuple[int, int] | None = None) -> tuple[list[np.ndarray], int]:
-    """Red, green and blue planes of an RGB frame as they are stored, and their bits."""
+    """Red, green and blue planes of an RGB frame as they are stored, and their bits.
+
+    Alpha goes along where there is some: without it FFmpeg (swscale 9.5) leaves parts of rows unwritten above 8 bits.
+    """
     from av.video.reformatter import Interpolation
 
     bits = max(8, frame.format.components[0].bits)
     width, height = size or (frame.width, frame.height)
-    pixel_format = "gbrp" if bits == 8 else f"gbrp{bits}le"
+    planes = "gbrap" if has_alpha(frame) else "gbrp"
+    pixel_format = planes if bits == 8 else f"{planes}{bits}le"
     planar = frame.reformat(width=width, height=height, format=pixel_format, interpolation=Interpolation.BICUBIC)
     green, blue, red = (plane.copy() for plane in _planes(planar))
     return [red, green, blue], bits

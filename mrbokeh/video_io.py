@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from mrbokeh.errors import InputError
+from mrbokeh.video_alpha import has_alpha, stored_alpha
 from mrbokeh.video_color import VideoColor, color_of
 from mrbokeh.video_decoding import decoded, frame_rate, opened, quarter_turns
 from mrbokeh.video_frames import display_bgr, linear_rgb
@@ -18,10 +19,14 @@ from mrbokeh.video_writer import VideoWriter as VideoWriter
 
 @dataclass(frozen=True)
 class Frame:
-    """rgb: (H, W, 3) linear Rec.709, upright. time_s: from the start of the video, as it is written in the file."""
+    """rgb: (H, W, 3) linear Rec.709, upright. time_s: from the start of the video, as it is written in the file.
+
+    alpha: (H, W) in [0, 1], by which rgb is multiplied; None is opaque.
+    """
 
     rgb: Float32[np.ndarray, "height width 3"]
     time_s: float
+    alpha: Float32[np.ndarray, "height width"] | None = None
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,10 @@ class DisplayFrame:
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video's header and first frame say. Sizes are those of the upright picture; frame_count is None where unknown."""
+    """What a video's header and first frame say. Sizes are those of the upright picture; frame_count is None where unknown.
+
+    rotation_deg: counter-clockwise, that brings the stored picture upright. has_alpha: whether frames hold coverage, be they opaque.
+    """
 
     width_px: int
     height_px: int
@@ -43,6 +51,12 @@ class VideoInfo:
     frame_count: int | None
     color: VideoColor
     rotation_deg: int
+    has_alpha: bool = False
+
+    @property
+    def quarter_turns(self) -> int:
+        """Counter-clockwise, that bring the stored picture upright."""
+        return self.rotation_deg // 90 % 4
 
 
 def probe(path: Path, *, as_codes: bool = False) -> VideoInfo:
@@ -53,11 +67,15 @@ def probe(path: Path, *, as_codes: bool = False) -> VideoInfo:
             raise InputError(f"{path} holds no picture that can be decoded: it is damaged or cut off")
         width_px, height_px = (frame.height, frame.width) if quarter_turns(frame, path) % 2 else (frame.width, frame.height)
         color = color_of(frame, str(path), as_codes=as_codes)
-        return VideoInfo(width_px, height_px, frame_rate(stream), stream.time_base, stream.frames or None, color, frame.rotation)
+        count, turned = stream.frames or None, frame.rotation
+        return VideoInfo(width_px, height_px, frame_rate(stream), stream.time_base, count, color, turned, has_alpha(frame))
 
 
 def read_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-    """Frames `start` to `stop` (excluded) of a video as linear light, one at a time; times are kept, also variable ones."""
+    """Frames `start` to `stop` (excluded) of a video as linear light, one at a time; times are kept, also variable ones.
+
+    Coverage is left out: colour is as it is stored, straight (`mrbokeh.picture_sources` has both).
+    """
     for stored, time_s in decoded(path, start, stop):
         yield upright_frame(stored, time_s, path)
 
@@ -69,6 +87,17 @@ def upright_frame(stored: Any, time_s: float, path: Path, *, as_codes: bool = Fa
     """
     rgb = linear_rgb(stored, color_of(stored, str(path), as_codes=as_codes))
     return Frame(np.ascontiguousarray(np.rot90(rgb, quarter_turns(stored, path))), time_s)
+
+
+def upright_alpha(stored: Any, path: Path) -> Float32[np.ndarray, "height width"]:
+    """The coverage of a decoded PyAV frame that has some, in [0, 1], turned as it is to be shown."""
+    return np.ascontiguousarray(np.rot90(stored_alpha(stored), quarter_turns(stored, path)))
+
+
+def has_alpha_apart(path: Path) -> bool:
+    """Whether a video keeps coverage apart from its pictures, as VP8 and VP9 do, where FFmpeg's own decoders do not read it."""
+    with opened(path) as (_, stream):
+        return bool(stream.metadata.get("alpha_mode") == "1")
 
 
 def read_display_frames(path: Path, width_px: int, height_px: int) -> Iterator[DisplayFrame]:

@@ -88,7 +88,7 @@ class VideoWriter:
             raise InputError(f"{self.path}: expected pictures of {self.size_px[0]}x{self.size_px[1]} px, got {width}x{height} px")
         if channels not in ((3, 4) if self.encoding.alpha else (3,)):
             raise InputError(
-                f"{self.path}: pictures with alpha need an encoding that keeps it (prores4444-alpha), not {self.encoding.codec}"
+                f"{self.path}: pictures with alpha need an encoding that keeps it (prores4444-alpha, ffv1-alpha), not {self.encoding.codec}"
             )
         frame = encoded_frame(picture, self.encoding, self.color)
         frame.pts, frame.time_base, frame.duration = self.next_tick(time_s), self.time_base, self._ticks_per_frame

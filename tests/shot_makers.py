@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mrbokeh.layer import Layer
+from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
 
 
@@ -42,7 +43,7 @@ class Brightening:
     def __init__(self, recipe: Brighter) -> None:
         self._recipe = recipe
 
-    def make(self, index: int, rgb: np.ndarray, time_s: float) -> np.ndarray | Layer:  # noqa: ARG002
+    def make(self, index: int, rgb: np.ndarray, time_s: float, alpha: np.ndarray | None = None) -> Picture:  # noqa: ARG002
         recipe = self._recipe
         if recipe.gate is not None and index >= recipe.held_from:
             wait_for(recipe.gate.exists)
@@ -51,9 +52,9 @@ class Brightening:
             os.kill(os.getpid(), 9)
         result = (0.5 * rgb + np.float32(recipe.amount * (index % 5 + 1) / 5)).astype(np.float32)
         if recipe.as_layer:
-            alpha = np.full(rgb.shape[:2], 0.5, np.float32)
-            return Layer(result * alpha[..., None], alpha, np.full_like(alpha, 2.0))
-        return result
+            half = np.full(rgb.shape[:2], 0.5, np.float32)
+            return Layer(result * half[..., None], half, np.full_like(half, 2.0))
+        return result if alpha is None else Rgba(result * alpha[..., None], alpha)
 
 
 def wait_for(reached: Callable[[], object], seconds: float = 60.0) -> None:

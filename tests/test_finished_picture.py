@@ -98,7 +98,7 @@ def test_an_opaque_plate_stays_without_alpha(files: Path) -> None:
 
 
 def test_alpha_turns_with_the_picture(files: Path) -> None:
-    turned = read_alpha(files / "plate.png", quarter_turns=1)
+    turned = read_alpha(files / "plate.png", orientation=8)
     assert turned is not None and turned.shape == SIZE[::-1]
     np.testing.assert_allclose(turned[0, :], half_covered()[:, -1], atol=STEP)  # counter-clockwise: the right side comes up
 

@@ -16,16 +16,18 @@ from mrbokeh.commands._former_names import formerly, renamed
 def made_app() -> typer.Typer:
     app = typer.Typer()
 
-    @app.command(cls=formerly(focus_distance_m="--focus"))
-    def say(words: list[str], focus: float = 1.0) -> None:
-        typer.echo(f"{focus} {' '.join(words)}")
+    @app.command(cls=formerly("focus_distance_m", range="--far"))
+    def say(words: list[str], focus: float = 1.0, far: float = 3.0) -> None:
+        typer.echo(f"{focus} {' '.join(words)} {far}")
 
     return app
 
 
-@pytest.mark.parametrize("given", [["--focus", "2"], ["--focus-distance-m", "2"], ["--focus-distance-m=2"]])
+@pytest.mark.parametrize(
+    "given", [["--focus", "2", "--far", "5"], ["--focus-distance-m", "2", "--range", "5"], ["--focus-distance-m=2", "--range=5"]]
+)
 def test_both_spellings_mean_the_same(given: list[str]) -> None:
-    assert CliRunner().invoke(made_app(), [*given, "word"]).stdout == "2.0 word\n"
+    assert CliRunner().invoke(made_app(), [*given, "word"]).stdout == "2.0 word 5.0\n"
 
 
 def test_the_former_one_is_hidden_and_mistakes_name_the_new_one() -> None:

@@ -82,7 +82,7 @@ def test_the_opening_turns_as_the_picture_does(quarters: int) -> None:
 
 def test_a_lens_described_upright_is_left_as_it_is_there(tmp_path: Path) -> None:
     tall = replace(UPRIGHT, aperture=Aperture.heart())
-    picture = Photograph(np.zeros((96, 64, 3), np.float32), quarter_turns=3)
+    picture = Photograph(np.zeros((96, 64, 3), np.float32), orientation=6)
     assert lens_as_held(tall, picture, tmp_path) == tall
     turned = lens_as_held(replace(LEVEL, aperture=Aperture.heart()), picture, tmp_path)
     assert not np.allclose(turned.aperture.outlines[0], tall.aperture.outlines[0])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from capture.photos.photograph import upright
 from mrbokeh.color import srgb_to_linear
 from mrbokeh.errors import InputError
+from mrbokeh.exif_orientation import as_stored, upright
 from mrbokeh.photograph import read_photograph
 from mrbokeh.plate import open_plate
 
@@ -16,27 +16,37 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 shared = pytest.mark.skipif(not DATA.is_dir(), reason="the photographs beside the project are not here")
 
 
+QUALITY = {".jpg": {"quality": 100, "subsampling": 0}, ".webp": {"lossless": True}}
+
+
 def saved(path: Path, orientation: int) -> Path:
     ramp = np.random.default_rng(orientation).integers(0, 256, (8, 12, 3), np.uint8)
     exif = Image.Exif()
     exif[0x0112] = orientation
-    Image.fromarray(ramp).save(path, exif=exif, quality=100, subsampling=0)
+    Image.fromarray(ramp).save(path, exif=exif, **QUALITY.get(path.suffix, {}))
     return path
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_pictures_are_turned_as_their_files_ask(orientation: int, tmp_path: Path) -> None:
-    """As Pillow turns them, to the error of two JPEG decoders."""
-    path = saved(tmp_path / "photo.jpg", orientation)
-    expected = np.asarray(ImageOps.exif_transpose(Image.open(path)))
-    found = read_photograph(path).rgb
-    np.testing.assert_allclose(found, srgb_to_linear(expected / 255.0), atol=0.02)
+    """As Pillow turns them, JPEG to the error of two decoders."""
+    for name, atol in (("photo.jpg", 0.02), ("photo.tif", 1e-6), ("photo.png", 1e-6), ("photo.webp", 1e-6)):
+        path = saved(tmp_path / name, orientation)
+        expected = np.asarray(ImageOps.exif_transpose(Image.open(path)))
+        found = read_photograph(path).rgb
+        np.testing.assert_allclose(found, srgb_to_linear(expected / 255.0), atol=atol, err_msg=name)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_what_is_upright_goes_back(orientation: int) -> None:
+    picture = np.arange(18).reshape(2, 3, 3)
+    np.testing.assert_array_equal(as_stored(upright(picture, orientation), orientation), picture)
 
 
 def test_a_quarter_turn_is_counter_clockwise() -> None:
     picture = np.zeros((2, 3, 3), np.float32)
     picture[0, 2] = 1.0  # the upper right corner goes to the upper left
-    assert upright(picture, 1, False)[0, 0, 0] == 1.0
+    assert upright(picture, 8)[0, 0, 0] == 1.0
 
 
 @shared

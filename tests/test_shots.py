@@ -32,7 +32,14 @@ from mrbokeh.shots.video_target import VideoTarget
 from mrbokeh.video_io import VideoWriter, probe, read_frames
 from tests.shot_makers import Brighter, wait_for
 
-INTRA = [("prores4444", ".mov"), ("prores4444-alpha", ".mov"), ("dnxhr-hqx", ".mov"), ("dnxhr-hqx", ".mxf"), ("ffv1", ".mkv")]
+INTRA = [
+    ("prores4444", ".mov"),
+    ("prores4444-alpha", ".mov"),
+    ("dnxhr-hqx", ".mov"),
+    ("dnxhr-hqx", ".mxf"),
+    ("ffv1", ".mkv"),
+    ("ffv1-alpha", ".mkv"),
+]
 INTER = [("h264", ".mp4"), ("h264-10bit", ".mkv"), ("h265-10bit", ".mp4"), ("h265-10bit", ".mov"), ("h265-10bit", ".mkv")]
 COUNT, PER_SEGMENT = 23, 5
 

@@ -288,19 +288,6 @@ def test_the_exposure_of_a_video_is_stated_by_the_user(clip: Path, tmp_path: Pat
         run(clip, *options[:4], *options[-1:], "1/50,400,2.8", "--out", tmp_path / "no.mkv")
 
 
-def test_alpha_of_a_clip_is_said_to_be_left_out(clip: Path, settings: list[str], tmp_path: Path) -> None:
-    """Numbered EXR, and ProRes 4444; opaque clips say nothing."""
-    half = np.full((64, 96), 0.5, np.float32)
-    write_exr(tmp_path / "in.0.exr", ExrPart(dict.fromkeys("RGBA", half)))
-    with VideoWriter(tmp_path / "in.mov", 96, 64, encoding="prores4444-alpha") as writer:
-        writer.write(np.repeat(half[..., None], 4, axis=2), 0.0)
-    for source, more in (("in.%d.exr", ("--rate", "25")), ("in.mov", ())):
-        assert f"warning: the alpha of {tmp_path / source} is left out" in run(
-            tmp_path / source, *more, *settings, "--out", tmp_path / f"{source[-3:]}.%d.png"
-        )
-    assert "warning" not in run(clip, *settings, "--frames", "0:1", "--out", tmp_path / "opaque.%d.png")
-
-
 @pytest.mark.usefixtures("settings")
 def test_objects_are_taken_out_of_a_render_by_their_cryptomatte(tmp_path: Path) -> None:
     """Red "near" covers columns 0 to 5 of 9, green "far" 6 to 8; both are in focus, and only one is wanted."""

@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 from capture.stacks.ingest import ingest
 from mrbokeh.color import srgb_to_linear
+from mrbokeh.commands.composite import app
 from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, write_image
+from mrbokeh.image_io import read_image, write_image, write_layer
+from mrbokeh.layer import Layer
 from mrbokeh.photograph import read_photograph
 from tests.made_photographs import only_stack, sources
 
@@ -39,6 +42,19 @@ def test_a_webp_photograph_is_turned_and_tells_its_lens(tmp_path: Path) -> None:
     assert (found.focal_length_mm, found.f_number) == (50.0, 2.0)
     # A diagonal of 43.27 mm at 4:3 is 34.6 mm long and 26.0 mm wide, which is what lies along the rows of the upright picture.
     assert found.sensor_width_mm == pytest.approx(25.96, abs=0.01)
+
+
+def test_composite_takes_a_webp_photograph(tmp_path: Path) -> None:
+    """Upright, with the lens of its EXIF: a card at the distance of the focus stays a square, and all else is the photograph's."""
+    alpha = np.zeros((32, 24), np.float32)
+    alpha[10:20, 5:15] = 1.0
+    depth_m = np.where(alpha > 0, 2.0, np.inf).astype(np.float32)
+    write_layer(tmp_path / "card.exr", Layer(np.repeat(0.5 * alpha[..., None], 3, axis=2), alpha, depth_m), half=False)
+    photo, out = saved_webp(tmp_path / "photo.webp"), tmp_path / "out.exr"
+    given = [str(photo), "--layer", str(tmp_path / "card.exr"), "--mode", "over", "--out", str(out)]
+    assert CliRunner().invoke(app, given, catch_exceptions=False).exit_code == 0
+    upright = srgb_to_linear(np.rot90(CODES, 3) / 255.0)
+    np.testing.assert_allclose(read_image(out), np.where(alpha[..., None] > 0, 0.5, upright), rtol=2.0**-11, atol=1e-6)
 
 
 def test_webp_goes_into_a_stack(tmp_path: Path) -> None:

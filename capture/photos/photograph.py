@@ -3,24 +3,22 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
 
 from capture.photos.developing import develop, is_raw
 from capture.photos.metadata import read_metadata
 from capture.photos.photo_metadata import PhotoMetadata
 from mrbokeh.color import convert
 from mrbokeh.cut_out import cut_from_px
+from mrbokeh.exif_orientation import known_orientation, quarter_turns, stored_orientation, upright
 from mrbokeh.photograph import Photograph
-
-# EXIF 2.3, tag Orientation: quarter turns counter-clockwise that bring the stored picture upright, and whether it is mirrored first.
-_UPRIGHT = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False), 7: (3, True), 8: (1, False)}
 
 
 def read_photograph(path: Path) -> Photograph:
     """White balance is the camera's own; EXR and HDR are taken as they are."""
     decoded, metadata = develop(path, None), read_metadata(path)
     rgb = decoded.rgb if decoded.rec709_from_camera is None else convert(decoded.rgb, np.array(decoded.rec709_from_camera))
-    turns, mirrored = _UPRIGHT.get(metadata.orientation or 1, (0, False))
+    orientation = known_orientation(metadata.orientation or stored_orientation(path))
+    turns = quarter_turns(orientation)
     stored_height_px, stored_width_px = rgb.shape[:2]
     sensor_width_mm = _sensor_width_mm(metadata, decoded.photosites.width, decoded.photosites.height)
     if sensor_width_mm is not None and turns % 2:
@@ -28,21 +26,16 @@ def read_photograph(path: Path) -> Photograph:
     # A camera set to another shape cuts its JPEG only, and RAW has margins.
     whole_px = None if is_raw(path) else cut_from_px((stored_width_px, stored_height_px), metadata.taken_size_px)
     return Photograph(
-        upright(rgb, turns, mirrored),
+        upright(rgb, orientation),
         metadata.focal_length_mm,
         metadata.f_number,
         metadata.focus_distance_m,
         sensor_width_mm,
         metadata.exposure_time_s,
         metadata.iso,
-        turns,
+        orientation,
         whole_px[::-1] if whole_px is not None and turns % 2 else whole_px,
     )
-
-
-def upright(rgb: Float32[np.ndarray, "height width 3"], turns: int, mirrored: bool) -> Float32[np.ndarray, "new_height new_width 3"]:
-    """Mirrored left to right where asked, then turned counter-clockwise by quarters."""
-    return np.ascontiguousarray(np.rot90(rgb[:, ::-1] if mirrored else rgb, turns))
 
 
 def _sensor_width_mm(metadata: PhotoMetadata, width_px: int, height_px: int) -> float | None:

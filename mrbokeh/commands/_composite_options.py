@@ -15,7 +15,7 @@ PhotoArgument = Annotated[
     Path,
     typer.Argument(
         metavar="PHOTO",
-        help="A photograph (RAW, JPEG, TIFF, PNG, EXR), the folder of a merged focal stack, or a capture bundle of the viewfinder.",
+        help="A photograph (RAW, JPEG, TIFF, PNG, WebP, EXR, HDR), the folder of a merged focal stack, or a viewfinder's capture bundle.",
     ),
 ]
 OutOption = Annotated[

@@ -94,8 +94,8 @@ class ResultOptions:
     encoding: Annotated[
         str | None,
         typer.Option(
-            help="h264, h264-10bit, h265-10bit, prores4444, prores4444-alpha, prores422, dnxhr-hqx or ffv1; by default the usual one of "
-            "OUT.",
+            help="h264, h264-10bit, h265-10bit, prores4444, prores4444-alpha, prores422, dnxhr-hqx, ffv1 or ffv1-alpha; by default the "
+            "usual one of OUT, with alpha where CLIP has some.",
             rich_help_panel=RESULT,
         ),
     ] = None
@@ -109,9 +109,7 @@ class ResultOptions:
     ] = None
     virtual_only: Annotated[
         bool,
-        typer.Option(
-            "--virtual-only", help="Write the blurred virtual layer with alpha: EXR files, or prores4444-alpha.", rich_help_panel=RESULT
-        ),
+        typer.Option("--virtual-only", help="Write the blurred virtual layer with alpha: EXR files, .mov or .mkv.", rich_help_panel=RESULT),
     ] = False
     overwrite: shared.OverwriteOption = False
 

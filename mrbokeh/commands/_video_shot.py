@@ -8,6 +8,8 @@ from mrbokeh.commands._insertion_options import ColourOptions, VirtualOptions
 from mrbokeh.commands._look_options import LookGroup
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.errors import InputError
+from mrbokeh.held_lens import Holding, lens_held
+from mrbokeh.lens_file import read_lens
 from mrbokeh.picture_sources.base import PictureSource
 from mrbokeh.picture_sources.choose import parse_rate
 from mrbokeh.picture_sources.numbered_files import is_pattern
@@ -20,6 +22,7 @@ from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
 from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.video_target import VideoTarget
+from mrbokeh.video_encodings import with_alpha
 
 if TYPE_CHECKING:
     from mrbokeh.shots.scene_layers import SceneLayers
@@ -53,6 +56,7 @@ def recipe_of(
         look=_look(look, source, taken),
         first_number=_first_number(source, taken),
         virtual_only=virtual_only,
+        holding=_holding(source, lens),
     )
 
 
@@ -62,7 +66,8 @@ def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour:
             if value is not None:
                 raise InputError(f"{name} {value} is for videos, but {out} are pictures: leave it out")
         return SequenceTarget(out.resolve(), recipe.first_number, result.virtual_only, colour.of_result)
-    encoding = result.encoding or ("prores4444-alpha" if result.virtual_only else None)
+    keeping = with_alpha(out) if result.virtual_only or source.info.has_alpha else None
+    encoding = result.encoding or keeping or ("prores4444-alpha" if result.virtual_only else None)
     sound = None if is_pattern(source.path) else source.path
     even_rate = None if result.constant_rate is None else parse_rate(result.constant_rate)
     return VideoTarget(out.resolve(), encoding, sound, colour.of_result, even_rate)
@@ -121,6 +126,13 @@ def _look(look: LookGroup, source: PictureSource, taken: options.ClipOptions) ->
         return None
     start, _ = parse_frames(taken.frames)
     return ClipLook(look.wanted, source.path, taken.rate, start, _first_number(source, taken), source.space)
+
+
+def _holding(source: PictureSource, lens: Path) -> Holding:
+    """Told here and once, for every worker turns the lens alike."""
+    holding = Holding((source.info.width_px, source.info.height_px), source.info.quarter_turns)
+    lens_held(read_lens(lens), holding, source.path)
+    return holding
 
 
 def _first_number(source: PictureSource, taken: options.ClipOptions) -> int:

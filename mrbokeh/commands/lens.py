@@ -124,18 +124,9 @@ def coc(
         typer.echo(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px")
 
 
-_FORMER_NAMES: dict[Any, dict[str, str]] = {
-    psf: {
-        "focus_distance_m": "--focus",
-        "sensor_width_mm": "--sensor-width",
-        "sensor_height_mm": "--sensor-height",
-        "image_width_px": "--image-width",
-        "nearest_m": "--near",
-        "farthest_m": "--far",
-    },
-    show: {"width": "--image-width"},
-    match: {"focus_distance_m": "--focus", "focal_length_mm": "--focal-length", "sensor_width_mm": "--sensor-width"},
-}
-
-for command in (psf, spreadlets, show, export, fit, match):
-    app.command(cls=formerly(**_FORMER_NAMES.get(command, {})))(command)
+app.command(cls=formerly("focus_distance_m", "sensor_width_mm", "sensor_height_mm", "image_width_px", "nearest_m", "farthest_m"))(psf)
+app.command()(spreadlets)
+app.command(cls=formerly(width="--image-width"))(show)
+app.command()(export)
+app.command()(fit)
+app.command(cls=formerly("focus_distance_m", "focal_length_mm", "sensor_width_mm"))(match)

@@ -13,7 +13,7 @@ from mrbokeh.renderers.choose import DEFAULT
 app = typer.Typer(add_completion=False)
 
 
-@app.command(cls=formerly(focus_distance_m="--focus"))
+@app.command(cls=formerly("focus_distance_m"))
 def render(
     lens: Annotated[Path, typer.Option(help="Lens file (LENS.json), see `mrbokeh lens new`.")],
     out: Annotated[Path, typer.Option(help="Where the result goes: .exr, or .png, .tif, .jpg (over black).")],

@@ -72,7 +72,7 @@ def track(
     typer.echo(_told(tracked, out))
 
 
-@app.command("convert", cls=formerly(frame_rate="--rate"))
+@app.command("convert", cls=formerly("frame_rate"))
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A track: .json, .chan, .jsonl, transforms.json or a folder of COLMAP.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; the suffix says in which format.")],

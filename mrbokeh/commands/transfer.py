@@ -16,7 +16,7 @@ from mrbokeh.transferring import SharpPhotograph
 app = typer.Typer(add_completion=False)
 
 
-@app.command(cls=formerly(frame_rate="--rate"))
+@app.command(cls=formerly("frame_rate"))
 def transfer(
     photo: Annotated[Path, typer.Argument(help="All-in-focus photograph; of a phone's JPEG with depth the sharp original is taken.")],
     lens: Annotated[Path, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network.")],

@@ -1,5 +1,7 @@
 """`mrbokeh video`: virtual objects in every frame of a clip, blurred by its lens."""
 
+from pathlib import Path
+
 import typer
 
 from mrbokeh.atomic_files import require_safe_outputs
@@ -9,14 +11,15 @@ from mrbokeh.commands._look_options import LookGroup
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands._video_shot import parse_frames as parse_frames
 from mrbokeh.commands._video_shot import recipe_of, shot_of, target_of
+from mrbokeh.picture_sources.base import PictureSource
 from mrbokeh.picture_sources.choose import open_source
-from mrbokeh.picture_sources.clip_alpha import has_alpha
 from mrbokeh.progress import progress_bars
 from mrbokeh.shots.crew import Crew, OneProcess
 from mrbokeh.shots.dask_crew import DaskCrew
 from mrbokeh.shots.making import make_shot
 from mrbokeh.shots.process_crew import ProcessCrew
-from mrbokeh.shots.shot import Shot
+from mrbokeh.shots.shot import Shot, Target
+from mrbokeh.video_io import has_alpha_apart
 from mrbokeh.workers import cores
 
 app = typer.Typer(add_completion=False)
@@ -54,11 +57,20 @@ def video(
     shot = shot_of(source, recipe, target, taken.frames, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
     _try_first_frame(shot)
-    if has_alpha(source, shot.start):
-        typer.echo(f"warning: the alpha of {clip} is left out: its pictures are taken as opaque", err=True)
+    if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
+        typer.echo(f"warning: {clip} {lost}", err=True)
     note = _made(shot, _crew(work, len(shot.segments)), result.overwrite)
     frames = shot.stop - shot.start
     typer.echo(f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})")
+
+
+def _alpha_lost(clip: Path, source: PictureSource, target: Target) -> str | None:
+    """What to tell of the clip where its alpha is not read, or cannot be kept."""
+    if source.info.has_alpha:
+        return target.lacks_alpha and f"has alpha, but {target.lacks_alpha}: what it does not cover is black in {target.path.name}"
+    if source.file_of(0) is None and has_alpha_apart(clip):
+        return "keeps its alpha apart (VP8, VP9), where it is not read: it is taken as opaque; turn it into ProRes 4444 or FFV1 before"
+    return None
 
 
 def _crew(work: options.WorkOptions, segments: int) -> Crew:
@@ -71,7 +83,7 @@ def _crew(work: options.WorkOptions, segments: int) -> Crew:
 def _try_first_frame(shot: Shot) -> None:
     """Mistakes in files and options are told at once, and not by a worker."""
     frame = next(shot.source.frames(shot.start, shot.start + 1))
-    shot.recipe.build(1).make(shot.start, frame.rgb, frame.time_s)
+    shot.recipe.build(1).make(shot.start, frame.rgb, frame.time_s, frame.alpha)
 
 
 def _made(shot: Shot, crew: Crew, overwrite: bool) -> str:

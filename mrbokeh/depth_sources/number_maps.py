@@ -8,7 +8,7 @@ from jaxtyping import Float32
 from mrbokeh.depth_sources.depth_map import DepthMap
 from mrbokeh.depth_sources.depth_settings import DepthSettings
 from mrbokeh.errors import InputError
-from mrbokeh.image_io import stored_pixels
+from mrbokeh.picture_codec import stored_pixels
 
 Plane = Float32[np.ndarray, "height width"]
 

@@ -9,6 +9,7 @@ import numpy as np
 from mrbokeh.cut_out import cut_from_px
 from mrbokeh.errors import InputError
 from mrbokeh.film_plane import lens_distance_m
+from mrbokeh.option_names import flag
 
 _EXIF_IFD = 0x8769
 _F_NUMBER, _SUBJECT_DISTANCE, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x829D, 0x9206, 0x920A, 0xA405
@@ -16,12 +17,6 @@ _PIXEL_WIDTH, _PIXEL_HEIGHT, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA003, 0x
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 _FULL_FRAME_DIAGONAL_MM = float(np.hypot(36.0, 24.0))
 _INFINITELY_FAR = 0xFFFFFFFF
-_OPTIONS = {
-    "focal_length_mm": "--focal-length",
-    "f_number": "--f-number",
-    "sensor_width_mm": "--sensor-width",
-    "focus_distance_m": "--focus",
-}
 
 
 @dataclass(frozen=True)
@@ -37,7 +32,7 @@ class PhotoFacts:
         """With what the user states in place of what the file does."""
         for name, value in values.items():
             if value is not None and not value > 0.0:
-                raise InputError(f"expected {_OPTIONS[name]} above 0, got {value:g}")
+                raise InputError(f"expected {flag(name)} above 0, got {value:g}")
         return PhotoFacts(
             **{each.name: getattr(self, each.name) if values.get(each.name) is None else values[each.name] for each in fields(self)}
         )
@@ -45,7 +40,7 @@ class PhotoFacts:
     def require(self, where: Path | str) -> None:
         """Everything but the focus distance."""
         names = ("focal_length_mm", "f_number", "sensor_width_mm")
-        missing = [_OPTIONS[name] for name in names if getattr(self, name) is None]
+        missing = [flag(name) for name in names if getattr(self, name) is None]
         if missing:
             raise InputError(f"{where}: its metadata do not tell all that a lens needs: give {', '.join(missing)}")
 

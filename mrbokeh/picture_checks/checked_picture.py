@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float32
 from mrbokeh.color import linear_to_srgb
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import ExrPart, read_exr
-from mrbokeh.image_io import INTEGER_SUFFIXES, read_image, read_layer, stored_pixels
+from mrbokeh.image_io import INTEGER_SUFFIXES, read_image, read_layer
 from mrbokeh.layer import Layer
+from mrbokeh.picture_codec import stored_pixels
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

@@ -10,6 +10,7 @@ from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.picture_checks.checked_picture import SHADOW, SHARP, VIRTUAL, CheckedPicture
 from mrbokeh.picture_checks.findings import CheckReport, Finding
+from mrbokeh.picture_codec import write_stored
 
 Mask = Bool[np.ndarray, "height width"]
 
@@ -68,11 +69,6 @@ class LeakMap:
         """A PNG with the leaked pixels in white, darker where in few pictures only. False where there are none."""
         if self.counts is None or not self.counts.any():
             return False
-        import cv2
-
-        from mrbokeh.atomic_files import atomic_path
-
         shade = np.where(self.counts > 0, np.maximum(64, 255 * self.counts // self.counts.max()), 0).astype(np.uint8)
-        with atomic_path(path) as temporary:
-            cv2.imencode(".png", shade)[1].tofile(temporary)
+        write_stored(path, shade)
         return True

@@ -47,5 +47,8 @@ class PictureSource(Protocol):
         ...
 
     def frames(self, start: int, stop: int, threads: int = 0) -> Iterator[Frame]:
-        """Frames from `start` to `stop` (excluded) as linear light; threads: of the decoder, 0 takes all."""
+        """Frames from `start` to `stop` (excluded) as linear light, with alpha where `info.has_alpha`.
+
+        threads: of the decoder, 0 takes all.
+        """
         ...

@@ -12,7 +12,7 @@ from mrbokeh.color_management import NamedSpace
 from mrbokeh.errors import InputError
 from mrbokeh.picture_sources.frame_index import FrameIndex
 from mrbokeh.video_decoding import chroma_placement, opened, told_as_damage
-from mrbokeh.video_io import Frame, VideoInfo, probe, upright_frame
+from mrbokeh.video_io import Frame, VideoInfo, probe, upright_alpha, upright_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +51,19 @@ class VideoSource:
                 if number != expected:
                     break
                 time_s = float(self.index.shown[number].item() * self.index.time_base)
-                yield self._linear(upright_frame(placed(stored), time_s, self.path, as_codes=self.space is not None))
+                yield self._frame(placed(stored), time_s)
                 expected += 1
         if expected < stop:
             raise InputError(f"{self.path}: frame {expected} cannot be decoded; the file is damaged or cut off there")
 
-    def _linear(self, frame: Frame) -> Frame:
-        return frame if self.space is None else replace(frame, rgb=self.space.to_rec709(frame.rgb))
+    def _frame(self, stored: Any, time_s: float) -> Frame:
+        """Colour is stored straight, and multiplied by alpha once it is light."""
+        frame = upright_frame(stored, time_s, self.path, as_codes=self.space is not None)
+        rgb = frame.rgb if self.space is None else self.space.to_rec709(frame.rgb)
+        if not self.info.has_alpha:
+            return replace(frame, rgb=rgb)
+        alpha = upright_alpha(stored, self.path)
+        return replace(frame, rgb=rgb * alpha[..., None], alpha=alpha)
 
     def _numbered_from(self, start: int, container: Any, stream: Any) -> Iterator[tuple[int, Any]]:
         """(number, PyAV frame) from a keyframe on; the first is not after `start`."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from mrbokeh.errors import InputError
+from mrbokeh.option_names import flag
 from mrbokeh.psf_models.base import PsfModel
 
 
@@ -88,16 +89,6 @@ _MODELS: dict[str, tuple[Callable[[ModelOptions], PsfModel], frozenset[str]]] = 
     "volume": (_volume, frozenset(_VOLUME)),
     "stylized": (_stylized, frozenset({"image", "diameter_px", "counts", "device"})),
 }
-_FLAGS = {
-    "diameter_px": "--diameter",
-    "motion_px": "--motion",
-    "focus_distance_m": "--focus",
-    "sensor_width_mm": "--sensor-width",
-    "sensor_height_mm": "--sensor-height",
-    "image_width_px": "--image-width",
-    "nearest_m": "--near",
-    "farthest_m": "--far",
-}
 MODEL_NAMES = tuple(_MODELS)
 
 
@@ -112,6 +103,6 @@ def choose_model(name: str, options: ModelOptions | None = None) -> PsfModel:
         raise InputError(f"expected a model out of {', '.join(MODEL_NAMES)}, got {name!r}")
     make, known = _MODELS[name]
     named = _given(options, *(each.name for each in fields(options)))
-    if stray := [_FLAGS.get(key, f"--{key.replace('_', '-')}") for key in named if key not in known]:
+    if stray := [flag(key) for key in named if key not in known]:
         raise InputError(f"{', '.join(stray)} does nothing for the model {name}: leave it out, or choose another model")
     return make(options)

@@ -103,6 +103,41 @@ def _any_in_reach(spans: np.ndarray, top: int, bottom: int, left: int, right: in
 
 
 @njit(cache=True, nogil=True)
+def _stage_level(
+    lines: np.ndarray, lit: np.ndarray, source: tuple, top: int, bottom: int, tile: int, tile_px: int, radius_px: int, level: int
+) -> bool:
+    """One level's share of all rows of the picture that reach rows top:bottom of a tile; False where that is nothing.
+
+    source: values, shares, levels, uppers and spans of `scatter_piece`.
+    """
+    values, shares, levels, uppers, spans = source
+    tiles_away = (radius_px + tile_px - 1) // tile_px
+    first, end = tile - tiles_away, tile + tiles_away + 1
+    if not _any_in_reach(spans, top - radius_px, bottom + radius_px, first, end, level):
+        return False
+    left, pixels = tile * tile_px - radius_px, tile_px + 2 * radius_px
+    any_lit = False
+    for i in range(lines.shape[0]):
+        y = top - radius_px + i
+        lit[i] = (
+            0 <= y < min(values.shape[0], bottom + radius_px)
+            and _any_in_reach(spans, y, y + 1, first, end, level)
+            and _stage(lines[i], values[y], shares[y], levels[y], uppers[y], left, pixels, level)
+        )
+        any_lit = any_lit or lit[i]
+    return any_lit
+
+
+@njit(cache=True, nogil=True)
+def _add_tile(out: np.ndarray, sums: np.ndarray) -> None:
+    channels = out.shape[2]
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            for c in range(channels):
+                out[y, x, c] += sums[y, x * channels + c]
+
+
+@njit(cache=True, nogil=True)
 def scatter_piece(
     out: np.ndarray,
     values: np.ndarray,
@@ -125,7 +160,7 @@ def scatter_piece(
     the kernel of level + 1, the rest to that of its level. columns (levels, terms, 3 + K + 6), rows (levels, terms, K): taps
     in the order in which a pixel of the result meets its sources; K differs, radii_px and ranks say how much of it is used.
     """
-    height, width, channels = values.shape
+    channels = values.shape[2]
     tile_px = TILE_FLOATS // channels
     size = bottom - top + (-(bottom - top)) % _ROWS_AT_ONCE
     longest = 2 * radii_px.max() + 1
@@ -133,31 +168,12 @@ def scatter_piece(
     across = np.empty((size + longest + 6, TILE_FLOATS), np.float32)
     lines = np.empty((across.shape[0], TILE_FLOATS + longest * channels), np.float32)
     lit = np.empty(across.shape[0], np.bool_)
+    source = (values, shares, levels, uppers, spans)
     for tile in range(first_tile, end_tile):
-        left = tile * tile_px
         sums[:] = np.float32(0)
         for level in range(ranks.shape[0]):
-            radius_px = radii_px[level]
-            tiles_away = (radius_px + tile_px - 1) // tile_px
-            if ranks[level] == 0 or not _any_in_reach(
-                spans, top - radius_px, bottom + radius_px, tile - tiles_away, tile + tiles_away + 1, level
-            ):
-                continue
-            count = 2 * radius_px + 1
+            terms, count = ranks[level], 2 * radii_px[level] + 1
             used = size + count + 6
-            any_lit = False
-            for i in range(used):
-                y = top - radius_px + i
-                lit[i] = (
-                    0 <= y < min(height, bottom + radius_px)
-                    and _any_in_reach(spans, y, y + 1, tile - tiles_away, tile + tiles_away + 1, level)
-                    and _stage(lines[i], values[y], shares[y], levels[y], uppers[y], left - radius_px, tile_px + count - 1, level)
-                )
-                any_lit = any_lit or lit[i]
-            if any_lit:
-                terms = ranks[level]
+            if terms > 0 and _stage_level(lines[:used], lit[:used], source, top, bottom, tile, tile_px, radii_px[level], level):
                 _level_on_tile(sums, lines[:used], lit[:used], across[:used], columns[level, :terms], rows[level, :terms, :count], channels)
-        for y in range(top, bottom):
-            for x in range(left, min(width, left + tile_px)):
-                for c in range(channels):
-                    out[y, x, c] += sums[y - top, (x - left) * channels + c]
+        _add_tile(out[top:bottom, tile * tile_px : (tile + 1) * tile_px], sums)

@@ -18,7 +18,8 @@ from mrbokeh.scene.light_change_pictures import LightChange, changed, seen_surfa
 from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.mitsuba_camera import CameraRays
-from mrbokeh.scene.mitsuba_paths import Rays, followed, shining_light
+from mrbokeh.scene.mitsuba_drawn_lights import shining_light
+from mrbokeh.scene.mitsuba_paths import Rays, followed
 from mrbokeh.scene.mitsuba_reflection import Reflection, reflection
 from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
 from mrbokeh.scene.mitsuba_world import World, drawn_meshes, world_of

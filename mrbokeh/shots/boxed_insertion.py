@@ -19,6 +19,7 @@ from mrbokeh.layer import Layer, clear, flatten
 from mrbokeh.lens import Lens
 from mrbokeh.pixel_box import NOWHERE, Box, is_same_everywhere
 from mrbokeh.plate import Plate, plate_of
+from mrbokeh.plate_alpha import coverage_with
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.shots.kept import Kept
 
@@ -39,6 +40,14 @@ class Part:
             return self.inserted.rgb
         result = rgb.copy()
         self.box.paste(self.inserted.rgb, result)
+        return result
+
+    def covered(self, alpha: Plane) -> Plane:
+        """The frame's own alpha with it; other pixels stay bit for bit."""
+        if self.box is None:
+            return coverage_with(alpha, self.inserted.virtual.alpha)
+        result = alpha.copy()
+        self.box.paste(coverage_with(self.box.cut(alpha, "edge"), self.inserted.virtual.alpha), result)
         return result
 
     def whole(self, rgb: Rgb) -> Inserted:

@@ -9,14 +9,19 @@ from jaxtyping import Float32
 
 from mrbokeh.camera import Camera
 from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
+from mrbokeh.held_lens import Holding, lens_held
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import read_lens
 from mrbokeh.plate import Plate, plate_of
+from mrbokeh.plate_alpha import coverage_with
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
 from mrbokeh.shots.boxed_insertion import BoxedInsertion
-from mrbokeh.shots.frame_maker import Picture
+from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.hooks import CameraSource, DepthSource, Description, Finisher, FocusSource, LayerSource, MatteSource, Moment
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
 
 _LOCAL = ("polygon", "scatter")
 """Renderers that light leaves no farther than its circle of confusion."""
@@ -26,8 +31,8 @@ _LOCAL = ("polygon", "scatter")
 class CompositeRecipe:
     """A MakerRecipe. first_number: what frame 0 of the clip is called by in sequences, tracks and focus pulls.
 
-    focus: None leaves the lens as its file has it. near_m: how far what the matte shows is, where there is no depth.
-    virtual_only: the blurred virtual layer alone, in place of the picture.
+    focus: None leaves the lens as its file has it. holding: of the camera, by which the file's lens is turned; None leaves it.
+    near_m: how far what the matte shows is, where there is no depth. virtual_only: the blurred virtual layer alone, not the picture.
     """
 
     lens: Path
@@ -42,6 +47,7 @@ class CompositeRecipe:
     look: Description[Finisher] | None = None
     first_number: int = 0
     virtual_only: bool = False
+    holding: Holding | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -57,7 +63,8 @@ class CompositeMaker:
     """A FrameMaker. What did not change since the last frame is not made again: reading, rendering, cutting, blur."""
 
     def __init__(self, recipe: CompositeRecipe, threads: int) -> None:
-        self._recipe, self._lens = recipe, read_lens(recipe.lens)
+        lens = read_lens(recipe.lens)
+        self._recipe, self._lens = recipe, lens if recipe.holding is None else lens_held(lens, recipe.holding)
         self._sources = [each.opened(threads) for each in recipe.layers]
         self._camera = None if recipe.camera is None else recipe.camera.opened(threads)
         self._focus = None if recipe.focus is None else recipe.focus.opened(threads)
@@ -67,23 +74,25 @@ class CompositeMaker:
         renderer = make_renderer(recipe.renderer, threads=threads)
         self._boxed = BoxedInsertion(insertion_of(recipe.mode, recipe.near_m), renderer, local=recipe.renderer in _LOCAL)
 
-    def make(self, index: int, rgb: Float32[np.ndarray, "height width 3"], time_s: float) -> Picture:
+    def make(self, index: int, rgb: Rgb, time_s: float, alpha: Plane | None = None) -> Picture:
         height, width = rgb.shape[:2]
         moment = Moment(self._recipe.first_number + index, time_s, (width, height))
         camera = None if self._camera is None else self._camera.camera_at(moment)
-        plate = self._plate(moment, rgb, camera)
+        plate = replace(self._plate(moment, rgb, camera), alpha=alpha)
         part = self._boxed.insert(plate, self._layers(moment))
         if self._finisher is None and not self._recipe.virtual_only:
-            return part.over(rgb)
+            return part.over(rgb) if alpha is None else Rgba(part.over(rgb), part.covered(alpha))
         inserted = part.whole(rgb)
         if self._finisher is not None:
             inserted = self._finisher.finished(inserted, plate, moment.number)
-        return inserted.virtual if self._recipe.virtual_only else inserted.rgb
+        if self._recipe.virtual_only:
+            return inserted.virtual
+        return inserted.rgb if alpha is None else Rgba(inserted.rgb, coverage_with(alpha, inserted.virtual.alpha))
 
     def _layers(self, moment: Moment) -> Sequence[Layer]:
         return [layer for source in self._sources for layer in source.layers_at(moment, self._camera)]
 
-    def _plate(self, moment: Moment, rgb: Float32[np.ndarray, "height width 3"], camera: Camera | None) -> Plate:
+    def _plate(self, moment: Moment, rgb: Rgb, camera: Camera | None) -> Plate:
         depth_m = None if self._depth is None else self._depth.depth_m_at(moment)
         lens = self._lens_at(moment.number)
         plate = plate_of(rgb, lens, depth_m) if camera is None else Plate(rgb, depth_m, lens, camera)

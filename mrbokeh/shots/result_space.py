@@ -5,14 +5,14 @@ from dataclasses import replace
 from mrbokeh.color_management import NamedSpace
 from mrbokeh.finished_picture import in_named_space
 from mrbokeh.layer import Layer
-from mrbokeh.shots.frame_maker import Picture
+from mrbokeh.shots.frame_maker import Picture, Rgba
 
 
 def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
     """A copy in that space; None leaves linear Rec.709.
 
-    Curves are for straight colour: a layer is divided by its coverage before them and multiplied after; light without coverage is lost.
+    Curves are for straight colour: what has coverage is divided by it before them and multiplied after; light without coverage is lost.
     """
-    if isinstance(picture, Layer):
+    if isinstance(picture, (Layer, Rgba)):
         return replace(picture, rgb=in_named_space(picture.rgb, picture.alpha, space))
     return in_named_space(picture, None, space)

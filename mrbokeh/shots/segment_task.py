@@ -38,7 +38,7 @@ def make_segment(task: SegmentTask, made: Callable[[], None] = lambda: None) -> 
             made()
 
         def make(index: int, frame: Frame) -> Picture:
-            return maker.make(index, frame.rgb, frame.time_s)
+            return maker.make(index, frame.rgb, frame.time_s, frame.alpha)
 
         frames = shot.source.frames(segment.start, segment.stop, task.threads)
         stream(frames, segment.start, make, write, overlap=task.threads != 1)

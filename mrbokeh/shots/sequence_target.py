@@ -13,7 +13,8 @@ from mrbokeh.finished_picture import exr_part, in_named_space, write_finished
 from mrbokeh.image_io import INTEGER_SUFFIXES, write_layer
 from mrbokeh.layer import Layer
 from mrbokeh.picture_sources.numbered_files import numbered
-from mrbokeh.shots.frame_maker import Picture
+from mrbokeh.plate_alpha import HOLDING_ALPHA
+from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import PartSink, Shot
 
@@ -36,6 +37,11 @@ class SequenceTarget:
     def settings(self) -> dict[str, str]:
         numbers = f"{self.first_number} layers={self.layers}"
         return {"container": self.path.name, "numbers": numbers, "output space": str(self.space or "")}
+
+    @property
+    def lacks_alpha(self) -> str | None:
+        suffix = self.path.suffix.lower()
+        return None if suffix in HOLDING_ALPHA else f"{suffix} cannot hold it (write .exr, .png or .tif)"
 
     def require_new(self, shot: Shot, overwrite: bool) -> None:
         suffix = self.path.suffix.lower()
@@ -73,7 +79,9 @@ class _Sink:
 
     def write(self, picture: Picture, index: int, time_s: float) -> None:  # noqa: ARG002
         path, space = self.target.file(index), self.target.space
-        if not isinstance(picture, Layer):
+        if isinstance(picture, Rgba):
+            write_finished(path, picture.rgb, picture.alpha, space)
+        elif not isinstance(picture, Layer):
             write_finished(path, picture, None, space)
         elif space is None:
             write_layer(path, picture)

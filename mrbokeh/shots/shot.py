@@ -79,6 +79,11 @@ class Target(Protocol):
         """What the parts depend on beside the pictures."""
         ...
 
+    @property
+    def lacks_alpha(self) -> str | None:
+        """Why coverage of finished pictures is left out, and what keeps it; None where it is stored."""
+        ...
+
     def require_new(self, shot: Shot, overwrite: bool) -> None:
         """Raises InputError where the result exists already, or cannot hold such pictures and times."""
         ...

@@ -20,11 +20,11 @@ from mrbokeh.atomic_files import refuse_existing
 from mrbokeh.color_management import NamedSpace
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
-from mrbokeh.shots.frame_maker import Picture
+from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.result_space import in_space
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import PartSink, Shot
-from mrbokeh.video_encodings import encoding_for, encoding_name
+from mrbokeh.video_encodings import encoding_for, encoding_name, with_alpha
 from mrbokeh.video_packets import PacketWriter, packets_of
 from mrbokeh.video_writer import VideoWriter
 
@@ -53,6 +53,14 @@ class VideoTarget:
             "output space": str(self.space or ""),
             "even rate": str(self.even_rate or ""),
         }
+
+    @property
+    def lacks_alpha(self) -> str | None:
+        if encoding_for(self.path, self.encoding).alpha:
+            return None
+        keeping = with_alpha(self.path)
+        instead = ".mov, .mkv or frames.%04d.exr" if keeping is None else f"--encoding {keeping}"
+        return f"{encoding_name(self.path, self.encoding)} cannot hold it (write {instead})"
 
     def require_new(self, shot: Shot, overwrite: bool) -> None:
         refuse_existing(self.path, overwrite)
@@ -132,8 +140,9 @@ class _Sink:
     start: int
 
     def write(self, picture: Picture, index: int, time_s: float) -> None:
-        stored = in_space(picture, self.target.space)
-        if isinstance(stored, Layer):
+        kept = picture.rgb if isinstance(picture, Rgba) and not self.writer.encoding.alpha else picture
+        stored = in_space(kept, self.target.space)
+        if isinstance(stored, (Layer, Rgba)):
             stored = np.dstack([stored.rgb, stored.alpha])
         rate = self.target.even_rate
         self.writer.write(stored, time_s - self.begin_s if rate is None else float((index - self.start) / rate))
