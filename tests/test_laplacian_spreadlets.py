@@ -350,6 +350,15 @@ def test_a_bank_of_an_apertures_kernels_is_the_aperture(coc_px: float) -> None:
     np.testing.assert_allclose(densely, reference, atol=4e-5)  # single precision: each of 1400 sums may round by 2**-25
 
 
+def test_a_kernel_that_was_turned_first_is_the_same_upright() -> None:
+    """What lies before the focus asks for it turned; kept unsorted for that, it was summed wrongly for what lies behind."""
+    values, far, near = picture(11), np.full(SIZE, 42.0, np.float32), np.full(SIZE, -42.0, np.float32)
+    renderer = LaplacianSpreadlets(bank_of(PENTAGON))
+    renderer.spread_bank(values, near, Place())
+    expected = LaplacianSpreadlets(bank_of(PENTAGON)).spread_bank(values, far, Place())
+    np.testing.assert_array_equal(renderer.spread_bank(values, far, Place()), expected)
+
+
 def test_kernels_are_turned_with_the_motion() -> None:
     """A bar to the right, used for a point that moves down, is a bar downwards; its light is the same."""
     bar = np.zeros((41, 41, 1), np.float32)

@@ -11,6 +11,7 @@ from mrbokeh.commands._look_options import LookGroup
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands._video_shot import parse_frames as parse_frames
 from mrbokeh.commands._video_shot import recipe_of, shot_of, target_of
+from mrbokeh.interrupts import kept_when_interrupted
 from mrbokeh.picture_sources.base import PictureSource
 from mrbokeh.picture_sources.choose import open_source
 from mrbokeh.progress import progress_bars
@@ -23,8 +24,6 @@ from mrbokeh.video_io import has_alpha_apart
 from mrbokeh.workers import cores
 
 app = typer.Typer(add_completion=False)
-
-INTERRUPTED = 130
 
 
 @app.command()
@@ -87,10 +86,6 @@ def _try_first_frame(shot: Shot) -> None:
 
 
 def _made(shot: Shot, crew: Crew, overwrite: bool) -> str:
-    with progress_bars() as bars:
+    with kept_when_interrupted(f"finished segments are kept in {shot.parts_path}"), progress_bars() as bars:
         task = bars.add_task("compositing", total=shot.stop - shot.start)
-        try:
-            return make_shot(shot, crew, overwrite=overwrite, progress=lambda count: bars.advance(task, count))
-        except KeyboardInterrupt:
-            typer.echo(f"interrupted: finished segments wait in {shot.parts_path}; the same command goes on from there", err=True)
-            raise typer.Exit(INTERRUPTED) from None
+        return make_shot(shot, crew, overwrite=overwrite, progress=lambda count: bars.advance(task, count))

@@ -113,8 +113,14 @@ class BankTables:
         found = {code: self._kept.get((code, dense)) for code in codes}
         new = [code for code, spreadlet in found.items() if spreadlet is None]
         for code in track(new, "spreadlets of the bank") if len(new) >= _SHOW_FROM else new:
-            found[code] = self._kept[code, dense] = by_rows(self._computed(code, dense))
+            found[code] = self._made(code, dense)
         return joined_points([found[code] for code in codes], channel)
+
+    def _made(self, code: int, dense: bool) -> Spreadlet:
+        """Sorted by row, and kept."""
+        if (code, dense) not in self._kept:
+            self._kept[code, dense] = by_rows(self._computed(code, dense))
+        return self._kept[code, dense]
 
     def _computed(self, code: int, dense: bool) -> Spreadlet:
         cell, turn = divmod(code // 2, self.angles)
@@ -123,8 +129,7 @@ class BankTables:
             kernel = turned_kernel(self.bank.kernels[cell], angle_rad)
             return taps_of(kernel) if dense else whole_laplacian(kernel)
         if turn:
-            upright = self._kept.get((code - 2 * turn, False))
-            upright = upright or self._kept.setdefault((code - 2 * turn, False), self._computed(code - 2 * turn, False))
+            upright = self._made(code - 2 * turn, dense=False)
             if len(upright.points) > _MOST_TURNED:
                 return whole_laplacian(turned_kernel(self.bank.kernels[cell], angle_rad))
             return Spreadlet(*turned(upright.points, upright.values, angle_rad))
