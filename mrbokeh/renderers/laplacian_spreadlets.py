@@ -151,7 +151,8 @@ class LaplacianSpreadlets:
     ) -> None:
         """Add the light of all pixels with a code, those whose kind is dense (True) by all taps, the others by Laplacians."""
         base, largest = max(kinds, default=0) + 1, None
-        sparse = np.array([kinds.get(code) is False for code in range(base)])
+        sparse = np.zeros(base, np.bool_)
+        sparse[[code for code, dense in kinds.items() if not dense]] = True
         if self._sums_whole_numbers and sparse.any():
             found, largest = lamps_among(values, codes, sparse)
             where = np.nonzero(found)
