@@ -12,7 +12,7 @@ from mrbokeh.errors import InputError
 from mrbokeh.png_chunks import without_chatter
 from mrbokeh.quiet_opencv import quiet_opencv
 from mrbokeh.srgb_codes import srgb_codes
-from mrbokeh.tiff_pixels import tiff_as_stored
+from mrbokeh.tiff_pixels import tiff_as_stored, with_straight_alpha
 from mrbokeh.tiff_tags import TIFF_SUFFIXES
 
 Encoding = Literal["srgb", "linear"]
@@ -57,8 +57,9 @@ def write_stored(path: Path | str, pixels: Shaped[np.ndarray, "height width *cha
     done, data = cv2.imencode(suffix, pixels)
     if not done:
         raise InputError(f"cannot encode a picture of shape {pixels.shape} as {suffix}")
+    says_alpha = suffix in TIFF_SUFFIXES and pixels.ndim == 3 and pixels.shape[2] == 4
     with atomic_path(path) as temporary:
-        data.tofile(temporary)
+        temporary.write_bytes(with_straight_alpha(data.tobytes()) if says_alpha else data.data)
 
 
 def linear_from_codes(

@@ -7,7 +7,7 @@ import pytest
 import tifffile
 
 from mrbokeh.exif_orientation import stored_orientation
-from mrbokeh.picture_codec import stored_pixels
+from mrbokeh.picture_codec import stored_pixels, stored_rgb, write_stored
 from mrbokeh.tiff_tags import tiff_tags
 
 SHADES = (np.uint8, np.uint16, np.float32)
@@ -56,6 +56,21 @@ def test_colour_that_is_multiplied_is_divided(tmp_path: Path, dtype: type) -> No
     np.testing.assert_array_equal(stored[..., 3], rgba[..., 3])
     # Half a code of what is stored, and half a one of the quotient.
     np.testing.assert_allclose(stored[..., :3] * (stored[..., 3:] / top), rgba[..., :3], atol=1e-6 * top if dtype is np.float32 else 1.0)
+
+
+@pytest.mark.parametrize("size", [(2, 3), (5, 7), (61, 33)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_what_is_written_says_that_its_alpha_is_straight(tmp_path: Path, dtype: type, size: tuple[int, int]) -> None:
+    """As tifffile reads it, whose parser is its own; without the tag other programs guess, and some multiply."""
+    rgba = np.random.default_rng(5).integers(0, np.iinfo(dtype).max, (*size, 4)).astype(dtype)
+    write_stored(tmp_path / "a.tif", rgba)
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        assert [int(each) for each in file.pages[0].extrasamples] == [2] and len(file.pages) == 1
+        codes = [tag.code for tag in file.pages[0].tags]
+        assert codes == sorted(codes)
+    np.testing.assert_array_equal(stored_rgb(tmp_path / "a.tif"), rgba)
+    write_stored(tmp_path / "b.tif", rgba[..., :3])
+    assert 338 not in tiff_tags(tmp_path / "b.tif")
 
 
 def test_tags_of_any_tiff_and_of_none(tmp_path: Path) -> None:
