@@ -2,6 +2,7 @@
 
 Shared by all renderers that spread light; they differ in the `Spread` alone.
 
+Circles of confusion are diameters at which kernels are drawn (mrbokeh.drawn_diameters) from here on.
 1. Every layer is continued beyond the frame by the largest blur: the border of an opaque one outwards, one with holes not at all.
 2. Layers are rendered one by one and laid over one another, but an opaque layer together with what is behind it, and
    layers that interleave in depth together.
@@ -61,8 +62,9 @@ def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread | Optics, 
 
     spread: how kernels of the lens's aperture are summed, or an Optics that takes the aperture's place.
     """
-    coc_px = [coc_px_of(layer, lens) for layer in _checked(layers)]
+    _check(layers)
     optics = spread if isinstance(spread, Optics) else ThroughAperture.of(layers, lens.aperture, spread, layering.field_cells)
+    coc_px = [optics.drawn_px(coc_px_of(layer, lens)) for layer in layers]
     margin = optics.margin_px(layers, coc_px)
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
@@ -74,7 +76,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread | Optics, 
     return _as_layer(colour, taken, layers)
 
 
-def _checked(layers: Sequence[Layer]) -> Sequence[Layer]:
+def _check(layers: Sequence[Layer]) -> None:
     if not layers:
         raise InputError("nothing to render: expected at least one layer, got none")
     sizes = {layer.alpha.shape for layer in layers}
@@ -83,7 +85,6 @@ def _checked(layers: Sequence[Layer]) -> Sequence[Layer]:
     names = {tuple((name, values.shape[2]) for name, values in layer.extra.items()) for layer in layers}
     if len(names) > 1:
         raise InputError(f"layers must have the same extra channels in the same order, but came with {sorted(names)}")
-    return layers
 
 
 def _groups(sheets: Sequence[Sheet]) -> list[list[Sheet]]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.aperture import Aperture
+from mrbokeh.drawn_diameters import drawn_diameters_px
 from mrbokeh.layer import Layer
 from mrbokeh.motion import farthest_px, motion_channels, moved
 from mrbokeh.slice_sorting import Part
@@ -31,6 +32,10 @@ class Optics(Protocol):
 
     @property
     def coverages(self) -> int: ...
+
+    def drawn_px(self, coc_px: Plane) -> Plane:
+        """The signed diameters by which kernels are chosen for circles of confusion, in the same order."""
+        ...
 
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:
         """How many whole pixels the light of any pixel of the layers, with these signed diameters, travels at most."""
@@ -71,6 +76,9 @@ class ThroughAperture:
     @property
     def coverages(self) -> int:
         return 3 if self.aperture.is_chromatic else 1
+
+    def drawn_px(self, coc_px: Plane) -> Plane:
+        return drawn_diameters_px(coc_px, self.aperture)
 
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:  # noqa: ARG002
         return reach_px(self.aperture, max(float(np.abs(each).max()) for each in coc_px)) + self.farthest_px

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from capture.report.pixel_spread import drawn_diameters_px
 from mrbokeh.aperture import Aperture
 from mrbokeh.layer import opaque
 from mrbokeh.lens import Lens
@@ -24,13 +23,10 @@ class Reblur:
     """Predicts slices by a renderer of mrbokeh, occlusion and hidden background as it does them.
 
     name: what the user calls the renderer, which tells whether predictions that are kept would come out the same; "" for its repr.
-    draws: whether it draws kernels with the coverage of whole pixels, so that their diameters need `drawn_diameters_px`; networks that
-    have learned from photographs do not.
     """
 
     renderer: Renderer = field(default_factory=PolygonDifferences)
     name: str = ""
-    draws: bool = True
 
     @property
     def identity(self) -> str:
@@ -38,7 +34,6 @@ class Reblur:
 
     def __call__(self, all_in_focus: Rgb, coc_px: Plane, aperture: Aperture) -> Rgb:
         """coc_px: signed diameters, in pixels of the picture."""
-        coc_px = drawn_diameters_px(coc_px, aperture) if self.draws else coc_px
         largest_px = float(np.abs(coc_px).max(initial=0.0))
         if largest_px < _LEAST_PX:
             return all_in_focus
@@ -54,7 +49,7 @@ def reblur_by(name: str) -> Reblur:
     renderer = make_renderer(name)
     if path.suffix.lower() != ".onnx":
         return Reblur(renderer, name)
-    return Reblur(renderer, f"{path.resolve()}, {path.stat().st_mtime_ns}", draws=False)
+    return Reblur(renderer, f"{path.resolve()}, {path.stat().st_mtime_ns}")
 
 
 def lens_with_growth(px_per_dioptre: float, width_px: int, aperture: Aperture) -> Lens:

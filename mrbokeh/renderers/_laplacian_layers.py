@@ -53,6 +53,10 @@ class BankOptics:
     def coverages(self) -> int:
         return self.tables.bank.channels
 
+    def drawn_px(self, coc_px: Plane) -> Plane:
+        """As they are: a bank is looked up by the circle of confusion."""
+        return coc_px
+
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:
         """Raises InputError where blur or motion is clearly larger than the bank's largest."""
         reach, frame = 0, Frame(self.size[1], self.size[0])

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from aiortc.mediastreams import MediaStreamError, MediaStreamTrack
@@ -11,13 +12,16 @@ from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
 
 # Where aiortc keeps the RTP timestamp of what it sent last; it is a random number plus our ticks.
 _RTP_TIMESTAMP = "_RTCRtpSender__rtp_timestamp"
+# The channel that carries a failure may lose it: it is told again so often while it lasts.
+_REMIND_S = 1.0
 
 
 class PacketTrack(MediaStreamTrack):
     """Begins to watch the stream with the first `recv`, which is when the connection stands, so that nobody encodes for nobody.
 
     sent(frame, rtp_timestamp): called when a packet is on its way, None where this aiortc does not tell the timestamp.
-    failed(sentence): the camera failed, None when it is back. Both in the event loop. Set `codec` and `sender` before it is used.
+    failed(sentence): the camera failed, again and again while it does; None when it is back. Both in the event loop.
+    Set `codec` and `sender` before it is used.
     """
 
     kind = "video"
@@ -63,11 +67,16 @@ class PacketTrack(MediaStreamTrack):
             self._tell(self._queue.failure)
             if frame is not None:
                 return frame
-            await self._news.wait()
+            await self._woken()
         raise MediaStreamError
 
+    async def _woken(self) -> None:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(None if self._told is None else _REMIND_S):
+                await self._news.wait()
+
     def _tell(self, failure: str | None) -> None:
-        if failure != self._told:
+        if failure is not None or self._told is not None:
             self._told = failure
             self._failed(failure)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.drawn_diameters import drawn_diameters_px
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
@@ -31,11 +32,13 @@ def motion_of(layer: Layer) -> Float32[np.ndarray, "height width 2"]:
 
 
 def coc_px_of(layer: Layer, lens: Lens) -> Float32[np.ndarray, "height width"]:
-    """Signed circle of confusion; 0 where nothing is covered and up to one pixel, where light stays as it is."""
+    """Signed diameters to draw (mrbokeh.drawn_diameters); 0 where nothing is covered and up to one pixel, where light stays as it is."""
     covered = layer.alpha > 0
     if not (layer.depth_m > 0)[covered].all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
-    coc_px = lens.coc_px(np.where(covered, layer.depth_m, np.inf), layer.width_px)
+    coc_px = drawn_diameters_px(
+        np.asarray(lens.coc_px(np.where(covered, layer.depth_m, np.inf), layer.width_px), np.float32), lens.aperture
+    )
     return np.where(covered & (np.abs(coc_px) > 1.0), coc_px, 0.0).astype(np.float32)
 
 

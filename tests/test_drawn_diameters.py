@@ -5,17 +5,24 @@ import numpy as np
 import pytest
 
 from capture.report.examination import STEP_PX
-from capture.report.pixel_spread import drawn_diameters_px
 from capture.report.reblur import Reblur
 from capture.report.slice_fit import Prediction, SliceFit, fit_slice
 from mrbokeh.aperture import Aperture
+from mrbokeh.drawn_diameters import drawn_diameters_px
+from mrbokeh.image_metrics import psnr
+from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.renderers.scatter_reference import ScatterReference
 
 FINER = 5
 HEIGHT_PX, WIDTH_PX = 64, 96
+INNER = np.s_[6:-6, 6:-6]
+EXACT = ScatterReference(threads=1)
 
 
-@pytest.mark.parametrize("aperture", [Aperture.disc(), Aperture.ring(0.5), Aperture.blades(6)])
+APERTURES = [Aperture.disc(), Aperture.ring(0.5), Aperture.blades(6), Aperture.heart()]
+
+
+@pytest.mark.parametrize("aperture", APERTURES[:3])
 @pytest.mark.parametrize("coc_px", [-1.6, 2.3, 3.0, 7.7, -15.7, 16.3, 30.0])
 def test_what_is_drawn_passes_detail_as_blur_does(aperture: Aperture, coc_px: float) -> None:
     """Along x, from waves of 50 px down to those of 3: what a kernel drawn 40 times as large (whose pixels are fine) leaves of them."""
@@ -35,13 +42,22 @@ def left_of_waves(aperture: Aperture, diameter_px: float, frequencies: np.ndarra
     return np.abs(np.exp(2j * np.pi * frequencies[:, None] * along) @ row)
 
 
-def test_the_order_of_diameters_stays() -> None:
+def test_far_beyond_a_pixel_variances_add() -> None:
+    """What is drawn differs from the blur by the same in squares, whatever the diameter; 4 / 3 px^2 for a disc's variance alone."""
+    coc_px = np.array([[20.0, 40.0, 100.0]], np.float32)
+    less = coc_px[0] ** 2 - drawn_diameters_px(coc_px, Aperture.disc())[0] ** 2
+    np.testing.assert_allclose(less, less[0], rtol=0.02)
+    assert 0.5 < less[0] < 4.0 / 3.0
+
+
+@pytest.mark.parametrize("aperture", APERTURES)
+def test_the_order_of_diameters_stays(aperture: Aperture) -> None:
     coc_px = np.linspace(-20.0, 20.0, 4001, dtype=np.float32)[None]
-    drawn = drawn_diameters_px(coc_px, Aperture.ring(0.5))[0]
+    drawn = drawn_diameters_px(coc_px, aperture)[0]
     steps = np.diff(drawn)
     assert (steps > 0.0).all() and steps.max() < 0.05, "no jump where 0.01 px follow on each other"
+    np.testing.assert_array_equal(drawn[np.abs(coc_px[0]) <= 1.0], coc_px[np.abs(coc_px) <= 1.0])
     np.testing.assert_allclose(drawn, -drawn[::-1], atol=1e-6)
-    assert drawn_diameters_px(np.zeros((1, 1), np.float32), Aperture.disc())[0, 0] == 0.0
 
 
 def picture(finer: int) -> np.ndarray:
@@ -55,22 +71,38 @@ def reduced(rgb: np.ndarray, factor: int) -> np.ndarray:
     return np.ascontiguousarray(rgb.reshape(height, factor, width, factor, -1).mean(axis=(1, 3)), np.float32)
 
 
-def fitted(aperture: Aperture, draws: bool) -> SliceFit:
-    """A slice that is focused behind everything, 0.3 to 9 px of blur, photographed with pixels of 5 x 5 finer ones."""
-    exact = ScatterReference(threads=1)
+def fine_and_coarse(aperture: Aperture) -> tuple[np.ndarray, np.ndarray]:
+    """0.3 to 9 px of blur (H, W), and the picture that pixels of 5 x 5 finer ones catch of it."""
     coc_px = np.broadcast_to(-np.linspace(0.3, 9.0, WIDTH_PX, dtype=np.float32), (HEIGHT_PX, WIDTH_PX)).copy()
     fine_px = FINER * np.repeat(np.repeat(coc_px, FINER, axis=0), FINER, axis=1)
-    photographed = reduced(Reblur(exact, draws=False)(picture(FINER), fine_px, aperture), FINER)
-    reblur = Reblur(exact, draws=draws)
-    predicted = (reblur(picture(1), coc_px + np.float32(step), aperture) for step in (0.0, -STEP_PX, STEP_PX))
+    return coc_px, reduced(Reblur(EXACT)(picture(FINER), fine_px, aperture), FINER)
+
+
+def fitted(aperture: Aperture) -> SliceFit:
+    """A slice that is focused behind everything."""
+    coc_px, photographed = fine_and_coarse(aperture)
+    predicted = (Reblur(EXACT)(picture(1), coc_px + np.float32(step), aperture) for step in (0.0, -STEP_PX, STEP_PX))
     counted = np.zeros(coc_px.shape, bool)
-    counted[6:-6, 6:-6] = True
+    counted[INNER] = True
     return fit_slice(photographed, Prediction(*predicted, coc_px, STEP_PX), counted)[0]
 
 
-@pytest.mark.parametrize("aperture", [Aperture.disc(), Aperture.ring(0.5), Aperture.blades(6)])
-def test_a_slice_at_its_focus_is_found_there(aperture: Aperture) -> None:
+@pytest.mark.parametrize("aperture", APERTURES[:3])
+def test_a_slice_at_its_focus_is_found_there(aperture: Aperture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawn without regard to the pixels, the very same slice seems to be focused elsewhere, and blurred by another lens."""
-    right, wrong = fitted(aperture, draws=True), fitted(aperture, draws=False)
+    right = fitted(aperture)
+    monkeypatch.setattr("mrbokeh.optics.drawn_diameters_px", lambda coc_px, _: coc_px)
+    wrong = fitted(aperture)
     assert abs(right.focus_px.value) < 0.1 and abs(right.blur_gain.value) < 0.015
     assert abs(wrong.focus_px.value) > 0.2 and abs(wrong.blur_gain.value) > 0.03
+
+
+@pytest.mark.parametrize("name", ["scatter", "polygon", "low-rank", "laplacian", "lrdm"])
+def test_every_renderer_blurs_a_picture_of_pixels_as_the_lens_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    coc_px, photographed = fine_and_coarse(Aperture.disc())
+    reblur = Reblur(make_renderer(name))
+    right = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
+    for module in ("mrbokeh.optics", "mrbokeh.renderers.layered_reconstruction._layer_samples"):
+        monkeypatch.setattr(f"{module}.drawn_diameters_px", lambda coc_px, _: coc_px)
+    wrong = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
+    assert right > wrong + 2.0
