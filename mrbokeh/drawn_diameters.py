@@ -2,8 +2,8 @@
 
 A kernel holds the share of an opening that lies in each pixel, and a pixel of the sharp picture is a mean over its area already. That
 area would count twice: a disc drawn at 2 px blurs as one of 2.3 px does. Kernels are drawn at the diameter at which they pass an edge
-most like the opening itself does. Up to one pixel they stay the identity, from there they grow fast, between 1.5 and 3.5 px they are up to
-half a pixel smaller than the blur, and beyond 6 px by a hundredth or less.
+most like the opening itself does, but never larger than it is. Between 1.5 and 3.5 px that is up to half a pixel smaller, beyond 6 px by a
+hundredth or less; up to one pixel kernels stay the identity.
 """
 
 from functools import lru_cache
@@ -27,9 +27,9 @@ _FREQUENCIES = np.linspace(0.02, 0.5, 25)
 """Cycles per pixel."""
 _WEIGHTS = _FREQUENCIES**-2.0
 """The power of an edge along its axis."""
-_STEEPEST = 3.0
-"""Just above one pixel, where a kernel that blurs so little is larger than its blur."""
 _RISE = 1e-6
+_EVEN = np.hanning(17)[1:-1]
+"""Over half a pixel to each side: where blur grows from pixel to pixel, a bend here would show as a dip of opacity."""
 
 
 def drawn_diameters_px(coc_px: Plane, aperture: Aperture) -> Plane:
@@ -51,8 +51,9 @@ def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
     steps_px = np.arange(_WIDEST_PX * STEPS_PER_PX + 1.0) / STEPS_PER_PX
     off = _distances(_drawn_transfers(aperture), _transfers(aperture))
     meant = np.maximum.accumulate([_lowest(_BLURS_PX, row) for row in off]) + _RISE * _DRAWN_PX
-    growing = 1.0 + _STEEPEST * (steps_px - 1.0)
-    return np.where(steps_px > 1.0, np.minimum(np.interp(steps_px, meant, _DRAWN_PX), growing), steps_px).astype(np.float32)
+    drawn = np.minimum(np.interp(steps_px, meant, _DRAWN_PX), steps_px)
+    around = np.pad(drawn, len(_EVEN) // 2, mode="reflect", reflect_type="odd")
+    return np.where(steps_px > 1.0, np.convolve(around, _EVEN / _EVEN.sum(), mode="valid"), steps_px).astype(np.float32)
 
 
 def _distances(one: Transfers, other: Transfers) -> Float[np.ndarray, "ones others"]:

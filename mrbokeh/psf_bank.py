@@ -17,6 +17,8 @@ Turns = Literal["none", "motion", "field"]
 Kernel = Float32[np.ndarray, "size size channels"]
 Grid = NestedGrid | ProportionalGrid
 
+MEASURED = "measured"
+"""The model of banks whose kernels were fitted to photographs."""
 _MOST_LIGHT = 1.001
 """What a kernel may sum to: 1, but for the rounding of float32."""
 
@@ -64,6 +66,11 @@ class PsfBank:
     @property
     def channels(self) -> int:
         return int(self.kernels[0].shape[-1])
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether kernels are what became of pixels in photographs. Others are traced: what falls from a point into each pixel."""
+        return self.model == MEASURED
 
     @property
     def radius_px(self) -> int:

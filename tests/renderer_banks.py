@@ -60,7 +60,8 @@ def lone_pixel(row: int, column: int, coc_px: float) -> list[Layer]:
 
 @cache
 def discs_bank() -> PsfBank:
-    return bank_of(Aperture.disc(), (1, 1))
+    """Of kernels of exact coverage, which no lens was measured for."""
+    return replace(bank_of(Aperture.disc(), (1, 1)), model="simple")
 
 
 @cache

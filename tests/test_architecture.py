@@ -62,7 +62,7 @@ ROWS = (
     ("hidden_background", "_hidden_background_numba", "_depth_edges_numba", "_rims_numba"),
     ("sheets", "_sheets_numba"),
     ("lit_pixels", "_lit_pixels_numba", "motion", "_motion_numba"),
-    ("spreading", "light_field_samples"),
+    ("spreading", "light_field_samples", "drawn_diameters", "_drawn_diameters_numba"),
     ("spreadlets_file",),
     ("spreadlets",),
     ("spreadlet_values", "_spreadlets_numba"),

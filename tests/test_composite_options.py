@@ -195,7 +195,7 @@ def test_all_slices_get_one_scene(files: Path, tmp_path_factory: pytest.TempPath
     camera = Camera(WIDTH, HEIGHT, (LENS.focal_px(WIDTH),) * 2, (WIDTH / 2, HEIGHT / 2))
     plane = np.ones((HEIGHT, WIDTH), np.float32)
     write_merged(stack, plate_rgb(), plane, plane, 2 * plane)
-    slices = tuple(Slice(f"{index}.exr", distance_m) for index, distance_m in enumerate((1.3, 3.0)))
+    slices = tuple(Slice(f"{index}.exr", distance_m) for index, distance_m in enumerate((1.3, 6.0)))
     write_focal_stack(replace(FocalStack(stack, slices, LENS, camera, registered=True), merged=True))
     out = files / "stack_with_card"
     words = (stack, "--all-slices", "--layer", files / "card.exr", "--out", out)

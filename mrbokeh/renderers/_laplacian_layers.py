@@ -14,6 +14,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from mrbokeh.aperture import Aperture
+from mrbokeh.drawn_diameters import drawn_diameters_px
 from mrbokeh.errors import InputError
 from mrbokeh.layer import Layer
 from mrbokeh.lens import Lens
@@ -24,6 +26,8 @@ from mrbokeh.renderers._laplacian_bank import BankTables, Place
 from mrbokeh.slice_sorting import Part
 from mrbokeh.spreading import Frame
 
+_DISC = Aperture.disc()
+"""Stands for all openings, whose drawn diameters differ by a tenth of a pixel."""
 _BEYOND_PX, _BEYOND = 1.0, 1.05  # how far the largest kernel stands for larger ones
 
 
@@ -54,8 +58,8 @@ class BankOptics:
         return self.tables.bank.channels
 
     def drawn_px(self, coc_px: Plane) -> Plane:
-        """As they are: a bank is looked up by the circle of confusion."""
-        return coc_px
+        """As they are for measured kernels; those that were traced hold the pixel's area, as drawn ones do."""
+        return coc_px if self.tables.bank.is_measured else drawn_diameters_px(coc_px, _DISC)
 
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:
         """Raises InputError where blur or motion is clearly larger than the bank's largest."""
