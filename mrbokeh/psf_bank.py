@@ -17,8 +17,6 @@ Turns = Literal["none", "motion", "field"]
 Kernel = Float32[np.ndarray, "size size channels"]
 Grid = NestedGrid | ProportionalGrid
 
-MEASURED = "measured"
-"""The model of banks whose kernels were fitted to photographs."""
 _MOST_LIGHT = 1.001
 """What a kernel may sum to: 1, but for the rounding of float32."""
 
@@ -29,7 +27,8 @@ class PsfBank:
 
     model: name of what made it. axes: the coordinates; counts: steps of the grid along each (`NestedGrid`).
     kernels: one per cell, (K, K, C) float32, K odd and its own for each, C 1 or 3; rows go down, columns right, the source
-    in the middle pixel. Each stands for the whole of its cell. A channel sums to 1, or to less where light is absorbed
+    in the middle pixel: what falls from a point into each pixel (renderers see to it that a pixel is no point: see
+    mrbokeh.drawn_diameters). Each stands for the whole of its cell. A channel sums to 1, or to less where light is absorbed
     (`throughput`); a renderer then darkens the picture by that much.
     turns: what a kernel is turned by where it is used, from x towards y: "motion", the kernels are those of motion to the
     right; "field", of a source to the right of the middle of the frame; "none".
@@ -66,11 +65,6 @@ class PsfBank:
     @property
     def channels(self) -> int:
         return int(self.kernels[0].shape[-1])
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether kernels are what became of pixels in photographs. Others are traced: what falls from a point into each pixel."""
-        return self.model == MEASURED
 
     @property
     def radius_px(self) -> int:

@@ -60,8 +60,7 @@ def lone_pixel(row: int, column: int, coc_px: float) -> list[Layer]:
 
 @cache
 def discs_bank() -> PsfBank:
-    """Of kernels of exact coverage, which no lens was measured for."""
-    return replace(bank_of(Aperture.disc(), (1, 1)), model="simple")
+    return bank_of(Aperture.disc(), (1, 1))
 
 
 @cache

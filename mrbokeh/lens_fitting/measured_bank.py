@@ -9,7 +9,7 @@ from mrbokeh.lens_fitting.lens_fit import LensFit
 from mrbokeh.lens_fitting.pupil_picture import kernel_of
 from mrbokeh.nested_grid import NestedGrid
 from mrbokeh.progress import track
-from mrbokeh.psf_bank import MEASURED, Axis, PsfBank, physical_boxes
+from mrbokeh.psf_bank import Axis, PsfBank, physical_boxes
 from mrbokeh.psf_models.base import centred
 
 EXPONENT = 1.5  # steps are fine in focus, where a pixel's step changes a kernel most
@@ -28,7 +28,7 @@ def bank_of(fit: LensFit) -> PsfBank:
     boxes = physical_boxes(axes, NestedGrid(counts, nested=False))
     kernels = tuple(_kernel(fit, box) for box in track(list(boxes), "bank"))
     turns = "field" if fit.knots.rings else "none"
-    return PsfBank(MEASURED, axes, counts, kernels, turns, nested=False, settings=_settings(fit, boxes))
+    return PsfBank("measured", axes, counts, kernels, turns, nested=False, settings=_settings(fit, boxes))
 
 
 def _axes(fit: LensFit) -> tuple[tuple[Axis, ...], tuple[int, ...]]:

@@ -58,8 +58,8 @@ class BankOptics:
         return self.tables.bank.channels
 
     def drawn_px(self, coc_px: Plane) -> Plane:
-        """As they are for measured kernels; those that were traced hold the pixel's area, as drawn ones do."""
-        return coc_px if self.tables.bank.is_measured else drawn_diameters_px(coc_px, _DISC)
+        """Kernels of banks hold the pixel's area as those of openings do."""
+        return drawn_diameters_px(coc_px, _DISC)
 
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:
         """Raises InputError where blur or motion is clearly larger than the bank's largest."""
