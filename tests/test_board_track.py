@@ -30,6 +30,7 @@ from mrbokeh.commands.track import app
 from mrbokeh.errors import InputError
 from mrbokeh.video_io import VideoWriter
 from tests.traced_board_clip import BOARD, MOTION, clip_of, pose_error
+from tests.video_files import turned_clip
 
 FRAMES, HIDDEN = 16, (6, 7, 8)
 CAMERA = Camera(640, 360, (609.0, 609.0), (320.0, 180.0))
@@ -81,6 +82,17 @@ def test_intrinsics_follow_the_size_of_the_clip(clip: Path) -> None:
     once = track_board(clip, BOARD, true_camera(0))
     np.testing.assert_allclose(twice.track.at(3).camera.camera_from_world, once.track.at(3).camera.camera_from_world, atol=1e-9)
     assert twice.track.size_px == (320, 180)
+
+
+@pytest.mark.parametrize("turn_deg", [90, -90])
+def test_an_upright_clip_is_tracked_with_the_intrinsics_of_the_level_camera(clip: Path, tmp_path: Path, turn_deg: int) -> None:
+    """Pictures turned counter-clockwise are those of a camera that was turned clockwise (y points down)."""
+    upright = track_board(turned_clip(clip, tmp_path / "upright.mkv", turn_deg), BOARD, true_camera(0)).track
+    assert upright.size_px == (180, 320)
+    level, turn = track_board(clip, BOARD, true_camera(0)).track, Rotation.from_euler("z", -turn_deg, degrees=True).as_matrix()
+    for number in (0, 3, 15):
+        pose = level.at(number).camera.camera_from_world[:3]
+        np.testing.assert_allclose(upright.at(number).camera.camera_from_world[:3], turn @ pose, atol=2e-3)
 
 
 def test_a_board_that_is_not_there_is_told(clip: Path) -> None:

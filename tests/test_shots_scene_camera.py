@@ -39,6 +39,14 @@ def test_one_camera_follows_the_scene(tmp_path: Path) -> None:
         assert scene_track(tmp_path / "camera.json", SIZE, up).up == up
 
 
+def test_a_camera_of_pictures_of_another_shape_is_refused(tmp_path: Path) -> None:
+    """Stretched to the plate it would show objects too narrow; another size of the same shape is well."""
+    write_json(tmp_path / "camera.json", camera_to_json(camera()))
+    assert scene_track(tmp_path / "camera.json", (2 * WIDTH, 2 * HEIGHT), "-z").size_px == SIZE
+    with pytest.raises(InputError, match=rf"plate's shape \({HEIGHT}x{WIDTH}\), got one for {WIDTH}x{HEIGHT}"):
+        scene_track(tmp_path / "camera.json", (HEIGHT, WIDTH), "-z")
+
+
 @pytest.mark.parametrize(("name", "up"), [("colmap", "-y"), ("track.chan", r"\+y"), ("transforms.json", r"\+z"), ("track.json", "-z")])
 def test_a_track_with_another_axis_is_told(tmp_path: Path, name: str, up: str) -> None:
     """Each format by its own convention: COLMAP's usual -y, Nuke's +y, nerfstudio's +z, ours as it states."""

@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
 from mrbokeh.camera import Camera
 from mrbokeh.camera_track.board_calibration import Calibration, calibrated
 from mrbokeh.camera_track.board_corners import RollingCorners, Undistorting, read_greys
 from mrbokeh.camera_track.board_smoothing import Observation, residual_px, steadied
+from mrbokeh.camera_track.clip_intrinsics import Intrinsics, intrinsics_of_clip
 from mrbokeh.camera_track.track import CameraTrack
 from mrbokeh.camera_track.tracked_frame import Distortion, TrackedFrame
 from mrbokeh.charuco.board import CharucoBoard
@@ -69,9 +68,11 @@ def calibrate_clip(clip: Path, board: CharucoBoard) -> Calibration:
 def track_board(
     clip: Path, board: CharucoBoard, camera: Camera, distortion: Distortion | None = None, settings: TrackSettings | None = None
 ) -> BoardTrack:
-    """camera: intrinsics; its size is made that of the clip. Raises InputError where the board is never seen."""
+    """camera: intrinsics, made those of the clip's pictures. Raises InputError where these have another shape and where the board is never
+    seen."""
     settings, info = settings or TrackSettings(), probe(clip)
-    camera = replace(camera.resized(info.width_px, info.height_px), camera_from_world=np.eye(4))
+    intrinsics = intrinsics_of_clip(Intrinsics(camera, distortion), (info.width_px, info.height_px), info.quarter_turns, clip)
+    camera, distortion = intrinsics.camera, intrinsics.distortion
     undistorted, times_s = Undistorting(camera, distortion), []
 
     def greys() -> Iterator[Grey]:
