@@ -2,8 +2,8 @@
 
 A kernel holds the share of an opening that lies in each pixel, and a pixel of the sharp picture is a mean over its area already. That
 area would count twice: a disc drawn at 2 px blurs as one of 2.3 px does. Kernels are drawn at the diameter at which they pass an edge
-most like the opening itself does, but never larger than it is. Between 1.5 and 3.5 px that is up to half a pixel smaller, beyond 6 px by a
-hundredth or less; up to one pixel kernels stay the identity.
+most like the opening itself does, but never larger than it is: between 1.5 and 3.5 px up to half a pixel smaller, beyond 6 px by one or
+two hundredths. Up to one pixel kernels stay the identity.
 """
 
 from functools import lru_cache
