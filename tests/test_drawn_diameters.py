@@ -99,7 +99,7 @@ def test_a_slice_at_its_focus_is_found_there(aperture: Aperture, monkeypatch: py
     assert abs(wrong.focus_px.value) > 0.2 and abs(wrong.blur_gain.value) > 0.03
 
 
-@pytest.mark.parametrize("name", ["scatter", "polygon", "low-rank", "laplacian", "lrdm"])
+@pytest.mark.parametrize("name", ["scatter", "polygon", "low-rank", "laplacian", pytest.param("lrdm", marks=pytest.mark.slow)])
 def test_every_renderer_blurs_a_picture_of_pixels_as_the_lens_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     coc_px, photographed = fine_and_coarse(Aperture.disc())
     reblur = Reblur(make_renderer(name))
