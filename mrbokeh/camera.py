@@ -61,9 +61,9 @@ class Camera:
         return Camera(width_px, height_px, (float(fx), float(fy)), (float(cx), float(cy)), self.camera_from_world)
 
 
-def have_same_shape(size_px: tuple[int, int], other_px: tuple[int, int]) -> bool:
+def have_same_shape(size_px: tuple[int, int], other_px: tuple[int, int], within: float = _SAME_SHAPE) -> bool:
     """Whether (width, height) of two pictures are of one shape, up to the rounding to whole or even pixels."""
-    return abs(size_px[0] * other_px[1] / (size_px[1] * other_px[0]) - 1.0) < _SAME_SHAPE
+    return abs(size_px[0] * other_px[1] / (size_px[1] * other_px[0]) - 1.0) <= within
 
 
 def depth_m_from_zbuffer(zbuffer: Float[np.ndarray, "*batch"], near_m: float, far_m: float) -> Float[np.ndarray, "*batch"]:

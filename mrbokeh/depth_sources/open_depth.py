@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.camera import have_same_shape
 from mrbokeh.depth_sources.depth_map import DepthMap, with_holes_filled
 from mrbokeh.depth_sources.depth_settings import DepthSettings
 from mrbokeh.depth_sources.edge_snapping import refined_dioptres
@@ -53,7 +54,7 @@ def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthM
 
 def _require_same_aspect(source: Path, depth: DepthMap, photo_rgb: Rgb) -> None:
     (rows, columns), (height, width) = depth.depth_m.shape, photo_rgb.shape[:2]
-    if abs(columns / rows / (width / height) - 1.0) > _SAME_ASPECT:
+    if not have_same_shape((columns, rows), (width, height), _SAME_ASPECT):
         raise InputError(
             f"{source} is {columns}x{rows} px, the photograph {width}x{height} px: expected one view, cut the same way (is one turned?)"
         )

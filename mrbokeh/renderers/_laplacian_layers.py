@@ -27,7 +27,7 @@ from mrbokeh.slice_sorting import Part
 from mrbokeh.spreading import Frame
 
 _DISC = Aperture.disc()
-"""Stands for all openings, whose drawn diameters differ by a tenth of a pixel."""
+"""Stands for all openings, whose drawn diameters differ by 0.3 px at most."""
 _BEYOND_PX, _BEYOND = 1.0, 1.05  # how far the largest kernel stands for larger ones
 
 
