@@ -1,0 +1,92 @@
+"""Sharpness of an all-in-focus picture beside its slices, measured without truth, lens or focus distances.
+
+The detail of a block is the root mean square of what a Gaussian of DETAIL_SIGMA_PX takes from the display-encoded luminance. The measures
+hold for any tool's result, once it lies on the registered slices.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+from mrbokeh.color import linear_to_srgb
+
+BLOCK_PX = 24
+DETAIL_SIGMA_PX = 1.5
+BORDER_BLOCKS = 2
+"""Blocks at the border of the picture that are left out: slices have no data there, or mirrored data."""
+KEPT_DETAIL = 0.6
+FLAT_PERCENTILE = 30.0
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Blocks = Float32[np.ndarray, "rows columns"]
+BlockMask = Bool[np.ndarray, "rows columns"]
+
+
+def block_detail(rgb: Rgb) -> Blocks:
+    """Return the detail of every block of linear Rec.709, 1.0 being display white; the border blocks and a rest below BLOCK_PX are cut off."""
+    luminance = linear_to_srgb(np.clip(rgb, 0.0, 1.0)) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    fine = luminance - cv2.GaussianBlur(luminance, (0, 0), DETAIL_SIGMA_PX)
+    rows, columns = (side // BLOCK_PX for side in luminance.shape)
+    blocks = (fine * fine)[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX)
+    border = min(BORDER_BLOCKS, (rows - 1) // 2, (columns - 1) // 2) if min(rows, columns) else 0
+    return np.sqrt(blocks.mean(axis=(1, 3)))[border : rows - border, border : columns - border].astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SharpestSlices:
+    """What the registered slices of a stack reach, block by block.
+
+    detail: of the sharpest slice of each block. index: which slice that is. largest: the largest linear value of all slices.
+    """
+
+    detail: Blocks
+    index: Int[np.ndarray, "rows columns"]
+    largest: float
+
+    @classmethod
+    def of(cls, slices: Iterable[Rgb]) -> "SharpestSlices":
+        """Read the slices (linear Rec.709, one size) once."""
+        details, largest = [], 0.0
+        for rgb in slices:
+            details.append(block_detail(rgb))
+            largest = max(largest, float(rgb.max()))
+        stacked = np.stack(details)
+        return cls(stacked.max(axis=0), stacked.argmax(axis=0), largest)
+
+    @cached_property
+    def textured(self) -> BlockMask:
+        """Blocks with more detail than the median block."""
+        return self.detail > np.median(self.detail)
+
+    @cached_property
+    def flat(self) -> BlockMask:
+        return self.detail < np.percentile(self.detail, FLAT_PERCENTILE)
+
+    def measure(self, picture: Rgb) -> "Sharpness":
+        """Measure an all-in-focus picture that lies on the slices: linear Rec.709 of their size."""
+        kept = block_detail(picture) / np.maximum(self.detail, 1e-9)
+        lost = self.textured & (kept < KEPT_DETAIL)
+        share = float(lost.sum() / max(int(self.textured.sum()), 1))
+        raised = float(np.percentile(kept[self.flat], 95.0)) if self.flat.any() else 0.0
+        return Sharpness(share, raised, float(picture.max()) / max(self.largest, 1e-9), kept, lost)
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """An all-in-focus picture beside its slices.
+
+    lost: share of the textured blocks that keep less than KEPT_DETAIL of the detail of their sharpest slice.
+    flat: 95th percentile, over flat blocks, of their detail over that of the sharpest slice; seams and noise raise it above 1.
+    top: largest linear value over the largest of all slices.
+    kept: detail of each block over that of its sharpest slice. lost_blocks: which blocks are lost.
+    """
+
+    lost: float
+    flat: float
+    top: float
+    kept: Blocks
+    lost_blocks: BlockMask
