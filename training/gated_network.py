@@ -20,8 +20,8 @@ light comes from, so light is conserved; see training/field_mixing.py.
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
+from training.depthwise import depthwise
 from training.field_mixing import FieldMixing
 from training.gated_bins import bins_px, hat_lines
 from training.gated_kernels import fresh_kernels
@@ -109,7 +109,7 @@ class GatedTiles(nn.Module):
         maps = gated.flatten(1, -3)
         if not torch.compiler.is_exporting():
             maps = maps.contiguous(memory_format=torch.channels_last)
-        blurred = functional.conv2d(maps, kernels, padding=n, groups=kernels.shape[0]).reshape(gated.shape)
+        blurred = depthwise(maps, kernels, padding=n).reshape(gated.shape)
         return blurred if self.mixing is None else blurred.sum(dim=3)
 
     def _weights(self, gates: Tensor, coverage: Tensor, used: list[int]) -> Tensor:

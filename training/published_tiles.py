@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from training.depthwise import depthwise
 from training.gated_kernels import disc_kernel
 from training.network_settings import NetworkSettings
 
@@ -82,8 +83,14 @@ class ResidualBlock(nn.Module):
         self._initialise(settings.initialisation, features, tiles)
 
     def forward(self, x: Tensor) -> Tensor:
-        change = self.second(self._padded(torch.relu(self.first(self._padded(x)))))
+        change = self._convolved(self.second, torch.relu(self._convolved(self.first, x)))
         return self.mix(torch.relu(x + change))
+
+    def _convolved(self, convolution: nn.Conv2d, x: Tensor) -> Tensor:
+        padded = self._padded(x)
+        if convolution.groups < convolution.in_channels:
+            return convolution(padded)  # type: ignore[no-any-return]
+        return depthwise(padded, convolution.weight, convolution.bias)
 
     def _padded(self, x: Tensor) -> Tensor:
         mode: Literal["constant", "replicate", "reflect"] = "constant" if self.padding == "zeros" else self.padding  # type: ignore[assignment]
