@@ -18,6 +18,7 @@ from mrbokeh.tiff_tags import TIFF_SUFFIXES
 Encoding = Literal["srgb", "linear"]
 
 _INTEGER_RANGE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+_SWAPPED_BY_OPENCV = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 
 
 def stored_pixels(path: Path) -> np.ndarray:
@@ -40,9 +41,13 @@ def stored_pixels(path: Path) -> np.ndarray:
 
 def stored_rgb(path: Path) -> Shaped[np.ndarray, "height width channels"]:
     """The stored numbers as (H, W, 3 or 4), red first; grey is repeated."""
+    import cv2
+
     pixels = stored_pixels(path)
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
+    if pixels.dtype in _SWAPPED_BY_OPENCV:
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
     order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]
     return np.ascontiguousarray(pixels[..., order])
 
@@ -71,8 +76,17 @@ def linear_from_codes(
     top = np.float32(_INTEGER_RANGE[codes.dtype])
     if encoding != "srgb":
         return codes / top
-    linear = srgb_to_linear(np.arange(int(top) + 1) / top)[codes[..., :3]]
+    linear = _looked_up(srgb_to_linear(np.arange(int(top) + 1) / top), codes[..., :3])
     return linear if codes.shape[2] == 3 else np.dstack([linear, codes[..., 3] / top])
+
+
+def _looked_up(
+    table: Float32[np.ndarray, " codes"], codes: Shaped[np.ndarray, "height width channels"]
+) -> Float32[np.ndarray, "height width channels"]:
+    """The entry of each code; by OpenCV for 8 bits, which its tables are for."""
+    import cv2
+
+    return np.asarray(cv2.LUT(np.ascontiguousarray(codes), table)) if codes.dtype == np.uint8 else table[codes]
 
 
 def codes_of(rgb: Float32[np.ndarray, "height width 3"], dtype: type, encoding: Encoding) -> Shaped[np.ndarray, "height width 3"]:

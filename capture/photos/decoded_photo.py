@@ -31,6 +31,8 @@ class DecodedPhoto:
     white_balance: multipliers of red, green, blue, green being 1; None where it was applied before (JPEG, EXR).
     saturation_level: the linear value of a saturated green or grey; None where there is no such thing (EXR).
     remarks: what a reader of the result should know.
+    half_suffices: the file holds 8 bits a channel. Their steps are 0.9 % near white and more below, those of half 0.1 % at most; 14-bit RAW
+    and 16-bit files have finer ones near white (0.006 %) than half (0.05 %).
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -40,3 +42,4 @@ class DecodedPhoto:
     white_balance: WhiteBalance | None = None
     saturation_level: float | None = 1.0
     remarks: tuple[str, ...] = ()
+    half_suffices: bool = False

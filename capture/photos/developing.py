@@ -10,6 +10,7 @@ from capture.photos.decoded_photo import DecodedPhoto, Photosites
 from capture.photos.raw import RAW_SUFFIXES, decode_raw
 from capture.photos.saturation import dilated, resized_share
 from mrbokeh.image_io import ENCODED_SUFFIXES, read_image
+from mrbokeh.picture_codec import linear_from_codes, stored_rgb
 
 _LARGEST_HALF = 65504.0
 _FULL = 1.0 - 1e-6
@@ -17,14 +18,6 @@ _FULL = 1.0 - 1e-6
 
 def is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
-
-
-def stored_as_half(path: Path) -> bool:
-    """Half is enough for 8-bit JPEG and WebP: their steps are 0.9 % near white and more below, those of half 0.1 % at most.
-
-    14-bit RAW and 16-bit files have finer steps near white (0.006 %) than half (0.05 %), so they are kept as float.
-    """
-    return path.suffix.lower() in (".jpg", ".jpeg", ".webp")
 
 
 def develop(
@@ -45,17 +38,29 @@ def develop(
 
 
 def _picture(path: Path) -> DecodedPhoto:
+    if path.suffix.lower() in ENCODED_SUFFIXES:
+        return _encoded(path)
     rgb = read_image(path)
     height, width = rgb.shape[:2]
-    if path.suffix.lower() in ENCODED_SUFFIXES:
-        full = np.any(rgb >= _FULL, axis=-1)
-        return DecodedPhoto(rgb, None, dilated(full).astype(np.float32), Photosites(width, height, int(np.count_nonzero(full))))
     finite = np.isfinite(rgb)
     remarks: tuple[str, ...] = ()
     if not finite.all():
         remarks = (f"{np.count_nonzero(~finite.all(axis=-1))} pixels were not finite: NaN became 0, infinity {_LARGEST_HALF:g}",)
         rgb = np.nan_to_num(rgb, nan=0.0, posinf=_LARGEST_HALF, neginf=0.0)
     return DecodedPhoto(rgb, None, np.zeros((height, width), np.float32), Photosites(width, height), saturation_level=None, remarks=remarks)
+
+
+def _encoded(path: Path) -> DecodedPhoto:
+    """Full is the largest code in any channel (TIFF of floats: 1)."""
+    import cv2
+
+    codes = stored_rgb(path)[..., :3]
+    is_float = codes.dtype.kind == "f"
+    rgb = codes.astype(np.float32) if is_float else linear_from_codes(codes, "srgb", path)
+    red, green, blue = cv2.split(np.ascontiguousarray(codes))
+    full = cv2.max(cv2.max(red, green), blue) >= (_FULL if is_float else np.iinfo(codes.dtype).max)
+    photosites = Photosites(full.shape[1], full.shape[0], int(np.count_nonzero(full)))
+    return DecodedPhoto(rgb, None, dilated(full).astype(np.float32), photosites, half_suffices=codes.dtype == np.uint8)
 
 
 def _no_wider(decoded: DecodedPhoto, width: int) -> DecodedPhoto:

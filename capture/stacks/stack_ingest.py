@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.photos.decoded_photo import DecodedPhoto
-from capture.photos.developing import develop, is_raw, stored_as_half
+from capture.photos.developing import develop, is_raw
 from capture.photos.libraw import WhiteBalance
 from capture.photos.photo_files import SkippedFile
 from capture.stacks.disk_space import DiskFullError
@@ -131,7 +131,7 @@ class StackWork:
         # Slices get their numbers when all are there: an unreadable photograph must leave no gap.
         fingerprint = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:12]
         path = self.folder / FOLDER / f"made_{len(self.finished):03d}_{fingerprint}.exr"
-        write_slice(path, rgb, decoded.saturated, primaries, record, half=stored_as_half(photo.path))
+        write_slice(path, rgb, decoded.saturated, primaries, record, half=decoded.half_suffices)
         return FinishedSlice(photo, path, record)
 
     def _developed(self, photo: Photo) -> DecodedPhoto:
