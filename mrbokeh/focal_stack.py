@@ -75,6 +75,11 @@ class FocalStack:
         """Every focus distance is known, so that depth is in metres; else it is the index of the sharpest slice."""
         return all(distance is not None for distance in self.focus_distances_m)
 
+    @property
+    def metres_known(self) -> bool:
+        """False where merging guessed metres because focus distances are unknown; its circles of confusion are measured all the same."""
+        return bool((self.metadata.get("metres") or {}).get("known", True))
+
     def slice_camera_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
         return read_camera_rgb(self.folder / self.slices[index].path)
 

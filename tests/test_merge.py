@@ -174,16 +174,16 @@ def test_a_stack_without_a_merge_has_no_second_pass(tmp_path: Path) -> None:
         second_pass(stack, np.ones((4, 4), np.float32))
 
 
-def test_photographs_without_distances_give_an_index(tmp_path: Path) -> None:
+def test_photographs_without_distances_give_an_index_and_guessed_metres(tmp_path: Path) -> None:
     folder = tmp_path / "board"
     folder.mkdir()
     for path in sorted((DATA / "pcb_oblique").glob("*.jpg")):
         (folder / path.name).write_bytes(path.read_bytes())
     ingested([folder], tmp_path / "scene", 512)
     stack = merge_scene(tmp_path / "scene")[0]
-    assert not stack.is_metric
-    with pytest.raises(InputError, match="focus distances are unknown"):
-        stack.depth_m()
+    assert stack.is_metric and not stack.metres_known, "blur is solved from the slices, metres are guessed"
+    assert pytest.approx(min(each for each in stack.focus_distances_m if each is not None)) == 1.0
+    assert np.isfinite(stack.depth_m()).all()
     index = stack.focus_index()
     assert index.min() >= 0 and index.max() <= 6
     # The connector in front (bottom middle) is sharp in the first slices, the board's far end (upper left) in the last.

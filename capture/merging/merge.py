@@ -12,6 +12,7 @@ from jaxtyping import Float32
 from capture.merging.alignment import Registration, register_stack
 from capture.merging.all_in_focus import NARROW_CROSSOVER, all_in_focus, crossover_of
 from capture.merging.depth_from_focus import FocusMap, focus_map
+from capture.merging.focus_direction import FILE_ORDER
 from capture.merging.focus_volume import focus_volume
 from capture.merging.light_discs import DiscMeasurement
 from capture.merging.light_energy import with_light_energy
@@ -19,6 +20,8 @@ from capture.merging.lights import Extremes, find_lights
 from capture.merging.registered_slices import RegisteredSlices, newer, read_slice, source_path
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
+from capture.merging.relative_focus import solve_relative_focus
+from capture.merging.relative_stack import as_stated, with_guessed_metres, write_relative_depth
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
 from capture.merging.slice_optics import SliceOptics
 from capture.stacks.sentinel_focus import stated_by_sentinel
@@ -46,6 +49,7 @@ def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None 
 
 def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None) -> FocalStack:
     """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
+    stack = as_stated(stack)
     _require_a_sweep(stack)
     name = stack.folder.name
     slices = RegisteredSlices(stack, _registration_of(stack, overwrite, registration))
@@ -59,6 +63,8 @@ def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path |
     blended = all_in_focus(passing, focus.merge_index, _crossover(merged, volume.shape[1]))
     sharp = with_light_energy(blended, measurement.discs, lights)
     write_merged(stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus), stack.rec709_from_camera)
+    if not stack.is_metric:
+        merged = _with_solved_blur(merged, slices, sharp, focus)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
     write_focal_stack(merged)
     write_merge_sheet(merged)
@@ -106,6 +112,15 @@ def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
     read = lru_cache(maxsize=1)(lambda index: read_slice(sources[index]))
     unknown = np.flatnonzero(stated_by_sentinel(stack)).tolist()
     return register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0, unknown)
+
+
+def _with_solved_blur(merged: FocalStack, slices: RegisteredSlices, sharp: Rgb, focus: FocusMap) -> FocalStack:
+    """Blur in pixels where no metres are known: into the stack, and into its depth.exr."""
+    index, confidence = focus.focus_index, focus.confidence
+    relative = solve_relative_focus(slices.passing, sharp, index, confidence, len(merged), slices.valid, slices.saturated)
+    guessed = with_guessed_metres(merged, relative, FILE_ORDER, (sharp.shape[1], sharp.shape[0]))
+    write_relative_depth(guessed, index, confidence, relative, FILE_ORDER)
+    return guessed
 
 
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:

@@ -1,0 +1,245 @@
+"""Where each slice is focused and where each surface lies, in pixels of blur, from the pictures alone.
+
+The circle of confusion of a surface at position u in a slice focused at u_i is |u_i - u| pixels in the registered slices: positions are
+affine in dioptres (a dioptre is as many pixels as the blur grows by), and no lens needs to be known for them. That blur grows alike in
+all registered slices follows from the entrance pupil: seen from the scene, a disc of confusion is the pupil, whatever the focus.
+
+What is sharp in slice j is blurred in slice i by the disc that explains i best; such diameters for all pairs give the positions by least
+squares, and with them every place its own.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from capture.merging.blur_evidence import BlurEvidence, blur_evidence
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Positions = Float[np.ndarray, " slices"]
+
+_BLOCKS = 5
+_MODEL_SHARE = 0.01
+"""Of a cell's texture: what a disc does not reproduce of real blur, whatever its size."""
+_ROUNDS = 4
+_REACH = 5
+_WIDEST_OFFSET_STEPS = 0.8
+_WINDOW_SAMPLES = 12.0
+"""Independent pixels in a window, for the uncertainty of a place."""
+_PRIOR_STEPS = 0.5
+_SPREAD_STEPS = 1.0
+_LEAST_ERROR_PX, _LEAST_ERROR_SHARE = 0.05, 0.02
+
+
+@dataclass(frozen=True)
+class RelativeFocus:
+    """positions_px, errors_px: (slices,) where each slice is focused, increasing with its index, and the standard error to its neighbours.
+
+    focus_px, error_px: (H, W) the position of the surface at each pixel. The circle of confusion there is positions_px[i] - focus_px.
+    """
+
+    positions_px: Positions
+    errors_px: Positions
+    focus_px: Plane
+    error_px: Plane
+
+
+def solve_relative_focus(
+    slices: Callable[[], Iterable[Rgb]],
+    all_in_focus: Rgb,
+    focus_index: Plane,
+    confidence: Plane,
+    count: int,
+    valid: Callable[[int], Mask] | None = None,
+    excluded: Mask | None = None,
+) -> RelativeFocus:
+    """Solve registered slices, which are read once, and their all-in-focus picture.
+
+    focus_index, confidence: of the merge. valid: where slice i has data. excluded: pixels that were full in some slice.
+    """
+    evidence = blur_evidence(slices, all_in_focus, count, valid, excluded)
+    places = _Places.of(evidence, focus_index, confidence, count)
+    positions, errors = _positions(places)
+    offset, cell_error = _offsets(places, positions)
+    return RelativeFocus(positions, errors, *_dense(places, positions, offset, cell_error, focus_index))
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Cells: errors in units of their variance; index: fractional; nearest: slice; own: the slices that their sharp picture is of."""
+
+    evidence: BlurEvidence
+    errors: Float32[np.ndarray, "cells slices rungs"]
+    gaps: Float32[np.ndarray, "cells steps"]
+    index: Float32[np.ndarray, " cells"]
+    nearest: Int[np.ndarray, " cells"]
+    own: Float32[np.ndarray, "cells slices"]
+    weight: Float32[np.ndarray, " cells"]
+    block: Int[np.ndarray, " cells"]
+
+    @classmethod
+    def of(cls, evidence: BlurEvidence, focus_index: Plane, confidence: Plane, count: int) -> "_Places":
+        index, trust = evidence.at_cells(focus_index).astype(np.float32), evidence.at_cells(confidence)
+        own = np.clip(1.0 - np.abs(index[:, None] - np.arange(count)), 0.0, 1.0).astype(np.float32)
+        own = np.clip((own - 0.25) * 2.0, 0.0, 1.0)
+        own /= own.sum(axis=1, keepdims=True)
+        known = evidence.errors[:, :, 0] >= 0
+        lowest = np.where(known, evidence.errors.min(axis=2), np.inf)
+        lowest[own > 0.05] = np.inf
+        finite = np.isfinite(lowest)
+        floor = float(np.percentile(lowest[finite], 10)) + 1e-9 if finite.any() else 1e-9
+        variance = floor + _MODEL_SHARE * evidence.texture
+        errors = evidence.errors / variance[:, None, None]
+        errors[~known | (own > 0.05)] = -1.0
+        grid = index.reshape(evidence.shape)
+        box = np.ones((5, 5), np.uint8)
+        jump = (cv2.dilate(grid, box) - cv2.erode(grid, box)).ravel()
+        weight = trust / (1.0 + (jump / 0.7) ** 2) * (evidence.texture > 5.0 * floor)
+        rows, columns = np.indices(evidence.shape)
+        block = (rows * _BLOCKS // evidence.shape[0]) * _BLOCKS + columns * _BLOCKS // evidence.shape[1]
+        nearest = np.rint(index).astype(np.int64)
+        return cls(
+            evidence,
+            errors,
+            (evidence.gaps / variance[:, None]).astype(np.float32),
+            index,
+            nearest,
+            own,
+            weight.astype(np.float32),
+            block.ravel().astype(np.int64),
+        )
+
+    @property
+    def count(self) -> int:
+        return self.errors.shape[1]
+
+
+def _positions(places: _Places) -> tuple[Positions, Positions]:
+    """By least squares of the diameters of all pairs, first as they are and then of what is left of them."""
+    widest = float(places.evidence.diameters_px[-1])
+    sharp = np.abs(places.index - places.nearest) <= 0.3
+    diameters = np.arange(0.0, widest + 0.01, widest / 60.0)
+    no_base = np.zeros((len(places.index), places.count))
+    measured = _measured(places, places.weight * sharp, no_base, np.zeros(len(places.index)), diameters)
+    positions, errors = _solved(measured, np.zeros(places.count), places.count)
+    offsets = np.linspace(-0.15, 0.15, 31) * widest
+    for _ in range(_ROUNDS):
+        offset, _ = _offsets(places, positions)
+        place = np.interp(places.index, np.arange(places.count), positions) + offset
+        base = np.abs(positions[None, :] - place[:, None])
+        own_blur = (places.own * base**2).sum(axis=1)
+        base[base > 0.9 * widest] = 1e6
+        measured = _measured(places, places.weight, base, own_blur, offsets)
+        positions, errors = _solved(measured, positions, places.count)
+    return positions, errors
+
+
+@dataclass(frozen=True)
+class _Diameters:
+    """Of pairs: slice, the slice in which its cells are sharp, what to add to the diameter so far, and how sure that is."""
+
+    one: Int[np.ndarray, " pairs"]
+    other: Int[np.ndarray, " pairs"]
+    value_px: Float[np.ndarray, " pairs"]
+    error_px: Float[np.ndarray, " pairs"]
+
+
+def _measured(
+    places: _Places,
+    weight: Float32[np.ndarray, " cells"],
+    base: Float[np.ndarray, "cells slices"],
+    own_blur: Float[np.ndarray, " cells"],
+    candidates: Float[np.ndarray, " candidates"],
+) -> _Diameters:
+    from capture.merging._relative_focus_numba import sum_curves
+
+    curves = np.zeros((places.count, places.count, _BLOCKS**2, len(candidates)))
+    usable = np.where(base[:, :, None] > 1e5, np.float32(-1.0), places.errors) if base.max() > 1e5 else places.errors
+    squares = places.evidence.diameters_px**2
+    sum_curves(usable, places.gaps, squares, weight.astype(np.float32), places.nearest, places.block, base, own_blur, candidates, curves)
+    total = curves.sum(axis=2)
+    best = np.clip(total.argmin(axis=2), 1, len(candidates) - 2)
+    inside = (total.argmin(axis=2) < len(candidates) - 1) & (total.max(axis=2) > 0)
+    step = candidates[1] - candidates[0]
+    before, at, after = (np.take_along_axis(curves, (best + k)[:, :, None, None], axis=3)[..., 0] for k in (-1, 0, 1))
+    bend = (before - 2.0 * at + after).sum(axis=2) / step**2
+    slope = (after - before) / (2.0 * step)
+    shift = np.where(bend > 0, -slope.sum(axis=2) / np.maximum(bend, 1e-12), 0.0)
+    shift = np.clip(shift, -step, step)
+    error = np.sqrt((slope - slope.mean(axis=2, keepdims=True)).__pow__(2).sum(axis=2)) / np.maximum(bend, 1e-12)
+    one, other = np.nonzero(inside & (bend > 0) & ~np.eye(places.count, dtype=bool))
+    value = candidates[best] + shift
+    return _Diameters(one, other, value[one, other], error[one, other])
+
+
+def _solved(measured: _Diameters, before: Positions, count: int) -> tuple[Positions, Positions]:
+    """Robust weighted least squares; bends of the positions over the index cost a little, so that nothing stays open."""
+    sign = np.where(measured.one > measured.other, 1.0, -1.0)
+    wanted = (before[measured.one] - before[measured.other]) + sign * measured.value_px
+    rows = np.zeros((len(wanted), count))
+    rows[np.arange(len(wanted)), measured.one] += 1.0
+    rows[np.arange(len(wanted)), measured.other] -= 1.0
+    sigma = np.sqrt(measured.error_px**2 + _LEAST_ERROR_PX**2 + (_LEAST_ERROR_SHARE * wanted) ** 2)
+    typical = float(np.median(np.abs(wanted) / np.abs(measured.one - measured.other))) if len(wanted) else 1.0
+    bends = np.diff(np.eye(count), 2, axis=0) / (2.0 * max(typical, 0.1))
+    robust = np.ones(len(wanted))
+    positions = before
+    for _ in range(8):
+        scaled = np.sqrt(robust) / sigma
+        system = np.vstack([rows * scaled[:, None], bends, np.ones((1, count))])
+        side = np.concatenate([wanted * scaled, np.zeros(len(bends) + 1)])
+        positions = np.linalg.lstsq(system, side, rcond=None)[0]
+        off = np.abs(rows @ positions - wanted) / sigma
+        robust = np.minimum(1.0, 1.5 / np.maximum(off, 1e-9))
+    positions = np.maximum.accumulate(positions)
+    covariance = np.linalg.inv(system.T @ system)
+    excess = max(1.0, float((robust * off**2).sum()) / max(len(wanted) - count + 1, 1))
+    steps = np.diff(np.eye(count), axis=0)
+    step_error = np.sqrt(np.einsum("ij,jk,ik->i", steps, covariance, steps) * excess)
+    return positions, np.array([max(step_error[max(i - 1, 0)], step_error[min(i, count - 2)]) for i in range(count)])
+
+
+def _offsets(places: _Places, positions: Positions) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
+    """(what to add to the position that the focus index gives, standard error) of each cell."""
+    from capture.merging._relative_focus_numba import best_offsets
+
+    steps = np.maximum(np.gradient(positions), 0.3)
+    local = np.interp(places.index, np.arange(places.count), steps)
+    start = np.interp(places.index, np.arange(places.count), positions)
+    offsets, bends = np.empty_like(start), np.empty_like(start)
+    prior = 1.0 / (_WINDOW_SAMPLES * (_PRIOR_STEPS * local) ** 2)
+    best_offsets(
+        places.errors,
+        places.gaps,
+        places.evidence.diameters_px**2,
+        positions,
+        start,
+        _WIDEST_OFFSET_STEPS * local / _REACH,
+        places.own.astype(np.float64),
+        prior,
+        _REACH,
+        offsets,
+        bends,
+    )
+    information = 0.5 * bends * _WINDOW_SAMPLES + 1e-9
+    shape = places.evidence.shape
+    trust = information.reshape(shape).astype(np.float32)
+    summed = cv2.GaussianBlur((offsets.reshape(shape) * trust).astype(np.float32), (0, 0), _SPREAD_STEPS)
+    smooth = summed / cv2.GaussianBlur(trust, (0, 0), _SPREAD_STEPS)
+    return smooth.ravel().astype(np.float64), 1.0 / np.sqrt(information)
+
+
+def _dense(
+    places: _Places, positions: Positions, offset: Float[np.ndarray, " cells"], error: Float[np.ndarray, " cells"], focus_index: Plane
+) -> tuple[Plane, Plane]:
+    height, width = focus_index.shape
+    shape = places.evidence.shape
+    along = np.arange(places.count)
+    fine = np.interp(focus_index, along, positions)
+    moved = cv2.resize(offset.reshape(shape).astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    error_px = cv2.resize(error.reshape(shape).astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return (fine + moved).astype(np.float32), error_px

@@ -1,0 +1,226 @@
+"""A merged stack whose focus distances nobody stated: its blur as solved from the slices, in metres that are guessed and say so.
+
+Circles of confusion need no metres: positions in pixels of blur are affine in dioptres. Two numbers make dioptres of them, a scale and an
+offset. Stated distances, or the focal length, f-number and sensor of the lens, tell one or both; what remains is put so that the farthest
+plane of focus is twice as far as the nearest, and without any of that they lie at 2 m and 1 m.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from capture.merging.focus_direction import Direction
+from capture.merging.relative_focus import RelativeFocus
+from mrbokeh.camera import Camera
+from mrbokeh.camera_file import camera_from_json, camera_to_json
+from mrbokeh.exr_io import ExrPart, write_exr
+from mrbokeh.focal_stack import FocalStack, Slice
+from mrbokeh.lens import Lens
+from mrbokeh.lens_file import lens_from_json, lens_to_json
+
+METRES = "metres"
+"""Key in a stack's metadata: known (whether its metres are), why (in words), gauge (numbers)."""
+STATED = "stated_before_guessing"
+STATED_DISTANCE = "stated_focus_distance_m"
+POSITION = "blur_position_px"
+_NEAREST_DIOPTRES, _FARTHEST_DIOPTRES = 1.0, 0.5
+_FAR_OVER_NEAR = 2.0
+_LEAST_DIOPTRES = 1e-3
+_LEAST_RANGE_PX = 0.5
+_SENSOR_MM, _FOCAL_LENGTH_MM = 36.0, 35.0
+
+Plane = Float32[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """dioptres = offset_dioptres + position_px / px_per_dioptre (below 0 where the last slice is the nearest... signed).
+
+    scale_from, offset_from: "distances", "lens" or "guess".
+    """
+
+    px_per_dioptre: float
+    offset_dioptres: float
+    scale_from: str
+    offset_from: str
+
+    def dioptres(self, positions_px: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        return np.maximum(self.offset_dioptres + np.asarray(positions_px) / self.px_per_dioptre, _LEAST_DIOPTRES)
+
+    @property
+    def known(self) -> bool:
+        return "guess" not in (self.scale_from, self.offset_from)
+
+
+def as_stated(stack: FocalStack) -> FocalStack:
+    """The stack with nothing in it that an earlier merge guessed."""
+    if STATED not in stack.metadata:
+        return stack
+    kept: Mapping[str, Any] = stack.metadata[STATED]
+    metadata = {key: value for key, value in stack.metadata.items() if key not in (STATED, METRES)}
+    return replace(
+        stack,
+        slices=tuple(_stated_slice(each) for each in stack.slices),
+        lens=None if kept["lens"] is None else lens_from_json(kept["lens"], str(stack.folder)),
+        camera=None if kept["camera"] is None else camera_from_json(kept["camera"]),
+        metadata=metadata,
+    )
+
+
+def _stated_slice(each: Slice) -> Slice:
+    ours = (STATED_DISTANCE, POSITION, "blur_position_error_px", "px_per_dioptre", "px_per_dioptre_width_px")
+    stated = each.metadata.get(STATED_DISTANCE)
+    metadata = {key: value for key, value in each.metadata.items() if key not in ours}
+    return replace(each, focus_distance_m=None if stated is None else float(stated), metadata=metadata)
+
+
+def with_guessed_metres(stack: FocalStack, relative: RelativeFocus, direction: Direction, size_px: tuple[int, int]) -> FocalStack:
+    """The merged stack with a focus distance for every slice, a lens that blurs as was solved and a camera. size_px: (width, height)."""
+    stated = as_stated(stack)
+    positions_px = nearness_px(relative.positions_px, direction)
+    gauge = gauge_of(stated, positions_px, size_px)
+    dioptres = gauge.dioptres(positions_px)
+    distances_m = [1.0 / float(each) if each_stated is None else each_stated for each, each_stated in _paired(dioptres, stated)]
+    growth = gauge.px_per_dioptre
+    slices = tuple(
+        replace(
+            each,
+            focus_distance_m=distance_m,
+            metadata=each.metadata
+            | {
+                STATED_DISTANCE: _json_number(each.focus_distance_m),
+                POSITION: float(position),
+                "blur_position_error_px": float(error),
+                # Blur grows alike in all registered slices, so less in those that registration enlarged.
+                "px_per_dioptre": growth / each.scale,
+                "px_per_dioptre_width_px": size_px[0],
+            },
+        )
+        for each, distance_m, position, error in zip(stated.slices, distances_m, positions_px, relative.errors_px, strict=True)
+    )
+    lens = _nominal_lens(stated, size_px, growth, distances_m[stack.reference])
+    before = {
+        "lens": None if stated.lens is None else lens_to_json(stated.lens),
+        "camera": None if stated.camera is None else camera_to_json(stated.camera),
+    }
+    facts = {"known": gauge.known, "why": _why(gauge, direction, stated), "gauge": _gauge_json(gauge, direction, distances_m)}
+    metadata = stated.metadata | {METRES: facts, STATED: before}
+    return replace(stated, slices=slices, lens=lens, camera=stated.camera or _camera(lens, size_px), metadata=metadata)
+
+
+def nearness_px(positions_px: Float[np.ndarray, "*batch"], direction: Direction) -> Float[np.ndarray, "*batch"]:
+    """Positions that grow towards the camera, as dioptres do."""
+    return -positions_px if direction.near_first else positions_px
+
+
+def gauge_of(stated: FocalStack, positions_px: Float[np.ndarray, " slices"], size_px: tuple[int, int]) -> Gauge:
+    """Scale and offset from what is known, else guessed. positions_px: growing towards the camera."""
+    told = [(float(p), 1.0 / d) for p, d in zip(positions_px, stated.focus_distances_m, strict=True) if d is not None]
+    spread_px = max(float(np.ptp(positions_px)), _LEAST_RANGE_PX)
+    farthest_px = float(np.min(positions_px))
+    if len(told) >= 2 and np.ptp([p for p, _ in told]) > _LEAST_RANGE_PX:
+        slope, offset = np.polyfit([p for p, _ in told], [d for _, d in told], 1)
+        if slope > 0:
+            return Gauge(1.0 / float(slope), float(offset), "distances", "distances")
+    growth = _stated_growth(stated, size_px[0])
+    if growth is not None:
+        if told:
+            return Gauge(growth, float(np.mean([d - p / growth for p, d in told])), "lens", "distances")
+        return Gauge(growth, spread_px / growth / (_FAR_OVER_NEAR - 1.0) - farthest_px / growth, "lens", "guess")
+    if told:
+        # The farthest plane is at D, the nearest at twice that; the stated one lies between them as its position does.
+        shares = [1.0 + (_FAR_OVER_NEAR - 1.0) * (p - farthest_px) / spread_px for p, _ in told]
+        farthest = float(np.mean([d / share for (_, d), share in zip(told, shares, strict=True)]))
+        growth = spread_px / max((_FAR_OVER_NEAR - 1.0) * farthest, _LEAST_DIOPTRES)
+        return Gauge(growth, farthest - farthest_px / growth, "guess", "distances")
+    growth = spread_px / (_NEAREST_DIOPTRES - _FARTHEST_DIOPTRES)
+    return Gauge(growth, _FARTHEST_DIOPTRES - farthest_px / growth, "guess", "guess")
+
+
+def write_relative_depth(stack: FocalStack, focus_index: Plane, confidence: Plane, relative: RelativeFocus, direction: Direction) -> None:
+    """depth.exr of a stack of `with_guessed_metres`: with Z in its metres, and blur_position and blur_position_error in pixels."""
+    position_px = nearness_px(relative.focus_px, direction).astype(np.float32)
+    gauge = stack.metadata[METRES]["gauge"]
+    dioptres = np.maximum(gauge["offset_dioptres"] + position_px / gauge["px_per_dioptre"], _LEAST_DIOPTRES)
+    channels = {
+        "focus_index": focus_index,
+        "confidence": confidence,
+        "Z": (1.0 / dioptres).astype(np.float32),
+        "blur_position": position_px,
+        "blur_position_error": relative.error_px,
+    }
+    write_exr(Path(stack.folder) / "depth.exr", ExrPart(channels))
+
+
+def _paired(dioptres: Float[np.ndarray, " slices"], stated: FocalStack) -> zip:
+    return zip(dioptres, stated.focus_distances_m, strict=True)
+
+
+def _stated_growth(stated: FocalStack, width_px: int) -> float | None:
+    """Pixels of blur per dioptre of the lens that the photographs state, focused far away."""
+    facts = _stated_lens(stated)
+    if facts is None:
+        return None
+    return width_px / facts["sensor_width_mm"] * facts["focal_length_mm"] ** 2 / facts["f_number"] / 1000.0
+
+
+def _stated_lens(stated: FocalStack) -> dict[str, float] | None:
+    """focal_length_mm, f_number and sensor_width_mm, where all are known."""
+    if stated.lens is not None:
+        return {name: getattr(stated.lens, name) for name in ("focal_length_mm", "f_number", "sensor_width_mm")}
+    facts = stated.metadata.get("optics") or {}
+    return facts if all(facts.get(name) for name in ("focal_length_mm", "f_number", "sensor_width_mm")) else None
+
+
+def _nominal_lens(stated: FocalStack, size_px: tuple[int, int], growth: float, focus_m: float) -> Lens:
+    facts = _stated_lens(stated)
+    if stated.lens is not None:
+        return stated.lens.focused_at(focus_m)
+    if facts is not None:
+        return Lens(facts["focal_length_mm"], facts["f_number"], max(focus_m, 0.00101 * facts["focal_length_mm"]), facts["sensor_width_mm"])
+    sensor_mm = _SENSOR_MM * min(1.0, size_px[0] / size_px[1])
+    guess = Lens(_FOCAL_LENGTH_MM, 1.0, max(focus_m, 0.00101 * _FOCAL_LENGTH_MM), sensor_mm)
+    return replace(guess, f_number=guess.coc_px_per_dioptre(size_px[0]) / growth)
+
+
+def _camera(lens: Lens, size_px: tuple[int, int]) -> Camera:
+    focal_px = lens.focal_px(size_px[0])
+    return Camera(*size_px, (focal_px, focal_px), (size_px[0] / 2.0, size_px[1] / 2.0))
+
+
+def _why(gauge: Gauge, direction: Direction, stated: FocalStack) -> str:
+    told = sum(each is not None for each in stated.focus_distances_m)
+    blur = "blur in pixels is solved from the slices"
+    near = "" if direction.sure else f"; that the {'first' if direction.near_first else 'last'} slice is the nearest is a guess"
+    match gauge.scale_from, gauge.offset_from:
+        case "distances", _:
+            return f"{blur}, metres are those of {told} of {len(stated)} stated focus distances{near}"
+        case "lens", "distances":
+            return f"{blur}, metres follow from the stated lens and {told} of {len(stated)} focus distances{near}"
+        case "lens", _:
+            return f"{blur} and the lens is stated, but no focus distance: how far away all lies is a guess{near}"
+        case _, "distances":
+            return f"{blur} and one focus distance is stated; how deep the scene is remains a guess{near}"
+    return f"{blur}; no focus distance is stated: the nearest plane of focus is put at 1 m and the farthest at 2 m{near}"
+
+
+def _gauge_json(gauge: Gauge, direction: Direction, distances_m: list[float]) -> dict[str, Any]:
+    return {
+        "px_per_dioptre": gauge.px_per_dioptre,
+        "offset_dioptres": gauge.offset_dioptres,
+        "scale_from": gauge.scale_from,
+        "offset_from": gauge.offset_from,
+        "nearest_m": min(distances_m),
+        "farthest_m": _json_number(max(distances_m)),
+        "near_first": direction.near_first,
+        "near_first_from": direction.source,
+        "near_first_sure": direction.sure,
+    }
+
+
+def _json_number(value: float | None) -> float | str | None:
+    return "inf" if value == float("inf") else value
