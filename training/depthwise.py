@@ -2,8 +2,8 @@
 
 Blur of d pixels needs kernels d + 1 wide, and PyTorch's own gradient with respect to depthwise weights grows on a CPU much faster than
 the convolution itself: one of 35 x 35 over 128 x 128 pixels took 170 times as long backward as forward. The gradient of a kernel is the
-correlation of what went in with the gradient of what came out, of which only the kernel's own pixels are wanted; the gradient of the
-input is a convolution with the mirrored kernel. Fourier transforms and the forward convolution give both in about the forward's time.
+correlation of what went in with the gradient of what came out, of which only the kernel's own pixels are wanted, and that of the input
+a convolution. Fourier transforms give both in about the time of the convolution forward.
 """
 
 from typing import Any
@@ -43,24 +43,31 @@ class _Depthwise(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
         maps, kernels = ctx.saved_tensors
-        of_maps = _of_maps(kernels, gradient, ctx.padding) if ctx.needs_input_grad[0] else None
-        of_kernels = _of_kernels(maps, gradient, kernels.shape[-1], ctx.padding) if ctx.needs_input_grad[1] else None
+        parts = [
+            _gradients(maps[:, channels], kernels[channels, 0], gradient[:, channels], ctx.padding, ctx.needs_input_grad[:2])
+            for channels in (slice(start, start + _CHANNELS_AT_ONCE) for start in range(0, maps.shape[1], _CHANNELS_AT_ONCE))
+        ]
+        of_maps = torch.cat([each for each, _ in parts if each is not None], dim=1) if ctx.needs_input_grad[0] else None
+        of_kernels = torch.cat([each for _, each in parts if each is not None])[:, None] if ctx.needs_input_grad[1] else None
         return of_maps, of_kernels, None
 
 
-def _of_maps(kernels: Tensor, gradient: Tensor, padding: int) -> Tensor:
-    mirrored = kernels.flip((-2, -1))
-    gradient = gradient.contiguous(memory_format=torch.channels_last)
-    return functional.conv2d(gradient, mirrored, padding=kernels.shape[-1] - 1 - padding, groups=kernels.shape[0])
+def _gradients(
+    maps: Tensor, kernels: Tensor, gradient: Tensor, padding: int, wanted: tuple[bool, bool]
+) -> tuple[Tensor | None, Tensor | None]:
+    """(of the maps, of the kernels (C, k, k)), each where it is wanted.
 
-
-def _of_kernels(maps: Tensor, gradient: Tensor, size: int, padding: int) -> Tensor:
-    """(C, 1, size, size): sum over pictures and pixels p of maps(p + offset - padding) * gradient(p), for every offset in the kernel."""
-    lengths = [scipy.fft.next_fast_len(length + 2 * padding, real=True) for length in maps.shape[-2:]]
-    parts = []
-    for start in range(0, maps.shape[1], _CHANNELS_AT_ONCE):
-        channels = slice(start, start + _CHANNELS_AT_ONCE)
-        seen = torch.fft.rfft2(functional.pad(maps[:, channels].contiguous(), (padding,) * 4), s=lengths)
-        wanted = torch.fft.rfft2(gradient[:, channels].contiguous(), s=lengths)
-        parts.append(torch.fft.irfft2((seen * wanted.conj()).sum(dim=0), s=lengths)[:, :size, :size])
-    return torch.cat(parts)[:, None]
+    With out(p) = sum over o of maps(p + o - padding) kernel(o), that of maps(q) is sum over o of gradient(q + padding - o) kernel(o), and
+    that of kernel(o) the sum over p of maps(p + o - padding) gradient(p).
+    """
+    size, (height, width) = kernels.shape[-1], maps.shape[-2:]
+    lengths = [scipy.fft.next_fast_len(length + 2 * padding, real=True) for length in (height, width)]
+    error = torch.fft.rfft2(gradient.contiguous(), s=lengths)
+    of_maps = of_kernels = None
+    if wanted[0]:
+        whole = torch.fft.irfft2(error * torch.fft.rfft2(kernels, s=lengths), s=lengths)
+        of_maps = whole[..., padding : padding + height, padding : padding + width]
+    if wanted[1]:
+        seen = torch.fft.rfft2(functional.pad(maps.contiguous(), (padding,) * 4), s=lengths)
+        of_kernels = torch.fft.irfft2((seen * error.conj()).sum(dim=0), s=lengths)[:, :size, :size]
+    return of_maps, of_kernels
