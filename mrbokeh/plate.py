@@ -26,6 +26,7 @@ class Plate:
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
+    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -35,6 +36,7 @@ class Plate:
     sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None
     near_alpha: Float32[np.ndarray, "height width"] | None = None
     alpha: Float32[np.ndarray, "height width"] | None = None
+    metres_guessed: bool = False
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -57,6 +59,10 @@ class Plate:
         depth_m = float(self.depth_m[int(y_px), int(x_px)])
         x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px]), np.array(depth_m))
         return float(x_m), float(y_m), float(z_m)
+
+    def length_m(self, pixels: float, depth_m: float) -> float:
+        """Of what covers so many pixels upright at a depth, facing the camera."""
+        return pixels / self.camera.focal_px[1] * depth_m
 
 
 def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
@@ -121,7 +127,8 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     rgb = stack.slice_rgb(slice_index)
     camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
-    return Plate(rgb, stack.depth_m(), focused, replace(camera, camera_from_world=np.eye(4)), stack.all_in_focus())
+    upright, guessed = replace(camera, camera_from_world=np.eye(4)), not stack.metres_known
+    return Plate(rgb, stack.depth_m(), focused, upright, stack.all_in_focus(), metres_guessed=guessed)
 
 
 def _pinhole(lens: Lens, rgb: Float32[np.ndarray, "height width 3"]) -> Camera:

@@ -32,7 +32,7 @@ ROWS = (
     ("film_plane",),
     ("psf_models.", "spreadlets_build"),
     ("psf_bank_export", "bank_fits_file"),
-    ("focal_stack_dataset",),
+    ("focal_stack_dataset", "guessed_metres", "focus_places"),
     ("picture_sources.",),
     ("focal_stack", "video_io", "scene.", "contact_sheet", "psf_bank_file", "light_field_samples_file", "motion_file"),
     ("video_packets",),

@@ -8,11 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.camera_rgb import read_camera_rgb, write_camera_rgb
-from mrbokeh.commands.refocus import app, parse_focus
+from mrbokeh.commands.refocus import app
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.focus_places import parse_focus
 from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import Layer
 from mrbokeh.lens_file import write_lens

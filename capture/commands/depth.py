@@ -38,4 +38,4 @@ def depth_command(
     for stack in result.stacks:
         typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
     if result.left_out:
-        typer.echo(f"without a pose, depth from focus only: {', '.join(result.left_out)}")
+        typer.echo(f"without a pose or with guessed metres, depth from focus only: {', '.join(result.left_out)}")

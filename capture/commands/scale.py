@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.errors import InputError
+
 HELP = "\n\n".join(
     (
         "Find how many metres the unit of the camera poses is: from a ChArUco board in the scene, from a measured distance between two "
@@ -12,6 +14,10 @@ HELP = "\n\n".join(
         "with their disagreement; the board counts most, then the distance, then the focus.",
         "Then the focus and the growth of blur of every slice are calibrated against the depth: into stack.json, and as "
         "SCENE/lens_calibration.json for later stacks of that lens (--lens-calibration), which need no poses.",
+        "One stack whose focus distances nobody stated has guessed metres; it needs no poses but one known length (--ruler) or distance "
+        "(--distance-at), at pixels of its all-in-focus picture. What photographs state stays, what is told fixes the rest, and what is "
+        "still guessed is said: two things at different depths tell how deep the scene is.",
+        "Example:  mrbokeh capture scale STACK --ruler 310,220,480,224,0.05",
         "Example:  mrbokeh capture scale scene/ --board 8x6 --square-mm 30 --marker-mm 22",
         "Example:  mrbokeh capture scale scene/ --distance view_0,view_3,0.25",
         "Example:  mrbokeh capture scale other_scene/ --lens-calibration scene/lens_calibration.json",
@@ -20,7 +26,9 @@ HELP = "\n\n".join(
 
 
 def scale_command(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder that `mrbokeh capture poses` worked on")],
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE", help="folder that `mrbokeh capture poses` worked on; a stack for --ruler and --distance-at")
+    ],
     board: Annotated[
         str | None,
         typer.Option(
@@ -35,6 +43,14 @@ def scale_command(
     lens_calibration: Annotated[
         Path | None, typer.Option(metavar="FILE", help="only put this calibration to use on the stacks; poses are not needed")
     ] = None,
+    ruler: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X1,Y1,X2,Y2,METRES", help="a known length between what is seen at two pixels of a stack; may be repeated"),
+    ] = None,
+    distance_at: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X,Y,METRES", help="a known distance from the lens to what is seen at a pixel of a stack; may be repeated"),
+    ] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="calibrate the focus of the stacks")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find the scale again")] = False,
 ) -> None:
@@ -43,12 +59,31 @@ def scale_command(
     from capture.views.scale_distance import parse_distance
     from capture.views.scale_text import scale_lines
 
+    if ruler or distance_at:
+        if board or distance or lens_calibration:
+            raise InputError("--ruler and --distance-at are for one stack, --board, --distance and --lens-calibration for a scene: choose")
+        _tell(scene, ruler or [], distance_at or [], overwrite)
+        return
     if lens_calibration is not None:
         _apply(scene, lens_calibration)
         return
     wanted_board = None if board is None else board_from_options(board, square_mm, marker_mm, dictionary)
     wanted_distance = None if distance is None else parse_distance(distance)
     for line in scale_lines(scale_scene(scene, ScaleRequest(wanted_board, wanted_distance, calibrate, overwrite))):
+        typer.echo(line)
+
+
+def _tell(folder: Path, rulers: list[str], distances: list[str], overwrite: bool) -> None:
+    from capture.views.stack_metres import Fact, lines_of, parse_known_distance, parse_length, tell_metres
+    from mrbokeh.focal_stack import find_focal_stacks
+
+    facts: list[Fact] = [*[parse_length(each) for each in rulers], *[parse_known_distance(each) for each in distances]]
+    stacks = find_focal_stacks(folder)
+    if len(stacks) > 1:
+        raise InputError(
+            f"{folder} has {len(stacks)} stacks: give the folder of the one whose pixels these are, such as {stacks[0].folder}"
+        )
+    for line in lines_of(tell_metres(stacks[0], facts, overwrite)):
         typer.echo(line)
 
 

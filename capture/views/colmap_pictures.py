@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from capture.merging.relative_stack import as_stated
 from capture.views.colmap_job import ColmapPicture
 from capture.views.lens_calibration import stated_distances_m
 from mrbokeh.color import luminance
@@ -51,8 +52,9 @@ def stack_cameras(stacks: Sequence[FocalStack], choice: str) -> tuple[list[int],
     """(number of the camera of each stack, prior of each camera): one for each size, lens and focus of the reference slice.
 
     The focal length in pixels breathes with the focus, so only pictures registered to the same focus share a camera.
-    Where nobody knows the focus, stacks of one size are taken to have been focused alike.
+    Where nobody knows the focus, stacks of one size are taken to have been focused alike; what merging guessed is no prior.
     """
+    stacks = [as_stated(stack) for stack in stacks]
     keys = [_camera_key(stack) for stack in stacks]
     priors = [None if each.camera is None else (each.camera.focal_px[0], *each.camera.principal_px) for each in stacks]
     return _numbered(keys, priors, choice)

@@ -24,6 +24,7 @@ from mrbokeh.aperture import Aperture
 from mrbokeh.color import luminance
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack
+from mrbokeh.guessed_metres import KEY
 from mrbokeh.progress import track
 
 _WIDEST_PX = 1600
@@ -99,7 +100,14 @@ def calibrated_stack(found: StackFocus, view: SparseView) -> FocalStack:
     rows = zip(stack.slices, stated_distances_m(stack), found.fit.dioptres, found.fit.px_per_dioptre, strict=True)
     for each, stated_m, dioptre, growth in rows:
         slices.append(with_calibrated_focus(each, stated_m, float(dioptre), float(growth) / each.scale, found.width_px))
-    return with_view(focused_stack(stack, slices), view)
+    return with_view(_with_known_metres(focused_stack(stack, slices)), view)
+
+
+def _with_known_metres(stack: FocalStack) -> FocalStack:
+    """Where metres were guessed before, they rest on the camera poses now."""
+    if KEY not in stack.metadata:
+        return stack
+    return replace(stack, metadata=stack.metadata | {KEY: {"known": True, "why": "metres rest on the camera poses"}})
 
 
 def with_view(stack: FocalStack, view: SparseView) -> FocalStack:

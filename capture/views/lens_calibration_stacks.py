@@ -19,12 +19,12 @@ def calibrate_scene(scene: Path, calibration: LensCalibration) -> list[FocalStac
     changed = [apply_lens_calibration(stack, calibration) for stack in stacks]
     for stack in changed:
         if stack.merged:
-            _write_depth(stack)
+            write_depth(stack)
         write_focal_stack(stack)
     return changed
 
 
-def _write_depth(stack: FocalStack) -> None:
+def write_depth(stack: FocalStack) -> None:
     """Depth in metres anew from the focus index, interpolated in dioptres."""
     parts = read_exr(stack.depth_path)
     channels = dict(parts[0].channels)

@@ -12,6 +12,7 @@ from capture.views.colmap_job import job_from_json
 from capture.views.focus_calibration_stacks import StackFocus, calibrated_stack, focus_start, lens_calibrations, stack_focus, with_view
 from capture.views.lens_calibration import FILE_NAME as CALIBRATION_NAME
 from capture.views.lens_calibration import LensCalibration, write_lens_calibration
+from capture.views.lens_calibration_stacks import write_depth
 from capture.views.scale_answer import ScaleAnswer
 from capture.views.scale_board import board_scale
 from capture.views.scale_distance import distance_scale
@@ -149,7 +150,10 @@ def _calibrated(
         write_lens_calibration(scene / numbered(CALIBRATION_NAME, number), calibration)
     for name, stack in stacks.items():
         view = metric.view(name)
-        write_focal_stack(calibrated_stack(calibrated[name], view) if name in calibrated else with_view(stack, view))
+        changed = calibrated_stack(calibrated[name], view) if name in calibrated else with_view(stack, view)
+        if changed.metres_known and not stack.metres_known:
+            write_depth(changed)
+        write_focal_stack(changed)
     return ScaledScene(result, calibrated, uncalibrated, calibrations)
 
 

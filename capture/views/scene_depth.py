@@ -50,7 +50,7 @@ class SceneDepthSettings:
 
 @dataclass(frozen=True)
 class SceneDepth:
-    """stacks: with dense depth now. left_out: names of stacks without a pose, which keep their depth from focus."""
+    """stacks: with dense depth now. left_out: names of stacks without a pose, or with guessed metres, which keep their depth from focus."""
 
     stacks: tuple[FocalStack, ...]
     left_out: tuple[str, ...]
@@ -65,9 +65,12 @@ def deepen_scene(scene: Path, settings: SceneDepthSettings | None = None) -> Sce
     unmerged = [name for name, stack in stacks.items() if not stack.merged]
     if unmerged:
         raise InputError(f"expected merged stacks in {scene}, but {', '.join(unmerged)} are not: run `mrbokeh capture merge` first")
-    placed = [view for view in model.views if view.name in stacks]
+    placed = [view for view in model.views if view.name in stacks and stacks[view.name].metres_known]
     if len(placed) < 2:
-        raise InputError(f"dense depth needs two placed stacks or more, {scene} has {len(placed)}: photograph more viewpoints")
+        raise InputError(
+            f"dense depth needs two placed stacks or more whose focus is known in metres (`mrbokeh capture scale`), {scene} has "
+            f"{len(placed)}: photograph more viewpoints"
+        )
     pictures = FirstPictures({view.name: stacks[view.name] for view in placed})
     known = SceneKnowledge(model, pictures, PatchMatchScene(scene, unscaled) if settings.patch_match else None)
     done = [deepen_stack(stacks[view.name], known, settings) for view in track(placed, "depth")]

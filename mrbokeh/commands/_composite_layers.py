@@ -2,21 +2,27 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from mrbokeh.camera import Camera
 from mrbokeh.capture_bundle import CaptureBundle
 from mrbokeh.commands._composite_options import ObjectOptions, RenderingOptions
 from mrbokeh.commands._insertion_options import VirtualOptions
 from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.layer import Layer, flatten
 from mrbokeh.plate import Plate
 from mrbokeh.staging.scene_description import SceneDescription
 
 if TYPE_CHECKING:
     from mrbokeh.exr_layers.deep_samples import DeepSamples
+
+_COVERED = 0.5
+_HIGH_SHARE = 0.25
+"""Of the picture's height, which an object takes whose size is neither told nor known."""
 
 LayersFor = Callable[[Plate], list[Layer]]
 """The same scene for every plate of one view: sharp layers, front first."""
@@ -35,7 +41,27 @@ def layers_by(
         rendered.append(_scene_layers(virtual.scene, virtual.camera, rendering))
     if not still and not rendered and not files.deep:
         raise InputError("nothing to put into the photograph: give --object OBJ.glb, --scene SCENE.toml or --layer RGBAZ.exr")
+    if standing.at_pixel and not rendered:
+        x_px, y_px = _pair(standing.at_pixel)
+        standing_there = standing_on_pixel(files.among(still), first, x_px, y_px)
+        return lambda _: standing_there
+    if standing.at_pixel and standing.object_ is None:
+        raise InputError("--at-pixel places an --object or the --layers; a scene file says itself where its objects stand: leave it out")
     return lambda plate: files.among([*still, *(layer for make in rendered for layer in make(plate))])
+
+
+def standing_on_pixel(layers: Sequence[Layer], plate: Plate, x_px: float, y_px: float) -> list[Layer]:
+    """Layers with all their depth scaled about the camera, which leaves their picture as it is, so that what of them is at the pixel, or
+    nearest to it, lies as far as the photograph there. Raises InputError where nothing of them has a depth.
+    """
+    surface_m = plate.point_under_pixel_m(x_px, y_px)[2]
+    whole = flatten(layers)
+    rows, columns = np.nonzero((whole.alpha > _COVERED) & np.isfinite(whole.depth_m) & (whole.depth_m > 0))
+    if not len(rows):
+        raise InputError("--at-pixel: expected a layer with depth (Z) where it covers the picture, found none: render it with its Z")
+    nearest = int(np.argmin(np.hypot(rows - int(y_px), columns - int(x_px))))
+    factor = np.float32(surface_m / whole.depth_m[rows[nearest], columns[nearest]])
+    return [replace(layer, depth_m=layer.depth_m * factor) for layer in layers]
 
 
 @dataclass(frozen=True)
@@ -68,13 +94,24 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
 
     if options.at and options.at_pixel:
         raise InputError("--at and --at-pixel both say where the object stands: give one of them")
-    if options.height is not None and not 0.0 < options.height < math.inf:
-        raise InputError(f"--height: expected metres above 0, got {options.height:g}")
     stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*_pair(options.at_pixel))
     light = Lighting(options.environment, exposure=options.exposure)
     turn, tilt = math.radians(options.turn), math.radians(options.tilt)
-    one = OneObject(glb, stands_at_m, options.height, turn, tilt, light, options.shadow)
+    one = OneObject(glb, stands_at_m, _height_m(options.height, first, stands_at_m[2]), turn, tilt, light, options.shadow)
     return _filmed(one.described(), rendering, lambda plate: one.seen_by(plate.camera))
+
+
+def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
+    """In metres, or of so many pixels at that depth. None keeps the size of the file, unless that is of no use: metres are guessed."""
+    if text is None:
+        return plate.length_m(_HIGH_SHARE * plate.rgb.shape[0], depth_m) if plate.metres_guessed else None
+    try:
+        number = float(text.removesuffix("px"))
+    except ValueError:
+        number = math.nan
+    if not 0.0 < number < math.inf:
+        raise InputError(f"--height: expected metres above 0 such as 0.1, or pixels such as 120px, got {text!r}")
+    return plate.length_m(number, depth_m) if text.endswith("px") else number
 
 
 def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) -> LayersFor:

@@ -65,17 +65,28 @@ class PlateOptions(shared.NearOptions):
 
 @dataclass(frozen=True)
 class ObjectOptions:
-    """Where the --object stands: at or at_pixel, as typed; height in metres, angles in degrees."""
+    """Where the --object stands: at or at_pixel, and its height, as typed; angles in degrees."""
 
     object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.", rich_help_panel=VIRTUAL)] = None
     at: Annotated[
         str | None, typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens.", rich_help_panel=VIRTUAL)
     ] = None
     at_pixel: Annotated[
-        str | None, typer.Option(help="X,Y of the pixel on which the object stands; needs depth.", rich_help_panel=VIRTUAL)
+        str | None,
+        typer.Option(
+            help="X,Y of the pixel on which the object stands; needs depth. Without --object the layers stand there: their depth is scaled "
+            "so that it is the photograph's at that pixel, which leaves them as they look.",
+            rich_help_panel=VIRTUAL,
+        ),
     ] = None
     height: Annotated[
-        float | None, typer.Option(help="Height of the object in metres; default: as in the file.", rich_help_panel=VIRTUAL)
+        str | None,
+        typer.Option(
+            metavar="METRES|PIXELSpx",
+            help="Height of the object in metres, or such as 120px: as long as so many pixels are where it stands. Default: as in the "
+            "file, or a quarter of the picture where the metres of the stack are guessed.",
+            rich_help_panel=VIRTUAL,
+        ),
     ] = None
     turn: Annotated[float, typer.Option(help="Turn of the object about the vertical in degrees.", rich_help_panel=VIRTUAL)] = 0.0
     tilt: Annotated[float, typer.Option(help="How far the camera looks down, in degrees.", rich_help_panel=VIRTUAL)] = 0.0

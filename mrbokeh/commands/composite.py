@@ -39,6 +39,8 @@ def composite(
 
     Example: mrbokeh composite IMG_2041.NEF --layer lantern.exr --depth phone.jpg --grain auto --out out.exr
 
+    Example: mrbokeh composite STACK --slice 3 --object cake.glb --at-pixel 300,250 --height 120px --out out.png
+
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
     from mrbokeh.capture_bundle import is_bundle, read_bundle
@@ -56,6 +58,7 @@ def composite(
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
     plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus)
+    _tell_metres(photo, virtual, standing)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)
@@ -72,6 +75,20 @@ def composite(
     if lost := alpha_lost(out, plate):
         typer.echo(f"warning: {lost}", err=True)
     typer.echo(f"wrote {out} ({mode}; {blur_told(plate, sharp)})")
+
+
+def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions) -> None:
+    """What of a stack's metres is guessed, and what follows for layers."""
+    from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
+    from mrbokeh.guessed_metres import metres_note
+
+    if not (photo / FILE_NAME).is_file():
+        return
+    stack = read_focal_stack(photo)
+    if note := metres_note(stack):
+        typer.echo(note)
+    if not stack.metres_known and virtual.layer and not standing.at_pixel:
+        typer.echo("the layers' depth is taken for guessed metres: --at-pixel X,Y puts them onto the surface at a pixel")
 
 
 def _into_all_slices(

@@ -18,7 +18,13 @@ _SETTINGS = "refocus.json"
 @app.command()
 def refocus(
     stack: Annotated[Path, typer.Argument(help="Folder of a merged focal stack.")],
-    focus: Annotated[str, typer.Option(help="Focus distances in metres, such as 0.8,1.2,inf, or NEAR:FAR:COUNT, evenly in dioptres.")],
+    focus: Annotated[
+        str,
+        typer.Option(
+            help="Where to focus: metres, such as 0.8,1.2,inf; @X,Y on what is seen at that pixel; #2.5 between slices 2 and 3, counted "
+            "from 0; or FROM:TO:COUNT of these, such as 0.5:inf:12 or #0:#13:24, evenly in dioptres and so in blur."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the new focal stack.")],
     f_number: Annotated[float | None, typer.Option(help="Another opening of the stack's lens.")] = None,
     lens: Annotated[Path | None, typer.Option(help="LENS.json or LENS.onnx in place of the stack's lens.")] = None,
@@ -40,9 +46,13 @@ def refocus(
     A captured focus gives the captured slice, unless --no-residuals. OUT is a focal stack again; an interrupted run goes on.
 
     Example: mrbokeh refocus SCENE/view_0 --focus 0.5:inf:12 --out refocused
+
+    Example: mrbokeh refocus STACK --focus @300,200,#2.5 --out refocused
     """
     from mrbokeh.atomic_files import require_safe_outputs
     from mrbokeh.focal_stack import read_focal_stack, write_focal_stack, write_merged
+    from mrbokeh.focus_places import Seen, parse_focus
+    from mrbokeh.guessed_metres import metres_note, unit_of
     from mrbokeh.image_io import require_suffix
     from mrbokeh.interrupts import kept_when_interrupted
 
@@ -51,38 +61,32 @@ def refocus(
     if sheet is not None:
         require_suffix(sheet, (".png",), "--sheet")
         require_safe_outputs((sheet,), (lens, out), overwrite)
-    source, distances_m = read_focal_stack(stack), parse_focus(focus)
+    source = read_focal_stack(stack)
+    distances_m = parse_focus(focus, Seen.of(source))
+    if note := metres_note(source):
+        typer.echo(note)
     way = _way(source, f_number, lens, renderer, residuals)
+    if note and way.lens is not None:
+        typer.echo(f"the blur of this lens grows {_times_as_fast(way):.2f} times as fast as in the slices")
     _make_room(out, overwrite)
     settings = {"stack": str(stack.resolve()), "f_number": f_number, "lens": str(lens), "renderer": renderer, "residuals": residuals}
     with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
         slices = _write_slices(way, distances_m, out, settings, overwrite)
     write_merged(out, source.all_in_focus(), source.focus_index(), source.depth_confidence(), source.depth_m())
     made = FocalStack(
-        out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata={"refocused": settings}
+        out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata=_metadata(source, settings)
     )
     write_focal_stack(made)
     if sheet is not None:
         _write_sheet(sheet, made)
-    typer.echo(f"wrote {out} ({len(slices)} slices)")
+    typer.echo(f"wrote {out} ({len(slices)} slices, in focus at {', '.join(f'{each:.3g}' for each in distances_m)} {unit_of(source)})")
 
 
-def parse_focus(text: str) -> tuple[float, ...]:
-    """Distances in metres, commas between them, or NEAR:FAR:COUNT, evenly in dioptres."""
-    import numpy as np
+def _metadata(source: FocalStack, settings: dict) -> dict:
+    """What of the source's holds for its new slices too: what its metres rest on."""
+    from mrbokeh.guessed_metres import KEY
 
-    try:
-        if ":" in text:
-            near, far, count = text.split(":")
-            dioptres = np.linspace(1.0 / float(near), 1.0 / float(far), int(count))
-            distances = tuple(float("inf") if each == 0 else float(1.0 / each) for each in dioptres)
-        else:
-            distances = tuple(float(each) for each in text.split(","))
-    except (ValueError, ZeroDivisionError):
-        distances = ()
-    if not distances or not all(each > 0 for each in distances) or len(set(distances)) < len(distances):
-        raise InputError(f"--focus: expected different distances in metres such as 0.8,1.2,inf, or NEAR:FAR:COUNT, got {text!r}")
-    return distances
+    return {"refocused": settings} | {name: source.metadata[name] for name in (KEY,) if name in source.metadata}
 
 
 def _make_room(out: Path, overwrite: bool) -> None:
@@ -114,16 +118,34 @@ def _way(source: FocalStack, f_number: float | None, lens: Path | None, renderer
 def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, settings: dict, overwrite: bool) -> tuple[Slice, ...]:
     """Slices that are there already, made with the same settings by a run that was stopped, are kept."""
     from mrbokeh.atomic_files import read_json, write_json
+    from mrbokeh.focus_places import slice_names
     from mrbokeh.image_io import write_image
     from mrbokeh.progress import track
 
     kept = not overwrite and (out / _SETTINGS).is_file() and read_json(out / _SETTINGS, "settings of refocus") == settings
     write_json(out / _SETTINGS, settings)
-    slices = tuple(Slice(f"slice_{distance_m:.4f}m.exr", distance_m) for distance_m in distances_m)
+    slices = tuple(
+        Slice(name, distance_m, metadata=_growth(way, distance_m))
+        for name, distance_m in zip(slice_names(distances_m), distances_m, strict=True)
+    )
     for each, distance_m in track(list(zip(slices, distances_m, strict=True)), "refocusing"):
         if not (kept and (out / each.path).is_file()):
             write_image(out / each.path, way.slice_at(distance_m), half=False)
     return slices
+
+
+def _growth(way: Refocusing, distance_m: float) -> dict:
+    """How fast blur grows in a new slice, where that was measured of the captured ones."""
+    width_px = way.stack.slices[0].metadata.get("px_per_dioptre_width_px")
+    if way.lens is not None or width_px is None:
+        return {}
+    return {"px_per_dioptre": way.lens_at(distance_m).coc_px_per_dioptre(width_px), "px_per_dioptre_width_px": width_px}
+
+
+def _times_as_fast(way: Refocusing) -> float:
+    """How the blur of another lens compares with that of the stack's, where both focus as the reference slice."""
+    focus_m = way.stack.lens_of(way.stack.reference).focus_distance_m
+    return way.lens_at(focus_m).coc_px_per_dioptre(1) / Refocusing(way.stack, way.renderer).lens_at(focus_m).coc_px_per_dioptre(1)
 
 
 def _write_sheet(path: Path, made: FocalStack) -> None:

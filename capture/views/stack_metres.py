@@ -1,0 +1,273 @@
+"""Metres for one stack whose focus distances nobody stated, from lengths and distances that the user knows.
+
+Its dioptres are known up to D' = p + q D, for blur in pixels is the same with px_per_dioptre / q. The rule: what the photographs state
+stays (a stated lens fixes q = 1, a stated focus distance counts as one more fact); the facts told fix the rest by least squares of their
+relative errors; and where facts lie at one depth only, the world is scaled as a whole (p = 0), which keeps proportions that are guessed.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.optimize import least_squares
+
+from capture.views.lens_calibration import STATED_KEY
+from mrbokeh.camera import Camera
+from mrbokeh.errors import InputError
+from mrbokeh.exr_io import read_exr, write_exr
+from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.guessed_metres import KEY, metres_facts
+from mrbokeh.lens import Lens
+
+FACTS = "told"
+_BEFORE = "stated_before_guessing"
+_NEAR_PIXEL_PX = 2
+_LEAST_CONFIDENCE = 0.1
+_LEAST_SPREAD_PX = 3.0
+"""Facts whose surfaces differ in blur by less lie at one depth: they cannot tell how deep the scene is."""
+_CONTRADICTS = 0.1
+_LEAST_DIOPTRES = 1e-6
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """metres between what is seen at two pixels."""
+
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+    metres: float
+
+    @property
+    def pixels(self) -> tuple[tuple[float, float], ...]:
+        return (self.x1, self.y1), (self.x2, self.y2)
+
+    def __str__(self) -> str:
+        return f"the length of {self.metres:g} m from pixel {self.x1:g},{self.y1:g} to {self.x2:g},{self.y2:g}"
+
+
+@dataclass(frozen=True)
+class KnownDistance:
+    """metres from the lens, along its axis, to what is seen at a pixel."""
+
+    x: float
+    y: float
+    metres: float
+
+    @property
+    def pixels(self) -> tuple[tuple[float, float], ...]:
+        return ((self.x, self.y),)
+
+    def __str__(self) -> str:
+        return f"the distance of {self.metres:g} m at pixel {self.x:g},{self.y:g}"
+
+
+Fact = KnownLength | KnownDistance
+
+
+@dataclass(frozen=True)
+class Regauged:
+    """stack: as written. errors: by how much each fact told is missed, as a share."""
+
+    stack: FocalStack
+    errors: tuple[tuple[Fact, float], ...]
+
+
+def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False) -> Regauged:
+    """Put the metres that follow from all facts told into stack.json and depth.exr. overwrite: earlier ones count no more.
+
+    Raises InputError where the stack's metres are known already, or facts contradict one another.
+    """
+    depth_m, confidence = stack.depth_m(), stack.depth_confidence()
+    facts = _with_earlier(stack, told, overwrite)
+    camera = stack.camera
+    if not metres_facts(stack) or camera is None or (metres_facts(stack).get("known") and FACTS not in metres_facts(stack)):
+        sizes = "; ".join(f"{each} is {_now(each, depth_m, confidence, camera):.4g} m by them" for each in told if camera is not None)
+        raise InputError(
+            f"{stack.folder} knows its metres from its focus distances{' (' + sizes + ')' if sizes else ''}: to correct them state focus "
+            f"distances in lens.toml and merge again, or find the scale of camera poses with --board or --distance"
+        )
+    solving = _Solving(tuple(_Equation.of(each, depth_m, confidence, camera) for each in facts), _stated_dioptres(stack), _gauge(stack))
+    p, q, deep = solving.solution()
+    changed = _regauged(stack, p, q, _told(stack, facts, deep))
+    _write_depth(changed, p, q)
+    write_focal_stack(changed)
+    return Regauged(changed, tuple((each.fact, each.error(p, q)) for each in solving.equations))
+
+
+def lines_of(done: Regauged) -> list[str]:
+    """What was found, for people."""
+    distances_m = [each for each in done.stack.focus_distances_m if each is not None]
+    facts = metres_facts(done.stack)
+    lines = [f"{done.stack.folder}: focused from {min(distances_m):.4g} m to {max(distances_m):.4g} m, {facts['why']}"]
+    lines += [f"{done.stack.folder}: still guessed: {facts['guessed']}"] if facts.get("guessed") else []
+    off = [f"{fact} by {100 * error:+.1f} %" for fact, error in done.errors if abs(error) > _CONTRADICTS]
+    return [*lines, f"warning: what was told disagrees: {', '.join(off)}: look at the pixels and measure again"] if off else lines
+
+
+def parse_length(text: str) -> KnownLength:
+    return KnownLength(*_numbers(text, 5, "--ruler", "X1,Y1,X2,Y2,METRES such as 310,220,480,224,0.05"))
+
+
+def parse_known_distance(text: str) -> KnownDistance:
+    return KnownDistance(*_numbers(text, 3, "--distance-at", "X,Y,METRES such as 310,220,0.35"))
+
+
+def _numbers(text: str, count: int, option: str, expected: str) -> list[float]:
+    try:
+        numbers = [float(each) for each in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all() or numbers[-1] <= 0.0 or (count == 5 and numbers[:2] == numbers[2:4]):
+        raise InputError(f"{option}: expected {expected}, got {text!r}")
+    return numbers
+
+
+def _with_earlier(stack: FocalStack, told: Sequence[Fact], overwrite: bool) -> tuple[Fact, ...]:
+    """Facts of earlier calls, and the new ones in place of those at the same pixels."""
+    earlier = [] if overwrite else [_fact(each) for each in metres_facts(stack).get(FACTS, ())]
+    return tuple({each.pixels: each for each in (*earlier, *told)}.values())
+
+
+def _fact(document: Mapping[str, float]) -> Fact:
+    return KnownLength(**document) if "x1" in document else KnownDistance(**document)
+
+
+@dataclass(frozen=True)
+class _Equation:
+    """A fact, with the directions (x / z, y / z, 1) and the dioptres, as they are now, of what is at its pixels."""
+
+    fact: Fact
+    rays: Float[np.ndarray, "pixels 3"]
+    dioptres: Float[np.ndarray, " pixels"]
+
+    @classmethod
+    def of(
+        cls, fact: Fact, depth_m: Float32[np.ndarray, "height width"], confidence: Float32[np.ndarray, "height width"], camera: Camera
+    ) -> "_Equation":
+        rays = [camera.unproject(np.array(each), np.array(1.0)) for each in fact.pixels]
+        return cls(fact, np.array(rays), np.array([1.0 / _depth_at(depth_m, confidence, *each) for each in fact.pixels]))
+
+    def metres(self, p: float, q: float) -> float:
+        depth_m = 1.0 / np.maximum(p + q * self.dioptres, _LEAST_DIOPTRES)
+        points_m = self.rays * depth_m[:, None]
+        return float(depth_m[0]) if len(points_m) == 1 else float(np.linalg.norm(points_m[0] - points_m[1]))
+
+    def error(self, p: float, q: float) -> float:
+        return self.metres(p, q) / self.fact.metres - 1.0
+
+
+@dataclass(frozen=True)
+class _Solving:
+    """stated: dioptres of slices whose focus the photographs state. gauge: of the stack, as merging or an earlier call left it."""
+
+    equations: tuple[_Equation, ...]
+    stated: Float[np.ndarray, " slices"]
+    gauge: Mapping[str, Any]
+
+    def solution(self) -> tuple[float, float, bool]:
+        """(p, q, whether both rest on facts)."""
+        if self.gauge["scale_from"] == "lens":
+            return self._least(lambda x: (float(x[0]), 1.0), [self._offset_start()])[0], 1.0, True
+        start = float(np.exp(np.mean([np.log(each.metres(0.0, 1.0) / each.fact.metres) for each in self.equations])))
+        seen = np.concatenate([*(each.dioptres for each in self.equations), self.stated])
+        if np.ptp(seen) * self.gauge["px_per_dioptre"] < _LEAST_SPREAD_PX:
+            return 0.0, start, False
+        p, q = self._least(lambda x: (float(x[0]), float(np.exp(x[1]))), [0.0, np.log(start)])
+        return p, q, True
+
+    def _offset_start(self) -> float:
+        """Where the first fact would be right were all its surfaces at one depth."""
+        first = self.equations[0]
+        return float(first.dioptres.mean() * (first.metres(0.0, 1.0) / first.fact.metres - 1.0))
+
+    def _least(self, of: Callable[[Float[np.ndarray, " numbers"]], tuple[float, float]], start: list[float]) -> tuple[float, float]:
+        def off(numbers: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, " facts"]:
+            p, q = of(numbers)
+            told = [np.log1p(each.error(p, q)) for each in self.equations]
+            return np.array([*told, *np.log(np.maximum(p + q * self.stated, _LEAST_DIOPTRES) / self.stated)])
+
+        return of(least_squares(off, start, x_scale="jac").x)
+
+
+def _depth_at(depth_m: Float32[np.ndarray, "height width"], confidence: Float32[np.ndarray, "height width"], x: float, y: float) -> float:
+    height, width = depth_m.shape
+    if not (0 <= x < width and 0 <= y < height):
+        raise InputError(f"pixel {x:g},{y:g} lies outside the picture of {width}x{height} px: read it off the all-in-focus picture")
+    rows, columns = (slice(max(int(at) - _NEAR_PIXEL_PX, 0), int(at) + _NEAR_PIXEL_PX + 1) for at in (y, x))
+    near = depth_m[rows, columns][(confidence[rows, columns] >= _LEAST_CONFIDENCE) & np.isfinite(depth_m[rows, columns])]
+    if not len(near):
+        raise InputError(f"nothing at pixel {x:g},{y:g} tells how far away it is: choose a place with texture")
+    return float(np.median(near))
+
+
+def _now(fact: Fact, depth_m: np.ndarray, confidence: np.ndarray, camera: Camera) -> float:
+    return _Equation.of(fact, depth_m, confidence, camera).metres(0.0, 1.0)
+
+
+def _stated_dioptres(stack: FocalStack) -> Float[np.ndarray, " slices"]:
+    """Of the slices that state their focus; as they lie in the stack's present dioptres, which agree with them."""
+    told = [each.focus_distance_m for each in stack.slices if each.metadata.get(STATED_KEY) is not None]
+    return np.array([1.0 / each for each in told if each], np.float64)
+
+
+def _gauge(stack: FocalStack) -> dict[str, Any]:
+    """Of merging; with where lens and field of view come from."""
+    gauge = dict(metres_facts(stack)["gauge"])
+    stated = stack.metadata.get(_BEFORE) or {}
+    known = gauge["scale_from"] == "lens" or bool(stated.get("lens"))
+    return {"lens_from": "stated" if known else "guess", "view_from": "stated" if known or stated.get("camera") else "guess"} | gauge
+
+
+def _told(stack: FocalStack, facts: Sequence[Fact], deep: bool) -> dict[str, Any]:
+    """The stack's facts about metres, as they are now."""
+    guessed = []
+    if not deep:
+        guessed.append("how deep the scene is for its distance, as all that was told lies at one depth")
+    if _gauge(stack)["view_from"] == "guess":
+        guessed.append("the field of view, so that distances stand beside lengths in a guessed proportion")
+    count = f"{len(facts)} known lengths and distances" if len(facts) > 1 else str(facts[0])
+    return {"known": True, "why": f"metres rest on {count}", "guessed": "; ".join(guessed) or None, FACTS: [asdict(each) for each in facts]}
+
+
+def _regauged(stack: FocalStack, p: float, q: float, told: dict[str, Any]) -> FocalStack:
+    slices = tuple(_regauged_slice(stack, each, p, q) for each in stack.slices)
+    gauge = _gauge(stack)
+    gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / q, "offset_dioptres": p + q * gauge["offset_dioptres"]}
+    gauge |= {"offset_from": "told"} | ({} if gauge["scale_from"] == "lens" else {"scale_from": "told"})
+    distances_m = [float(each.focus_distance_m or 0.0) for each in slices]
+    gauge |= {"nearest_m": min(distances_m), "farthest_m": max(distances_m) if np.isfinite(max(distances_m)) else "inf"}
+    lens = _lens_at(stack, gauge["lens_from"], distances_m)
+    return replace(stack, slices=slices, lens=lens, metadata=stack.metadata | {KEY: told | {"gauge": gauge}})
+
+
+def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
+    dioptres = p + q / float(each.focus_distance_m or np.inf)
+    if dioptres <= 0.0:
+        raise InputError(f"{stack.folder}: by what was told {each.path} is focused beyond infinity: look at the pixels and measure again")
+    metadata = each.metadata | {"px_per_dioptre": each.metadata["px_per_dioptre"] / q}
+    return replace(each, focus_distance_m=1.0 / dioptres, metadata=metadata)
+
+
+def _lens_at(stack: FocalStack, lens_from: str, distances_m: list[float]) -> Lens | None:
+    """A stated lens keeps its length; a nominal one is scaled like the world, so that it can focus there and sees the same."""
+    lens = stack.lens
+    if lens is None or lens_from == "stated":
+        return None if lens is None else lens.focused_at(distances_m[stack.reference])
+    factor = min(new / float(old) for new, old in zip(distances_m, stack.focus_distances_m, strict=True) if old is not None)
+    return replace(
+        lens,
+        focal_length_mm=lens.focal_length_mm * factor,
+        sensor_width_mm=lens.sensor_width_mm * factor,
+        sensor_height_mm=None if lens.sensor_height_mm is None else lens.sensor_height_mm * factor,
+        focus_distance_m=distances_m[stack.reference],
+    )
+
+
+def _write_depth(stack: FocalStack, p: float, q: float) -> None:
+    part = read_exr(stack.depth_path)[0]
+    dioptres = np.maximum(p + q / part.channels["Z"].astype(np.float64), _LEAST_DIOPTRES)
+    write_exr(stack.depth_path, replace(part, channels=dict(part.channels) | {"Z": (1.0 / dioptres).astype(np.float32)}))

@@ -1,0 +1,52 @@
+"""What is known of the metres of a focal stack, in one line for people.
+
+Where no focus distance is known, merging measures blur from the slices alone and guesses the metres (`metadata["metres"]`: known, why,
+guessed, gauge): circles of confusion are right in pixels, lengths and distances are not, until one known length or distance is told.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mrbokeh.focal_stack import FILE_NAME, FocalStack, read_focal_stack
+
+KEY = "metres"
+GUESSED = "guessed metres"
+_WHY = "no focus distance is known"
+
+
+def metres_facts(stack: FocalStack) -> Mapping[str, Any]:
+    """known: whether metres are; why: in words; guessed: what else is a guess where they are known. Empty for stacks that state theirs."""
+    facts = stack.metadata.get(KEY)
+    return facts if isinstance(facts, Mapping) else {}
+
+
+def unit_of(stack: FocalStack) -> str:
+    """What its distances are in, for messages."""
+    return "m" if stack.metres_known else GUESSED
+
+
+def metres_note(stack: FocalStack) -> str:
+    """One sentence on what is known and what is guessed; empty where all metres are known."""
+    facts = metres_facts(stack)
+    if not stack.metres_known:
+        return (
+            f"{stack.folder}: metres are guessed ({facts.get('why') or _WHY}): blur is measured from the slices; "
+            f"give one known length by `mrbokeh capture scale {stack.folder} --ruler X1,Y1,X2,Y2,METRES`"
+        )
+    return f"{stack.folder}: {facts.get('why')}; still guessed: {facts['guessed']}" if facts.get("guessed") else ""
+
+
+def metres_notes(stacks: Iterable[FocalStack]) -> str:
+    """One line for all stacks of a command; empty where all metres are known."""
+    notes = [note for note in map(metres_note, stacks) if note]
+    if len(notes) < 2:
+        return "".join(notes)
+    return f"metres are guessed, at least in part, in {len(notes)} of the stacks, in pixels blur is measured; the first: {notes[0]}"
+
+
+def note_of_file(path: Path | None) -> str:
+    """The note of the stack that a picture or depth file belongs to."""
+    if path is None or not (path.parent / FILE_NAME).is_file():
+        return ""
+    return metres_note(read_focal_stack(path.parent))
