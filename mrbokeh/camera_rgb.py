@@ -79,7 +79,16 @@ def read_camera_rgb(path: Path) -> Float32[np.ndarray, "height width 3"]:
 
 def read_slice_masks(path: Path) -> SliceMasks:
     """The masks of a slice; without layers none of it is saturated and all is valid."""
+    return _masks_of(read_exr(path)[0])
+
+
+def read_slice(path: Path) -> tuple[Float32[np.ndarray, "height width 3"], SliceMasks]:
+    """The numbers of a slice as they are stored and its masks, from a file that is opened once."""
     part = read_exr(path)[0]
+    return part.stacked("RGB"), _masks_of(part)
+
+
+def _masks_of(part: ExrPart) -> SliceMasks:
     shape = next(iter(part.channels.values())).shape
     saturated, valid = part.channels.get(SATURATED), part.channels.get(VALID)
     return SliceMasks(
