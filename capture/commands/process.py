@@ -25,7 +25,10 @@ def process_command(
     square_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a square as measured on the print")] = None,
     marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
     distance: Annotated[str | None, typer.Option(metavar="VIEW_A,VIEW_B,METRES", help="between two camera centres")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="exit with 1 when a gate of the report fails")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="exit with 1 when a gate fails or is not judged")] = False,
+    allow_absent: Annotated[
+        list[str] | None, typer.Option("--allow-absent", metavar="NAME", help="a gate that --strict may leave unjudged (repeatable)")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="make all stages again, from the photographs on")] = False,
 ) -> None:
     from capture.commands.depth import depth_command
@@ -34,12 +37,14 @@ def process_command(
     from capture.commands.poses import poses_command
     from capture.commands.report import report_command
     from capture.commands.scale import scale_command
+    from capture.report.strictness import require_gates
     from capture.stacks.session import FILE_NAME as SESSION_NAME
     from capture.views.board_options import board_from_options
     from capture.views.scale_distance import parse_distance
     from mrbokeh.errors import InputError
     from mrbokeh.focal_stack import find_focal_stacks
 
+    require_gates(allow_absent or [], strict)
     if distance is not None:
         parse_distance(distance)
     if board is not None:
@@ -59,4 +64,4 @@ def process_command(
         else:
             scale_command(out, board=board, square_mm=square_mm, marker_mm=marker_mm, distance=distance, overwrite=overwrite)
             depth_command(out, overwrite=overwrite)
-    report_command(out, strict=strict, overwrite=overwrite)
+    report_command(out, strict=strict, allow_absent=allow_absent, overwrite=overwrite)

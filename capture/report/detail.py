@@ -4,13 +4,13 @@ The detail of a block is the root mean square of what a Gaussian of DETAIL_SIGMA
 hold for any tool's result, once it lies on the registered slices.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Int, Shaped
 
 from mrbokeh.color import linear_to_srgb
 
@@ -26,14 +26,30 @@ Blocks = Float32[np.ndarray, "rows columns"]
 BlockMask = Bool[np.ndarray, "rows columns"]
 
 
+def display_luminance(rgb: Rgb) -> Float32[np.ndarray, "height width"]:
+    """Return the luminance of linear Rec.709 as displayed: encoded by the sRGB curve, clipped to 1."""
+    return linear_to_srgb(np.clip(rgb, 0.0, 1.0)) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
 def block_detail(rgb: Rgb) -> Blocks:
-    """Return the detail of every block of linear Rec.709, 1.0 being display white; the border blocks and a rest below BLOCK_PX are cut off."""
-    luminance = linear_to_srgb(np.clip(rgb, 0.0, 1.0)) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    """Return the detail of every block of linear Rec.709 (1.0 is display white); border blocks and a rest below BLOCK_PX are cut off."""
+    luminance = display_luminance(rgb)
     fine = luminance - cv2.GaussianBlur(luminance, (0, 0), DETAIL_SIGMA_PX)
-    rows, columns = (side // BLOCK_PX for side in luminance.shape)
-    blocks = (fine * fine)[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX)
-    border = min(BORDER_BLOCKS, (rows - 1) // 2, (columns - 1) // 2) if min(rows, columns) else 0
-    return np.sqrt(blocks.mean(axis=(1, 3)))[border : rows - border, border : columns - border].astype(np.float32)
+    return np.sqrt(inner_blocks(fine * fine).mean(axis=(1, 3))).astype(np.float32)
+
+
+def inner_blocks(plane: Shaped[np.ndarray, "height width"]) -> Shaped[np.ndarray, "rows block columns block"]:
+    """Return a plane cut into its blocks, those at the border and a rest below BLOCK_PX left out."""
+    rows, columns = (side // BLOCK_PX for side in plane.shape)
+    border = border_blocks(plane.shape)
+    blocks = plane[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX)
+    return blocks[border : rows - border, :, border : columns - border]
+
+
+def border_blocks(shape: tuple[int, ...]) -> int:
+    """Return how many blocks are left out at each side of a picture of (height, width): fewer than BORDER_BLOCKS where it is small."""
+    rows, columns = (side // BLOCK_PX for side in shape[:2])
+    return min(BORDER_BLOCKS, (rows - 1) // 2, (columns - 1) // 2) if min(rows, columns) else 0
 
 
 @dataclass(frozen=True)
@@ -54,6 +70,11 @@ class SharpestSlices:
         for rgb in slices:
             details.append(block_detail(rgb))
             largest = max(largest, float(rgb.max()))
+        return cls.of_details(details, largest)
+
+    @classmethod
+    def of_details(cls, details: Sequence[Blocks], largest: float) -> "SharpestSlices":
+        """details: what `block_detail` says of each slice, 0 where a slice has no data. largest: linear value of all slices."""
         stacked = np.stack(details)
         return cls(stacked.max(axis=0), stacked.argmax(axis=0), largest)
 

@@ -1,4 +1,4 @@
-"""One pass over a merged stack: predicts every slice, compares, and keeps what gates, pictures and masks need."""
+"""One pass over a merged stack: looks at every slice, predicts it, compares, and keeps what gates, pictures and masks need."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +11,8 @@ from capture.report.exposure_drift import low_frequency_gain
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.focus_curve import focus_curve
 from capture.report.moving_objects import Disagreement, moving
+from capture.report.neighbour_places import PlaceEvidence
+from capture.report.picture_evidence import PictureEvidence, PictureLook
 from capture.report.reblur import Reblur
 from capture.report.slice_fit import Prediction, fit_slice
 from capture.report.stack_rules import DEPTH_OFF_PX
@@ -32,12 +34,13 @@ _WIDEST_BORDER = 0.1
 class Examination:
     """Findings, and the maps behind their shares: None where nothing can be predicted.
 
-    moving: (H, W) at the width of the report.
+    moving: (H, W) at the width of the report. look: the all-in-focus picture beside its slices, at full size.
     """
 
     findings: StackFindings
     depth: DepthCheck | None
     moving: Mask | None
+    look: PictureLook
 
 
 Watch = Callable[[int, Rgb, Rgb], None]
@@ -48,13 +51,18 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
     """Raises InputError where the stack is not merged."""
     height, width = view.all_in_focus.shape[:2]
     found, disagreements, evidence = [], [], DepthEvidence()
-    for index in track(range(len(view)), f"{view.stack.folder.name}: re-blur"):
+    picture, places = PictureEvidence(), PlaceEvidence()
+    for index in track(range(len(view)), f"{view.stack.folder.name}: examine"):
+        rgb, masks = view.stored(index)
+        picture.add(rgb, masks.valid)
+        places.add(view.slice_rgb(index), view.usable(index))
         of_slice, kept = _examine_slice(view, index, reblur, evidence, watch)
         found.append(of_slice)
         if kept is not None:
             disagreements.append(kept)
     depth = evidence.check() if view.is_explained else None
     moved = None if depth is None else moving(disagreements, depth.off_px)
+    look = picture.look(view.stack.all_in_focus())
     curve = focus_curve(view.focus_index, view.confidence, len(view))
     findings = StackFindings(
         view.stack,
@@ -64,8 +72,10 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
         curve,
         None if depth is None else depth.share_beyond(DEPTH_OFF_PX),
         None if moved is None else float(moved.mean()),
+        look.findings,
+        places.places(view.full_size_px[0] / width),
     )
-    return Examination(findings, depth, moved)
+    return Examination(findings, depth, moved, look)
 
 
 def _examine_slice(

@@ -7,6 +7,8 @@ import numpy as np
 
 from capture.report.focus_curve import FocusCurve
 from capture.report.focus_spacing import FocusSpacing, focus_spacing
+from capture.report.neighbour_places import NeighbourPlace
+from capture.report.picture_evidence import PictureFindings
 from capture.report.registration_drift import RegistrationDrift, registration_drift
 from capture.report.slice_fit import SliceFit
 from capture.stacks.sentinel_focus import stated_by_sentinel
@@ -37,6 +39,7 @@ class StackFindings:
 
     size_px, full_size_px: width and height of the pictures as examined and as stored. depth_off_share: of the pixels that tell, how many
     contradict depth by more than `stack_rules.DEPTH_OFF_PX`. moving_share: of the picture. Both are None where nothing can be predicted.
+    picture: the all-in-focus picture beside its slices, at full size; None where nobody looked. pairs: how neighbouring slices lie.
     """
 
     stack: FocalStack
@@ -46,6 +49,8 @@ class StackFindings:
     curve: FocusCurve
     depth_off_share: float | None
     moving_share: float | None
+    picture: PictureFindings | None = None
+    pairs: tuple[NeighbourPlace, ...] = ()
 
     @property
     def name(self) -> str:

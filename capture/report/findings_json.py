@@ -7,6 +7,8 @@ import numpy as np
 
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.focus_curve import FocusCurve
+from capture.report.neighbour_places import NeighbourPlace
+from capture.report.picture_evidence import PictureFindings
 from capture.report.slice_fit import NAMES, Change, SliceFit
 from mrbokeh.focal_stack import FocalStack
 
@@ -47,6 +49,8 @@ def findings_document(findings: StackFindings) -> dict[str, Any]:
         "curve": vars(curve) | {"shares": curve.shares.tolist()},
         "depth_off_share": findings.depth_off_share,
         "moving_share": findings.moving_share,
+        "picture": None if findings.picture is None else picture_document(findings.picture, exact),
+        "pairs": [pair_document(each, exact) for each in findings.pairs],
     }
 
 
@@ -61,7 +65,34 @@ def findings_from(document: dict[str, Any], stack: FocalStack) -> StackFindings:
         FocusCurve(**curve | {"shares": np.asarray(curve["shares"], np.float64)}),
         document["depth_off_share"],
         document["moving_share"],
+        None if document["picture"] is None else _picture_from(document["picture"]),
+        tuple(_pair_from(each) for each in document["pairs"]),
     )
+
+
+def picture_document(found: PictureFindings, number: Number) -> dict[str, Any]:
+    return {
+        "lost_share": number(found.lost),
+        "flat_detail": number(found.flat),
+        "largest": number(found.top),
+        "largest_of_slices": number(found.slices_top),
+        "seen_px": list(found.seen_px),
+    }
+
+
+def _picture_from(document: dict[str, Any]) -> PictureFindings:
+    width, height = document["seen_px"]
+    lost, flat = _number(document["lost_share"]), _number(document["flat_detail"])
+    return PictureFindings(lost, flat, float(document["largest"]), float(document["largest_of_slices"]), (int(width), int(height)))
+
+
+def pair_document(found: NeighbourPlace, number: Number) -> dict[str, Any]:
+    return {"first": found.first, "off_px": number(found.off_px), "error_px": number(found.error_px), "place_px": list(found.place_px)}
+
+
+def _pair_from(document: dict[str, Any]) -> NeighbourPlace:
+    x, y = document["place_px"]
+    return NeighbourPlace(int(document["first"]), _number(document["off_px"]), float(document["error_px"]), (int(x), int(y)))
 
 
 def _change_document(change: Change, number: Number) -> dict[str, Any]:

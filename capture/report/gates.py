@@ -1,5 +1,6 @@
 """Gates: what a stack must reach to be trusted, each with its number, its limit, the reason and the remedy."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -36,7 +37,8 @@ class Gate:
         return self.verdict is Verdict.FAILED
 
     def as_json(self) -> dict[str, Any]:
-        return vars(self) | {"verdict": str(self.verdict)}
+        value = self.value if self.value is not None and abs(self.value) < float("inf") else None
+        return vars(self) | {"verdict": str(self.verdict), "value": value}
 
 
 @dataclass(frozen=True)
@@ -58,3 +60,34 @@ class Rule:
 
 def failed(gates: Sequence[Gate]) -> list[Gate]:
     return [each for each in gates if each.failed]
+
+
+def absent(gates: Sequence[Gate]) -> list[Gate]:
+    return [each for each in gates if each.verdict is Verdict.ABSENT]
+
+
+def tally(gates: Sequence[Gate]) -> str:
+    """How many were judged, how many of them failed, and the names of those that were not."""
+    names = absent_names(gates)
+    return f"{counts(gates)}: {names}" if names else counts(gates)
+
+
+def absent_names(gates: Sequence[Gate]) -> str:
+    missing = Counter(each.name for each in absent(gates))
+    return ", ".join(name if count == 1 else f"{name} ({count} times)" for name, count in missing.items())
+
+
+def verdict_lines(gates: Sequence[Gate]) -> list[str]:
+    """A line for each gate that failed, with what to do, and one for each reason why some were not judged."""
+    lines = [f"failed: {each.where}: {each.name}: {each.measured} (wanted: {each.limit}). {each.advice}" for each in failed(gates)]
+    reasons: dict[str, list[str]] = {}
+    for each in absent(gates):
+        names = reasons.setdefault(each.measured, [])
+        if each.name not in names:
+            names.append(each.name)
+    return [*lines, *(f"absent: {', '.join(names)}: {reason}" for reason, names in reasons.items())]
+
+
+def counts(gates: Sequence[Gate]) -> str:
+    missing = len(absent(gates))
+    return f"{len(gates) - missing} of {len(gates)} gates judged, {len(failed(gates))} failed, {missing} absent"

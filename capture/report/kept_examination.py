@@ -18,6 +18,7 @@ from capture.report.findings_json import findings_document, findings_from
 from capture.report.pictures import Shown
 from capture.report.reblur import Reblur
 from capture.report.registration_drift import FILE_NAME as REGISTRATION_FILE
+from capture.report.worst_places import ShownPlace
 from mrbokeh.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME as STACK_FILE
@@ -28,7 +29,7 @@ Mask = Bool[np.ndarray, "height width"]
 Signature = dict[str, Any]
 
 FOLDER, JSON_NAME, MOVING_NAME = "report", "found.json", "moving.png"
-VERSION = 2
+VERSION = 3
 """To be raised whenever other numbers or pictures would be found in the same stack."""
 
 
@@ -44,11 +45,22 @@ class KeptPicture:
 
 
 @dataclass(frozen=True)
+class KeptPlace:
+    """A place where the merged picture is worst for a gate. at_px: x, y of the first pixel of a block."""
+
+    gate: str
+    at_px: tuple[int, int]
+    caption: str
+    pictures: tuple[KeptPicture, ...]
+
+
+@dataclass(frozen=True)
 class KeptExamination:
-    """Findings in memory; pictures, and moving_path where anybody knows what moved, on disk."""
+    """Findings in memory; pictures, those of the worst places, and moving_path where anybody knows what moved, on disk."""
 
     findings: StackFindings
     pictures: tuple[KeptPicture, ...]
+    places: tuple[KeptPlace, ...]
     moving_path: Path | None
 
     def moving(self) -> Mask | None:
@@ -68,19 +80,24 @@ def signature_of(stack: FocalStack, reblur: Reblur, widest_px: int) -> Signature
     return {"version": VERSION, "width_px": widest_px, "renderer": reblur.identity, "files": files}
 
 
-def keep(stack: FocalStack, signature: Signature, examination: Examination, pictures: Sequence[Shown]) -> KeptExamination:
+def keep(
+    stack: FocalStack, signature: Signature, examination: Examination, pictures: Sequence[Shown], places: Sequence[ShownPlace]
+) -> KeptExamination:
     """signature: taken before the stack was examined. Replaces what was kept before."""
     folder = stack.folder / FOLDER
     _forget(folder)
-    names = [f"picture_{number:02d}.jpg" for number in range(len(pictures))]
-    for name, picture in zip(names, pictures, strict=True):
-        _write(folder / name, picture.jpeg)
+    listed = _written(folder, "picture", pictures)
+    crops = [_written(folder, f"picture_place_{number:02d}", each.pictures) for number, each in enumerate(places)]
     if examination.moving is not None:
         _write(folder / MOVING_NAME, cv2.imencode(".png", np.where(examination.moving, np.uint8(255), np.uint8(0)))[1].tobytes())
     document = {
         "signature": signature,
         "findings": findings_document(examination.findings),
-        "pictures": [{"file": name, "caption": picture.caption} for name, picture in zip(names, pictures, strict=True)],
+        "pictures": listed,
+        "places": [
+            {"gate": each.place.gate, "at_px": list(each.place.at_px), "caption": each.place.caption, "pictures": files}
+            for each, files in zip(places, crops, strict=True)
+        ],
         "moving": None if examination.moving is None else MOVING_NAME,
     }
     write_json(folder / JSON_NAME, document)
@@ -97,16 +114,31 @@ def kept(stack: FocalStack, signature: Signature) -> KeptExamination | None:
         found = _from_document(document, stack)
     except (InputError, KeyError, TypeError, ValueError):
         return None
-    files = [*(each.path for each in found.pictures), *([found.moving_path] if found.moving_path else [])]
+    pictures = [*found.pictures, *(picture for place in found.places for picture in place.pictures)]
+    files = [*(each.path for each in pictures), *([found.moving_path] if found.moving_path else [])]
     return found if all(each.is_file() for each in files) else None
 
 
 def _from_document(document: dict[str, Any], stack: FocalStack) -> KeptExamination:
     folder = stack.folder / FOLDER
-    pictures = tuple(KeptPicture(folder / each["file"], each["caption"]) for each in document["pictures"])
-    return KeptExamination(
-        findings_from(document["findings"], stack), pictures, None if document["moving"] is None else folder / document["moving"]
+    places = tuple(
+        KeptPlace(each["gate"], (int(each["at_px"][0]), int(each["at_px"][1])), each["caption"], _pictures_from(each["pictures"], folder))
+        for each in document["places"]
     )
+    moving_path = None if document["moving"] is None else folder / document["moving"]
+    return KeptExamination(findings_from(document["findings"], stack), _pictures_from(document["pictures"], folder), places, moving_path)
+
+
+def _pictures_from(listed: list[dict[str, Any]], folder: Path) -> tuple[KeptPicture, ...]:
+    return tuple(KeptPicture(folder / each["file"], each["caption"]) for each in listed)
+
+
+def _written(folder: Path, name: str, pictures: Sequence[Shown]) -> list[dict[str, Any]]:
+    """Files and captions of what was written."""
+    listed = [{"file": f"{name}_{number:02d}.jpg", "caption": each.caption} for number, each in enumerate(pictures)]
+    for entry, each in zip(listed, pictures, strict=True):
+        _write(folder / entry["file"], each.jpeg)
+    return listed
 
 
 def _forget(folder: Path) -> None:

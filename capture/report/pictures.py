@@ -1,5 +1,6 @@
 """Pictures of the report as JPEG in memory."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +20,9 @@ WIDEST_PX = 480
 _QUALITY = 82
 _DIFFERENCE_GAIN = 5.0
 _DEPTH_SPAN_PX = 3.0
+_CROP_QUALITY = 95
+_MOST_CONTRAST = 8.0
+_MARK = (255, 0, 200)
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,35 @@ def slice_triple(index: int, rgb: Rgb, prediction: Rgb) -> list[Shown]:
     ]
 
 
+def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *, enhance: bool, overlay: bool) -> list[Shown]:
+    """Crops at 100 %, each with its name; block: x, y and side of a square to be framed in all of them.
+
+    enhance: raise the contrast of all alike, until the first fills the range. overlay: add the last two crops in red and cyan.
+    """
+    levels = [display_rgb8(np.clip(rgb, 0.0, 1e4).astype(np.float32)).astype(np.float32) for _, rgb in crops]
+    names, contrast = [name for name, _ in crops], 1.0
+    if overlay:
+        red, cyan = (each.mean(axis=2) for each in levels[-2:])
+        levels.append(np.stack([red, cyan, cyan], axis=2))
+        names.append(f"{names[-2]} in red, {names[-1]} in cyan")
+    if enhance:
+        middle = levels[0].mean(axis=(0, 1))
+        contrast = float(np.clip(110.0 / max(np.percentile(np.abs(levels[0] - middle), 99.0), 1e-3), 1.0, _MOST_CONTRAST))
+        levels = [127.0 + contrast * (each - middle) for each in levels]
+    suffix = f", contrast {contrast:.1f} times" if contrast > 1.0 else ""
+    return [
+        Shown(_framed_jpeg(np.clip(np.round(each), 0, 255).astype(np.uint8), block), name + suffix)
+        for name, each in zip(names, levels, strict=True)
+    ]
+
+
+def _framed_jpeg(rgb8: np.ndarray, block: tuple[int, int, int]) -> bytes:
+    """Without loss of colour, and with a frame that leaves the square itself free."""
+    x, y, side = block
+    framed = cv2.rectangle(np.ascontiguousarray(rgb8), (x - 1, y - 1), (x + side, y + side), _MARK, 1)
+    return _jpeg(framed, _CROP_QUALITY)
+
+
 def stack_maps(view: StackView, moving: Mask | None, depth_off_px: Plane | None) -> list[Shown]:
     """All in focus, depth, confidence; what moved and where slices contradict depth, if anybody knows."""
     pictures = [
@@ -74,5 +107,7 @@ def _coloured(level: Plane, colours: int) -> bytes:
     return _jpeg(bgr[..., ::-1])
 
 
-def _jpeg(rgb8: np.ndarray) -> bytes:
-    return cv2.imencode(".jpg", np.ascontiguousarray(rgb8[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+def _jpeg(rgb8: np.ndarray, quality: int = _QUALITY) -> bytes:
+    sampling = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if quality > _QUALITY else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+    return cv2.imencode(".jpg", np.ascontiguousarray(rgb8[..., ::-1]), options)[1].tobytes()

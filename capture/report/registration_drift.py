@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +18,7 @@ class RegistrationDrift:
     """Per slice, against the reference. shift_px: (N, 2) of the picture's middle, right and down. rotation_rad, magnification: (N,).
 
     correlations: of each pair of neighbours, () where they are not known. width_px: of the pictures.
+    residuals_px: how far a corner lies off by the worst pair that a slice was registered with; None where no pair held, () if not known.
     """
 
     shift_px: Float[np.ndarray, "slices 2"]
@@ -24,6 +26,7 @@ class RegistrationDrift:
     magnification: Float[np.ndarray, " slices"]
     correlations: tuple[float, ...]
     width_px: int
+    residuals_px: tuple[float | None, ...] = ()
 
     @property
     def largest_jump_px(self) -> float:
@@ -43,24 +46,39 @@ def registration_drift(stack: FocalStack, width_px: int, height_px: int) -> Regi
     found = [each.metadata.get("reference_from_slice") for each in stack.slices]
     if not stack.registered or any(each is None for each in found):
         return None
-    return drift_of([np.asarray(each, np.float64) for each in found], width_px, height_px, _correlations(stack))
+    document = _document(stack)
+    transforms = [np.asarray(each, np.float64) for each in found]
+    return drift_of(transforms, width_px, height_px, _numbers(document, "correlations"), _numbers(document, "residuals_px"))
 
 
 def drift_of(
-    reference_from_slice: Sequence[Float[np.ndarray, "2 3"]], width_px: int, height_px: int, correlations: Sequence[float] = ()
+    reference_from_slice: Sequence[Float[np.ndarray, "2 3"]],
+    width_px: int,
+    height_px: int,
+    correlations: Sequence[float | None] = (),
+    residuals_px: Sequence[float | None] = (),
 ) -> RegistrationDrift:
     transforms = np.stack(list(reference_from_slice))
     middle = np.array([0.5 * width_px, 0.5 * height_px])
     shift_px = transforms[:, :, :2] @ middle + transforms[:, :, 2] - middle
     magnification = np.sqrt(np.abs(np.linalg.det(transforms[:, :, :2])))
     rotation_rad = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
-    return RegistrationDrift(shift_px, rotation_rad, magnification, tuple(float(each) for each in correlations), width_px)
+    known = [float(each) for each in correlations if each is not None]
+    all_known = tuple(known) if len(known) == len(correlations) else ()
+    return RegistrationDrift(shift_px, rotation_rad, magnification, all_known, width_px, tuple(residuals_px))
 
 
-def _correlations(stack: FocalStack) -> list[float]:
+def _document(stack: FocalStack) -> dict[str, Any]:
     try:
         document = json.loads((stack.folder / FILE_NAME).read_text(encoding="utf-8"))
     except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _numbers(document: dict[str, Any], name: str) -> list[float | None]:
+    """A list of numbers or null; empty where the document has none."""
+    values = document.get(name)
+    if not isinstance(values, list) or not all(each is None or isinstance(each, int | float) for each in values):
         return []
-    values = document.get("correlations") if isinstance(document, dict) else None
-    return [float(each) for each in values] if isinstance(values, list) and all(isinstance(v, int | float) for v in values) else []
+    return [None if each is None else float(each) for each in values]

@@ -11,12 +11,19 @@ from capture.report.gates import Gate, Rule
 from capture.views.sparse_model import SparseModel
 from capture.views.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
 from mrbokeh.atomic_files import read_json
+from mrbokeh.focal_stack import FocalStack
 
 FOLDER = "reconstruction"
 LARGEST_REPROJECTION_PX = 1.0
 LARGEST_DISAGREEMENT = 0.01
 WHERE = "scene"
 
+MERGED = Rule(
+    "all stacks merged",
+    "all-in-focus picture and depth of every stack",
+    "Nothing else can be judged before.",
+    "Run `mrbokeh capture merge` on the scene.",
+)
 PLACED = Rule(
     "all viewpoints placed",
     "none left out",
@@ -36,6 +43,7 @@ SCALES = Rule(
     "an error of all focus distances by one dioptre offset; this can.",
     "If they disagree, trust the board and calibrate the lens against it (`mrbokeh capture scale`, then `depth`).",
 )
+SCENE_RULES = (MERGED, PLACED, REPROJECTION, SCALES)
 
 
 @dataclass(frozen=True)
@@ -66,6 +74,12 @@ def scales_in(document: dict[str, Any]) -> dict[str, float]:
     entries = answers.values() if isinstance(answers, dict) else answers
     found = {str(each["method"]): float(each["metres_per_unit"]) for each in entries if isinstance(each, dict)}
     return found or {str(document.get("method", "used")): float(document["metres_per_unit"])}
+
+
+def merged_gate(stacks: Sequence[FocalStack]) -> Gate:
+    waiting = [stack.folder.name for stack in stacks if not stack.merged]
+    named = f" (waiting: {', '.join(waiting)})" if waiting else ""
+    return MERGED.judge(WHERE, float(len(waiting)), f"{len(stacks) - len(waiting)} of {len(stacks)}{named}", not waiting)
 
 
 def scene_gates(reconstruction: Reconstruction) -> list[Gate]:

@@ -1,12 +1,14 @@
 """`report.html`: the whole report as one page."""
 
+import html
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from capture.report.gates import Gate, failed
+from capture.report.gates import Gate, Verdict, absent, absent_names, counts, failed
 from capture.report.poses_view import poses_view
 from capture.report.scene_gates import WHERE, Reconstruction
+from capture.report.stack_rules import PICTURE_RULES
 from capture.report.stack_section import ExaminedStack, gate_table, stack_section
 from mrbokeh import __version__
 from mrbokeh.html_page import cell, section, table, write_page
@@ -16,6 +18,9 @@ MOST_WITH_PICTURES = 12
 _STYLE = """
 details { margin: 1rem 0; border-top: 1px solid #ddd; padding-top: .6rem; } summary { cursor: pointer; padding: .3rem 0; }
 .gates td { border-bottom: 1px solid #eee; } .charts { margin: 1rem 0; }
+.place { display: inline-block; vertical-align: top; margin: .4rem 1.6rem .4rem 0; } .place p { margin: 0; font-size: 14px; }
+.place figure { width: 160px; vertical-align: top; margin: .3rem .5rem .3rem 0; } .place figcaption { line-height: 1.3; }
+.place img { max-width: none; border: 0; display: block; }
 @media (max-width: 640px) {
   .gates tr:first-child { display: none; } .gates tr { display: block; padding: .5rem 0; border-bottom: 1px solid #ccc; }
   .gates td { display: block; border: 0; padding: 0; } .gates td.name { font-weight: bold; }
@@ -35,15 +40,31 @@ class SceneReport:
     def failures(self) -> list[Gate]:
         return failed(self.gates)
 
+    @property
+    def absences(self) -> list[Gate]:
+        return absent(self.gates)
+
+    @property
+    def passed(self) -> bool:
+        """No gate failed, and those that look at the all-in-focus picture were judged, in every stack."""
+        looked_at = all(
+            any(gate.name == rule.name and gate.verdict is Verdict.PASSED for gate in each.gates)
+            for each in self.stacks
+            for rule in PICTURE_RULES
+        )
+        return bool(self.stacks) and looked_at and not self.failures
+
 
 def write_html(report: SceneReport) -> None:
     """One file in the folder of the scene, with all pictures inside."""
     failures = report.failures
-    verdict = f"{len(failures)} of {len(report.gates)} gates failed" if failures else f"no gate failed of {len(report.gates)}"
-    kind = "missed" if failures else "met"
+    kind = "missed" if failures else "met" if report.passed else "muted"
+    unseen = "" if failures or report.passed else " Not passed: nobody looked at the all-in-focus picture of every stack."
     blocks = [
         f"<h1>Capture report: {report.scene.resolve().name}</h1>",
-        f'<p class="{kind}">{verdict}.</p><p class="muted">{len(report.stacks)} merged stacks, mrbokeh {__version__}.</p>',
+        f'<p class="{kind}">{counts(report.gates)}.{unseen}</p>',
+        f'<p class="muted">Absent: {html.escape(absent_names(report.gates))}.</p>' if report.absences else "",
+        f'<p class="muted">Merged stacks: {len(report.stacks)}. mrbokeh {__version__}.</p>',
         section("What failed", "The sections below have all gates.", [gate_table(failures, with_place=True)]) if failures else "",
         *_scene_sections(report),
         section("Stacks", "", _stack_sections(report.stacks)),

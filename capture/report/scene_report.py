@@ -1,35 +1,27 @@
 """`report.html` and `report.json` of a scene."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from capture.report.examination import Examination, examine
 from capture.report.exclusion_masks import exclusion_masks, has_fresh_exclusions, write_exclusions
 from capture.report.findings import StackFindings
-from capture.report.findings_json import finite, slice_document
-from capture.report.gates import Gate, Rule
+from capture.report.findings_json import finite, pair_document, picture_document, slice_document
 from capture.report.kept_examination import keep, kept, signature_of
 from capture.report.pictures import Shown, slice_triple, stack_maps
 from capture.report.reblur import Reblur
-from capture.report.scene_gates import WHERE, read_reconstruction, scene_gates
+from capture.report.scene_gates import merged_gate, read_reconstruction, scene_gates
 from capture.report.scene_page import SceneReport, write_html
 from capture.report.stack_gates import stack_gates
 from capture.report.stack_section import ExaminedStack
 from capture.report.stack_view import DEFAULT_WIDTH_PX, StackView
+from capture.report.worst_places import ShownPlace, shown_places, worst_places
 from mrbokeh import __version__
 from mrbokeh.atomic_files import write_json
 from mrbokeh.focal_stack import FocalStack, find_focal_stacks
 
 JSON_NAME = "report.json"
-FORMAT, VERSION = "mrbokeh-capture-report", 1
-
-MERGED = Rule(
-    "all stacks merged",
-    "all-in-focus picture and depth of every stack",
-    "Nothing else can be judged before.",
-    "Run `mrbokeh capture merge` on the scene.",
-)
+FORMAT, VERSION = "mrbokeh-capture-report", 2
 
 
 def report_scene(scene: Path, reblur: Reblur | None = None, widest_px: int = DEFAULT_WIDTH_PX, *, overwrite: bool = False) -> SceneReport:
@@ -47,24 +39,24 @@ def report_scene(scene: Path, reblur: Reblur | None = None, widest_px: int = DEF
     return report
 
 
-def merged_gate(stacks: Sequence[FocalStack]) -> Gate:
-    waiting = [stack.folder.name for stack in stacks if not stack.merged]
-    named = f" (waiting: {', '.join(waiting)})" if waiting else ""
-    return MERGED.judge(WHERE, float(len(waiting)), f"{len(stacks) - len(waiting)} of {len(stacks)}{named}", not waiting)
-
-
 def examine_stack(stack: FocalStack, reblur: Reblur, widest_px: int, *, overwrite: bool = False) -> ExaminedStack:
     """Findings, gates and pictures of a merged stack, found now or before; sees to it that its exclusion.exr is fresh."""
     signature = signature_of(stack, reblur, widest_px)
     found = None if overwrite else kept(stack, signature)
     reused = found is not None
     if found is None:
-        examination, pictures = _examine(StackView(stack, widest_px), reblur)
+        view = StackView(stack, widest_px)
+        examination, pictures = _examine(view, reblur)
         write_exclusions(stack, exclusion_masks(stack, examination.moving))
-        found = keep(stack, signature, examination, pictures)
+        found = keep(stack, signature, examination, pictures, _places(view, examination))
     elif not has_fresh_exclusions(stack):
         write_exclusions(stack, exclusion_masks(stack, found.moving()))
-    return ExaminedStack(found.findings, stack_gates(found.findings), found.pictures, reused)
+    return ExaminedStack(found.findings, stack_gates(found.findings), found.pictures, found.places, reused)
+
+
+def _places(view: StackView, examination: Examination) -> list[ShownPlace]:
+    look = examination.look
+    return shown_places(view.stack, look.picture, worst_places(look, view.stack.focus_index(), examination.findings.pairs))
 
 
 def _examine(view: StackView, reblur: Reblur) -> tuple[Examination, list[Shown]]:
@@ -94,20 +86,27 @@ def report_document(report: SceneReport) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "made_by": f"mrbokeh {__version__}",
-        "passed": not report.failures,
+        "passed": report.passed,
+        "judged": len(report.gates) - len(report.absences),
+        "failed": len(report.failures),
+        "absent": len(report.absences),
         "gates": [each.as_json() for each in report.gates],
         "scales_metres_per_unit": report.reconstruction.scales,
-        "stacks": {each.findings.name: _stack_document(each.findings) for each in report.stacks},
+        "stacks": {each.findings.name: _stack_document(each) for each in report.stacks},
     }
 
 
-def _stack_document(findings: StackFindings) -> dict[str, Any]:
-    drift = findings.drift
+def _stack_document(examined: ExaminedStack) -> dict[str, Any]:
+    findings, drift = examined.findings, examined.findings.drift
     return {
         "examined_width_px": findings.size_px[0],
         "moving_share": findings.moving_share,
         "sharp_shares": findings.curve.shares.tolist(),
         "registration_shift_px": None if drift is None else drift.shift_px.tolist(),
         "registration_magnification": None if drift is None else drift.magnification.tolist(),
+        "registration_residuals_px": None if drift is None else list(drift.residuals_px),
+        "picture": None if findings.picture is None else picture_document(findings.picture, finite),
+        "neighbours": [pair_document(each, finite) for each in findings.pairs],
+        "worst_places": [{"gate": each.gate, "at_px": list(each.at_px), "what": each.caption} for each in examined.places],
         "slices": [slice_document(each, finite) for each in findings.slices],
     }

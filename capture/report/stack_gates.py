@@ -6,6 +6,7 @@ import numpy as np
 
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.gates import Gate, Rule
+from capture.report.picture_gates import picture_gates
 from capture.report.slice_fit import Change
 from capture.report.stack_rules import (
     BLUR,
@@ -40,6 +41,7 @@ from capture.report.stack_rules import (
 def stack_gates(findings: StackFindings) -> list[Gate]:
     """In the order in which to read them."""
     return [
+        *picture_gates(findings),
         _spacing(findings),
         _range(findings),
         _texture(findings),

@@ -5,10 +5,22 @@ fit of a right one finds focus within 0.1 px, blur within 1 %, place within 0.03
 much reads as 9.6 % of blur. The merged stacks of the demo's desk, which are right, read focus within 0.3 px and -1.4 to +0.8 % of blur with
 calibrated focus, but -3.3 to -3.5 % before calibration and second pass: blur that merging leaves in the all-in-focus picture, and depth
 from focus. 7 % leaves twice that, and is below a tenth.
+
+The gates that need no lens were set on 14 real stacks. Registered slices, measured where both are sharp, lie 0.0 to 0.6 px apart (standard
+errors 0.01 to 0.4); those of a phone held by hand 1.4 px at a width of 1600. 1 px tells them apart, and is what one sees at 100 %. Where too
+little is sharp in both, what is left is how far pairs of the registration disagree at a corner: at most 0.17 % of the width on 30 stacks
+from a light field camera, whose slices cannot move, and 0.25 % on others, but 0.4 % on one of these stacks whose slices were put 1 % apart.
 """
 
+from capture.report.detail import KEPT_DETAIL
 from capture.report.gates import Rule
 
+LARGEST_LOST = 0.002
+LARGEST_FLAT = 1.1
+LARGEST_TOP = 1.5
+LARGEST_APART_PX = 1.0
+LARGEST_APART = 5e-4
+LARGEST_PAIR_RESIDUAL = 3e-3
 LEAST_DB = 30.0
 LARGEST_FOCUS_PX = 0.6
 LARGEST_BLUR_GAIN = 0.07
@@ -24,8 +36,37 @@ LEAST_CORRELATION = 0.8
 LARGEST_JUMP = 0.01
 LEAST_TRUSTED = 0.2
 
+NO_BLOCKS = "the pictures are too small or too even to have blocks that tell: merge larger ones"
+HIGHLIGHTS = "highlights"
+"""Of the metadata of a merged stack: which highlights were drawn anew, as `drawn`, and the `largest_supported` value by measured flux."""
+
 NO_PREDICTION = "needs a merged stack with lens and focus distances: add them to lens.toml, ingest and merge again"
 
+SHARP = Rule(
+    "as sharp as its slices",
+    f"at most {LARGEST_LOST:.1%} of the textured blocks with less than {KEPT_DETAIL:.0%} of the detail of their sharpest slice",
+    "What is sharp in a slice and not in the all-in-focus picture was lost by merging.",
+    "Look at the crops. Where slices do not match there (movement, wind), leave out the slice; else merge again with --overwrite.",
+)
+SEAMS = Rule(
+    "no seams",
+    f"95% of the flat blocks with at most {LARGEST_FLAT:g} times the detail of their sharpest slice",
+    "Detail that no slice has comes from borders between slices of different tint or brightness, or from noise.",
+    "Look at the crops. Lock exposure and white balance, avoid flickering lamps; merge again with --overwrite.",
+)
+LIGHT = Rule(
+    "no invented light",
+    f"nothing brighter than {LARGEST_TOP:g} times the largest value of the slices, or than the measured flux of a disc supports",
+    "A lamp that no slice shows becomes a bright disc in every picture that is blurred anew.",
+    "Look at the crops: a lamp whose discs are clipped in all slices needs a shorter exposure; else merge again with --overwrite.",
+)
+PLACES = Rule(
+    "registration residual",
+    f"neighbouring slices within {LARGEST_APART_PX:g} px ({LARGEST_APART:.2%} of widths beyond {LARGEST_APART_PX / LARGEST_APART:.0f} px) "
+    f"where both are sharp, else pairs that agree within {LARGEST_PAIR_RESIDUAL:.1%} of the width",
+    "Where slices do not lie on one another, edges are doubled and depth is wrong.",
+    "Look at the two slices: a camera that moved sideways shows another view; use a tripod, or leave out the slice and merge again.",
+)
 SPACING = Rule(
     "no slice missing",
     "even steps in dioptres, each once and in order",
@@ -98,3 +139,24 @@ SATURATION = Rule(
     "Clipped highlights give bokeh discs that are too dark, the most visible part of the blur.",
     "Expose so that the brightest lights just fit where they are out of focus.",
 )
+
+STACK_RULES = (
+    SHARP,
+    SEAMS,
+    LIGHT,
+    PLACES,
+    SPACING,
+    RANGE,
+    TEXTURE,
+    REGISTRATION,
+    SATURATION,
+    EXPOSURE,
+    RESIDUAL,
+    FOCUS,
+    BLUR,
+    PLACE,
+    DEPTH,
+    MOTION,
+)
+PICTURE_RULES = (SHARP, SEAMS, LIGHT)
+"""Those that look at the all-in-focus picture: without their verdict nobody has."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from capture.report.charts import Axes, chart
 from capture.report.findings import StackFindings
-from capture.report.gates import Gate
-from capture.report.kept_examination import KeptPicture
+from capture.report.gates import Gate, counts
+from capture.report.kept_examination import KeptPicture, KeptPlace
 from capture.report.stack_rules import LARGEST_BLUR_GAIN, LARGEST_EXPOSURE, LARGEST_FOCUS_PX, LEAST_DB
 from mrbokeh.html_page import cell, table
 
@@ -23,6 +23,7 @@ class ExaminedStack:
     findings: StackFindings
     gates: Sequence[Gate]
     pictures: Sequence[KeptPicture] = ()
+    places: Sequence[KeptPlace] = ()
     reused: bool = False
 
     @property
@@ -44,12 +45,29 @@ def gate_table(gates: Sequence[Gate], *, with_place: bool = False) -> str:
 
 def stack_section(examined: ExaminedStack, *, with_pictures: bool) -> str:
     findings = examined.findings
-    failures = f"{examined.failures} failed" if examined.failures else "all passed"
-    summary = f"{html.escape(findings.name)}: {len(findings.slices)} slices, {failures}"
+    summary = f"{html.escape(findings.name)}: {len(findings.slices)} slices, {html.escape(counts(examined.gates))}"
     pictures = "".join(each.html() for each in examined.pictures) if with_pictures else ""
-    body = gate_table(examined.gates) + f'<div class="charts">{"".join(charts(findings))}</div>' + pictures
+    places = place_section(examined) if with_pictures else ""
+    body = gate_table(examined.gates) + places + f'<div class="charts">{"".join(charts(findings))}</div>' + pictures
     opened = " open" if with_pictures else ""
     return f'<details{opened} id="{html.escape(findings.name)}"><summary><b>{summary}</b></summary>{body}</details>'
+
+
+def place_section(examined: ExaminedStack) -> str:
+    """Crops of the worst places, by gate."""
+    parts = []
+    for gate in examined.gates:
+        places = [each for each in examined.places if each.gate == gate.name]
+        if places:
+            parts.append(f'<h3>{html.escape(gate.name)}: <span class="{_MARKS[str(gate.verdict)][0]}">{gate.verdict}</span></h3>')
+            parts += [f'<div class="place"><p>{html.escape(each.caption)}</p>{_crops(each)}</div>' for each in places]
+    if not parts:
+        return ""
+    return '<p class="muted">The worst places, pixel by pixel; pictures of one row show the same pixels.</p>' + "".join(parts)
+
+
+def _crops(place: KeptPlace) -> str:
+    return "".join(each.html() for each in place.pictures)
 
 
 def charts(findings: StackFindings) -> list[str]:

@@ -1,7 +1,8 @@
 """A merged stack as the report looks at it: registered pictures at a bounded width, read one at a time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float32
 
 from capture.merging.slice_optics import SliceOptics
 from mrbokeh.aperture import Aperture
+from mrbokeh.camera_rgb import SliceMasks, read_slice
 from mrbokeh.focal_stack import FocalStack
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -37,16 +39,31 @@ class StackView:
     def all_in_focus(self) -> Rgb:
         return self._shrunk(self.stack.all_in_focus())
 
+    def stored(self, index: int) -> tuple[Rgb, SliceMasks]:
+        """A slice at the size of its file, in Rec.709, and its masks. The last one that was asked for is held."""
+        return self._read(index)
+
     def slice_rgb(self, index: int) -> Rgb:
-        return self._shrunk(self.stack.slice_rgb(index))
+        return self._shrunk(self.stored(index)[0])
 
     def usable(self, index: int) -> Mask:
         """Where a slice has data and none of it is saturated."""
-        masks = self.stack.slice_masks(index)
+        masks = self.stored(index)[1]
         return self._shrunk_mask(masks.valid & ~masks.saturated)
 
     def saturated(self, index: int) -> Mask:
-        return ~self._shrunk_mask(~self.stack.slice_masks(index).saturated)
+        return ~self._shrunk_mask(~self.stored(index)[1].saturated)
+
+    @cached_property
+    def _read(self) -> Callable[[int], tuple[Rgb, SliceMasks]]:
+        # Not self: a view that refers to itself would outlive its use.
+        stack = self.stack
+
+        def read(index: int) -> tuple[Rgb, SliceMasks]:
+            camera_rgb, masks = read_slice(stack.folder / stack.slices[index].path)
+            return stack.to_rec709(camera_rgb), masks
+
+        return lru_cache(maxsize=1)(read)
 
     @cached_property
     def confidence(self) -> Plane:

@@ -1,0 +1,185 @@
+"""How far neighbouring slices lie off one another, measured in the registered pictures themselves.
+
+Patches that are sharp in both slices are found again by normalised cross-correlation, which blur by an even kernel leaves in place, and
+one similarity is fitted to their displacements (Cauchy's weights). Patches that are blurred in one of the two are left out: where the
+opening is cut off, blurred things move with the focus, and no registration could help that.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from capture.report.detail import display_luminance
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Displacements = Float64[np.ndarray, "patches 2"]
+
+HALF_PX, SEARCH_PX = 24, 8
+_BAND_PX = (0.8, 3.0)
+_CELLS = (10, 15)
+_LEAST_ENERGY = 0.004
+"""Of the fine detail, display white being 1: about the noise of a photograph of 8 bits."""
+_LEAST_CORRELATION = 0.6
+_SHARP_IN_BOTH = 0.5
+FEWEST_PATCHES = 8
+_ROUNDS = 20
+_LEAST_SCATTER_PX = 0.05
+
+
+@dataclass(frozen=True)
+class NeighbourPlace:
+    """Where slice first + 1 lies against slice first.
+
+    off_px: root mean square of the fitted displacements, in pixels of the stored pictures; None where too few patches are sharp in both.
+    error_px: its standard error. place_px: x, y of the middle of the patch to look at, in pixels of the stored pictures.
+    """
+
+    first: int
+    off_px: float | None
+    error_px: float
+    place_px: tuple[int, int]
+
+    def exceeds(self, limit_px: float, sigmas: float = 3.0) -> bool:
+        """Whether they lie farther apart than the limit, and not by chance."""
+        return self.off_px is not None and self.off_px > max(limit_px, sigmas * self.error_px)
+
+    def rank(self) -> tuple[bool, float]:
+        """Larger for a pair that is farther apart, above all where that is no chance."""
+        return self.exceeds(0.0), -1.0 if self.off_px is None else self.off_px
+
+
+@dataclass
+class PlaceEvidence:
+    """Takes the slices one after the other, all at one size, and holds two of them at a time."""
+
+    _last: tuple[Plane, Mask, Plane] | None = None
+    _sharpest: Plane | None = None
+    _pairs: list["_Patches"] = field(default_factory=list)
+
+    def add(self, rgb: Rgb, usable: Mask) -> None:
+        luminance = display_luminance(rgb)
+        fine = cv2.GaussianBlur(luminance, (0, 0), _BAND_PX[0]) - cv2.GaussianBlur(luminance, (0, 0), _BAND_PX[1])
+        energy = np.sqrt(cv2.boxFilter(fine * fine, -1, (2 * HALF_PX, 2 * HALF_PX)))
+        if self._last is not None:
+            before, usable_before, energy_before = self._last
+            allowed = _whole_patches(usable & usable_before)
+            self._pairs.append(_matched(before, fine, np.where(allowed, np.minimum(energy, energy_before), 0.0)))
+        self._sharpest = energy if self._sharpest is None else np.maximum(self._sharpest, energy)
+        self._last = (fine, usable, energy)
+
+    def places(self, stored_per_px: float = 1.0) -> tuple[NeighbourPlace, ...]:
+        """Every pair of neighbours. stored_per_px: how many pixels of the stored pictures a pixel of those added is."""
+        if self._sharpest is None:
+            return ()
+        return tuple(_place(index, each, self._sharpest, stored_per_px) for index, each in enumerate(self._pairs))
+
+
+@dataclass(frozen=True)
+class _Patches:
+    """Patches found again. at: x, y of their middles. moved: to the right and down. energy: of the less sharp of the two slices."""
+
+    at: Displacements
+    moved: Displacements
+    energy: Float64[np.ndarray, " patches"]
+    size_px: tuple[int, int]
+
+    def kept(self, chosen: Bool[np.ndarray, " patches"]) -> "_Patches":
+        return _Patches(self.at[chosen], self.moved[chosen], self.energy[chosen], self.size_px)
+
+
+def _whole_patches(usable: Mask) -> Mask:
+    """Middles of patches that lie within the picture with room to search, and on usable pixels alone."""
+    reach = HALF_PX + SEARCH_PX
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return cv2.erode(usable.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+
+
+def _matched(before: Plane, after: Plane, energy: Plane) -> _Patches:
+    """In each cell of the picture the patch with the most energy."""
+    at, moved, energies = [], [], []
+    rows, columns = (np.linspace(0, size, cells + 1).astype(int) for size, cells in zip(energy.shape, _CELLS, strict=True))
+    for top, bottom in pairwise(rows):
+        for left, right in pairwise(columns):
+            cell = energy[top:bottom, left:right]
+            if not cell.size or cell.max() < _LEAST_ENERGY:
+                continue
+            row, column = divmod(int(cell.argmax()), cell.shape[1])
+            x, y = int(left) + column, int(top) + row
+            found = _displacement(before, after, x, y)
+            if found is not None:
+                at.append((x + 0.5, y + 0.5))
+                moved.append(found)
+                energies.append(float(energy[y, x]))
+    return _Patches(_pairs_of(at), _pairs_of(moved), np.array(energies, np.float64), energy.shape[::-1])
+
+
+def _pairs_of(values: Sequence[tuple[float, float]]) -> Displacements:
+    return np.array(values, np.float64).reshape(-1, 2)
+
+
+def _displacement(before: Plane, after: Plane, x: int, y: int) -> tuple[float, float] | None:
+    """By how much the patch around a pixel went right and down; None where it is not found within SEARCH_PX."""
+    patch = before[y - HALF_PX : y + HALF_PX, x - HALF_PX : x + HALF_PX]
+    reach = HALF_PX + SEARCH_PX
+    likeness = cv2.matchTemplate(after[y - reach : y + reach, x - reach : x + reach], patch, cv2.TM_CCOEFF_NORMED)
+    _, best, _, (column, row) = cv2.minMaxLoc(likeness)
+    inside = 0 < column < 2 * SEARCH_PX and 0 < row < 2 * SEARCH_PX
+    if best < _LEAST_CORRELATION or not inside:
+        return None
+    across, down = likeness[row, column - 1 : column + 2], likeness[row - 1 : row + 2, column]
+    return column - SEARCH_PX + _peak(across), row - SEARCH_PX + _peak(down)
+
+
+def _peak(three: Float32[np.ndarray, "3"]) -> float:
+    """Where a parabola through three values has its peak, counted from the middle one."""
+    left, middle, right = (float(each) for each in three)
+    bend = left - 2.0 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+
+
+def _place(first: int, patches: _Patches, sharpest: Plane, stored_per_px: float) -> NeighbourPlace:
+    x, y = patches.at.astype(int).T
+    sharp = patches.kept(patches.energy >= _SHARP_IN_BOTH * sharpest[y, x]) if len(x) else patches
+    if len(sharp.at) < FEWEST_PATCHES:
+        return NeighbourPlace(first, None, float("inf"), _best_place(sharp if len(sharp.at) else patches, stored_per_px))
+    fitted, error_px = _fitted(sharp)
+    sizes = np.hypot(*fitted.T)
+    off_px = float(np.sqrt(np.mean(sizes**2)))
+    farthest = sharp.at[int(sizes.argmax())]
+    return NeighbourPlace(first, off_px * stored_per_px, error_px * stored_per_px, _stored(farthest, stored_per_px))
+
+
+def _best_place(patches: _Patches, stored_per_px: float) -> tuple[int, int]:
+    """Of the patch that can be seen best; the middle of the picture where there is none."""
+    at = patches.at[int(patches.energy.argmax())] if len(patches.at) else 0.5 * np.array(patches.size_px)
+    return _stored(at, stored_per_px)
+
+
+def _stored(at: Float64[np.ndarray, "2"], stored_per_px: float) -> tuple[int, int]:
+    return int(at[0] * stored_per_px), int(at[1] * stored_per_px)
+
+
+def _fitted(patches: _Patches) -> tuple[Displacements, float]:
+    """The displacements of the similarity that fits the patches best, and the standard error of their root mean square."""
+    count = len(patches.at)
+    x, y = ((patches.at - 0.5 * np.array(patches.size_px)) / (0.5 * np.hypot(*patches.size_px))).T
+    one, none = np.ones(count), np.zeros(count)
+    columns = np.concatenate([np.stack([one, none, x, -y], axis=1), np.stack([none, one, y, x], axis=1)])
+    side, weight, scatter_px = patches.moved.T.ravel(), np.ones(2 * count), 0.0
+    ridge = 1e-6 * np.eye(4)
+    for _ in range(_ROUNDS):
+        weighted = columns.T * weight
+        change = np.linalg.solve(weighted @ columns + ridge, weighted @ side)
+        off = np.hypot(*(side - columns @ change).reshape(2, count))
+        # The median length of a vector whose two parts have the deviation 1 is 1.18.
+        scatter_px = max(float(np.median(off)) / 1.18, _LEAST_SCATTER_PX)
+        weight = np.tile(1.0 / (1.0 + (off / scatter_px) ** 2), 2)
+    covariance = np.linalg.inv((columns.T * weight) @ columns + ridge) * scatter_px**2
+    variance = np.einsum("ik,kl,il->i", columns, covariance, columns)
+    return (columns @ change).reshape(2, count).T, float(np.sqrt(2.0 * variance.mean()))
