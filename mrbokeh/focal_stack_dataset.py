@@ -2,7 +2,7 @@
 
 DATASET/dataset.json is the manifest; DATASET/SCENE/VIEW/ are FocalStack folders (mrbokeh.focal_stack) whose exclusion.exr says
 what not to learn from. Stacks are whole in one part: slices of a viewpoint share their all-in-focus picture, so that a split by
-slices would test on what was trained on.
+slices tests less than one by viewpoints. Only where there is a single stack, slices inside it are held out.
 """
 
 import math
@@ -48,6 +48,7 @@ class StackRecord:
 
     files: by path within the folder. excluded_shares: of the picture, by reason, and "any" for all together.
     largest_coc_px: the largest diameter over all slices, among pixels that are not excluded.
+    held_out_slices: indices of those that are for testing although the stack is for training, because it is the only one.
     """
 
     name: str
@@ -59,6 +60,7 @@ class StackRecord:
     radiance: RadianceRange
     excluded_shares: dict[str, float]
     files: dict[str, FileRecord]
+    held_out_slices: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,22 @@ def network_blocks(largest_coc_px: float) -> int:
     return max(1, math.ceil((abs(largest_coc_px) - 1.0) / 2.0))
 
 
+def slices_to_hold_out(stack: FocalStack) -> tuple[int, ...]:
+    """Which slices of a stack are for testing where it is the only one: every fourth from the third on, in order of focus.
+
+    Never an end of the focus range, which nothing else would show, and never the reference slice, whose place the next one takes, unless
+    there are only three. Four fifths or so are left to train on; of two slices none is held out.
+    """
+    focus = [0.0 if distance is None else 1.0 / distance for distance in stack.focus_distances_m]
+    order = sorted(range(len(stack)), key=lambda index: (focus[index], index))
+    chosen = []
+    for place in range(min(2, len(order) - 2), len(order) - 1, 4):
+        if place > 0:
+            inside = [each for each in (place, place + 1, place - 1) if 0 < each < len(order) - 1]
+            chosen.append(next((order[each] for each in inside if order[each] != stack.reference), order[place]))
+    return tuple(sorted(chosen))
+
+
 def file_troubles(dataset: FocalStackDataset, record: StackRecord, sha256_of: Callable[[Path], str] | None = None) -> Iterator[str]:
     """What of a stack is missing or not as it was written, one sentence each; without sha256_of only sizes count, contents are not read."""
     for relative, expected in record.files.items():
@@ -120,6 +138,7 @@ def write_focal_stack_dataset(dataset: FocalStackDataset) -> None:
         "largest_coc_px": dataset.largest_coc_px,
         "network_blocks": dataset.network_blocks,
         "split": {part: [each.name for each in dataset.records(part)] for part in PARTS},
+        "slices_held_out_of_one_stack": {each.name: list(each.held_out_slices) for each in dataset.stacks if each.held_out_slices},
         "stacks": [record_to_json(each) for each in dataset.stacks],
         "metadata": dataset.metadata,
     }
@@ -149,7 +168,8 @@ def read_focal_stack_dataset(folder: Path | str) -> FocalStackDataset:
 
 
 def record_to_json(record: StackRecord) -> dict[str, Any]:
-    return asdict(record)
+    document = asdict(record)
+    return document if record.held_out_slices else {name: value for name, value in document.items() if name != "held_out_slices"}
 
 
 def record_from_json(document: dict[str, Any]) -> StackRecord:
@@ -157,4 +177,5 @@ def record_from_json(document: dict[str, Any]) -> StackRecord:
     if document["part"] not in PARTS:
         raise ValueError(f"part {document['part']!r}")
     files = {path: FileRecord(**each) for path, each in document["files"].items()}
-    return StackRecord(**document | {"files": files, "radiance": RadianceRange(**document["radiance"])})
+    held_out = tuple(int(index) for index in document.get("held_out_slices", ()))
+    return StackRecord(**document | {"files": files, "radiance": RadianceRange(**document["radiance"]), "held_out_slices": held_out})

@@ -229,7 +229,8 @@ def test_a_set_is_written_resumed_and_trained_on(tmp_path: Path) -> None:
 def require_trainable(out: Path) -> None:
     """`mrbokeh train fit` takes it; the circle of confusion of a pair is that of the lens at the depth of each pixel."""
     data = training_data([out])
-    train, test = data.split([], 0.2, 0)
+    split = data.split([], 0.2, 0)
+    train, test = split.train, split.test
     assert len(train) == 2 and len(test) == 2
     facts = data.facts(PairSet(train))
     assert (facts.width_px, facts.height_px) == (TINY.width_px, TINY.height_px)

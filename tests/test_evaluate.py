@@ -23,7 +23,7 @@ from training import train
 from training.blur_functions import blur_of
 from training.cli import app
 from training.dataset import PairSet
-from training.evaluation.comparison import Extras, compare, scored, unseen
+from training.evaluation.comparison import Extras, Unseen, compare, scored, unseen_of
 from training.evaluation.cost import peak_memory_mib
 from training.evaluation.focus_pull import focus_pull, is_fine
 from training.evaluation.methods import (
@@ -45,6 +45,7 @@ from training.evaluation.scores import MEASURES, Score, SliceScorer, mean_known
 from training.evaluation.tables import HEADINGS, table_rows
 from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
 from training.presets import demo_settings
+from training.stacks import Seen
 from training.training_data import training_data
 from training.weights import WHERE_TRUTH_IS_KNOWN
 
@@ -123,7 +124,7 @@ def test_every_failure_is_seen_by_its_measure(scene: Path) -> None:
 
 def test_gaussians_leak_and_renderers_do_not(scene: Path) -> None:
     """A scattered Gaussian throws the blurred wall over the sharp card. The scatter renderer made the truth."""
-    result = scored([*plain_methods(), renderer_method("scatter")], training_data([scene]).stacks[:1], Extras(memory=False))
+    result = scored([*plain_methods(), renderer_method("scatter")], Unseen(training_data([scene]).stacks[:1]), Extras(memory=False))
     on_card = {each.method: each for each in result.scores if each.slice_index == ON_THE_CARD}
     assert on_card[SCATTERED].leak > 0.005 > 1e-4 > on_card[REFERENCE].leak
     assert on_card[REFERENCE].psnr_db > 60.0
@@ -276,12 +277,12 @@ def test_what_evaluate_wants(scene: Path, runs: list[Path]) -> None:
         CliRunner().invoke(app, ["evaluate", str(runs[0])], catch_exceptions=False)
     with pytest.raises(InputError, match="give --out"):
         CliRunner().invoke(app, ["evaluate", *map(str, runs), "--data", str(scene)], catch_exceptions=False)
-    with pytest.raises(InputError, match="trained on all of these"):
-        unseen(training_data([scene]).stacks, ["card/view_0", "card/view_1"])
+    with pytest.raises(InputError, match="trained on every slice of these"):
+        unseen_of(training_data([scene]).stacks, [Seen(("card/view_0", "card/view_1"))])
 
 
 def test_the_table_is_sorted_and_has_a_cell_for_everything(scene: Path, tmp_path: Path) -> None:
-    result = compare(plain_methods(), training_data([scene]).stacks[:1], tmp_path, Extras(pull_frames=3))
+    result = compare(plain_methods(), Unseen(training_data([scene]).stacks[:1]), tmp_path, Extras(pull_frames=3))
     rows = table_rows(result)
     assert all(len(row) == len(HEADINGS) for row in rows)
     decibels = [float(row[1]) for row in rows]

@@ -22,7 +22,7 @@ from training.classical_blur import gaussian_gather, gaussian_scatter, scatter_r
 from training.cli import app
 from training.data_facts import gather_facts
 from training.dataset import PairSet, read_pair
-from training.evaluation.comparison import Extras, compare, unseen
+from training.evaluation.comparison import Extras, compare, unseen_of
 from training.evaluation.methods import NETWORK, NO_BLUR, network_method, plain_methods
 from training.network_settings import NetworkSettings
 from training.objective import learning_rate_factor
@@ -90,9 +90,9 @@ def test_facts_come_from_the_data(scene: Path) -> None:
 
 def test_the_network_learns_the_lens(scene: Path, run: Path, tmp_path: Path) -> None:
     """On a viewpoint it has not seen it beats no blur and both Gaussians by the 3 dB that the product promises."""
-    blur, trained_on = blur_of(run)
-    held_out = unseen(training_data([scene]).stacks, trained_on)
-    assert [stack.folder.name for stack in held_out] == ["view_2"]
+    blur, seen = blur_of(run)
+    held_out = unseen_of(training_data([scene]).stacks, [seen])
+    assert [stack.folder.name for stack in held_out.stacks] == ["view_2"] and not held_out.slices
     result = compare([network_method(NETWORK, blur), *plain_methods()], held_out, tmp_path, Extras(pull_frames=0, memory=False))
     assert result.gain_db(NETWORK, NO_BLUR) > 3.0
     assert result.gain_db(NETWORK, result.better_gaussian) > 3.0
@@ -103,8 +103,8 @@ def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
     picture is. (How far it comes with the published size of data is not for a test to show.)"""
     settings = dataclasses.replace(PUBLISHED, epochs=60, learning_rate=5e-3, radiance_scale=1.2, saturation=1.0)
     train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
-    blur, trained_on = blur_of(tmp_path / "run")
-    pairs = PairSet(unseen(training_data([scene]).stacks, trained_on))
+    blur, seen = blur_of(tmp_path / "run")
+    pairs = unseen_of(training_data([scene]).stacks, [seen]).pairs()
     assert load_run(tmp_path / "run")[0].grid is not None
     for pair in (pairs[0], pairs[2]):
         counted = pair.target.max(axis=2) < 1.0
@@ -199,10 +199,10 @@ def test_learning_rate_rises_then_falls_to_zero() -> None:
 
 def test_viewpoints_are_held_out_whole(scene: Path) -> None:
     data = training_data([scene])
-    kept, apart = data.split(["wall/view_1"], 0.2, 0)
-    assert [each.folder.name for each in kept] == ["view_0", "view_2"] and [each.folder.name for each in apart] == ["view_1"]
-    kept, apart = data.split([], 0.34, seed=5)
-    assert len(kept) == 2 and len(apart) == 1
+    split = data.split(["wall/view_1"], 0.2, 0)
+    assert [each.folder.name for each in split.train] == ["view_0", "view_2"] and [each.folder.name for each in split.test] == ["view_1"]
+    split = data.split([], 0.34, seed=5)
+    assert len(split.train) == 2 and len(split.test) == 1 and not split.held_out_slices
     with pytest.raises(InputError, match="names of stacks among"):
         data.split(["view_9"], 0.2, 0)
     with pytest.raises(InputError, match="none is left"):

@@ -11,20 +11,21 @@ from mrbokeh.renderers.onnx_network import OnnxNetwork
 from training.batches import network_inputs
 from training.dataset import Pair
 from training.run_folder import load_run
+from training.stacks import Seen
 
 Image = Float32[np.ndarray, "height width 3"]
 Blur = Callable[[Pair], Image]
 
 
-def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, tuple[str, ...]]:
-    """(the function, names of the stacks it was trained on) of a run folder or an .onnx file. device: of a run, cpu or cuda."""
+def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, Seen]:
+    """(the function, what it was trained on) of a run folder or an .onnx file. device: of a run, cpu or cuda."""
     if network.suffix.lower() == ".onnx":
         exported = OnnxNetwork(network)
 
         def exported_blur(pair: Pair) -> Image:
             return exported.blur(pair.all_in_focus, pair.coc_px, pair.place, (pair.f_number, pair.focal_length_mm))
 
-        return exported_blur, exported.facts.trained_on
+        return exported_blur, Seen(exported.facts.trained_on, exported.facts.held_out_slices)
     model, _, facts = load_run(network)
     model.to(device)
 
@@ -33,4 +34,4 @@ def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, tuple[str, ...]]:
         result = model(*(each.to(device) for each in network_inputs(pair)))
         return result[0].permute(1, 2, 0).contiguous().cpu().numpy()
 
-    return blur, facts.trained_on
+    return blur, Seen(facts.trained_on, facts.held_out_slices)

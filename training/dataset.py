@@ -8,7 +8,7 @@ from mrbokeh.workers import cores
 from training.pairs import Pair, read_pair
 from training.read_ahead import ReadAhead, Window
 from training.slice_rows import slice_size_px
-from training.stacks import stack_name
+from training.stacks import ChosenSlices, stack_name
 from training.weights import Counting
 
 __all__ = ["Pair", "PairSet", "read_pair"]
@@ -21,21 +21,24 @@ _PIECES_AHEAD = 4
 class PairSet:
     """The pairs of some stacks; what was used last and what comes next is kept in memory, up to a limit.
 
+    slices: only these of the stacks that it names.
     cache_mib: the limit. Where all pairs fit they stay, and each file is read once. Where they do not, crops are cut from windows: only
     the rows of a crop are read, over the whole width, as the file holds them. On slices of 24 megapixels 256 rows take 1/16 of the
     time and memory of a whole one. Reading takes about one window more in passing for each reader (`ReadAhead`).
     A copy for another process (pickle) starts with an empty memory.
     """
 
-    def __init__(self, stacks: Sequence[FocalStack], counting: Counting | None = None, cache_mib: int = 2048) -> None:
-        self.stacks = tuple(stacks)
-        self.keys = [(stack, index) for stack in self.stacks for index in range(len(stack))]
+    def __init__(
+        self, stacks: Sequence[FocalStack], counting: Counting | None = None, cache_mib: int = 2048, slices: ChosenSlices | None = None
+    ) -> None:
+        self.stacks, self._slices = tuple(stacks), dict(slices or {})
+        self.keys = [(stack, index) for stack in self.stacks for index in self._slices.get(stack_name(stack), range(len(stack)))]
         self._counting, self._cache_mib = counting or Counting(), cache_mib
         self._sizes_px: dict[int, tuple[int, int]] = {}
         self._cache = ReadAhead(self._read, cache_mib * 2**20, readers=max(1, min(4, cores() // 2)))
 
-    def __reduce__(self) -> tuple[type["PairSet"], tuple[tuple[FocalStack, ...], Counting, int]]:
-        return PairSet, (self.stacks, self._counting, self._cache_mib)
+    def __reduce__(self) -> tuple[type["PairSet"], tuple[tuple[FocalStack, ...], Counting, int, ChosenSlices]]:
+        return PairSet, (self.stacks, self._counting, self._cache_mib, self._slices)
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -47,6 +50,11 @@ class PairSet:
     def label(self, index: int) -> str:
         stack, slice_index = self.keys[index]
         return f"{stack_name(stack)} slice {slice_index}"
+
+    def left_out(self, stack: FocalStack) -> list[int]:
+        """The slices of one of its stacks that do not belong to it."""
+        chosen = self._slices.get(stack_name(stack))
+        return [] if chosen is None else [index for index in range(len(stack)) if index not in chosen]
 
     def size_px(self, index: int) -> tuple[int, int]:
         """(height, width) of a pair, from the header of its file."""

@@ -72,6 +72,7 @@ def network_facts_of(network: BlurNetwork, settings: NetworkSettings, facts: Run
         linear_in_radiance=network.linear_in_radiance,
         reach_px=network.reach_px,
         trained_on=facts.trained_on,
+        held_out_slices=facts.held_out_slices,
         commit=facts.commit,
         field_position=settings.field_position,
         f_numbers=facts.lens_ranges[0] if settings.lens_inputs else None,

@@ -12,6 +12,7 @@ from mrbokeh.focal_stack import FocalStack
 from training.batches import Batch, stack_pairs
 from training.dataset import PairSet
 from training.sheets import small_picture
+from training.stacks import ChosenSlices
 from training.weights import WHERE_TRUTH_IS_KNOWN
 
 SLICES = 4
@@ -31,8 +32,8 @@ class Look:
 class HeldOutSlices:
     """Some slices, spread over stacks and focus range; whole pictures."""
 
-    def __init__(self, stacks: Sequence[FocalStack]) -> None:
-        self._pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0)
+    def __init__(self, stacks: Sequence[FocalStack], slices: ChosenSlices | None = None) -> None:
+        self._pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0, slices=slices)
         spread = np.linspace(0, len(self._pairs) - 1, SLICES if len(self._pairs) else 0)
         self._chosen = [int(index) for index in np.unique(spread.round())]
 

@@ -6,11 +6,13 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import numpy as np
 import torch
 from rich.progress import Progress as Bars
 
+from mrbokeh.errors import InputError
 from mrbokeh.progress import progress_bars
 from training.batches import Batch, draw_share
 from training.checkpoint import FILE_NAME as CHECKPOINT_NAME
@@ -22,23 +24,41 @@ from training.learner import Learner
 from training.objective import learning_rate_factor, loss
 from training.record import Record, Task
 from training.run_folder import build_network
+from training.time_budget import is_rate_known, steps_within, too_few_words
 
 
 class Run:
-    """The constructor restores a checkpoint where there is one. Every process has a run; that of the first one writes and looks."""
+    """The constructor restores a checkpoint where there is one, unless it begins afresh. Every process has a run; that of the first one
+    writes and looks."""
 
-    def __init__(self, task: Task, ranks: Ranks) -> None:
+    def __init__(self, task: Task, ranks: Ranks, afresh: bool = False) -> None:
         self.task, self.settings, self.ranks = task, task.settings, ranks
         torch.set_num_threads(self.settings.threads or max(1, (os.cpu_count() or 1) // ranks.local_count))
         self.learner = Learner(build_network(self.settings, task.facts), self.settings, ranks.device)
         self._rng = np.random.default_rng(self.settings.seed)
-        self.progress = self._restored()
+        self.progress = Progress() if afresh else self._restored()
         self._record = Record(task, self.learner, self.progress, self._rng)
         self._halo_px = math.ceil(task.facts.largest_coc_px / 2.0)
+        # The rim of a crop that wide does not count; at least half of each side has to.
+        self._crop_px = self.settings.crop_px and max(self.settings.crop_px, 4 * self._halo_px)
         self._interruption = Interruption(alone=ranks.count == 1)
         self._stopped_by: int | None = None
         self._started_s = time.monotonic() - self.progress.elapsed_s
         self._saved_s = self._looked_s = self.progress.elapsed_s
+
+    def require_steps(self, least: int) -> None:
+        """Take the first steps of a budget in minutes; raises InputError where it has no time for `least` of them. Nothing is written."""
+        if self.settings.minutes is None or self.progress.step:
+            return
+        budget_s, ends_s = 60.0 * self.settings.minutes, list[float]()
+        with self._interruption, self._bars() as bars:
+            bar = bars.add_task("first steps, to see how many there is time for", total=None)
+            while not is_rate_known(ends_s, budget_s) and self._done() < 1.0 and self._stopped_by is None:
+                self._step(learning_rate_factor(self._done(), self.settings.warm_up))
+                ends_s.append(self.progress.elapsed_s)
+                bars.advance(bar)
+        if self._stopped_by is None and steps_within(ends_s, budget_s) < least:
+            raise InputError(too_few_words(ends_s, self.settings, self._halo_px, least))
 
     def train(self) -> Progress:
         """Use the rest of the budget; raises StoppedError, with a checkpoint, where any process is asked to stop."""
@@ -65,11 +85,21 @@ class Run:
 
     def _loop(self) -> None:
         with self._bars() as bars:
-            bar = bars.add_task("train", total=1000)
+            bar = bars.add_task(**self._bar())
             while (done := self._done()) < 1.0 and self._stopped_by is None and not self.progress.stopped_early:
                 self._step(learning_rate_factor(done, self.settings.warm_up))
-                bars.update(bar, completed=1000 * self._done(), description=f"train, loss {self.progress.smoothed_loss:.2e}")
+                bars.update(bar, **self._bar())
                 self._keep()
+
+    def _bar(self) -> dict[str, Any]:
+        """What is done of what: steps of those planned, or seconds of a budget in minutes beside the steps that they made."""
+        progress, loss_words = self.progress, "" if math.isnan(self.progress.smoothed_loss) else f", loss {self.progress.smoothed_loss:.2e}"
+        if self.settings.epochs is not None:
+            planned = math.ceil(self.settings.epochs * len(self.task.pairs) / (self.settings.batch * self.ranks.count))
+            return {"description": f"train{loss_words}, steps", "completed": progress.step, "total": planned}
+        budget_s = 60.0 * (self.settings.minutes or 0.0)
+        description = f"train, {progress.step} steps{loss_words}, seconds"
+        return {"description": description, "completed": min(progress.elapsed_s, budget_s), "total": budget_s}
 
     def _step(self, rate_factor: float) -> None:
         """One update from `batch` pictures of each process, one after the other: a picture uses few of the network's bins, all
@@ -83,7 +113,7 @@ class Run:
         """The pictures of this process, one by one. All draw from one sequence and pass over the pictures of the others, so that it
         does not matter who draws what: two processes see what one with twice the batch sees."""
         settings, noise = self.settings, self.settings.depth_noise
-        drawing = Drawing(self.task.pairs, settings.batch, settings.crop_px, self._halo_px, settings.crops_per_picture, noise > 0.0)
+        drawing = Drawing(self.task.pairs, settings.batch, self._crop_px, self._halo_px, settings.crops_per_picture, noise > 0.0)
         place, most_px = (self.ranks.number, self.ranks.count), self.task.facts.largest_coc_px
         for batch in draw_share(drawing, self._rng, *place, depth_noise=noise, largest_coc_px=most_px):
             yield batch.to(self.ranks.device)

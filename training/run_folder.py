@@ -28,7 +28,8 @@ class RunFacts:
     """What a trained network holds for, and where it came from.
 
     largest_coc_px: diameter; radiance_scale: the radiance at the upper end of the network's range;
-    trained_on, held_out: names of stacks; commit: of the source, or None where git is absent.
+    trained_on, held_out: names of stacks; held_out_slices: of the only stack, where there is one.
+    commit: of the source, or None where git is absent.
     f_numbers, focal_lengths_mm: (lowest, highest) of the data; None: those of `lens` alone.
     """
 
@@ -42,6 +43,7 @@ class RunFacts:
     commit: str | None
     f_numbers: tuple[float, float] | None = None
     focal_lengths_mm: tuple[float, float] | None = None
+    held_out_slices: tuple[int, ...] = ()
 
     @property
     def lens_ranges(self) -> LensRanges:

@@ -20,7 +20,8 @@ class TrainSettings:
 
     minutes, epochs: the budget; the learning rate follows it (short warm-up, then a cosine to zero), over elapsed time
         for minutes, over steps for epochs. An epoch shows as many pictures as there are pairs.
-    crop_px: side of the square crops, 0 for whole pictures. Crops are for one tile only: the loss of the published network is
+    crop_px: side of the square crops, 0 for whole pictures; larger where the largest blur would leave less than half of it.
+        Crops are for one tile only: the loss of the published network is
         over the reassembled picture.
     loss_scope: "picture" takes the error of the reassembled picture as published, "tile" that of every tile by itself (Table 1, last row).
     loss_weighting: the loss is a mean square error; "uniform" as published, "relative" divides each error by the true
@@ -44,7 +45,7 @@ class TrainSettings:
     patience: stop after so many looks at the held-out slices without a better one; 0 never stops early.
     sheets: write a sheet of predictions on held-out slices at every look, so that one can watch it learn.
     test_fraction: of the stacks (viewpoints) of scene folders, held out when no names are given; the paper's split is 80 : 20.
-        A data set has its own split.
+        Of a single stack every fourth slice is held out, none where this is 0. A data set has its own split.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)

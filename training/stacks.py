@@ -1,11 +1,62 @@
-"""Focal stacks to train on or to test on: their names, whether they can be used, and which are held out."""
+"""Focal stacks to train on or to test on: their names, whether they can be used, and which of them, or of their slices, are held out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack
+
+ChosenSlices = Mapping[str, Sequence[int]]
+"""Indices of slices by the name of their stack; of stacks that are not named, all slices are meant."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """train, test: whole stacks. held_out_slices: of the only stack, which then is in both."""
+
+    train: tuple[FocalStack, ...]
+    test: tuple[FocalStack, ...]
+    held_out_slices: tuple[int, ...] = ()
+
+    @property
+    def train_slices(self) -> ChosenSlices:
+        return self._of_only_stack([index for index in range(len(self.train[0])) if index not in self.held_out_slices])
+
+    @property
+    def test_slices(self) -> ChosenSlices:
+        return self._of_only_stack(self.held_out_slices)
+
+    def _of_only_stack(self, chosen: Sequence[int]) -> ChosenSlices:
+        return {stack_name(self.train[0]): chosen} if self.held_out_slices else {}
+
+    def words(self) -> str:
+        """What is trained on and what is kept apart, for people."""
+        kept = ", ".join(str(index) for index in self.held_out_slices)
+        if kept:
+            trained = len(self.train[0]) - len(self.held_out_slices)
+            return (
+                f"{trained} slices of {stack_name(self.train[0])} to train on; slices {kept} are held out of one stack, not an unseen view"
+            )
+        apart = ", ".join(stack_name(stack) for stack in self.test)
+        if apart:
+            return f"{len(self.train)} stacks to train on; held out: {apart}"
+        slices = sum(len(stack) for stack in self.train)
+        return f"{len(self.train)} stacks, {slices} slices to train on; nothing is held out, so nothing can tell how good the network is"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a network was trained on: names of stacks, all slices of them but held_out_slices where there is only one."""
+
+    stacks: tuple[str, ...]
+    held_out_slices: tuple[int, ...] = ()
+
+    def unseen_slices(self, stack: FocalStack) -> set[int]:
+        if stack_name(stack) not in self.stacks:
+            return set(range(len(stack)))
+        return {index for index in self.held_out_slices if index < len(stack)}
 
 
 def stack_name(stack: FocalStack) -> str:
@@ -18,9 +69,12 @@ def require_usable(stack: FocalStack) -> None:
     """Registered, merged and metric, or InputError."""
     if not (stack.merged and stack.registered):
         raise InputError(f"{stack.folder} is not registered and merged yet: run `mrbokeh capture merge` on it")
-    stack.lens_of(0)
     if not stack.is_metric:
-        raise InputError(f"{stack.folder} has slices without a focus distance: add them to lens.toml and ingest again")
+        raise InputError(
+            f"{stack.folder} has slices without a focus distance: merge it again (`mrbokeh capture merge --overwrite`), which solves their "
+            f"blur from the pictures, or add the distances to lens.toml and ingest"
+        )
+    stack.lens_of(0)
 
 
 def named(stacks: Sequence[FocalStack], held_out: Sequence[str]) -> list[str]:

@@ -1,11 +1,11 @@
 """Fit a network to focal stacks: what is learnt from what is settled here, then `Run` steps. Every choice is in settings.py."""
 
+import shutil
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
 from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
 from training.checkpoint import Progress
 from training.dataset import PairSet
 from training.distributed import Ranks, joined
@@ -15,37 +15,66 @@ from training.resuming import remove_unfinished, require_same_data, require_same
 from training.run import Run
 from training.run_folder import RunFacts, source_commit, write_facts
 from training.settings import TrainSettings, write_settings
-from training.stacks import stack_name
+from training.stacks import Split, stack_name
+from training.time_budget import LEAST_STEPS
 from training.training_data import TrainingData
 from training.weights import counting_of
 
 
-def fit(data: TrainingData, run_folder: Path, settings: TrainSettings, held_out: Sequence[str] = ()) -> Progress:
+def fit(
+    data: TrainingData,
+    run_folder: Path,
+    settings: TrainSettings,
+    held_out: Sequence[str] = (),
+    overwrite: bool = False,
+    least_steps: int = LEAST_STEPS,
+) -> Progress:
     """Train, or go on training, into run_folder; a finished run is left as it is. held_out: see `TrainingData.split`.
 
+    overwrite: start again where there is a run. least_steps: raises InputError, and writes or removes nothing, where the first steps say
+    that a budget in minutes has no time for so many.
     Ctrl-C and SIGTERM end it after the step (StoppedError, a KeyboardInterrupt) with a checkpoint, from which the same call goes on.
     Processes that torchrun started train together; all need the data, only the first needs the folder.
     """
     with joined(settings.device) as ranks:
-        return _fit(data, run_folder, settings, held_out, ranks)
+        return _fit(data, run_folder, settings, held_out, ranks, overwrite, least_steps)
 
 
-def _fit(data: TrainingData, run_folder: Path, settings: TrainSettings, held_out: Sequence[str], ranks: Ranks) -> Progress:
-    train_stacks, test_stacks = data.split(held_out, settings.test_fraction, settings.seed)
-    pairs, validation = PairSet(train_stacks, counting_of(settings), settings.cache_mib), HeldOutSlices(test_stacks)
+def _fit(
+    data: TrainingData,
+    run_folder: Path,
+    settings: TrainSettings,
+    held_out: Sequence[str],
+    ranks: Ranks,
+    overwrite: bool,
+    least_steps: int,
+) -> Progress:
+    split = data.split(held_out, settings.test_fraction, settings.seed)
+    pairs = PairSet(split.train, counting_of(settings), settings.cache_mib, split.train_slices)
+    validation = HeldOutSlices(split.test, split.test_slices)
     _require_looks(settings, validation)
 
-    def begun() -> RunFacts:
+    def checked() -> RunFacts:
+        if overwrite:
+            return _facts_of(data, pairs, split, settings)
         require_same_settings(run_folder, settings)
-        facts = _facts_of(data, pairs, test_stacks, settings)
+        facts = _facts_of(data, pairs, split, settings)
         require_same_data(run_folder, facts)
+        return facts
+
+    def begun(facts: RunFacts) -> None:
+        if overwrite and run_folder.exists():
+            shutil.rmtree(run_folder)
         remove_unfinished(run_folder)
         write_settings(run_folder, settings)
         write_facts(run_folder, facts)
-        return facts
 
     with closing(pairs):
-        return Run(Task(run_folder, settings, ranks.from_first(begun), pairs, validation), ranks).train()
+        facts = ranks.from_first(checked)
+        run = Run(Task(run_folder, settings, facts, pairs, validation), ranks, afresh=overwrite)
+        run.require_steps(least_steps)
+        ranks.from_first(lambda: begun(facts))
+        return run.train()
 
 
 def _require_looks(settings: TrainSettings, validation: HeldOutSlices) -> None:
@@ -56,7 +85,7 @@ def _require_looks(settings: TrainSettings, validation: HeldOutSlices) -> None:
         )
 
 
-def _facts_of(data: TrainingData, pairs: PairSet, test_stacks: Sequence[FocalStack], settings: TrainSettings) -> RunFacts:
+def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainSettings) -> RunFacts:
     found = data.facts(pairs, several_lenses=settings.network.lens_inputs)
     return RunFacts(
         lens=found.lens,
@@ -65,7 +94,8 @@ def _facts_of(data: TrainingData, pairs: PairSet, test_stacks: Sequence[FocalSta
         largest_coc_px=found.largest_coc_px,
         radiance_scale=settings.radiance_scale or found.radiance_scale,
         trained_on=tuple(stack_name(stack) for stack in pairs.stacks),
-        held_out=tuple(stack_name(stack) for stack in test_stacks),
+        held_out=() if split.held_out_slices else tuple(stack_name(stack) for stack in split.test),
+        held_out_slices=split.held_out_slices,
         commit=source_commit(),
         f_numbers=found.f_numbers,
         focal_lengths_mm=found.focal_lengths_mm,

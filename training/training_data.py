@@ -6,10 +6,10 @@ from pathlib import Path
 
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack, find_focal_stacks, read_focal_stack
-from mrbokeh.focal_stack_dataset import FILE_NAME, FocalStackDataset, file_troubles, read_focal_stack_dataset
+from mrbokeh.focal_stack_dataset import FILE_NAME, FocalStackDataset, file_troubles, read_focal_stack_dataset, slices_to_hold_out
 from training.data_facts import DataFacts, gather_facts, manifest_facts
 from training.dataset import PairSet
-from training.stacks import drawn, named, require_usable, split_stacks, stack_name
+from training.stacks import Split, drawn, named, require_usable, split_stacks, stack_name
 
 
 @dataclass(frozen=True)
@@ -19,15 +19,25 @@ class TrainingData:
     stacks: tuple[FocalStack, ...]
     dataset: FocalStackDataset | None = None
 
-    def split(self, held_out: Sequence[str], test_fraction: float, seed: int) -> tuple[list[FocalStack], list[FocalStack]]:
-        """(to train on, held out), whole stacks: held out are those named; without names those of the manifest; without one a fraction."""
+    def split(self, held_out: Sequence[str], test_fraction: float, seed: int) -> Split:
+        """Whole stacks: held out are those named; without names those of the manifest; without one a fraction.
+
+        Of a single stack slices are held out, those of the manifest or `slices_to_hold_out`, unless the fraction is 0.
+        """
         if held_out:
             apart = named(self.stacks, held_out)
         elif self.dataset is not None:
             apart = [stack_name(stack) for stack, record in zip(self.stacks, self.dataset.stacks, strict=True) if record.part == "test"]
         else:
             apart = drawn(self.stacks, test_fraction, seed)
-        return split_stacks(self.stacks, apart)
+        train, test = split_stacks(self.stacks, apart)
+        slices = self._slices_apart(test_fraction) if len(self.stacks) == 1 else ()
+        return Split(tuple(train), tuple(train if slices else test), slices)
+
+    def _slices_apart(self, test_fraction: float) -> tuple[int, ...]:
+        if self.dataset is not None:
+            return self.dataset.stacks[0].held_out_slices
+        return slices_to_hold_out(self.stacks[0]) if test_fraction > 0.0 else ()
 
     def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
         """Of the manifest, or from a look at every pair to train on. several_lenses: f-number and focal length may differ."""

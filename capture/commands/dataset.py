@@ -1,11 +1,14 @@
 """`mrbokeh capture dataset`: merged stacks as a data set with manifest, hashes, split and exclusion masks."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mrbokeh.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.focal_stack_dataset import FocalStackDataset
 
 HELP = "\n\n".join(
     (
@@ -41,6 +44,7 @@ def dataset_command(
     from capture.dataset.stack_writer import StackWriting
     from capture.dataset.writer import DatasetPlan, write_dataset
     from capture.report.reblur import reblur_by
+    from mrbokeh.guessed_metres import metres_notes
     from mrbokeh.interrupts import kept_when_interrupted
 
     if not scenes:
@@ -51,9 +55,20 @@ def dataset_command(
         dataset = write_dataset(scenes, out, plan, overwrite)
     train, held_out = len(dataset.records("train")), len(dataset.records("test"))
     typer.echo(
-        f"{out}: {train} stacks to train on, {held_out} to test on; largest circle of confusion {dataset.largest_coc_px:.1f} px "
+        f"{out}: {train} stacks to train on, {held_out} to test on{_slices_held_out(dataset)}; "
+        f"largest circle of confusion {dataset.largest_coc_px:.1f} px "
         f"(N = {dataset.network_blocks}), radiance scale {dataset.radiance_scale:.4g}"
     )
+    if note := metres_notes([*dataset.focal_stacks("train"), *dataset.focal_stacks("test")]):
+        typer.echo(note)
+
+
+def _slices_held_out(dataset: "FocalStackDataset") -> str:
+    """What a data set of one stack is tested on, in words."""
+    if len(dataset.stacks) > 1:
+        return ""
+    slices = ", ".join(str(index) for index in dataset.stacks[0].held_out_slices)
+    return f" but slices {slices}, held out of one stack, not an unseen view" if slices else "; no slice is held out either"
 
 
 def licence_text(text_or_file: str) -> str:

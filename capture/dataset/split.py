@@ -1,10 +1,11 @@
-"""Which stacks are for training and which for testing: whole viewpoints, the same ones on every machine."""
+"""Which stacks are for training and which for testing: whole viewpoints, the same ones on every machine; of a single one some slices."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import Part
+from mrbokeh.focal_stack import FocalStack
+from mrbokeh.focal_stack_dataset import Part, slices_to_hold_out
 
 
 def split_by_viewpoint(names: Sequence[str], test: Sequence[str] = (), test_share: float = 0.2, seed: int = 0) -> dict[str, Part]:
@@ -26,6 +27,13 @@ def split_by_viewpoint(names: Sequence[str], test: Sequence[str] = (), test_shar
     if len(apart) == len(names):
         raise InputError(f"all {len(names)} viewpoints are for testing, none is left to train on: test on fewer or give more scenes")
     return {name: "test" if name in apart else "train" for name in names}
+
+
+def slices_of_a_single_stack(stacks: Mapping[str, FocalStack], test_share: float = 0.2) -> dict[str, tuple[int, ...]]:
+    """Slices held out inside the stack where it is the only one and something is to be tested on; {} where viewpoints are split."""
+    if len(stacks) > 1 or test_share == 0.0:
+        return {}
+    return {name: slices_to_hold_out(stack) for name, stack in stacks.items()}
 
 
 def _is_called(full: str, name: str) -> bool:

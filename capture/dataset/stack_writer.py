@@ -44,9 +44,12 @@ def require_usable(stack: FocalStack) -> None:
     """Raises InputError naming what a stack lacks to be learned from."""
     if not (stack.merged and stack.registered):
         raise InputError(f"{stack.folder} is not registered and merged yet: run `mrbokeh capture merge` on it, or name another scene")
-    stack.lens_of(0)
     if not stack.is_metric:
-        raise InputError(f"{stack.folder} has slices without a focus distance: add them to lens.toml, ingest and merge again")
+        raise InputError(
+            f"{stack.folder} has slices without a focus distance: merge it again (`mrbokeh capture merge --overwrite`), which solves their "
+            f"blur from the pictures, or add the distances to lens.toml and ingest"
+        )
+    stack.lens_of(0)
     if is_depth_stale(stack):
         raise InputError(f"{stack.folder}: its depth was found with other focus distances than it has now: run `mrbokeh capture depth`")
 

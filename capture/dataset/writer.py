@@ -1,11 +1,11 @@
 """`mrbokeh capture dataset`: the stacks of some scenes as one data set. Stacks are written one by one, pictures read one by one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from capture.dataset.split import split_by_viewpoint
+from capture.dataset.split import slices_of_a_single_stack, split_by_viewpoint
 from capture.dataset.stack_writer import StackWriting, require_usable, write_stack
 from mrbokeh import __version__
 from mrbokeh.atomic_files import write_json
@@ -16,6 +16,8 @@ from mrbokeh.progress import track
 
 UNFINISHED_NAME = "unfinished.json"
 MAXIMUM = "maximum"
+METRES_GUESSED = "metres_guessed"
+"""Key in the data set's metadata: names of stacks whose circles of confusion are measured in pixels, and whose distances are guessed."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +45,13 @@ def write_dataset(scenes: Sequence[Path], out: Path, plan: DatasetPlan, overwrit
         raise InputError("a data set needs a licence note: give --licence with a text such as 'CC BY 4.0, Jane Doe' or a file")
     stacks = named_stacks(scenes)
     parts = split_by_viewpoint(list(stacks), plan.test, plan.test_share, plan.seed)
+    apart = slices_of_a_single_stack(stacks, plan.test_share)
     for stack in stacks.values():
         require_usable(stack)
     _claim(out, overwrite)
     records = tuple(
-        write_stack(stack, out, name, parts[name], plan.writing) for name, stack in track(stacks.items(), "data set", len(stacks))
+        replace(write_stack(stack, out, name, parts[name], plan.writing), held_out_slices=apart.get(name, ()))
+        for name, stack in track(stacks.items(), "data set", len(stacks))
     )
     scale = radiance_scale(records, plan.radiance_scale)
     metadata = {
@@ -55,7 +59,8 @@ def write_dataset(scenes: Sequence[Path], out: Path, plan: DatasetPlan, overwrit
         "made_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "radiance_scale_is": plan.radiance_scale,
         "split_seed": plan.seed,
-        "split_by": "names" if plan.test else "hash of seed and name",
+        "split_by": "slices of one stack" if apart else "names" if plan.test else "hash of seed and name",
+        METRES_GUESSED: [name for name, stack in stacks.items() if not stack.metres_known],
     }
     dataset = FocalStackDataset(out, plan.licence, scale, records, metadata)
     (out / "LICENCE.txt").write_text(plan.licence.rstrip() + "\n", encoding="utf-8")

@@ -21,9 +21,9 @@ class NetworkFacts:
     width_px, height_px: the pictures it was trained on; the only size when tiled.
     largest_coc_px: the largest diameter it was trained for. radiance_scale: the largest radiance it was trained for.
     reach_px: how far from a pixel the network looks. commit: of the training code, or None.
-    trained_on: names of the stacks.
+    trained_on: names of the stacks. held_out_slices: those of the only one that were not.
     field_position: the place in the frame is an input. f_numbers, focal_lengths_mm: (lowest, highest) trained on, where the lens is an
-    input, else None. All three are missing in files from before there were such inputs.
+    input, else None. These and held_out_slices are missing in older files.
     """
 
     lens: Lens
@@ -40,6 +40,7 @@ class NetworkFacts:
     field_position: bool = False
     f_numbers: tuple[float, float] | None = None
     focal_lengths_mm: tuple[float, float] | None = None
+    held_out_slices: tuple[int, ...] = ()
 
     @property
     def lens_inputs(self) -> bool:

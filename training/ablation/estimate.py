@@ -55,7 +55,7 @@ def step_seconds(planned: PlannedRun) -> float:
 
 
 def _pairs(planned: PlannedRun) -> PairSet:
-    train_stacks = planned.data_set.data.split(planned.data_set.held_out, 0.0, 0)[0]
+    train_stacks = planned.data_set.data.split(planned.data_set.held_out, 0.0, 0).train
     return PairSet(train_stacks, counting_of(planned.settings), planned.settings.cache_mib)
 
 

@@ -98,8 +98,8 @@ def scaled_tiles(base: TrainSettings, width_px: int, ablation: Ablation) -> dict
 def _data_set(folder: Path) -> DataSet:
     """The split is the manifest's, or for scene folders drawn once for all rows and seeds."""
     data = training_data([folder])
-    apart = data.split((), TEST_FRACTION, SPLIT_SEED)[1]
-    if not apart:
+    split = data.split((), TEST_FRACTION, SPLIT_SEED)
+    if not split.test or split.held_out_slices:
         raise InputError(f"{folder} has {len(data.stacks)} stack and none to test on: give data with at least two viewpoints")
-    names = tuple(stack_name(stack) for stack in apart)
+    names = tuple(stack_name(stack) for stack in split.test)
     return DataSet(folder.resolve().name, folder, data, names, slice_size_px(data.stacks[0], 0)[1])

@@ -6,7 +6,7 @@ from training import train
 from training.ablation.plan import PlannedRun
 from training.ablation.results import SCORES_NAME, RunResult, read_result, write_result
 from training.blur_functions import blur_of
-from training.evaluation.comparison import Extras, scored
+from training.evaluation.comparison import Extras, Unseen, scored
 from training.evaluation.focus_pull import focus_pull
 from training.evaluation.methods import network_method
 from training.evaluation.scores import MEASURES, Perceptual
@@ -25,7 +25,7 @@ def result_of(planned: PlannedRun, lpips: Perceptual | None = None) -> RunResult
     before = read_result(planned.folder)
     if before is not None and (lpips is None or before.measures["lpips"] == before.measures["lpips"]):
         return before
-    progress = train.fit(planned.data_set.data, planned.folder, planned.settings, planned.data_set.held_out)
+    progress = train.fit(planned.data_set.data, planned.folder, planned.settings, planned.data_set.held_out, least_steps=0)
     network, _, facts = load_run(planned.folder)
     measures, slices = _measured(planned, lpips)
     result = RunResult(
@@ -47,8 +47,8 @@ def result_of(planned: PlannedRun, lpips: Perceptual | None = None) -> RunResult
 def _measured(planned: PlannedRun, lpips: Perceptual | None) -> tuple[dict[str, float], int]:
     """(means over the held-out slices, their number); each slice is in scores.csv of the run."""
     method = network_method(planned.row.name, blur_of(planned.folder, device_of(planned.settings.device))[0])
-    stacks = [stack for stack in planned.data_set.data.stacks if stack_name(stack) in planned.data_set.held_out]
-    result = scored([method], stacks, Extras(lpips, memory=False))
+    stacks = tuple(stack for stack in planned.data_set.data.stacks if stack_name(stack) in planned.data_set.held_out)
+    result = scored([method], Unseen(stacks), Extras(lpips, memory=False))
     write_numbers(planned.folder / SCORES_NAME, result.scores)
     means = {name: result.mean(method.name, name) for name in MEASURES}
     return means | {FLICKER: focus_pull(stacks[0]).flicker_of(method)}, result.slices

@@ -41,7 +41,8 @@ def evaluate_command(
 ) -> None:
     """Compare networks with no blur, Gaussians of the right size and our renderers on stacks that none of them was trained on.
 
-    Of a data set these are the viewpoints that the networks' runs held out, whatever was given as --held-out.
+    Of a data set these are the viewpoints that the networks' runs held out, whatever was given as --held-out. Networks trained on one
+    stack are judged on the slices held out of it, beside the nearest slice they were trained on; that is no unseen view.
 
     Example: mrbokeh train evaluate runs/paper runs/gated fast.onnx --data lens_50mm --out comparison
 
@@ -49,8 +50,9 @@ def evaluate_command(
 
     Example: mrbokeh train evaluate runs/50mm --data lens_50mm --psf lens_50mm.bank --renderer polygon --out measured
     """
-    from training.evaluation.comparison import Extras, compare, unseen
-    from training.evaluation.methods import bank_methods, network_methods, plain_methods, renderer_methods
+    from mrbokeh.guessed_metres import metres_notes
+    from training.evaluation.comparison import Extras, compare, unseen_of
+    from training.evaluation.methods import bank_methods, nearest_method, network_methods, plain_methods, renderer_methods
     from training.evaluation.perceptual import OnnxPerceptualDistance
     from training.evaluation.tables import gain_lines, table_rows
     from training.training_data import training_data
@@ -60,12 +62,18 @@ def evaluate_command(
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out: expected a folder, but {folder} is a file")
     refuse_existing(folder / "evaluation.md", overwrite)
-    of_networks, trained_on = network_methods(networks, device)
+    of_networks, seen = network_methods(networks, device)
+    stacks = training_data(scenes).stacks
+    if note := metres_notes(stacks):
+        typer.echo(note)
+    unseen = unseen_of(stacks, seen)
     chosen = _renderers(renderer, reference)
     measured = [] if psf is None else bank_methods(chosen, psf)
-    methods = [*of_networks, *plain_methods(), *renderer_methods(chosen), *measured]
+    plain = [*plain_methods(), nearest_method()] if unseen.slices else plain_methods()
+    methods = [*of_networks, *plain, *renderer_methods(chosen), *measured]
     extras = Extras(None if lpips is None else OnnxPerceptualDistance(lpips), pull)
-    result = compare(methods, unseen(training_data(scenes).stacks, trained_on), folder, extras)
+    result = compare(methods, unseen, folder, extras)
+    typer.echo(f"{result.slices} {unseen.words}")
     for name, decibel, similarity, *_ in table_rows(result):
         typer.echo(f"{name:22s} {decibel:>7s} dB   SSIM {similarity}")
     for line in gain_lines(result):

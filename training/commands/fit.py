@@ -2,7 +2,6 @@
 
 import math
 import os
-import shutil
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -59,6 +58,8 @@ def fit_command(
     """Train a network on focal stacks; run again after an interruption and it goes on where it stopped.
 
     A data set brings its split by viewpoint, its radiance scale and its largest circle of confusion, which decides the network's N.
+    Of a single stack every fourth slice or so, inside its focus range, is held out; `mrbokeh train evaluate` judges on these.
+    A budget in minutes that has no time for 200 steps is refused after the first ones, before anything is written.
     Pixels that moved, have no data, show a calibration board, are saturated or have no trustworthy depth do not count.
 
     On several GPUs or machines torchrun starts it: every process takes its own pictures, `batch` of them a step. After an interruption it
@@ -81,23 +82,28 @@ def fit_command(
         settings = replace(settings, **budget | {name: value for name, value in given.items() if value is not None})
         if _number("RANK") == 0:
             _require_run(out)
-            if overwrite and out.exists():
-                shutil.rmtree(out)
-        _fit(scenes, out, settings, held_out or [])
+            typer.echo(f"reading {', '.join(str(scene) for scene in scenes)}", err=True)  # loading PyTorch takes seconds
+        _fit(scenes, out, settings, held_out or [], overwrite)
     except InputError:
         if _number("LOCAL_RANK"):  # one sentence for each machine
             raise typer.Exit(2) from None
         raise
 
 
-def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str]) -> None:
+def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str], overwrite: bool) -> None:
+    from mrbokeh.guessed_metres import metres_notes
     from training.interruption import StoppedError
     from training.train import fit
     from training.training_data import training_data
 
     code, said = 0, ""
     try:
-        said = f"{out}: {_summary(fit(training_data(scenes), out, settings, held_out))}"
+        data = training_data(scenes)
+        if _number("RANK") == 0:
+            typer.echo(data.split(held_out, settings.test_fraction, settings.seed).words(), err=True)
+            if note := metres_notes(data.stacks):
+                typer.echo(note, err=True)
+        said = f"{out}: {_summary(fit(data, out, settings, held_out, overwrite))}"
     except StoppedError as stop:
         code, said = stop.exit_code, f"stopped; the checkpoint in {out} is kept, run the same command again to go on"
     except KeyboardInterrupt:

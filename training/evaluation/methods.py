@@ -16,8 +16,10 @@ from mrbokeh.renderers.choose_bank import chosen_renderer
 from training.blur_functions import Blur, blur_of
 from training.classical_blur import gaussian_gather, gaussian_scatter, sigma_per_coc
 from training.evaluation.unseen_slice import UnseenSlice
+from training.stacks import Seen
 
 NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE = "network", "no blur", "Gaussian, scattered", "Gaussian, gathered", "scatter reference"
+NEAREST = "nearest slice"
 RENDERERS = ("polygon", "low-rank", "laplacian", "scatter")
 """Those that a table has unless it is told otherwise; `lrdm` takes minutes a picture."""
 
@@ -37,14 +39,11 @@ def network_method(name: str, blur: Blur) -> Method:
     return Method(name, lambda seen: blur(seen.pair), "network")
 
 
-def network_methods(networks: Sequence[Path], device: str = "cpu") -> tuple[list[Method], tuple[str, ...]]:
-    """(methods, names of all stacks that any of them was trained on) of run folders and .onnx files."""
-    methods, trained_on = [], list[str]()
-    for name, path in zip(network_names(networks), networks, strict=True):
-        blur, seen = blur_of(path, device)
-        methods.append(network_method(name, blur))
-        trained_on += seen
-    return methods, tuple(dict.fromkeys(trained_on))
+def network_methods(networks: Sequence[Path], device: str = "cpu") -> tuple[list[Method], list[Seen]]:
+    """(methods, what each was trained on) of run folders and .onnx files."""
+    found = [blur_of(path, device) for path in networks]
+    methods = [network_method(name, blur) for name, (blur, _) in zip(network_names(networks), found, strict=True)]
+    return methods, [seen for _, seen in found]
 
 
 def network_names(networks: Sequence[Path]) -> list[str]:
@@ -61,6 +60,16 @@ def plain_methods() -> list[Method]:
         Method(SCATTERED, lambda seen: gaussian_scatter(*_gaussian(seen)), "Gaussian"),
         Method(GATHERED, lambda seen: gaussian_gather(*_gaussian(seen)), "Gaussian"),
     ]
+
+
+def nearest_method() -> Method:
+    """For slices held out of one stack: the photograph of the nearest focus that was trained on, as it is."""
+
+    def nearest(seen: UnseenSlice) -> Image:
+        assert seen.nearest is not None, "only slices held out of a stack have a nearest one"
+        return seen.nearest
+
+    return Method(NEAREST, nearest, "plain")
 
 
 def renderer_methods(names: Sequence[str]) -> list[Method]:

@@ -50,10 +50,10 @@ def gain_lines(result: Evaluation) -> list[str]:
     ]
 
 
-def write_table(path: Path, result: Evaluation, against: str = "") -> None:
-    """against: what the focus pull was compared with, "" where there was none."""
+def write_table(path: Path, result: Evaluation, against: str = "", what: str = "slices of stacks not trained on") -> None:
+    """against: what the focus pull was compared with, "" where there was none. what: the slices are."""
     lines = [
-        f"Mean over {result.slices} slices of stacks not trained on. {_LEGEND}",
+        f"Mean over {result.slices} {what}. {_LEGEND}",
         "",
         *markdown_table(HEADINGS, table_rows(result)),
         "",

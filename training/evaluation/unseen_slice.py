@@ -1,5 +1,6 @@
-"""One slice of a stack that no network was trained on: what is known of it, and itself as the truth."""
+"""One slice that no network was trained on: what is known of it, and itself as the truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,8 @@ from training.stacks import stack_name
 @dataclass(frozen=True)
 class UnseenSlice:
     """pair: what networks get, with the truth. lens: gives the pair's circles of confusion from depth_m, in metres.
-    saturated: where the photograph says only "at least that much"."""
+    saturated: where the photograph says only "at least that much". nearest: where it was held out of its stack, the slice of the
+    nearest focus that was not."""
 
     stack: str
     index: int
@@ -22,6 +24,7 @@ class UnseenSlice:
     lens: Lens
     depth_m: Float32[np.ndarray, "height width"]
     saturated: Bool[np.ndarray, "height width"]
+    nearest: Float32[np.ndarray, "height width 3"] | None = None
 
     @property
     def label(self) -> str:
@@ -43,7 +46,15 @@ def unseen_slice(pairs: PairSet, index: int) -> UnseenSlice:
     """Of the pair at that index of the set."""
     stack, slice_index = pairs.keys[index]
     saturated = stack.slice_masks(slice_index).saturated
-    return UnseenSlice(stack_name(stack), slice_index, pairs[index], _lens(stack, slice_index), stack.depth_m(), saturated)
+    nearest = _nearest(stack, slice_index, pairs.left_out(stack))
+    return UnseenSlice(stack_name(stack), slice_index, pairs[index], _lens(stack, slice_index), stack.depth_m(), saturated, nearest)
+
+
+def _nearest(stack: FocalStack, index: int, others: Sequence[int]) -> Float32[np.ndarray, "height width 3"] | None:
+    if not others:
+        return None
+    dioptres = [1.0 / (distance or np.inf) for distance in stack.focus_distances_m]
+    return stack.slice_rgb(min(others, key=lambda other: abs(dioptres[other] - dioptres[index])))
 
 
 def _lens(stack: FocalStack, index: int) -> Lens:

@@ -73,12 +73,13 @@ def made_up_look(network: BlurNetwork, facts: NetworkFacts, size_px: tuple[int, 
 
 
 def looks_at(scenes: Sequence[Path], network: BlurNetwork, facts: NetworkFacts) -> list[Look]:
-    """Some slices of stacks that the network was not trained on, or of any where all were; no more than the middle of large pictures."""
-    from training.stacks import stack_name
+    """Some slices that the network was not trained on, or any where it was trained on all; no more than the middle of large pictures."""
+    from training.stacks import Seen, stack_name
 
     stacks = training_data(scenes).stacks
-    apart = [stack for stack in stacks if stack_name(stack) not in facts.trained_on]
-    pairs = PairSet(apart or stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0)
+    seen = Seen(facts.trained_on, facts.held_out_slices)
+    slices = {stack_name(stack): sorted(seen.unseen_slices(stack)) for stack in stacks}
+    pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0, slices=slices if any(slices.values()) else None)
     looks = []
     for index in np.unique(np.linspace(0, len(pairs) - 1, SLICES).round()):
         pair = pairs[int(index)]
