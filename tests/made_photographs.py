@@ -71,12 +71,17 @@ def set_neutral(path: Path, red: float, blue: float) -> None:
     path.write_bytes(data.replace(written, meant))
 
 
-def make_shoot(folder: Path) -> Path:
-    """Five DNGs in an order of names that is not the order of their focus."""
-    rgb = scene_rgb(72, 96)
+def make_shoot(folder: Path, blur_px: float = 0.0) -> Path:
+    """Five DNGs in an order of names that is not the order of their focus; each blurred (sigma) by blur_px more than the one before."""
     for index, focus_m in enumerate(DISTANCES_M):
+        rgb = defocused(scene_rgb(72, 96), blur_px * index)
         make_raw_photo(folder / f"IMG_{index + 8}.dng", rgb, focus_m, seconds=2 * index)
     return folder
+
+
+def defocused(rgb: Picture, sigma_px: float) -> Picture:
+    """What tells the slices of a stack apart."""
+    return gaussian_filter(rgb, (sigma_px, sigma_px, 0.0)).astype(np.float32)
 
 
 def only_stack(report: IngestReport) -> FocalStack:

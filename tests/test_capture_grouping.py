@@ -11,7 +11,7 @@ from capture.photos.focus_metadata import FocusReading
 from capture.photos.photo_files import find_photos
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import Sidecar
-from capture.stacks.grouping import Grouping, Photo, group_photos, of_one_camera
+from capture.stacks.grouping import Grouping, Photo, PhotoGroup, by_camera, group_photos, why_aside
 from mrbokeh.errors import InputError
 
 
@@ -56,17 +56,36 @@ def test_grouping_needs_what_it_goes_by() -> None:
         group_photos([("s", [photo("a"), photo("b", focus_m=1.0)])], Grouping.focus)
 
 
-def test_pictures_of_other_cameras_are_left_out() -> None:
-    photos = [
+def test_a_camera_with_one_picture_lies_aside() -> None:
+    photos = (
         photo("a.jpg"),
         photo("b.jpg"),
         photo("other.jpg", camera="B"),
         photo("fused.jpg", camera=None),
         photo("bad.dng", camera=None),
+    )
+    (group,) = by_camera(PhotoGroup("shoot", photos))
+    assert names(group.photos) == ["a.jpg", "b.jpg", "bad.dng"]
+    assert [(each.path.name, each.reason.split(",")[0]) for each in why_aside(group)] == [
+        ("other.jpg", "it was taken with B"),
+        ("fused.jpg", "it names no camera"),
     ]
-    kept, skipped = of_one_camera(photos)
-    assert names(kept) == ["a.jpg", "b.jpg", "bad.dng"]
-    assert [each.path.name for each in skipped] == ["other.jpg", "fused.jpg"]
+
+
+def test_cameras_with_two_pictures_or_more_make_a_stack_each() -> None:
+    cameras = {"a": "A", "b": "Model B/2", "c": "A", "d": "Model B/2", "e": "A"}
+    groups = group_photos([("shoot", [photo(name, camera=camera) for name, camera in cameras.items()])], Grouping.folder)
+    assert [(group.name, names(group.photos)) for group in groups] == [("shoot", ["a", "c", "e"]), ("shoot_Model_B_2", ["b", "d"])]
+    assert all(
+        group.remarks == ("photographs of 2 cameras, a stack for each: shoot (A, 3), shoot_Model_B_2 (Model B/2, 2)",) for group in groups
+    )
+
+
+def test_cameras_with_one_picture_each_make_one_stack() -> None:
+    """Nothing is the usual one there, so nothing is thrown away."""
+    (group,) = by_camera(PhotoGroup("shoot", tuple(photo(name, camera=name.upper()) for name in "abc")))
+    assert (names(group.photos), group.aside) == (["a", "b", "c"], ())
+    assert group.remarks == ("its 3 photographs name 3 cameras, none of them twice: one stack",)
 
 
 def test_which_files_are_photographs(tmp_path: Path) -> None:

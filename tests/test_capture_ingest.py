@@ -18,7 +18,7 @@ from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import read_focal_stack
 from mrbokeh.image_io import write_image
-from tests.made_photographs import DISTANCES_M, LENS, make_raw_photo, make_shoot, only_stack, scene_rgb, sources
+from tests.made_photographs import DISTANCES_M, LENS, defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, sources
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_infinity_survives_the_file(shoot: Path, tmp_path: Path) -> None:
 
 def test_pictures_without_metadata_and_what_a_sidecar_adds(tmp_path: Path) -> None:
     for index in range(3):
-        write_image(tmp_path / "shoot" / f"{index}.png", scene_rgb(48, 64, index))
+        write_image(tmp_path / "shoot" / f"{index}.png", defocused(scene_rgb(48, 64), index))
     report = ingest([tmp_path / "shoot"], tmp_path / "scene")
     stack = only_stack(report)
     assert stack.lens is None

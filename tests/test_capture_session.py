@@ -15,7 +15,7 @@ from capture.stacks.stack_ingest import Development
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack
 from mrbokeh.image_io import write_image
-from tests.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, set_neutral, sources
+from tests.made_photographs import defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, set_neutral, sources
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_overlap_tells_what_metadata_do_not(tmp_path: Path) -> None:
     rgb = np.minimum(scene_rgb(96, 128), 0.6)
     for view, picture in (("a", rgb), ("b", rgb * np.float32(0.7)), ("c", np.minimum(scene_rgb(96, 128, 5), 0.6))):
         for index in range(2):
-            write_image(tmp_path / "shoot" / view / f"{index}.png", picture)
+            write_image(tmp_path / "shoot" / view / f"{index}.png", defocused(picture, index))
     reports = {each.name: each for each in ingest([tmp_path / "shoot"], tmp_path / "scene").stacks}
     stacks = {name: report.stack for name, report in reports.items() if report.stack is not None}
     gains = {name: [each.metadata["exposure_gain"] for each in stack.slices] for name, stack in stacks.items()}

@@ -16,7 +16,9 @@ HELP = "\n\n".join(
         "else by file name. Pictures are not rotated.",
         "What metadata lacks is read from a lens.toml (lens) and a focus.csv (file,focus_distance_m,nearest_m,farthest_m) beside "
         "the photographs. Infinity that a camera states by a sentinel (0xFFFFFFFF, 655.35 m) is a value to start from, said and not "
-        "trusted; a focus.csv overrides it. Unusable files are named and skipped; slices that are there already are kept.",
+        "trusted; a focus.csv overrides it. Slices that are there already are kept.",
+        "Files that cannot be read, are of another size, almost all saturated or black, the same photograph as another or of another scene "
+        "than most of their stack are named and left out; --group none leaves out other sizes only.",
         "Example:  mrbokeh capture ingest shoot/ --out scene/",
         "Example:  mrbokeh capture ingest a.NEF b.NEF c.NEF --out scene/ --sidecar lens.toml --max-width 1500",
     )

@@ -40,7 +40,7 @@ class LowFrequency:
 
 @dataclass(frozen=True)
 class GainFit:
-    """gain: brings the slice's light to the reference's. log_scale, shift: between the two pictures; shift as a share of half the long side.
+    """gain: brings the slice's light to the reference's. log_scale, shift (a share of half the long side): between the pictures.
 
     spread: what is left of the difference, as the standard deviation (by the median) of the logarithm of light.
     likeness: correlation of the logarithms of both where they overlap, 1 for the same scene however bright.
@@ -96,7 +96,10 @@ def fit_gain(reference: LowFrequency, slice_: LowFrequency) -> GainFit | None:
 def _gauss_newton_step(
     reference: LowFrequency, slice_: LowFrequency, parameters: Float64[np.ndarray, "4"], sigma_px: float
 ) -> tuple[Float64[np.ndarray, "4"], float, float] | None:
-    """One weighted step for (log gain, log scale, shift x, shift y; shifts as a share of half the long side); spread and likeness before it."""
+    """One weighted step for (log gain, log scale, shift x, shift y); the spread and the likeness before it.
+
+    Shifts are shares of half the long side.
+    """
     light, usable, x, y = _breathed(reference, parameters)
     mask = (usable & slice_.usable).astype(np.float64)
     share = _blurred(mask, sigma_px)

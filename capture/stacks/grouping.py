@@ -1,8 +1,9 @@
 """Photographs into focal stacks: by folder, by pauses in time, by focus sweeps, or all into one."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
@@ -40,14 +41,19 @@ class Photo:
 
 @dataclass(frozen=True)
 class PhotoGroup:
-    """The photographs of one stack, in the order of their names, and the name that the stack gets."""
+    """The photographs of one stack, in the order of their names, and the name that the stack gets.
+
+    aside: of other cameras; taken only where the others cannot be used. remarks: what a reader of the stack should know.
+    """
 
     name: str
     photos: tuple[Photo, ...]
+    aside: tuple[Photo, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def group_photos(folders: Sequence[tuple[str, Sequence[Photo]]], grouping: Grouping) -> list[PhotoGroup]:
-    """Split (label, photographs) of each folder into stacks; Grouping.none puts everything into one.
+    """Split (label, photographs) of each folder into stacks, one for each camera; Grouping.none puts everything into one.
 
     Stacks of a split folder are numbered: label_00, label_01. Photographs within a stack stay in the given order.
     """
@@ -63,7 +69,7 @@ def group_photos(folders: Sequence[tuple[str, Sequence[Photo]]], grouping: Group
     for label, photos in folders:
         parts = split(photos)
         names = [label] if len(parts) == 1 else [f"{label}_{index:02d}" for index in range(len(parts))]
-        groups += [PhotoGroup(name, tuple(part)) for name, part in zip(names, parts, strict=True)]
+        groups += [each for name, part in zip(names, parts, strict=True) for each in by_camera(PhotoGroup(name, tuple(part)))]
     return _with_unique_names(groups)
 
 
@@ -109,21 +115,49 @@ def in_focus_order(photos: Sequence[Photo]) -> list[Photo]:
     return sorted(photos, key=lambda photo: photo.focus_distance_m or 0.0)
 
 
-def of_one_camera(photos: Sequence[Photo]) -> tuple[list[Photo], list[SkippedFile]]:
-    """The photographs of the camera that took most of them; the rest cannot share its lens and exposure and is left out.
+def by_camera(group: PhotoGroup) -> list[PhotoGroup]:
+    """A stack for each camera that took two photographs or more, since cameras share neither lens nor exposure.
 
-    So is a developed picture that names no camera where most do: typically a merged result that lies beside its sources.
-    RAW without a name stays: it may be damaged, which developing will tell.
+    The one that took most keeps the name of the group, and what belongs to no stack lies aside in it: single photographs of other cameras,
+    and developed pictures that name no camera where most do (typically a merged result beside its sources). RAW without a name stays: it
+    may be damaged, which developing will tell. Where no camera took two, all make one stack.
     """
-    usual = Counter(photo.metadata.camera_model for photo in photos).most_common(1)[0][0]
-    if usual is None:
-        return list(photos), []
-    kept = [photo for photo in photos if photo.metadata.camera_model == usual or (is_raw(photo.path) and not photo.metadata.camera_model)]
+    counted = Counter(photo.metadata.camera_model for photo in group.photos)
+    usual, most = counted.most_common(1)[0]
+    if usual is None or len(counted) == 1:
+        return [group]
+    if most == 1:
+        return [
+            replace(group, remarks=(f"its {len(group.photos)} photographs name {len(counted)} cameras, none of them twice: one stack",))
+        ]
+    repeated = [model for model, count in counted.most_common() if model and count > 1]
+    names = {model: group.name if model == usual else f"{group.name}_{_as_name(model)}" for model in repeated}
+    listed = ", ".join(f"{names[model]} ({model}, {counted[model]})" for model in repeated)
+    remarks = (f"photographs of {len(repeated)} cameras, a stack for each: {listed}",) if len(repeated) > 1 else ()
+    stacks = [
+        replace(
+            group, name=names[model], photos=tuple(each for each in group.photos if each.metadata.camera_model == model), remarks=remarks
+        )
+        for model in repeated
+    ]
+    rest = [each for each in group.photos if each.metadata.camera_model not in names]
+    damaged = [each for each in rest if is_raw(each.path) and not each.metadata.camera_model]
+    own = tuple(each for each in group.photos if each in stacks[0].photos or each in damaged)
+    return [replace(stacks[0], photos=own, aside=tuple(each for each in rest if each not in damaged)), *stacks[1:]]
+
+
+def why_aside(group: PhotoGroup) -> list[SkippedFile]:
+    """In words, for the photographs that lie aside."""
+    usual = next((each.metadata.camera_model for each in group.photos if each.metadata.camera_model), None)
     skipped = []
-    for photo in (each for each in photos if each not in kept):
+    for photo in group.aside:
         other = f"was taken with {photo.metadata.camera_model}" if photo.metadata.camera_model else "names no camera"
         skipped.append(SkippedFile(photo.path, f"it {other}, most of its stack with {usual} (--group none takes it all the same)"))
-    return kept, skipped
+    return skipped
+
+
+def _as_name(text: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", text).strip("._") or "camera"
 
 
 def _cut(photos: Sequence[Photo], cuts: Sequence[bool]) -> list[list[Photo]]:
@@ -141,5 +175,5 @@ def _with_unique_names(groups: list[PhotoGroup]) -> list[PhotoGroup]:
     result = []
     for group in groups:
         count = seen[group.name] = seen.get(group.name, 0) + 1
-        result.append(group if count == 1 else PhotoGroup(f"{group.name}_{count}", group.photos))
+        result.append(group if count == 1 else replace(group, name=f"{group.name}_{count}"))
     return result

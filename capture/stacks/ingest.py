@@ -15,10 +15,11 @@ from capture.photos.photo_files import PhotoFolder, SkippedFile, find_photos
 from capture.photos.raw import read_raw_metadata
 from capture.photos.sidecar import sidecar_of
 from capture.stacks.disk_space import told_when_full
-from capture.stacks.grouping import Grouping, Photo, PhotoGroup, group_photos, in_focus_order, of_one_camera
-from capture.stacks.session import Session, open_session
+from capture.stacks.grouping import Grouping, Photo, PhotoGroup, group_photos, in_focus_order, why_aside
+from capture.stacks.session import CameraChoice, Session, open_session
 from capture.stacks.stack_description import StackReport, finish_stack, finished_before, ingest_digest
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
+from capture.stacks.stack_remarks import FEWEST_TO_MERGE
 from mrbokeh.errors import InputError
 from mrbokeh.progress import progress_bars
 
@@ -56,7 +57,10 @@ def ingest(given: Sequence[Path], scene: Path, settings: IngestSettings | None =
             reports = [ingest_group(group, session, settings, lambda: progress.advance(developing)) for group in groups]
     skipped = _without_their_raw(skipped, reports)
     if not any(report.stack for report in reports):
-        raise InputError(_nothing_usable(given, [*skipped, *(each for report in reports for each in report.skipped)]))
+        problems = [f"{report.name}: {report.problem}" for report in reports if report.problem]
+        raise InputError(
+            "; ".join(problems) or _nothing_usable(given, [*skipped, *(each for report in reports for each in report.skipped)])
+        )
     return IngestReport(tuple(reports), tuple(skipped))
 
 
@@ -71,32 +75,49 @@ def photos_of_folder(folder: PhotoFolder, sidecar_path: Path | None = None, adva
 
 def ingest_group(group: PhotoGroup, session: Session, settings: IngestSettings, advance: Callable[[], None] = lambda: None) -> StackReport:
     """Make or complete the stack of a scene that a group is; `advance` is called after each photograph."""
-    folder = session.scene / group.name
-    chosen, strangers = (list(group.photos), []) if settings.grouping is Grouping.none else of_one_camera(group.photos)
-    photos, choice = in_focus_order(chosen), session.choice_for(chosen)
-    digest = ingest_digest(photos, settings.development, choice)
-    before = None if settings.overwrite else finished_before(group.name, folder, digest)
+    choice = session.choice_for(group.photos)
+    digest = ingest_digest(in_focus_order(group.photos) + list(group.aside), settings.development, choice)
+    before = None if settings.overwrite else finished_before(group.name, session.scene / group.name, digest)
     if before is not None:
-        for _ in photos:
+        for _ in group.photos:
             advance()
         return before
-    work = stack_work(folder, settings.development, choice, overwrite=settings.overwrite)
-    work.skipped += strangers
-    for photo in photos:
-        work.add(photo)
-        advance()
-    if work.leave_odd_sizes_out():
-        work = _with_another_reference(work)
+    work = _developed(group, choice, session, settings, advance)
+    if len(work.finished) < min(FEWEST_TO_MERGE, len(group.aside)):
+        work = _of_what_lies_aside(group, work, session, settings)
+    else:
+        work.skipped += why_aside(group)
+    try:
+        if work.finished and work.leave_out_what_is_odd(sizes_only=settings.grouping is Grouping.none):
+            work = work.with_another_reference()
+    except InputError as error:
+        work.give_up()
+        return StackReport(group.name, None, skipped=tuple(work.skipped), problem=str(error))
     return finish_stack(group.name, work, digest)
 
 
-def _with_another_reference(work: StackWork) -> StackWork:
-    """The slice that gave the exposure was left out: even out the others again, relative to the first of them."""
-    again = stack_work(work.folder, work.development, work.choice, overwrite=False)
-    again.skipped += work.skipped
-    for each in work.finished:
-        again.add(each.photo)
-    return again
+def _developed(
+    group: PhotoGroup, choice: CameraChoice, session: Session, settings: IngestSettings, advance: Callable[[], None] = lambda: None
+) -> StackWork:
+    """All photographs of a group that can be developed."""
+    work = stack_work(session.scene / group.name, settings.development, choice, overwrite=settings.overwrite)
+    work.remarks = group.remarks
+    for photo in in_focus_order(group.photos):
+        work.add(photo)
+        advance()
+    return work
+
+
+def _of_what_lies_aside(group: PhotoGroup, unusable: StackWork, session: Session, settings: IngestSettings) -> StackWork:
+    """A stack of what other cameras took, where too little of the usual one's photographs can be used."""
+    unusable.give_up()
+    left_out = [SkippedFile(each.photo.path, "too few photographs of its camera can be used") for each in unusable.finished]
+    remark = f"{len(group.aside)} photographs of other cameras are taken, because too few of the usual one's can be used"
+    other = PhotoGroup(group.name, group.aside, remarks=(*group.remarks, remark))
+    own_session = open_session(session.scene, [other], settings.development.white_balance, overwrite=False)
+    work = _developed(other, own_session.choice_for(other.photos), session, settings)
+    work.skipped += [*unusable.skipped, *left_out]
+    return work
 
 
 def _without_their_raw(skipped: Sequence[SkippedFile], reports: Sequence[StackReport]) -> list[SkippedFile]:

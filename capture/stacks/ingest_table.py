@@ -20,6 +20,8 @@ def print_report(report: IngestReport, console: Console) -> None:
     for each in report.stacks:
         for remark in each.remarks:
             console.print(f"{each.name}: {remark}", highlight=False, markup=False, soft_wrap=True)
+        if each.problem:
+            console.print(f"no stack {each.name}: {each.problem}", style="yellow", highlight=False, markup=False, soft_wrap=True)
     for skipped in (*report.skipped, *(one for each in report.stacks for one in each.skipped)):
         console.print(f"skipped {skipped.path.name}: {skipped.reason}", style="yellow", highlight=False, markup=False, soft_wrap=True)
 

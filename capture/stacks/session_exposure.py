@@ -29,10 +29,6 @@ def gain_to_session(decoded: DecodedPhoto, light: LowFrequency, stated: float | 
     return ExposureGain(session_from="nothing") if measured is None else ExposureGain(session=measured, session_from="overlap")
 
 
-def light_of(decoded: DecodedPhoto) -> LowFrequency:
-    return low_frequency(decoded.rgb, decoded.saturated, decoded.rec709_from_camera)
-
-
 def _light_of_stack(folder: Path) -> LowFrequency | None:
     """The large areas of a stack's first slice; None where it is not there (any more)."""
     try:

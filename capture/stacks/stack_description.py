@@ -24,7 +24,10 @@ _DEVELOPED_COLOUR = "scene-linear Rec.709; 1.0 is white"
 
 @dataclass(frozen=True)
 class StackReport:
-    """What became of the photographs of one stack; stack is None where none was usable; kept counts slices of earlier runs."""
+    """What became of the photographs of one stack; kept counts slices of earlier runs.
+
+    stack: None where no photograph was usable, or where they do not belong together: problem says why.
+    """
 
     name: str
     stack: FocalStack | None
@@ -32,6 +35,7 @@ class StackReport:
     kept: int = 0
     skipped: tuple[SkippedFile, ...] = ()
     remarks: tuple[str, ...] = ()
+    problem: str = ""
 
 
 def ingest_digest(photos: Sequence[Photo], development: Development, choice: CameraChoice) -> str:

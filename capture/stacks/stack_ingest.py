@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,19 @@ from capture.stacks.disk_space import DiskFullError
 from capture.stacks.exposure import ExposureGain, evened_out
 from capture.stacks.gain_fit import LowFrequency
 from capture.stacks.grouping import Photo
+from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, strangers
 from capture.stacks.session import CameraChoice
-from capture.stacks.session_exposure import gain_to_session, light_of, stated_gain
+from capture.stacks.session_exposure import gain_to_session, stated_gain
 from capture.stacks.slice_files import FOLDER, find_slices, source_record, write_slice
+from capture.stacks.slice_looks import SliceLook, look_at, look_of
 from capture.stacks.slice_metadata import slice_metadata
-from mrbokeh.camera_rgb import Matrix3x3, matrix3x3
+from mrbokeh.camera_rgb import Matrix3x3, matrix3x3, read_camera_rgb, read_slice_masks
 from mrbokeh.color import convert
 from mrbokeh.errors import InputError
 
 # To be raised when the same photograph would become another slice, so that old slices are made again.
-PROCESS_VERSION = 3
+PROCESS_VERSION = 4
+_MADE = "made_"
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,9 @@ class StackWork:
     finished: list[FinishedSlice] = field(default_factory=list)
     skipped: list[SkippedFile] = field(default_factory=list)
     kept: int = 0
+    remarks: tuple[str, ...] = ()
     _reference: LowFrequency | None = None
+    _looks: dict[Path, SliceLook] = field(default_factory=dict)
 
     def add(self, photo: Photo) -> None:
         """Make the slice of a photograph, or find it made; what cannot be developed is named and left out."""
@@ -81,17 +86,44 @@ class StackWork:
         except InputError as error:
             self.skipped.append(SkippedFile(photo.path, str(error).replace(str(photo.path), "it", 1)))
 
-    def leave_odd_sizes_out(self) -> bool:
-        """A stack has one size, the one that most of its slices have; others are named and left out. True if the first is."""
-        sizes = Counter(tuple(each.record["size_px"]) for each in self.finished)
-        if len(sizes) < 2:
-            return False
-        first, usual = self.finished[0], sizes.most_common(1)[0][0]
-        for each in [one for one in self.finished if tuple(one.record["size_px"]) != usual]:
-            width, height = each.record["size_px"]
-            self.skipped.append(SkippedFile(each.photo.path, f"{width}x{height} px, but most of its stack have {usual[0]}x{usual[1]} px"))
-            self.finished.remove(each)
+    def leave_out_what_is_odd(self, *, sizes_only: bool) -> bool:
+        """Name and leave out slices that do not belong (`capture.stacks.odd_slices`). True if the first is left out.
+
+        Raises InputError where no more than half of the slices belong together.
+        """
+        first = self.finished[0]
+        for odd in (odd_sizes,) if sizes_only else (odd_sizes, blown, duplicates, strangers):
+            reasons = odd([Candidate(each.photo, tuple(each.record["size_px"]), self._look(each)) for each in self.finished])
+            self.skipped += [SkippedFile(self.finished[index].photo.path, reason) for index, reason in reasons.items()]
+            self.finished = [each for index, each in enumerate(self.finished) if index not in reasons]
         return self.finished[0] is not first
+
+    def with_another_reference(self) -> "StackWork":
+        """The slice that gave the exposure was left out: the others evened out again, relative to the first of them."""
+        again = stack_work(self.folder, self.development, self.choice, overwrite=False)
+        again.skipped, again.remarks = [*self.skipped], self.remarks
+        for each in self.finished:
+            again.add(each.photo)
+        return again
+
+    def give_up(self) -> None:
+        """Take away the slices that this call has made, and folders that are empty then."""
+        for each in self.finished:
+            if each.path.name.startswith(_MADE):
+                each.path.unlink(missing_ok=True)
+        for folder in (self.folder / FOLDER, self.folder):
+            with suppress(OSError):  # it holds something, or is not there
+                folder.rmdir()
+
+    def _look(self, finished: FinishedSlice) -> SliceLook:
+        """As it was before its exposure was evened out; read from the slice where an earlier run made it."""
+        if finished.path not in self._looks:
+            metadata, matrix = finished.record["metadata"], finished.record["rec709_from_camera"]
+            gain = np.float32(metadata["exposure_gain"])
+            rgb, saturated = read_camera_rgb(finished.path) / gain, read_slice_masks(finished.path).saturated
+            primaries = None if matrix is None else matrix3x3(matrix)
+            self._looks[finished.path] = look_at(rgb, saturated, primaries, metadata["saturated_fraction"] or 0.0)
+        return self._looks[finished.path]
 
     def _request(self, photo: Photo) -> dict[str, Any]:
         """Everything that the pixels of the slice depend on."""
@@ -115,8 +147,9 @@ class StackWork:
 
     def _made(self, photo: Photo, request: dict[str, Any]) -> FinishedSlice:
         decoded = self._developed(photo)
+        look = look_of(decoded)
         primaries = self.rec709_from_camera if self.finished else decoded.rec709_from_camera
-        gain = self._gain(decoded, request)
+        gain = self._gain(decoded, look.light, request)
         rgb = in_primaries(decoded, primaries)
         if gain.total != 1.0:
             rgb = rgb * np.float32(gain.total)
@@ -130,22 +163,23 @@ class StackWork:
         }
         # Slices get their numbers when all are there: an unreadable photograph must leave no gap.
         fingerprint = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:12]
-        path = self.folder / FOLDER / f"made_{len(self.finished):03d}_{fingerprint}.exr"
+        path = self.folder / FOLDER / f"{_MADE}{len(self.finished):03d}_{fingerprint}.exr"
+        self._looks[path] = look
         write_slice(path, rgb, decoded.saturated, primaries, record, half=decoded.half_suffices)
         return FinishedSlice(photo, path, record)
 
     def _developed(self, photo: Photo) -> DecodedPhoto:
         return develop(photo.path, self.choice.white_balance, half_size=self.development.half_size, max_width=self.development.max_width)
 
-    def _gain(self, decoded: DecodedPhoto, request: dict[str, Any]) -> ExposureGain:
+    def _gain(self, decoded: DecodedPhoto, light: LowFrequency, request: dict[str, Any]) -> ExposureGain:
         """Relative to the reference, which is developed again if an earlier run made its slice."""
         if not self.finished:
-            self._reference = light_of(decoded)
-            return gain_to_session(decoded, self._reference, request["session_gain"], self._scale_stack())
+            self._reference = light
+            return gain_to_session(decoded, light, request["session_gain"], self._scale_stack())
         if self._reference is None:
-            self._reference = light_of(self._developed(self.finished[0].photo))
+            self._reference = look_of(self._developed(self.finished[0].photo)).light
         base = self.finished[0].record["metadata"]
-        gain = evened_out(self._reference, light_of(decoded), request["stated_gain"])
+        gain = evened_out(self._reference, light, request["stated_gain"])
         return replace(gain, session=base["exposure_gain_session"], session_from=base["exposure_gain_session_from"])
 
     def _scale_stack(self) -> Path | None:

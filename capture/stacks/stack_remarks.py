@@ -10,7 +10,7 @@ from capture.stacks.stack_ingest import StackWork
 from capture.stacks.stack_lens import lens_remarks
 from mrbokeh.lens import Lens
 
-FEWEST_TO_MERGE = 3
+FEWEST_TO_MERGE = 2
 
 
 def stack_remarks(work: StackWork, reference: Photo, lens: Lens | None, missing: str | None) -> list[str]:
@@ -18,9 +18,9 @@ def stack_remarks(work: StackWork, reference: Photo, lens: Lens | None, missing:
     photos = [each.photo for each in work.finished]
     counted = Counter(remark for each in work.finished for remark in each.record["remarks"])
     remarks = [remark if count == 1 or count == len(photos) else f"{remark} ({count} slices)" for remark, count in counted.items()]
-    remarks += _session_remarks(work)
+    remarks = [*work.remarks, *remarks, *_session_remarks(work)]
     if any((photo.metadata.orientation or 1) != 1 for photo in photos):
-        remarks.append("EXIF asks to turn pictures of this stack: they are left as the sensor saw them")
+        remarks.append("EXIF asks to turn pictures of this stack: they are left as the sensor saw them, and turned for people to look at")
     remarks += _sidecar_remarks(photos)
     if lens is None:
         remarks.append(f"no lens: {missing}. Give what is missing in a lens.toml beside the photographs and ingest again")
