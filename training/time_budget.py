@@ -35,8 +35,9 @@ def too_few_words(ends_s: Sequence[float], settings: TrainSettings, halo_px: int
     minutes, step_s = settings.minutes or 0.0, seconds_of_a_step(ends_s)
     steps, enough = steps_within(ends_s, 60.0 * minutes), 1.25 * (ends_s[0] + least * step_s) / 60.0
     enough = math.ceil(enough) if enough > 5.0 else math.ceil(10.0 * enough) / 10.0
+    took, plural = f"{float(format(step_s, '.2g')):g}", "" if steps == 1 else "s"
     return (
-        f"{minutes:g} minutes make about {steps} step{'' if steps == 1 else 's'} of {float(f'{step_s:.2g}'):g} s, and a network learns no lens in fewer than {least}: "
+        f"{minutes:g} minutes make about {steps} step{plural} of {took} s, and a network learns no lens in fewer than {least}: "
         f"give --minutes {enough:g}, or make steps shorter with {' or '.join(_shorter_steps(settings, halo_px))}"
     )
 
