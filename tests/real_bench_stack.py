@@ -2,14 +2,14 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.report.detail import BLOCK_PX, BORDER_BLOCKS, Sharpness, SharpestSlices
+from capture.report.detail import SharpestSlices, Sharpness, inner_blocks
 from mrbokeh.atomic_files import read_json
 from mrbokeh.focal_stack import FocalStack, find_focal_stacks
 from tests.process_cost import Cost, attempted, mrbokeh_command
@@ -54,6 +54,11 @@ class Captured:
         made = [cost for name, cost in self.costs.items() if name != "process"]
         return sum(cost.cpu_s for cost in made), max(cost.memory_mb for cost in made)
 
+    @property
+    def merged(self) -> bool:
+        """Whether there is a picture to measure: a failed report does not take it away."""
+        return "process" in self.costs
+
     def stack(self) -> FocalStack:
         return find_focal_stacks(self.scene)[0]
 
@@ -80,10 +85,6 @@ def linked(photographs: Sequence[Path], folder: Path) -> Path:
     return folder
 
 
-def own_figures(captured: Captured, measured: Sharpness) -> Figures:
-    return Figures(measured.lost, measured.flat, measured.top, *captured.making)
-
-
 def gate_facts(scene: Path) -> dict[str, Any]:
     """What the report says: passed, how many gates were judged of how many, which failed."""
     if not (scene / "report.json").is_file():
@@ -97,10 +98,7 @@ def gate_facts(scene: Path) -> dict[str, Any]:
 
 def covered_blocks(covered: Bool[np.ndarray, "height width"]) -> BlockMask:
     """Blocks whose pixels a picture covers all, laid out as those of `block_detail`."""
-    rows, columns = (side // BLOCK_PX for side in covered.shape)
-    blocks = covered[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX).all(axis=(1, 3))
-    border = min(BORDER_BLOCKS, (rows - 1) // 2, (columns - 1) // 2)
-    return blocks[border : rows - border, border : columns - border]
+    return np.asarray(inner_blocks(covered).all(axis=(1, 3)))
 
 
 def measured_where(sharpest: SharpestSlices, measured: Sharpness, known: BlockMask) -> tuple[float, float]:
@@ -108,7 +106,3 @@ def measured_where(sharpest: SharpestSlices, measured: Sharpness, known: BlockMa
     textured, flat = sharpest.textured & known, sharpest.flat & known
     lost = float((measured.lost_blocks & known).sum() / max(int(textured.sum()), 1))
     return lost, float(np.percentile(measured.kept[flat], 95.0)) if flat.any() else 0.0
-
-
-def as_json(figures: dict[str, Figures]) -> dict[str, dict[str, Any]]:
-    return {name: asdict(each) for name, each in figures.items()}
