@@ -12,6 +12,8 @@ from mrbokeh.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 
 KEY = "metres"
 GUESSED = "guessed metres"
+POSITION, POSITION_ERROR = "blur_position", "blur_position_error"
+"""Channels of depth.exr: where the surface lies in pixels of blur, growing towards the camera, and its standard error."""
 _WHY = "no focus distance is known"
 
 

@@ -12,7 +12,9 @@ from mrbokeh.camera_rgb import Matrix3x3, write_camera_rgb
 from mrbokeh.color import convert
 from mrbokeh.compositing.base import Inserted, Insertion
 from mrbokeh.errors import InputError
+from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, write_focal_stack, write_merged
+from mrbokeh.guessed_metres import POSITION, POSITION_ERROR, metres_facts
 from mrbokeh.layer import Layer, flatten
 from mrbokeh.lens import Lens
 from mrbokeh.plate import Plate, plate_of
@@ -106,8 +108,24 @@ def _write_merge(stack: FocalStack, inserted: Inserted, depth_m: Float32[np.ndar
         new_depth_m,
         stack.rec709_from_camera,
     )
+    _write_positions(stack, surface, new_depth_m, folder)
     if stack.exclusion_path.is_file():
         (folder / stack.exclusion_path.name).write_bytes(stack.exclusion_path.read_bytes())
+
+
+def _write_positions(stack: FocalStack, surface: Mask, depth_m: Float32[np.ndarray, "height width"], folder: Path) -> None:
+    """Positions in pixels of blur, of a stack that has them, are those of the virtual surfaces where these are seen."""
+    gauge = metres_facts(stack).get("gauge")
+    channels = read_exr(stack.depth_path)[0].channels
+    if gauge is None or not {POSITION, POSITION_ERROR} <= set(channels):
+        return
+    virtual_px = ((1.0 / depth_m - gauge["offset_dioptres"]) * gauge["px_per_dioptre"]).astype(np.float32)
+    ours = {
+        POSITION: np.where(surface, virtual_px, channels[POSITION]).astype(np.float32),
+        POSITION_ERROR: np.where(surface, np.float32(0.0), channels[POSITION_ERROR]).astype(np.float32),
+    }
+    made = read_exr(folder / stack.depth_path.name)[0]
+    write_exr(folder / stack.depth_path.name, replace(made, channels=dict(made.channels) | ours))
 
 
 def _touched(inserted: Inserted, rgb: Rgb) -> Mask:

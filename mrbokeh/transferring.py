@@ -12,6 +12,8 @@ from mrbokeh.depth_sources.depth_settings import DepthSettings
 from mrbokeh.depth_sources.open_depth import open_depth
 from mrbokeh.depth_sources.phone_depth import read_phone_photo
 from mrbokeh.errors import InputError
+from mrbokeh.focal_stack import FocalStack, read_focal_stack
+from mrbokeh.guessed_metres import GUESSED
 from mrbokeh.layer import Layer, opaque
 from mrbokeh.lens import Lens
 from mrbokeh.photograph import Photograph, read_photograph
@@ -23,11 +25,15 @@ _CLIPPED_FROM, _CLIPPED_AT = 0.97, 0.995
 
 @dataclass(frozen=True)
 class SharpPhotograph:
-    """photograph: all in focus; depth at its size. focus_m: where a phone had focused, in the unit of its depth, or None."""
+    """photograph: all in focus; depth at its size. focus_m: where a phone had focused, in the unit of its depth, or None.
+
+    stack: the focal stack that it is the all-in-focus picture of, or None.
+    """
 
     photograph: Photograph
     depth: DepthMap
     focus_m: float | None = None
+    stack: FocalStack | None = None
 
     @property
     def layer(self) -> Layer:
@@ -36,8 +42,10 @@ class SharpPhotograph:
 
 def open_sharp(photo: Path, depth: Path | None, settings: DepthSettings) -> SharpPhotograph:
     """depth: None where the photograph itself holds it (a phone's GDepth). Of a phone's photograph with a blurred face the sharp original
-    inside is taken. Raises InputError where there is no depth.
+    inside is taken, of a merged focal stack its all-in-focus picture and its depth. Raises InputError where there is no depth.
     """
+    if photo.is_dir():
+        return _of_stack(read_focal_stack(photo), depth, settings)
     phone = read_phone_photo(photo, settings.near_far_m if depth is None else None)
     if phone is None and depth is None:
         raise InputError(f"{photo} holds no depth of its own: give --depth (EXR, PNG, stereo disparity, or a depth network .onnx)")
@@ -48,6 +56,15 @@ def open_sharp(photo: Path, depth: Path | None, settings: DepthSettings) -> Shar
     if focus_m is not None and settings.near_far_m is not None:
         focus_m = None  # in the phone's own unit, which the user replaced
     return SharpPhotograph(photograph, open_depth(depth or photo, photograph.rgb, settings), focus_m)
+
+
+def _of_stack(stack: FocalStack, depth: Path | None, settings: DepthSettings) -> SharpPhotograph:
+    rgb = stack.all_in_focus()
+    if depth is not None:
+        return SharpPhotograph(Photograph(rgb), open_depth(depth, rgb, settings), stack=stack)
+    unit = "metres" if stack.metres_known else GUESSED
+    found = DepthMap(stack.depth_m(), stack.depth_valid(), f"of the stack {stack.folder}, {unit}")
+    return SharpPhotograph(Photograph(rgb), found, stack=stack)
 
 
 def seen_like(lens: Lens, photograph: Photograph, photo: Path) -> Lens:

@@ -3,11 +3,12 @@
 Its dioptres are known up to D' = p + q D, for blur in pixels is the same with px_per_dioptre / q. The rule: what the photographs state
 stays (a stated lens fixes q = 1, a stated focus distance counts as one more fact); the facts told fix the rest by least squares of their
 relative errors; and where facts lie at one depth only, the world is scaled as a whole (p = 0), which keeps proportions that are guessed.
+Blur looks alike on both sides of the focus: where merging had to guess which end of the sweep is near, facts at two depths tell (q < 0).
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -18,11 +19,12 @@ from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.guessed_metres import KEY, metres_facts
+from mrbokeh.guessed_metres import KEY, POSITION, metres_facts
 from mrbokeh.lens import Lens
 
 FACTS = "told"
 _BEFORE = "stated_before_guessing"
+_SLICE_POSITION = "blur_position_px"
 _NEAR_PIXEL_PX = 2
 _LEAST_CONFIDENCE = 0.1
 _LEAST_SPREAD_PX = 3.0
@@ -91,11 +93,11 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
             f"distances in lens.toml and merge again, or find the scale of camera poses with --board or --distance"
         )
     solving = _Solving(tuple(_Equation.of(each, depth_m, confidence, camera) for each in facts), _stated_dioptres(stack), _gauge(stack))
-    p, q, deep = solving.solution()
-    changed = _regauged(stack, p, q, _told(stack, facts, deep))
-    _write_depth(changed, p, q)
+    found = solving.solution()
+    changed = _regauged(stack, found, facts)
+    _write_depth(changed, found.p, found.q)
     write_focal_stack(changed)
-    return Regauged(changed, tuple((each.fact, each.error(p, q)) for each in solving.equations))
+    return Regauged(changed, tuple((each.fact, each.error(found.p, found.q)) for each in solving.equations))
 
 
 def lines_of(done: Regauged) -> list[str]:
@@ -160,6 +162,15 @@ class _Equation:
         return self.metres(p, q) / self.fact.metres - 1.0
 
 
+class _Solution(NamedTuple):
+    """D' = p + q D. deep: whether both rest on facts. directed: whether facts tell which end of the sweep is near."""
+
+    p: float
+    q: float
+    deep: bool
+    directed: bool
+
+
 @dataclass(frozen=True)
 class _Solving:
     """stated: dioptres of slices whose focus the photographs state. gauge: of the stack, as merging or an earlier call left it."""
@@ -168,21 +179,24 @@ class _Solving:
     stated: Float[np.ndarray, " slices"]
     gauge: Mapping[str, Any]
 
-    def solution(self) -> tuple[float, float, bool]:
-        """(p, q, whether both rest on facts)."""
+    def solution(self) -> _Solution:
+        """Of least squares; q is below 0 where the facts tell that what was taken for near is far."""
+        seen = np.array([*(each.dioptres.mean() for each in self.equations), *self.stated])
+        # What each fact would make of its own dioptres alone.
+        alone = np.array([*(each.dioptres.mean() * each.metres(0.0, 1.0) / each.fact.metres for each in self.equations), *self.stated])
+        deep = float(np.ptp(np.concatenate([seen, *(each.dioptres for each in self.equations)]))) * self.gauge["px_per_dioptre"]
+        if self.gauge["scale_from"] != "lens" and deep < _LEAST_SPREAD_PX:
+            return _Solution(0.0, float(np.exp(np.mean(np.log(alone / seen)))), deep=False, directed=False)
+        apart = float(np.ptp(seen)) * self.gauge["px_per_dioptre"] >= _LEAST_SPREAD_PX
+        slope = float(np.polyfit(seen, alone, 1)[0]) if apart else 1.0
+        sign = -1.0 if slope < 0.0 and not self.gauge.get("near_first_sure", True) else 1.0
         if self.gauge["scale_from"] == "lens":
-            return self._least(lambda x: (float(x[0]), 1.0), [self._offset_start()])[0], 1.0, True
-        start = float(np.exp(np.mean([np.log(each.metres(0.0, 1.0) / each.fact.metres) for each in self.equations])))
-        seen = np.concatenate([*(each.dioptres for each in self.equations), self.stated])
-        if np.ptp(seen) * self.gauge["px_per_dioptre"] < _LEAST_SPREAD_PX:
-            return 0.0, start, False
-        p, q = self._least(lambda x: (float(x[0]), float(np.exp(x[1]))), [0.0, np.log(start)])
-        return p, q, True
-
-    def _offset_start(self) -> float:
-        """Where the first fact would be right were all its surfaces at one depth."""
-        first = self.equations[0]
-        return float(first.dioptres.mean() * (first.metres(0.0, 1.0) / first.fact.metres - 1.0))
+            p, q = self._least(lambda x: (float(x[0]), sign), [float(np.mean(alone - sign * seen))])
+            return _Solution(p, q, deep=True, directed=apart)
+        size = abs(slope) if slope * sign > 0.0 else float(np.mean(alone) / np.mean(seen))
+        start = [float(np.mean(alone) - sign * size * np.mean(seen)), np.log(size)]
+        p, q = self._least(lambda x: (float(x[0]), sign * float(np.exp(x[1]))), start)
+        return _Solution(p, q, deep=True, directed=apart and slope * sign > 0.0)
 
     def _least(self, of: Callable[[Float[np.ndarray, " numbers"]], tuple[float, float]], start: list[float]) -> tuple[float, float]:
         def off(numbers: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, " facts"]:
@@ -222,33 +236,41 @@ def _gauge(stack: FocalStack) -> dict[str, Any]:
     return {"lens_from": "stated" if known else "guess", "view_from": "stated" if known or stated.get("camera") else "guess"} | gauge
 
 
-def _told(stack: FocalStack, facts: Sequence[Fact], deep: bool) -> dict[str, Any]:
+def _told(gauge: Mapping[str, Any], facts: Sequence[Fact], deep: bool) -> dict[str, Any]:
     """The stack's facts about metres, as they are now."""
     guessed = []
     if not deep:
         guessed.append("how deep the scene is for its distance, as all that was told lies at one depth")
-    if _gauge(stack)["view_from"] == "guess":
+    if not gauge.get("near_first_sure", True):
+        guessed.append(f"that the {'first' if gauge.get('near_first') else 'last'} slice is the nearest")
+    if gauge["view_from"] == "guess":
         guessed.append("the field of view, so that distances stand beside lengths in a guessed proportion")
     count = f"{len(facts)} known lengths and distances" if len(facts) > 1 else str(facts[0])
-    return {"known": True, "why": f"metres rest on {count}", "guessed": "; ".join(guessed) or None, FACTS: [asdict(each) for each in facts]}
+    told = [asdict(each) for each in facts]
+    return {"known": True, "why": f"metres rest on {count}", "guessed": "; ".join(guessed) or None, FACTS: told, "gauge": dict(gauge)}
 
 
-def _regauged(stack: FocalStack, p: float, q: float, told: dict[str, Any]) -> FocalStack:
-    slices = tuple(_regauged_slice(stack, each, p, q) for each in stack.slices)
-    gauge = _gauge(stack)
-    gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / q, "offset_dioptres": p + q * gauge["offset_dioptres"]}
-    gauge |= {"offset_from": "told"} | ({} if gauge["scale_from"] == "lens" else {"scale_from": "told"})
+def _regauged(stack: FocalStack, found: _Solution, facts: Sequence[Fact]) -> FocalStack:
+    slices = tuple(_regauged_slice(stack, each, found.p, found.q) for each in stack.slices)
     distances_m = [float(each.focus_distance_m or 0.0) for each in slices]
-    gauge |= {"nearest_m": min(distances_m), "farthest_m": max(distances_m) if np.isfinite(max(distances_m)) else "inf"}
+    gauge = _gauge(stack)
+    gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / abs(found.q), "offset_dioptres": found.p + found.q * gauge["offset_dioptres"]}
+    gauge |= {"offset_from": "told"} | ({} if gauge["scale_from"] == "lens" else {"scale_from": "told"})
+    gauge |= {"nearest_m": min(distances_m), "farthest_m": max(distances_m)}
+    if found.directed:
+        near_first = bool(gauge.get("near_first", True)) == (found.q > 0.0)
+        gauge |= {"near_first": near_first, "near_first_from": "told", "near_first_sure": True}
     lens = _lens_at(stack, gauge["lens_from"], distances_m)
-    return replace(stack, slices=slices, lens=lens, metadata=stack.metadata | {KEY: told | {"gauge": gauge}})
+    return replace(stack, slices=slices, lens=lens, metadata=stack.metadata | {KEY: _told(gauge, facts, found.deep)})
 
 
 def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
     dioptres = p + q / float(each.focus_distance_m or np.inf)
     if dioptres <= 0.0:
         raise InputError(f"{stack.folder}: by what was told {each.path} is focused beyond infinity: look at the pixels and measure again")
-    metadata = each.metadata | {"px_per_dioptre": each.metadata["px_per_dioptre"] / q}
+    metadata = each.metadata | {"px_per_dioptre": each.metadata["px_per_dioptre"] / abs(q)}
+    if _SLICE_POSITION in metadata:
+        metadata[_SLICE_POSITION] *= np.sign(q)
     return replace(each, focus_distance_m=1.0 / dioptres, metadata=metadata)
 
 
@@ -270,4 +292,5 @@ def _lens_at(stack: FocalStack, lens_from: str, distances_m: list[float]) -> Len
 def _write_depth(stack: FocalStack, p: float, q: float) -> None:
     part = read_exr(stack.depth_path)[0]
     dioptres = np.maximum(p + q / part.channels["Z"].astype(np.float64), _LEAST_DIOPTRES)
-    write_exr(stack.depth_path, replace(part, channels=dict(part.channels) | {"Z": (1.0 / dioptres).astype(np.float32)}))
+    turned = {POSITION: -part.channels[POSITION]} if q < 0.0 and POSITION in part.channels else {}
+    write_exr(stack.depth_path, replace(part, channels=dict(part.channels) | {"Z": (1.0 / dioptres).astype(np.float32)} | turned))

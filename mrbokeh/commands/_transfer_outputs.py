@@ -27,7 +27,9 @@ def check_out(out: Path, count: int) -> None:
         raise InputError(f"--focus states {count} distances: give a folder or a film ({', '.join(FILMS)}) to write to, got {out}")
 
 
-def write_blurred(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: Sequence[float], blurred: Blurred, frame_rate: float) -> None:
+def write_blurred(
+    out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tuple[float, ...], blurred: Blurred, frame_rate: float
+) -> None:
     if out.suffix.lower() in FILMS:
         _write_film(out, distances_m, blurred, frame_rate)
     elif out.suffix:
@@ -55,12 +57,14 @@ def is_transferred(folder: Path) -> bool:
     return (folder / FILE_NAME).is_file() and _MADE in read_focal_stack(folder).metadata
 
 
-def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: Sequence[float], blurred: Blurred) -> None:
+def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tuple[float, ...], blurred: Blurred) -> None:
     from mrbokeh.atomic_files import atomic_folder
     from mrbokeh.focal_stack import write_focal_stack, write_merged
+    from mrbokeh.focus_places import slice_names
+    from mrbokeh.guessed_metres import KEY, metres_facts
     from mrbokeh.image_io import write_image
 
-    slices = tuple(Slice(f"slice_{distance_m:.4f}m.exr", distance_m) for distance_m in distances_m)
+    slices = tuple(map(Slice, slice_names(distances_m), distances_m))
     depth = sharp.depth
     order = np.argsort([1.0 / each for each in distances_m])
     index = np.interp(depth.dioptres, np.sort([1.0 / each for each in distances_m]), order).astype(np.float32)
@@ -70,12 +74,13 @@ def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: Seq
         for each, distance_m in zip(slices, track(distances_m, "blurring"), strict=True):
             write_image(folder / each.path, blurred(distance_m), half=False)
         write_merged(folder, sharp.photograph.rgb, index, depth.valid.astype(np.float32), depth.depth_m)
-        made = FocalStack(folder, slices, lens.focused_at(distances_m[0]), registered=True, merged=True, metadata={_MADE: depth.note})
+        metadata = {_MADE: depth.note} | ({KEY: dict(metres_facts(sharp.stack))} if sharp.stack and metres_facts(sharp.stack) else {})
+        made = FocalStack(folder, slices, lens.focused_at(distances_m[0]), registered=True, merged=True, metadata=metadata)
         write_focal_stack(made)
 
 
 def write_sheet(path: Path, distances_m: Sequence[float], blurred: Blurred, sharp_rgb: Rgb) -> None:
     from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
 
-    pictures = {"all in focus": sharp_rgb} | {f"{each:.3g} m": blurred(each) for each in distances_m}
+    pictures = {"all in focus": sharp_rgb} | {f"{each:.4g} m": blurred(each) for each in distances_m}
     write_contact_sheet(path, [SheetRow("focus", pictures)])

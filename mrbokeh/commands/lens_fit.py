@@ -36,11 +36,12 @@ def fit(
 ) -> None:
     """Measure the kernels of a lens over signed blur, field and colour.
 
-    From merged, metric focal stacks (every blurred pixel tells a little), from pictures of isolated points of light out of focus (each
-    is its kernel), or from both. Use the bank with `mrbokeh render --psf LENS`.
+    From merged focal stacks (every blurred pixel tells a little; kernels go by blur in pixels, so that metres need not be known), from
+    pictures of isolated points of light out of focus (each is its kernel), or from both. Use the bank with `mrbokeh render --psf LENS`.
 
     Example: mrbokeh lens fit scene --out my_lens --regions 3x3
     """
+    from mrbokeh.guessed_metres import metres_notes
     from mrbokeh.lens_fitting.lens_fit import FitSettings, fit_lens
     from mrbokeh.lens_fitting.measured_bank import bank_of
     from mrbokeh.psf_bank_file import refuse_existing_bank, write_bank
@@ -49,7 +50,10 @@ def fit(
     _check(smoothness, pixels)
     settings = FitSettings(_diameters(diameters), _regions(regions), RINGS if symmetric else 0, smoothness, pixels, seed=seed)
     found, frame = _lights(lights or [], near_lights or [])
-    fitted = fit_lens(_stacks(stacks or []), found, settings, frame)
+    given = _stacks(stacks or [])
+    if note := metres_notes(given):
+        typer.echo(f"{note} (kernels are measured over blur in pixels, which needs no metres)")
+    fitted = fit_lens(given, found, settings, frame)
     bank = bank_of(fitted)
     write_bank(out, bank, overwrite)
     _draw(out, fitted, bank)

@@ -1,5 +1,6 @@
 """`mrbokeh refocus`: new slices of a focal stack at any focus, with its own lens or another."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -73,6 +74,7 @@ def refocus(
     with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
         slices = _write_slices(way, distances_m, out, settings, overwrite)
     write_merged(out, source.all_in_focus(), source.focus_index(), source.depth_confidence(), source.depth_m())
+    shutil.copyfile(source.depth_path, out / source.depth_path.name)  # with all that the source knows
     made = FocalStack(
         out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata=_metadata(source, settings)
     )
@@ -151,5 +153,5 @@ def _times_as_fast(way: Refocusing) -> float:
 def _write_sheet(path: Path, made: FocalStack) -> None:
     from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
 
-    pictures = {f"{each.focus_distance_m:.3g} m": made.slice_rgb(index) for index, each in enumerate(made.slices)}
+    pictures = {f"{each.focus_distance_m:.5g} m": made.slice_rgb(index) for index, each in enumerate(made.slices)}
     write_contact_sheet(path, [SheetRow("focus", pictures)])

@@ -18,7 +18,9 @@ app = typer.Typer(add_completion=False)
 
 @app.command(cls=formerly("frame_rate"))
 def transfer(
-    photo: Annotated[Path, typer.Argument(help="All-in-focus photograph; of a phone's JPEG with depth the sharp original is taken.")],
+    photo: Annotated[
+        Path, typer.Argument(help="All-in-focus photograph, or a merged focal stack; of a phone's JPEG with depth the sharp original.")
+    ],
     lens: Annotated[Path, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network.")],
     out: Annotated[Path, typer.Option(help="A picture, a film (.mov, .mp4, .mkv: a focus pull), or a folder (a focal stack).")],
     depth: Annotated[
@@ -38,7 +40,10 @@ def transfer(
         bool | None,
         typer.Option("--refine/--no-refine", help="Sharpen soft depth edges along the photograph. Default: where depth is soft."),
     ] = None,
-    focus: Annotated[str | None, typer.Option(help="Metres, such as 1.2 or 0.8,1.2,inf or NEAR:FAR:COUNT, evenly in dioptres.")] = None,
+    focus: Annotated[
+        str | None,
+        typer.Option(help="Metres, such as 1.2 or 0.8,1.2,inf; @X,Y at a pixel; #2.5 of a stack; FROM:TO:COUNT, evenly in dioptres."),
+    ] = None,
     focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None,
     renderer: Annotated[
         str | None, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
@@ -59,6 +64,7 @@ def transfer(
     Example: mrbokeh transfer aif.png --depth midas.onnx --disparity 0.5:inf --lens lens.json --focus 0.5:inf:48 --out pull.mp4
     """
     from mrbokeh.commands._transfer_outputs import check_out, write_blurred, write_sheet
+    from mrbokeh.guessed_metres import metres_note, note_of_file
     from mrbokeh.held_lens import lens_as_held
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.transferring import open_sharp, seen_like, with_recovered_highlights
@@ -75,6 +81,8 @@ def transfer(
     given, blurs = lens_and_renderer(lens, renderer)
     assert given is not None
     sharp = open_sharp(photo, depth, settings)
+    for note in dict.fromkeys(filter(None, (metres_note(sharp.stack) if sharp.stack else "", note_of_file(depth)))):
+        typer.echo(note)
     held = lens_as_held(given, sharp.photograph, photo)
     chosen = seen_like(held, sharp.photograph, photo) if same_view else held
     distances_m = _distances(chosen, sharp, focus, focus_at)
@@ -116,12 +124,13 @@ def _require_outputs(out: Path, sheet: Path | None, save_depth: Path | None, inp
 def _distances(lens: Lens, sharp: SharpPhotograph, focus: str | None, focus_at: str | None) -> tuple[float, ...]:
     """From --focus, from the depth at a pixel, else where the phone had focused, else as the lens file says."""
     from mrbokeh.commands._render_method import focused
-    from mrbokeh.commands.refocus import parse_focus
+    from mrbokeh.focus_places import Seen, parse_focus
 
     if focus is not None and focus_at is not None:
         raise InputError("give either --focus or --focus-at, not both")
     if focus is not None:
-        return parse_focus(focus)
+        slices_m = () if sharp.stack is None else tuple(each for each in sharp.stack.focus_distances_m if each is not None)
+        return parse_focus(focus, Seen(lens, sharp.depth.depth_m, slices_m))
     if focus_at is not None:
         return (focused(lens, {"photo": sharp.layer}, None, focus_at).focus_distance_m,)
     return (lens.focus_distance_m if sharp.focus_m is None else sharp.focus_m,)
