@@ -1,13 +1,15 @@
 """All pairs of some stacks as one sequence, read when asked for and in bounded memory, whole or a few rows at a time."""
 
 import functools
+import threading
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 
 from mrbokeh.focal_stack import FocalStack
 from mrbokeh.workers import cores
 from training.pairs import Pair, read_pair
 from training.read_ahead import ReadAhead, Window
-from training.slice_rows import slice_size_px
+from training.slice_rows import StackRows, read_stack_rows, slice_size_px
 from training.stacks import ChosenSlices, stack_name
 from training.weights import Counting
 
@@ -22,7 +24,8 @@ class PairSet:
     """The pairs of some stacks; what was used last and what comes next is kept in memory, up to a limit.
 
     slices: only these of the stacks that it names.
-    cache_mib: the limit. Where all pairs fit they stay, and each file is read once. Where they do not, crops are cut from windows: only
+    cache_mib: the limit. Where all pairs fit they stay, and each file is read once; slices share what belongs to their stack.
+    Where they do not, crops are cut from windows: only
     the rows of a crop are read, over the whole width, as the file holds them. On slices of 24 megapixels 256 rows take 1/16 of the
     time and memory of a whole one. Reading takes about one window more in passing for each reader (`ReadAhead`).
     A copy for another process (pickle) starts with an empty memory.
@@ -35,6 +38,8 @@ class PairSet:
         self.keys = [(stack, index) for stack in self.stacks for index in self._slices.get(stack_name(stack), range(len(stack)))]
         self._counting, self._cache_mib = counting or Counting(), cache_mib
         self._sizes_px: dict[int, tuple[int, int]] = {}
+        self._shared: dict[Path, StackRows] = {}
+        self._sharing = threading.Lock()
         self._cache = ReadAhead(self._read, cache_mib * 2**20, readers=max(1, min(4, cores() // 2)))
 
     def __reduce__(self) -> tuple[type["PairSet"], tuple[tuple[FocalStack, ...], Counting, int, ChosenSlices]]:
@@ -92,6 +97,7 @@ class PairSet:
     def close(self) -> None:
         """Forget all pictures and stop reading ahead."""
         self._cache.close()
+        self._shared.clear()
 
     def _window(self, index: int, rows: slice) -> Window:
         return Window(index, rows.start, rows.stop, self._bytes(index, rows.stop - rows.start))
@@ -100,4 +106,13 @@ class PairSet:
         return rows * self.size_px(index)[1] * (4 * _PLANES + (1 if self._counting.one_sided else 0))
 
     def _read(self, window: Window) -> Pair:
-        return read_pair(*self.keys[window.index], self._counting, slice(window.top, window.bottom))
+        stack, index = self.keys[window.index]
+        rows = slice(window.top, window.bottom)
+        return read_pair(stack, index, self._counting, rows, self._stack_rows(stack, rows) if self.all_fit else None)
+
+    def _stack_rows(self, stack: FocalStack, rows: slice) -> StackRows:
+        """Of the whole picture, read by whoever comes first."""
+        with self._sharing:
+            if stack.folder not in self._shared:
+                self._shared[stack.folder] = read_stack_rows(stack, rows)
+            return self._shared[stack.folder]

@@ -2,7 +2,8 @@
 
 Training on crops of large pictures would otherwise decode 24 megapixels for each crop. The files that this project writes are
 scan lines in ZIP blocks (https://openexr.com/en/latest/OpenEXRFileLayout.html); their blocks are found and decoded here, because OpenEXR's
-own Python module keeps all other threads waiting while it decodes, and what is used here does not. Other files are read whole and cut.
+own Python module keeps all other threads waiting while it decodes, and what is used here does not. Scan lines in other blocks (PIZ, which
+registered slices have) are decoded by that module, these rows only; tiles and cropped pictures are read whole and cut.
 """
 
 import functools
@@ -11,7 +12,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float32
@@ -46,10 +47,12 @@ class _Layout:
 
 
 def exr_size_px(path: Path) -> tuple[int, int]:
-    """(height, width) of the first part; of a file with plain scan lines only the header is read."""
+    """(height, width) of the first part; of a file with scan lines only the header is read."""
     layout = _layout_of(path)
     if layout is not None:
         return layout.height, layout.width
+    if (opened := _opened(path)) is not None:
+        return opened[1]
     shape = next(iter(read_exr(path)[0].channels.values())).shape
     return shape[0], shape[1]
 
@@ -60,7 +63,9 @@ def read_rows(path: Path, rows: slice, names: Sequence[str] = (), optional: Sequ
     rows: a plain slice within the picture. Raises InputError where the file is missing or damaged or lacks a channel.
     """
     layout = _layout_of(path)
-    if layout is None:
+    if layout is None and (found_by_rows := _decoded_by_openexr(path, rows, (*names, *optional))) is not None:
+        found = found_by_rows
+    elif layout is None:
         whole = read_exr(path)[0].channels
         found = {name: whole[name][rows].astype(np.float32) for name in (*names, *optional) if name in whole}
     else:
@@ -73,6 +78,35 @@ def read_rows(path: Path, rows: slice, names: Sequence[str] = (), optional: Sequ
     if missing:
         raise InputError(f"{path}: expected the EXR channels {list(names)}, but {missing} are missing: merge or ingest the stack again")
     return found
+
+
+def _opened(path: Path) -> tuple[Any, tuple[int, int]] | None:
+    """(the file in OpenEXR's older interface, which reads some rows alone, (height, width)); None where it is no whole picture in scan
+    lines or cannot be opened."""
+    import OpenEXR
+
+    try:
+        file = OpenEXR.InputFile(str(path))
+        header = file.header()
+        data, display = header["dataWindow"], header["displayWindow"]
+    except (OSError, KeyError, RuntimeError, ValueError):
+        return None
+    if "tiles" in header or (data.min.x, data.min.y, data.max.x, data.max.y) != (0, 0, display.max.x, display.max.y):
+        return None
+    return file, (data.max.y + 1, data.max.x + 1)
+
+
+def _decoded_by_openexr(path: Path, rows: slice, wanted: Sequence[str]) -> dict[str, Rows] | None:
+    """The channels that the file has of those wanted; None where it has to be read whole."""
+    import Imath
+
+    opened = _opened(path)
+    if opened is None:
+        return None
+    file, (_, width) = opened
+    names = [name for name in wanted if name in file.header()["channels"]]
+    planes = file.channels(names, Imath.PixelType(Imath.PixelType.FLOAT), rows.start, rows.stop - 1)
+    return {name: np.frombuffer(plane, np.float32).reshape(-1, width) for name, plane in zip(names, planes, strict=True)}
 
 
 def _decoded(path: Path, layout: _Layout, rows: slice, wanted: Sequence[str]) -> dict[str, Rows]:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32
 
 from mrbokeh.field_position import field_positions
 from mrbokeh.focal_stack import FocalStack
-from training.slice_rows import SliceRows, read_slice_rows, slice_size_px
+from training.slice_rows import StackRows, read_slice_rows, slice_size_px
 from training.weights import Counting, pixel_weight
 
 
@@ -67,14 +67,16 @@ class Pair:
         return replace(self, weight=self.weight * factor)
 
 
-def read_pair(stack: FocalStack, index: int, counting: Counting | None = None, rows: slice | None = None) -> Pair:
-    """rows: only these of the picture are read; None: all of them."""
+def read_pair(
+    stack: FocalStack, index: int, counting: Counting | None = None, rows: slice | None = None, shared: StackRows | None = None
+) -> Pair:
+    """rows: only these of the picture are read; None: all of them. shared: what the stack has in these rows, else it is read too."""
     counting, frame_px = counting or Counting(), slice_size_px(stack, index)
-    read = read_slice_rows(stack, index, rows or slice(0, frame_px[0]))
+    read = read_slice_rows(stack, index, rows or slice(0, frame_px[0]), shared)
     lens = stack.lens_of(index)
     return Pair(
-        all_in_focus=read.all_in_focus,
-        coc_px=_coc_px(stack, index, read, frame_px),
+        all_in_focus=read.shared.all_in_focus,
+        coc_px=_coc_px(stack, index, read.shared, frame_px),
         target=read.target,
         weight=pixel_weight(read, counting),
         f_number=lens.f_number,
@@ -82,12 +84,12 @@ def read_pair(stack: FocalStack, index: int, counting: Counting | None = None, r
         coc_px_per_dioptre=stack.coc_px_per_dioptre(index, frame_px[1]),
         focus_dioptres=1.0 / lens.focus_distance_m,
         frame_px=frame_px,
-        origin_px=(read.rows.start, 0),
+        origin_px=(read.shared.rows.start, 0),
         saturated=read.saturated if counting.one_sided else None,
     )
 
 
-def _coc_px(stack: FocalStack, index: int, read: SliceRows, frame_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+def _coc_px(stack: FocalStack, index: int, read: StackRows, frame_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
     """`FocalStack.coc_px` wants the whole picture where the focus is tilted or curved, for it then depends on the place."""
     lens = stack.lens_of(index)
     if lens.has_flat_focus or read.depth_m.shape == frame_px:

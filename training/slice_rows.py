@@ -1,6 +1,6 @@
 """Some rows of a slice with all that its stack knows of them; nothing else is decoded."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -17,17 +17,25 @@ REASONS = ("moving", "border", "board", "low_confidence")
 
 
 @dataclass(frozen=True)
-class SliceRows:
-    """rows: which of the picture. all_in_focus, target: (H, W, 3) linear Rec.709. confidence: of depth. exclusions: masks by reason."""
+class StackRows:
+    """What all slices of a stack share. rows: which of the picture. all_in_focus: (H, W, 3) linear Rec.709. confidence: of depth.
+    exclusions: masks by reason."""
 
     rows: slice
     all_in_focus: Float32[np.ndarray, "height width 3"]
-    target: Float32[np.ndarray, "height width 3"]
     depth_m: Float32[np.ndarray, "height width"]
     confidence: Float32[np.ndarray, "height width"]
+    exclusions: dict[str, Mask]
+
+
+@dataclass(frozen=True)
+class SliceRows:
+    """target: (H, W, 3) linear Rec.709."""
+
+    shared: StackRows
+    target: Float32[np.ndarray, "height width 3"]
     saturated: Mask
     valid: Mask
-    exclusions: dict[str, Mask] = field(default_factory=dict)
 
 
 def slice_size_px(stack: FocalStack, index: int) -> tuple[int, int]:
@@ -35,23 +43,26 @@ def slice_size_px(stack: FocalStack, index: int) -> tuple[int, int]:
     return exr_size_px(stack.folder / stack.slices[index].path)
 
 
-def read_slice_rows(stack: FocalStack, index: int, rows: slice) -> SliceRows:
+def read_stack_rows(stack: FocalStack, rows: slice) -> StackRows:
     """rows: a plain slice within the picture. Raises InputError where the stack is not merged and metric, or a file cannot be read."""
     if not (stack.merged and stack.is_metric):
         raise InputError(f"{stack.folder} has no all-in-focus picture with depth in metres: run `mrbokeh capture merge` on it")
+    depth = read_rows(stack.depth_path, rows, ("Z", "confidence"))
+    all_in_focus = stack.to_rec709(_stacked(read_rows(stack.all_in_focus_path, rows, "RGB")))
+    return StackRows(rows, all_in_focus, depth["Z"], depth["confidence"], _exclusions(stack, rows))
+
+
+def read_slice_rows(stack: FocalStack, index: int, rows: slice, shared: StackRows | None = None) -> SliceRows:
+    """shared: these rows of the stack, where they have been read; raises as `read_stack_rows` does."""
+    shared = read_stack_rows(stack, rows) if shared is None else shared
     photograph = read_rows(stack.folder / stack.slices[index].path, rows, "RGB", (SATURATED, VALID))
     saturated, valid = photograph.pop(SATURATED, None), photograph.pop(VALID, None)
     target = stack.to_rec709(_stacked(photograph))
-    depth = read_rows(stack.depth_path, rows, ("Z", "confidence"))
     return SliceRows(
-        rows,
-        stack.to_rec709(_stacked(read_rows(stack.all_in_focus_path, rows, "RGB"))),
+        shared,
         target,
-        depth["Z"],
-        depth["confidence"],
         np.zeros(target.shape[:2], bool) if saturated is None else saturated > 0,
         np.ones(target.shape[:2], bool) if valid is None else valid > 0.5,
-        _exclusions(stack, rows),
     )
 
 

@@ -45,10 +45,11 @@ def counting_of(settings: TrainSettings) -> Counting:
 
 def pixel_weight(read: SliceRows, counting: Counting) -> Float32[np.ndarray, "height width"]:
     """(H, W): 1 where the pixel counts, else 0."""
-    counted = (read.confidence >= counting.least_confidence) & read.valid
+    exclusions = read.shared.exclusions
+    counted = (read.shared.confidence >= counting.least_confidence) & read.valid
     for reason in REASONS:
-        if reason in read.exclusions and (reason != _LOW_CONFIDENCE or counting.least_confidence > 0):
-            counted &= ~read.exclusions[reason]
+        if reason in exclusions and (reason != _LOW_CONFIDENCE or counting.least_confidence > 0):
+            counted &= ~exclusions[reason]
     if not (counting.saturated or counting.one_sided):
         counted &= ~read.saturated
     if counting.saturation is not None:
