@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from mrbokeh.color import srgb_to_linear
 from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
@@ -12,6 +12,11 @@ from mrbokeh.image_io import write_preview
 
 SHEET_NAME = "merge.png"
 TRUSTED = 0.3
+_LEAST_TRUSTED = 0.05
+_LEAST_COLOUR = np.float32(0.25)
+_GREY = np.float32(127.5)
+_COLOURS = (18, 240)
+"""Of the 256 of the colour map, whose ends are nearly black."""
 
 Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -45,15 +50,26 @@ def shown_slices(stack: FocalStack) -> list[int]:
 
 
 def depth_picture(stack: FocalStack) -> Rgb:
-    """Depth (dioptres, or the focus index) in colours between its 1st and 99th percentile, grey where it is a guess; scene-linear."""
+    """`depth_codes` as scene-linear light, a little dimmed so that a tone curve for people leaves it as it is."""
+    return 0.8 * srgb_to_linear(depth_codes(stack).astype(np.float32) / 255.0)
+
+
+def depth_codes(stack: FocalStack) -> UInt8[np.ndarray, "height width 3"]:
+    """Depth (dioptres, or the focus index) in sRGB colours from near (red) to far (blue), grey where it is a guess.
+
+    The scale runs from the 1st to the 99th percentile of what is trusted, or of all where that is little.
+    """
     import cv2
 
     nearness: Plane = (1.0 / stack.depth_m() if stack.is_metric else -stack.focus_index()).astype(np.float32)
-    low, high = np.percentile(nearness, [1, 99])
-    level = np.clip((nearness - low) / max(high - low, 1e-9), 0, 1)
-    colours = cv2.applyColorMap(np.round(255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1] / np.float32(255.0)
-    trust = np.clip(stack.depth_confidence()[..., None] / TRUSTED, 0.25, 1.0)
-    return 0.8 * srgb_to_linear(trust * colours + (1 - trust) * 0.5)
+    confidence = stack.depth_confidence()
+    trusted = nearness[confidence >= TRUSTED]
+    low, high = np.percentile(trusted if trusted.size > _LEAST_TRUSTED * nearness.size else nearness, [1, 99])
+    dark, bright = _COLOURS
+    level = cv2.convertScaleAbs(np.clip(nearness - low, 0.0, high - low), alpha=(bright - dark) / max(float(high - low), 1e-9), beta=dark)
+    colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    trust = np.clip(confidence[..., None] / np.float32(TRUSTED), _LEAST_COLOUR, 1.0).astype(np.float32)
+    return np.rint(_GREY + trust * (colours.astype(np.float32) - _GREY)).astype(np.uint8)
 
 
 def _focus_text(stack: FocalStack, index: int) -> str:

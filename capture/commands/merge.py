@@ -7,7 +7,9 @@ import typer
 
 HELP = "\n\n".join(
     (
-        "Register the slices of every stack, merge an all-in-focus picture and find depth from focus.",
+        "Register the slices of every stack, merge an all-in-focus picture and find depth from focus. Other commands read "
+        "all_in_focus.exr and depth.exr; for people there are all_in_focus.png, all_in_focus.tif (16 bits), all_in_focus.dng (of RAW, "
+        "linear) and depth.png (near is red, far is blue, grey is a guess), turned upright where the camera says how.",
         "Stacks that are merged already are left alone unless --overwrite is given; an interrupted run goes on where it stopped. "
         "registration.json in the folder of each stack says how its slices fit together. --registration uses such a file for all "
         "stacks instead: those taken with the same lens and the same focus distances from a firm tripod.",
@@ -25,6 +27,7 @@ def merge_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="merge again what is merged already")] = False,
 ) -> None:
     from capture.merging.merge import merge_scene
+    from capture.merging.merged_pictures import readable_names
     from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.stack_pictures import SHEET_NAME
 
@@ -32,4 +35,5 @@ def merge_command(
         stacks = merge_scene(scene, overwrite, registration)
     for stack in stacks:
         depth = "depth in metres" if stack.is_metric else "focus distances unknown: depth is the index of the sharpest slice, not metres"
-        typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {SHEET_NAME}")
+        files = ", ".join([*readable_names(stack), SHEET_NAME])
+        typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {files}")

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
+from capture.merging.merged_pictures import write_readable_pictures
 from capture.merging.second_pass import DEPTH_SOURCE, first_pass_path, second_pass
 from capture.views.dense_finish import DenseDepth
 from mrbokeh.camera_rgb import read_camera_rgb
@@ -32,6 +33,7 @@ def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, objec
         found.depth_m,
         stack.rec709_from_camera,
     )
+    write_readable_pictures(deepened)
     write_focal_stack(deepened)
     write_merge_sheet(deepened)
     return deepened
