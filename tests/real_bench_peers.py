@@ -87,7 +87,7 @@ def peer_result(name: str, version: str, stack: RealStack, cache: Path) -> PeerR
     picture, told = folder / f"{stem}.png", folder / f"{stem}.json"
     if not told.is_file():
         with tempfile.TemporaryDirectory() as work:
-            photographs, out = linked(stack.photographs, Path(work) / "slices"), Path(work) / "result.tif"
+            photographs, out = linked(stack.photographs, Path(work) / "slices"), Path(work) / "result.png"
             costs = PEERS[name][1](photographs, out)
             if out.is_file() and not costs[-1].exit_code:
                 cv2.imwrite(str(picture), _eight_bits(out))
