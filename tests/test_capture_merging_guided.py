@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from capture.merging.guided_all_in_focus import all_in_focus_from_depth
-from capture.merging.light_discs import measure_discs
-from capture.merging.lights import find_lights, no_lights
 from capture.merging.nearer_blur import nearer_blur
+from capture.merging.restored_lights import restored_lights, with_restored_lights
 from capture.merging.slice_optics import SliceOptics
 from mrbokeh.aperture import Aperture
 from mrbokeh.errors import InputError
@@ -89,7 +88,7 @@ def test_large_blur_is_gathered_on_a_coarser_grid(monkeypatch: pytest.MonkeyPatc
 
 def test_a_far_wall_is_had_back_from_under_the_blur_of_a_near_edge() -> None:
     slices = photographs(Aperture.disc())
-    result = all_in_focus_from_depth(lambda: slices, 1.0 / dioptres(), optics(), *_no_lights(slices), truth())
+    result = all_in_focus_from_depth(lambda: slices, 1.0 / dioptres(), optics(), truth())
     inner = np.zeros(SIZE, bool)
     inner[BORDER:-BORDER, BORDER:-BORDER] = True
     beside = inner & (np.abs(np.arange(SIZE[1]) - EDGE) < 8)
@@ -104,7 +103,7 @@ def test_without_a_sharp_near_picture_the_slice_with_least_halo_is_better_than_n
     """A first pass that knows the near surface by its mean colour only still takes most of the halo off."""
     slices = photographs(Aperture.disc())
     flat = np.broadcast_to(texture(1).mean(axis=(0, 1)), (*SIZE, 3)).astype(np.float32)
-    result = all_in_focus_from_depth(lambda: slices, 1.0 / dioptres(), optics(), *_no_lights(slices), flat)
+    result = all_in_focus_from_depth(lambda: slices, 1.0 / dioptres(), optics(), flat)
     beside = np.s_[BORDER:-BORDER, EDGE : EDGE + 8]
     assert psnr(result[beside], truth()[beside]) > psnr(slices[2][beside], truth()[beside]) + 3.0
 
@@ -116,7 +115,7 @@ def test_slices_without_data_are_not_used() -> None:
     def valid(index: int) -> np.ndarray:
         return np.broadcast_to((np.arange(SIZE[1]) < 100) | (index != 2), SIZE).copy()
 
-    result = all_in_focus_from_depth(lambda: slices, 1.0 / dioptres(), optics(), *_no_lights(slices), truth(), valid)
+    result = all_in_focus_from_depth(lambda: slices, 1.0 / dioptres(), optics(), truth(), valid)
     np.testing.assert_allclose(result[BORDER:-BORDER, 104:-BORDER], slices[1][BORDER:-BORDER, 104:-BORDER], atol=1e-6)
 
 
@@ -125,7 +124,7 @@ def test_slices_that_are_equally_sharp_share_their_noise() -> None:
     rng, flat = np.random.default_rng(0), np.full((*SIZE, 3), 0.5, np.float32)
     slices = [flat + rng.normal(0, 0.01, flat.shape).astype(np.float32) for _ in range(2)]
     between = SliceOptics.of_slices((1.05, 0.95), (12.0, 12.0))
-    result = all_in_focus_from_depth(lambda: slices, np.ones(SIZE, np.float32), between, *_no_lights(slices), flat)
+    result = all_in_focus_from_depth(lambda: slices, np.ones(SIZE, np.float32), between, flat)
     assert result.std() == pytest.approx(0.01 / np.sqrt(2), rel=0.05)
 
 
@@ -136,12 +135,11 @@ def test_a_light_before_a_wall_leaves_no_ring() -> None:
     from tests.test_lights import slices as photographed
 
     stack = photographed(scene())
-    lights = find_lights(lambda: stack)
-    discs = measure_discs(stack, lights)
     five = SliceOptics.of_slices((5.0, 4.0, 3.0, 2.0, 1.0), [4.0] * 5, Aperture.blades(6))
     depth = np.full(WALL, 2.0, np.float32)
     depth[LIGHT_AT] = 4.0
-    guided = all_in_focus_from_depth(lambda: stack, 1.0 / depth, five, lights, discs, scene())
+    guided = all_in_focus_from_depth(lambda: stack, 1.0 / depth, five, scene())
+    guided = with_restored_lights(guided, restored_lights(lambda: stack, guided, guided=True)[1])
     ring = np.s_[LIGHT_AT[0] - 5 : LIGHT_AT[0] + 6, LIGHT_AT[1] + 2 : LIGHT_AT[1] + 7]
     # The wall never exceeds 0.3 and the disc adds 1.8 to it; what is left is the rim of the hexagon drawn in whole pixels.
     assert stack[3][ring].max() > 1.5
@@ -161,8 +159,3 @@ def test_optics_of_a_stack_are_its_circles_of_confusion() -> None:
 def test_optics_need_one_of_each_for_every_slice() -> None:
     with pytest.raises(InputError, match="got 2 and 1 of them"):
         SliceOptics.of_slices((1.0, 2.0), (12.0,))
-
-
-def _no_lights(slices: list[np.ndarray]) -> tuple:
-    lights = no_lights(SIZE)
-    return lights, measure_discs(slices, lights)

@@ -58,7 +58,7 @@ def test_the_all_in_focus_picture_of_two_planes() -> None:
     truth = np.ones((96, 128), np.float32)
     truth[:, 64:] = 3.0
     slices, rgb = stack_of(texture(), truth), texture()
-    merged = all_in_focus(slices, focus_of(slices).merge_index)
+    merged = all_in_focus(slices, focus_of(slices).focus_index)
     away_from_edge = np.abs(np.arange(128) - 64) > 8
     assert psnr(merged[:, away_from_edge], rgb[:, away_from_edge]) > 45
     assert max(psnr(each, rgb) for each in slices) < 35, "no slice alone does it"

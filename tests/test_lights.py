@@ -5,9 +5,8 @@ import pytest
 
 from capture.merging.all_in_focus import all_in_focus
 from capture.merging.depth_from_focus import depth_from_focus
-from capture.merging.light_discs import measure_discs
-from capture.merging.light_energy import with_light_energy
-from capture.merging.lights import find_lights
+from capture.merging.lights import Lights, find_lights, no_lights
+from capture.merging.restored_lights import restored_lights, with_restored_lights
 from capture.photos.clipped_highlights import neutral_where_full
 from mrbokeh.aperture import Aperture
 from mrbokeh.layer import opaque
@@ -57,7 +56,7 @@ def test_a_stack_without_lights_has_none() -> None:
     stack = [texture()] * 3
     lights = find_lights(lambda: stack)
     assert len(lights.sharpest) == 0 and lights.zone.max() == 0 and not lights.core.any()
-    assert with_light_energy(texture(), measure_discs(stack, lights), lights).tobytes() == texture().tobytes()
+    assert restored_lights(lambda: stack, stack[0])[1] == []
 
 
 def test_white_paper_is_not_a_light() -> None:
@@ -69,19 +68,21 @@ def test_white_paper_is_not_a_light() -> None:
 
 def test_the_merged_picture_has_no_ghost_ring() -> None:
     stack = slices(scene())
-    focus = depth_from_focus(stack, find_lights(lambda: stack))
     ring = np.s_[LIGHT_AT[0] - 5 : LIGHT_AT[0] + 6, LIGHT_AT[1] + 2 : LIGHT_AT[1] + 7]
     # Every slice but the light's own has light thrown on the ring; the texture alone never exceeds 0.3.
     assert max(each[ring].max() for each in stack) > 0.8
-    assert all_in_focus(stack, focus.merge_index)[ring].max() < 0.32
+    assert merged_with_lights(stack)[0][ring].max() < 0.32
+
+
+def merged_with_lights(stack: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, Lights]:
+    merged = all_in_focus(stack, depth_from_focus(stack, no_lights(SIZE)).focus_index)
+    lights, restored = restored_lights(lambda: stack, merged)
+    return with_restored_lights(merged, restored), merged, lights
 
 
 def test_energy_lost_to_saturation_is_found_in_the_discs() -> None:
-    stack = slices(scene())
-    lights = find_lights(lambda: stack)
-    merged = all_in_focus(stack, depth_from_focus(stack, find_lights(lambda: stack)).merge_index)
+    restored, merged, lights = merged_with_lights(slices(scene()))
     assert merged.max() <= FULL
-    restored = with_light_energy(merged, measure_discs(stack, lights), lights)
     # In slice 4 the disc of 12 px spreads the light over 94 px, 0.95 above the wall: nothing is full there.
     np.testing.assert_allclose(restored[LIGHT_AT], RADIANCE, rtol=0.03)
     away = lights.zone == 0
@@ -89,11 +90,41 @@ def test_energy_lost_to_saturation_is_found_in_the_discs() -> None:
 
 
 def test_a_light_that_fits_the_sensor_is_left_alone() -> None:
-    dim = np.array([1.8, 1.7, 1.6], np.float32)
-    stack = slices(scene(dim))
-    lights = find_lights(lambda: stack)
-    merged = all_in_focus(stack, depth_from_focus(stack, find_lights(lambda: stack)).merge_index)
-    np.testing.assert_allclose(with_light_energy(merged, measure_discs(stack, lights), lights)[LIGHT_AT], dim, rtol=0.15)
+    """At 1.8 it is below what fills the sensor; it stays as bright as its sharp slice shows it."""
+    stack = slices(scene(np.array([1.8, 1.7, 1.6], np.float32)))
+    restored, merged, lights = merged_with_lights(stack)
+    assert len(lights) == 0
+    np.testing.assert_array_equal(restored, merged)
+    np.testing.assert_allclose(merged[LIGHT_AT], stack[SHARP_SLICE][LIGHT_AT], rtol=0.05)
+
+
+def overexposed_print() -> list[np.ndarray]:
+    """White letters on dark paper, blurred with everything else: in every slice what the letters lose their surroundings get."""
+    rgb = overexposed_truth()
+    index = np.tile(np.linspace(0.0, 4.0, SIZE[1], dtype=np.float32), (SIZE[0], 1))
+    blurred = [blur_layer(opaque(rgb, np.ones(SIZE, np.float32)), 6.0 * (index - i), Aperture.disc(24)) for i in range(5)]
+    return [np.minimum(each.rgb / each.alpha[..., None], 1.0) for each in blurred]
+
+
+def test_white_print_is_taken_from_its_sharpest_slice() -> None:
+    """What is brighter than its surroundings is no lamp: nothing is drawn, and nothing is brighter than the slices."""
+    stack = overexposed_print()
+    restored, _, lights = merged_with_lights(stack)
+    assert len(lights) == 0
+    assert restored.max() <= max(each.max() for each in stack)
+    letters = np.s_[20:60, 120:300]
+    # The nearest slice is 3 px of blur off at most; the merge is no worse than taking every column from it.
+    nearest = np.stack([stack[round(4 * column / (SIZE[1] - 1))][:, column] for column in range(SIZE[1])], axis=1)
+    truth = overexposed_truth()[letters]
+    assert np.abs(restored[letters] - truth).mean() < 1.05 * np.abs(nearest[letters] - truth).mean()
+
+
+def overexposed_truth() -> np.ndarray:
+    rgb = texture()
+    for column in range(120, 300, 18):
+        rgb[20:60, column : column + 5] = 1.0
+        rgb[30:34, column : column + 12] = 1.0
+    return rgb
 
 
 @pytest.mark.parametrize(("pixel", "expected"), [

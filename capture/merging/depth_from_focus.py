@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, focus_volume, noise_floor, share_above
+from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, focus_volume, share_above
 from capture.merging.lights import Lights
 
-__all__ = ["FocusMap", "depth_from_focus", "focus_energy", "focus_map", "noise_floor", "peak_parabola", "share_above"]
+__all__ = ["FocusMap", "depth_from_focus", "focus_energy", "focus_map", "peak_parabola", "share_above"]
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -21,7 +21,7 @@ SMALL_STEP_COST = 0.3
 LARGE_STEP_COST = 3.0
 LARGEST_COST = 4.0
 # Detail has half its say in the labelling, and half its confidence, where its energy is this many times that of the noise.
-LABELLING_NOISE_FLOORS = 60.0
+LABELLING_NOISE_FLOORS = 30.0
 CONFIDENCE_NOISE_FLOORS = 10.0
 # Pixels this near to one that is full see its clipped rim, not detail.
 SATURATION_REACH_PX = 5
@@ -38,13 +38,10 @@ class FocusMap:
     """focus_index (H, W): fractional index of the slice in which the surface is sharp: its depth.
 
     confidence: (H, W) in [0, 1], 0 where the index is a guess from the surroundings.
-    merge_index: (H, W) the index to take the merged picture from: the same but around bright lights, where the slice is
-    the one that has least of the light's spread.
     """
 
     focus_index: Plane
     confidence: Plane
-    merge_index: Plane
 
     def dioptres(self, focus_dioptres: Sequence[float]) -> Plane:
         """(H, W) 1 / depth in metres, interpolated between the focus of the slices (1 / metres each)."""
@@ -67,17 +64,17 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     by_light = lights.slice_index()
     energies = volume.calmed()
     strongest = energies.max(axis=0)
-    log_energies = np.log(energies + np.float32(volume.floor), out=energies)
-    costs = _costs(log_energies, share_above(strongest, LABELLING_NOISE_FLOORS * volume.floor))
+    log_energies = np.log1p(energies, out=energies)
+    costs = _costs(log_energies, share_above(strongest, LABELLING_NOISE_FLOORS))
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     offset, _ = peak_parabola(log_energies, labels)
     index = volume.enlarged(np.where(volume.reduced(by_light) >= 0, labels, labels + offset).astype(np.float32), SURFACE_STEP)
-    trust = share_above(strongest, CONFIDENCE_NOISE_FLOORS * volume.floor) * _confidence(volume, labels)
+    trust = share_above(strongest, CONFIDENCE_NOISE_FLOORS) * _confidence(volume, labels)
     trust = volume.enlarged(trust) * _share_of_one_surface(index)
     confidence = np.where(_vetoed(by_light, saturated), 0.0, trust).astype(np.float32)
     index[lights.core] = lights.focus_index[lights.zone[lights.core] - 1]
-    return FocusMap(index, confidence, np.where(by_light >= 0, by_light, index).astype(np.float32))
+    return FocusMap(index, confidence)
 
 
 def _costs(log_energies: Volume, say: Plane) -> Volume:
@@ -102,7 +99,7 @@ def _vetoed(by_light: Labels, saturated: Bool[np.ndarray, "height width"] | None
 
 def _confidence(volume: FocusVolume, labels: np.ndarray) -> Plane:
     """From the energies as they are: averaged over slices every peak is flatter."""
-    log_energies = np.log(volume.energies + np.float32(volume.floor))
+    log_energies = np.log1p(volume.energies)
     return confidence_of(log_energies, labels, peak_parabola(log_energies, labels)[1])
 
 

@@ -1,42 +1,49 @@
-"""Focus energies of all slices of a stack, at a size that fits into memory."""
+"""Focus energies of all slices of a stack, in multiples of the noise, at a size that fits into memory."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, UInt8
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 Volume = Float32[np.ndarray, "slices height width"]
+Levels = UInt8[np.ndarray, "height width"]
 
 # The window of the energy is wide enough that every second pixel holds all of it.
 LEAST_SHRINK = 2
 LARGEST_VOLUME_BYTES = 300e6
 # Where the strongest energy of a pixel is this many times that of noise, its slices need no averaging.
 CALM_NOISE_FLOORS = 1000.0
+# Noise is measured at so many brightnesses, each on at least so many pixels, as a low percentile of their energies.
+_LEVELS = 24
+_FEWEST_PIXELS = 200
+_NOISE_PERCENTILE = 5.0
+_EVERY_PX = 3
+# Near black and white codes are crushed and clipped: what little noise is left there is no measure of certainty.
+_LEAST_OF_MEDIAN = 0.25
 
 
 @dataclass(frozen=True)
 class FocusVolume:
-    """energies (slices, h, w): local energy of fine detail in every slice. shape: (H, W) of the pictures, h = ceil(H / shrink)."""
+    """energies (slices, h, w): local energy of fine detail in every slice, over that of noise at this brightness.
+
+    shape: (H, W) of the pictures, h = ceil(H / shrink).
+    """
 
     energies: Volume
     shape: tuple[int, int]
 
-    @property
-    def floor(self) -> float:
-        return noise_floor(self.energies)
-
     def calmed(self) -> Volume:
-        """Energies with the noise of single slices averaged out where it matters: weights 1, 2, 1 along the slices.
+        """Return energies with the noise of single slices averaged out where it matters: weights 1, 2, 1 along the slices.
 
         Noise is new in every slice, detail is not. Where detail stands far above the noise the peak is kept as it is.
         """
         strongest = self.energies.max(axis=0)
-        share = np.float32(0.25) * (1.0 - share_above(strongest, CALM_NOISE_FLOORS * self.floor))
+        share = np.float32(0.25) * (1.0 - share_above(strongest, CALM_NOISE_FLOORS))
         result = np.empty_like(self.energies)
         last = len(self.energies) - 1
         for index, energy in enumerate(self.energies):
@@ -45,14 +52,14 @@ class FocusVolume:
         return result
 
     def reduced(self, plane: np.ndarray) -> np.ndarray:
-        """A picture of the stack's size at the size of the volume, every pixel being one of its own."""
+        """Return a picture of the stack's size at the size of the volume, every pixel being one of its own."""
         rows, columns = (
             np.minimum((np.arange(n) + 0.5) * full / n, full - 1).astype(int) for n, full in zip(self.size, self.shape, strict=True)
         )
         return plane[np.ix_(rows, columns)]
 
     def enlarged(self, plane: Plane, largest_step: float = np.inf) -> Float32[np.ndarray, "full_height full_width"]:
-        """A plane of the volume at the stack's size: bilinear, but nearest where neighbours differ by more than `largest_step`."""
+        """Return a plane of the volume at the stack's size: bilinear, but nearest where neighbours differ by more than `largest_step`."""
         size = (self.shape[1], self.shape[0])
         smooth = cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
         if not np.isfinite(largest_step):
@@ -66,35 +73,62 @@ class FocusVolume:
 
 
 def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None = None, count: int = 16) -> FocusVolume:
-    """The focus energies of registered slices, which are read once; where a slice has no data it has no energy.
+    """Return the focus energies of registered slices, which are read once; where a slice has no data it has no energy.
 
     count: how many slices there will be, for the memory they take.
     """
     energies: list[Plane] = []
+    levels: list[Levels] = []
     for index, rgb in enumerate(registered):
-        energy = focus_energy(rgb)
+        encoded = np.sqrt(np.maximum(rgb, 0.0))
+        energy = _energy(encoded)
         if valid is not None:
             energy[~valid(index)] = 0.0
         height, width = _reduced_size(energy.shape, count)
         energies.append(cv2.resize(energy, (width, height), interpolation=cv2.INTER_AREA))
-    return FocusVolume(np.stack(energies), (rgb.shape[0], rgb.shape[1]))
+        small = cv2.resize(encoded, (width, height), interpolation=cv2.INTER_AREA)
+        levels.append(np.minimum(cv2.transform(small, np.full((1, 3), _LEVELS / 3.0)), _LEVELS - 1).astype(np.uint8))
+    volume = np.stack(energies)
+    floors = noise_floors(volume, levels)
+    for energy, level in zip(volume, levels, strict=True):
+        energy /= floors[level]
+    return FocusVolume(volume, (rgb.shape[0], rgb.shape[1]))
 
 
 def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
-    """Local energy of fine detail (sum of squared Laplacians), in the square root of light where shot noise is even."""
-    encoded = cv2.GaussianBlur(np.sqrt(np.maximum(rgb, 0.0)), (0, 0), 0.7)
-    detail = cv2.Laplacian(encoded, cv2.CV_32F, ksize=1)
-    red, green, blue = cv2.split(cv2.multiply(detail, detail, dst=detail))
-    return cv2.GaussianBlur(cv2.add(cv2.add(red, green, dst=red), blue, dst=red), (0, 0), window_px)
+    """Return the local energy of fine detail (sum of squared Laplacians), in the square root of light where shot noise is even."""
+    return _energy(np.sqrt(np.maximum(rgb, 0.0)), window_px)
 
 
-def noise_floor(energies: Volume) -> float:
-    """The focus energy that noise alone has: what the smoothest places of the least sharp slice show."""
-    return float(np.percentile(energies.min(axis=0), 5)) + 1e-9
+def _energy(encoded: Rgb, window_px: float = 2.5) -> Plane:
+    detail = cv2.Laplacian(cv2.GaussianBlur(encoded, (0, 0), 0.7), cv2.CV_32F, ksize=1)
+    squared = cv2.transform(cv2.multiply(detail, detail, dst=detail), np.ones((1, 3)))
+    return cv2.GaussianBlur(squared, (0, 0), window_px)
+
+
+def noise_floors(energies: Volume, levels: list[Levels]) -> Float32[np.ndarray, " levels"]:
+    """Return the energy that noise alone has at each brightness (square root of light, in _LEVELS steps): what the smoothest places show.
+
+    Compression and clipping leave less noise in the dark and at white than in between, by a factor of ten in real JPEG: with one
+    floor for all, the noise of a defocused, brighter slice outshouts the sharp slice in the dark.
+    """
+    every = (slice(None, None, _EVERY_PX),) * 2
+    energy = np.concatenate([each[every].ravel() for each in energies])
+    level = np.concatenate([each[every].ravel() for each in levels])
+    level, energy = level[energy > 0], energy[energy > 0]
+    lows = {each: float(np.percentile(energy[level == each], _NOISE_PERCENTILE)) for each in _well_filled(level)}
+    if not lows:
+        return np.full(_LEVELS, (np.percentile(energy, _NOISE_PERCENTILE) if energy.size else 0.0) + 1e-9, np.float32)
+    floors = np.exp(np.interp(np.arange(_LEVELS), list(lows), np.log(np.array(list(lows.values())) + 1e-12)))
+    return np.maximum(floors, max(_LEAST_OF_MEDIAN * np.median(list(lows.values())), 1e-9)).astype(np.float32)
+
+
+def _well_filled(level: UInt8[np.ndarray, " pixels"]) -> list[int]:
+    return np.flatnonzero(np.bincount(level, minlength=_LEVELS) >= _FEWEST_PIXELS).tolist()
 
 
 def share_above(energy: Plane, half_at: float) -> Plane:
-    """From 0 to 1 with the energy, one half at `half_at`."""
+    """Return 0 to 1 with the energy, one half at `half_at`."""
     return (energy / (energy + np.float32(half_at))).astype(np.float32)
 
 

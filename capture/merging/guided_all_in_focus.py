@@ -11,9 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from capture.merging.light_discs import LightDiscs
-from capture.merging.light_energy import with_light_energy
-from capture.merging.lights import Lights
 from capture.merging.nearer_blur import nearer_blur
 from capture.merging.slice_optics import SliceOptics
 
@@ -34,19 +31,16 @@ def all_in_focus_from_depth(
     slices: Callable[[], Iterable[Rgb]],
     depth_m: Float[np.ndarray, "height width"],
     optics: SliceOptics,
-    lights: Lights,
-    discs: LightDiscs,
     sharp: Rgb,
     valid: Callable[[int], Mask] | None = None,
 ) -> Rgb:
     """All-in-focus picture of registered slices, guided by depth along the axis in metres (inf allowed).
 
     slices: gives a fresh pass over them, one held at a time. sharp: first-pass all-in-focus picture: near surfaces are
-    taken from it. valid: where slice i has data. Lights that saturated get their energy back, as in the first pass.
+    taken from it. valid: where slice i has data.
     """
     dioptres = (1.0 / np.asarray(depth_m, np.float64)).astype(np.float32)
     picture = _Picture.blank(dioptres.shape)
-    light_slice, around_lights = lights.slice_index(), np.zeros_like(sharp)
     for index, rgb in enumerate(slices()):
         coc_px = np.abs(optics.coc_px(index, dioptres))
         wanted = coc_px < LARGEST_COC_PX
@@ -55,9 +49,8 @@ def all_in_focus_from_depth(
         cost = coc_px + BLOCKED_COST_PX * nearer.share
         if valid is not None:
             cost = np.where(valid(index), cost, np.float32(1e3) + coc_px)
-        around_lights[light_slice == index] = rgb[light_slice == index]
         picture.add(np.maximum(rgb - nearer.light, 0.0) / (1.0 - blocked), cost)
-    return with_light_energy(picture.result(), discs, lights, around_lights)
+    return picture.result()
 
 
 @dataclass

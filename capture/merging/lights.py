@@ -7,6 +7,7 @@ chosen by the light itself: the one in which its energy is most concentrated thr
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -22,6 +23,10 @@ TIMES_SURROUNDINGS = 5.0
 WIDEST_SHARE = 0.03
 CLEARLY_BRIGHTER = 0.15
 LEAST_SHARE_OF_LIGHT = 0.1
+# The disc of a defocused light grows at least by this factor over the stack, and lies in one slice at least below what fills the sensor.
+# Print, paper and metal, which never fill it or are as large everywhere, do not.
+LEAST_GROWTH = 1.5
+UNSATURATED_SHARE = 0.92
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,24 @@ class Lights:
 
     def __len__(self) -> int:
         return len(self.sharpest)
+
+    @cached_property
+    def _boxes(self) -> list[tuple[slice, slice]]:
+        from scipy.ndimage import find_objects
+
+        return find_objects(self.zone, len(self))
+
+    def box(self, light: int, margin_px: int = 0) -> tuple[slice, slice]:
+        """Return the rows and columns of a light's zone with a margin, as far as the picture goes."""
+        sides = zip(self._boxes[light], self.zone.shape, strict=True)
+        rows, columns = (slice(max(each.start - margin_px, 0), min(each.stop + margin_px, size)) for each, size in sides)
+        return rows, columns
+
+    def only(self, kept: Bool[np.ndarray, " lights"]) -> "Lights":
+        """Return some of the lights; the others are no lights any more."""
+        number = np.concatenate([[0], np.where(kept, np.cumsum(kept), 0)]).astype(self.zone.dtype)
+        zone = number[self.zone]
+        return Lights(zone, self.core & (zone > 0), self.sharpest[kept], self.focus_index[kept], self.widest[kept], self.areas_px[:, kept])
 
     def slice_index(self) -> Int[np.ndarray, "height width"]:
         """(H, W): the sharpest slice of the light that reaches a pixel, -1 where none does."""
@@ -107,7 +130,15 @@ def _lights(spreads: "_Spreads", near: Int[np.ndarray, "height width"], distance
         mine = owner == index
         core.ravel()[members[mine]] = spreads.over_range(index)[mine]
     widest = np.where(seen, areas_px, -1.0).argmax(axis=0)
-    return Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), widest, areas_px)
+    found = Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), widest, areas_px)
+    return found.only(_grows(areas_px, peaks, seen))
+
+
+def _grows(areas_px: np.ndarray, peaks: np.ndarray, seen: np.ndarray) -> Bool[np.ndarray, " lights"]:
+    """Return which candidates (slices, lights) grow over the slices, and are below saturation in one of them."""
+    holds = seen & (peaks < UNSATURATED_SHARE * peaks.max(axis=0))
+    largest, least = np.where(seen, areas_px, 0.0).max(axis=0), np.where(seen, areas_px, np.inf).min(axis=0)
+    return holds.any(axis=0) & (largest > LEAST_GROWTH * least)
 
 
 def no_lights(shape: tuple[int, ...]) -> Lights:
@@ -155,6 +186,8 @@ class _Spreads:
 
     def __init__(self, numbers: Int[np.ndarray, " pixels"], floor: PerPixel) -> None:
         self.numbers, self.floor, self.count = numbers, floor, int(numbers.max())
+        self._order = np.argsort(numbers, kind="stable")
+        self._present, self._starts = np.unique(numbers[self._order], return_index=True)
         self.rows: list[tuple[PerLight, PerLight, PerLight]] = []
         self._over: list[UInt8[np.ndarray, " packed"]] = []
 
@@ -163,9 +196,9 @@ class _Spreads:
         excess = np.maximum(brightness - self.floor, 0.0)
         total = np.bincount(self.numbers, excess, self.count + 1)[1:]
         squares = np.bincount(self.numbers, excess * excess, self.count + 1)[1:]
-        peaks = np.zeros(self.count + 1)
-        np.maximum.at(peaks, self.numbers, brightness)
-        self.rows.append((total, total**2 / np.maximum(squares, 1e-12), peaks[1:]))
+        peaks = np.zeros(self.count)
+        peaks[self._present - 1] = np.maximum.reduceat(brightness[self._order], self._starts)
+        self.rows.append((total, total**2 / np.maximum(squares, 1e-12), peaks))
         self._over.append(np.packbits(brightness > OVER_RANGE))
 
     def over_range(self, index: int) -> Bool[np.ndarray, " pixels"]:

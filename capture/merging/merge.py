@@ -12,16 +12,14 @@ from jaxtyping import Float32
 from capture.merging.alignment import Registration, register_stack
 from capture.merging.all_in_focus import NARROW_CROSSOVER, all_in_focus, crossover_of
 from capture.merging.depth_from_focus import FocusMap, focus_map
-from capture.merging.focus_direction import FILE_ORDER
 from capture.merging.focus_volume import focus_volume
-from capture.merging.light_discs import DiscMeasurement
-from capture.merging.light_energy import with_light_energy
-from capture.merging.lights import Extremes, find_lights
+from capture.merging.lights import Extremes, no_lights
+from capture.merging.merged_pictures import write_readable_pictures
 from capture.merging.registered_slices import RegisteredSlices, newer, read_slice, source_path
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
-from capture.merging.relative_focus import solve_relative_focus
-from capture.merging.relative_stack import as_stated, with_guessed_metres, write_relative_depth
+from capture.merging.relative_stack import as_stated, in_focus_order, with_solved_blur
+from capture.merging.restored_lights import RestoredLight, restored_lights, with_restored_lights
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
 from capture.merging.slice_optics import SliceOptics
 from capture.stacks.sentinel_focus import stated_by_sentinel
@@ -32,7 +30,9 @@ from mrbokeh.lens import Lens
 from mrbokeh.progress import track
 from mrbokeh.stack_pictures import write_merge_sheet
 
-FEWEST_SLICES = 3
+FEWEST_SLICES = 2
+HIGHLIGHTS = "highlights"
+"""Key in a stack's metadata: how many lights were drawn anew, and the largest value that their measured flux supports."""
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -49,26 +49,33 @@ def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None 
 
 def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None) -> FocalStack:
     """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
-    stack = as_stated(stack)
+    stack = in_focus_order(as_stated(stack))
     _require_a_sweep(stack)
     name = stack.folder.name
     slices = RegisteredSlices(stack, _registration_of(stack, overwrite, registration))
     extremes = Extremes()
     made = extremes.watching(track(slices.made(keep=not overwrite), f"{name}: register", len(stack)))
     volume = focus_volume(made, slices.valid, len(stack))
-    lights = find_lights(slices.passing, extremes)
-    focus = focus_map(volume, lights, slices.saturated)
-    merged, measurement = _with_registration(stack, slices), DiscMeasurement(lights)
-    passing = measurement.watching(track(slices.passing(), f"{name}: all in focus", len(stack)))
-    blended = all_in_focus(passing, focus.merge_index, _crossover(merged, volume.shape[1]))
-    sharp = with_light_energy(blended, measurement.discs, lights)
+    merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
+    passing = track(slices.passing(), f"{name}: all in focus", len(stack))
+    sharp = all_in_focus(passing, focus.focus_index, _crossover(merged, volume.shape[1]))
+    lights, restored = restored_lights(slices.passing, sharp, extremes)
+    if restored:
+        sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
+    merged = _with_highlights(merged, restored)
     write_merged(stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus), stack.rec709_from_camera)
     if not stack.is_metric:
-        merged = _with_solved_blur(merged, slices, sharp, focus)
+        merged = with_solved_blur(merged, slices, sharp, focus)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
+    write_readable_pictures(merged, sharp)
     write_focal_stack(merged)
     write_merge_sheet(merged)
     return merged
+
+
+def _with_highlights(stack: FocalStack, restored: Sequence[RestoredLight]) -> FocalStack:
+    found = {"drawn": len(restored), "largest_supported": max((each.largest for each in restored), default=0.0)}
+    return replace(stack, metadata=stack.metadata | {HIGHLIGHTS: found})
 
 
 def _require_a_sweep(stack: FocalStack) -> None:
@@ -112,15 +119,6 @@ def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
     read = lru_cache(maxsize=1)(lambda index: read_slice(sources[index]))
     unknown = np.flatnonzero(stated_by_sentinel(stack)).tolist()
     return register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0, unknown)
-
-
-def _with_solved_blur(merged: FocalStack, slices: RegisteredSlices, sharp: Rgb, focus: FocusMap) -> FocalStack:
-    """Blur in pixels where no metres are known: into the stack, and into its depth.exr."""
-    index, confidence = focus.focus_index, focus.confidence
-    relative = solve_relative_focus(slices.passing, sharp, index, confidence, len(merged), slices.valid, slices.saturated)
-    guessed = with_guessed_metres(merged, relative, FILE_ORDER, (sharp.shape[1], sharp.shape[0]))
-    write_relative_depth(guessed, index, confidence, relative, FILE_ORDER)
-    return guessed
 
 
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:

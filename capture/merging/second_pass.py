@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from capture.merging.guided_all_in_focus import all_in_focus_from_depth
-from capture.merging.light_discs import measure_discs
-from capture.merging.lights import find_lights
+from capture.merging.restored_lights import restored_lights, with_restored_lights
 from capture.merging.slice_optics import SliceOptics
 from mrbokeh.atomic_files import atomic_path
 from mrbokeh.camera_rgb import read_camera_rgb
@@ -32,13 +31,12 @@ def second_pass(stack: FocalStack, depth_m: Float[np.ndarray, "height width"], o
         raise InputError(f"{stack.folder} is not merged yet: run `mrbokeh capture merge` before its depth is found")
     first = read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path))
     optics = SliceOptics.of_stack(stack, first.shape[1]) if optics is None else optics
-    lights = find_lights(stack.iter_camera_rgb)
-    discs = measure_discs(stack.iter_camera_rgb(), lights)
 
     def valid(index: int) -> Bool[np.ndarray, "height width"]:
         return stack.slice_masks(index).valid
 
-    return all_in_focus_from_depth(stack.iter_camera_rgb, depth_m, optics, lights, discs, first, valid)
+    guided = all_in_focus_from_depth(stack.iter_camera_rgb, depth_m, optics, first, valid)
+    return with_restored_lights(guided, restored_lights(stack.iter_camera_rgb, guided, guided=True)[1])
 
 
 def keep_first_pass(stack: FocalStack) -> None:

@@ -1,0 +1,283 @@
+"""Lights that the sensor could not hold, drawn anew in the all-in-focus picture where that explains the slices better.
+
+A light in focus fills a few photosites: its radiance is lost, and demosaicing makes a mess of what is left. Out of focus the same light
+lies spread over a disc below the saturation: its flux is a sum there, its place a centroid, each over many pixels. What is drawn of them
+is blurred again to every slice and compared with it, beside what the ordinary merge gives. Only what explains the slices clearly better
+replaces the ordinary merge; so print, paper, metal and sky stay what they are in their sharpest slice.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from capture.merging.lights import OVER_RANGE, UNSATURATED_SHARE, Extremes, Lights, find_lights
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Patches = Float32[np.ndarray, "slices height width 3"]
+Flux = Float[np.ndarray, "3"]
+
+# Slices that tell one light's flux may differ by this share; what differs more is no single light.
+LARGEST_SPREAD = 0.25
+RING_PX = 3.0
+# Slices in which a light is seen whole.
+FEWEST_SLICES = 3
+# A drawn light explains its slices, to this share of the light in them, and leaves at most this share of the ordinary merge's error.
+LEAST_EXPLAINED = 0.7
+LARGEST_ERROR_SHARE = 0.7
+# Slices to which a drawn light is blurred again: from the sharpest to the widest.
+COMPARED_SLICES = 5
+# Small lights that hold less than this share of their flux in focus do not show their shape: a disc is drawn, unless another way explains
+# the slices clearly better.
+LARGEST_DRAWN_PX = 30.0
+LARGEST_DRAWN_SHARE = 0.65
+CLEARLY = 1.3
+# Lights that hold this share of their flux in focus need no restoring.
+LARGEST_HELD_SHARE = 0.9
+CORE_SHARE = 0.7
+# Radii of lights that are drawn as discs. A point light behind a low-pass filter covers about USUAL_RADIUS_PX; demosaicing of full pixels
+# hides smaller differences, which count as much as this squared radiance per squared pixel of the radius.
+RADII_PX = np.arange(0.0, 2.51, 0.125)
+USUAL_RADIUS_PX = 1.0
+USUAL_WEIGHT = 10.0
+SUBPIXELS = 8
+MARGIN_PX = 3
+
+
+@dataclass(frozen=True)
+class RestoredLight:
+    """What replaces a part of the all-in-focus picture: picture (h, w, 3) where mask (h, w), at box (rows, columns)."""
+
+    box: tuple[slice, slice]
+    mask: Mask
+    picture: Rgb
+
+    @property
+    def largest(self) -> float:
+        return float(self.picture[self.mask].max(initial=0.0))
+
+
+def restored_lights(
+    slices: Callable[[], Iterable[Rgb]], merged: Rgb, extremes: Extremes | None = None, *, guided: bool = False
+) -> tuple[Lights, list[RestoredLight]]:
+    """Return the lights of registered slices that the evidence supports, and what is drawn for them in place of the merged picture.
+
+    slices: gives a fresh pass over them, one held at a time. extremes: what an earlier pass has gathered. guided: the picture was merged
+    by a depth that lights cannot mislead, so that what surrounds them stays.
+    """
+    candidates = find_lights(slices, extremes)
+    if len(candidates) == 0:
+        return candidates, []
+    boxes = [candidates.box(light, int(np.ceil(RING_PX)) + 1) for light in range(len(candidates))]
+    cut = [[rgb[box].copy() for box in boxes] for rgb in slices()]
+    found = [
+        _restored(np.stack([each[light] for each in cut]), merged[boxes[light]], boxes[light], candidates, light, guided)
+        for light in range(len(candidates))
+    ]
+    kept = np.array([each is not None for each in found])
+    return candidates.only(kept), [each for each in found if each is not None]
+
+
+def with_restored_lights(merged: Rgb, restored: Sequence[RestoredLight]) -> Rgb:
+    """Return the all-in-focus picture with its lights."""
+    result = merged.copy()
+    for each in restored:
+        result[each.box][each.mask] = each.picture[each.mask]
+    return result
+
+
+@dataclass(frozen=True)
+class Discs:
+    """A light in its slices: flux (slices, 3) above the surroundings, xy_px (slices, 2) its centroid in the patch, variance_px2 (slices,)
+    mean of both axes, peak (slices,), whole (slices,) whether the disc lies within the light's zone and the picture.
+    """
+
+    flux: Float[np.ndarray, "slices 3"]
+    xy_px: Float[np.ndarray, "slices 2"]
+    variance_px2: Float[np.ndarray, " slices"]
+    peak: Float[np.ndarray, " slices"]
+    whole: Bool[np.ndarray, " slices"]
+
+    @property
+    def believable(self) -> Bool[np.ndarray, " slices"]:
+        """Slices in which the light is whole, below saturation and about as bright as in the others."""
+        flux = self.flux.sum(axis=1)
+        good = self.whole & (self.peak < UNSATURATED_SHARE * self.peak.max()) & (flux > 0)
+        if good.any():
+            good &= np.abs(flux - np.median(flux[good])) < LARGEST_SPREAD * np.median(flux[good])
+        return good
+
+
+def measured_discs(patches: Patches, zone: Mask, centre_px: Float[np.ndarray, "2"], areas_px: Float[np.ndarray, " slices"]) -> Discs:
+    """Measure one light in all slices. zone: what is this light's; centre_px: (x, y) of its core, in the patch."""
+    rows = [_measured(patch, zone, centre_px, _radius_px(area)) for patch, area in zip(patches, areas_px, strict=True)]
+    table = np.array(rows, np.float64)
+    return Discs(table[:, 0:3], table[:, 3:5], table[:, 5], table[:, 6], table[:, 7] > 0)
+
+
+def _measured(patch: Rgb, zone: Mask, centre_px: Float[np.ndarray, "2"], radius_px: float) -> tuple[float, ...]:
+    """Return (flux r, g, b, x, y, variance, peak, whole) of one light in one slice."""
+    y, x = np.mgrid[: patch.shape[0], : patch.shape[1]] + 0.5
+    distance = np.hypot(x - centre_px[0], y - centre_px[1])
+    inside = distance < radius_px
+    ring = (distance >= radius_px) & (distance < radius_px + RING_PX)
+    level = np.median(patch[ring], axis=0) if ring.any() else np.zeros(3)
+    excess = (patch - level) * inside[..., None]
+    whole = bool(zone[inside].all()) and inside.sum() > 0.97 * np.pi * radius_px**2
+    weight = np.maximum(excess.sum(axis=2), 0.0)
+    total = max(float(weight.sum()), 1e-9)
+    mean_x, mean_y = float((weight * x).sum() / total), float((weight * y).sum() / total)
+    variance = 0.5 * float((weight * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum() / total)
+    return (*excess.sum(axis=(0, 1)).tolist(), mean_x, mean_y, variance, float(patch[inside].max(initial=0.0)), float(whole))
+
+
+def _radius_px(area_px: float) -> float:
+    """Return the radius of a disc of that area, with a margin for its soft rim."""
+    return 1.15 * float(np.sqrt(area_px / np.pi)) + 2.0
+
+
+def _restored(patches: Patches, ordinary: Rgb, box: tuple[slice, slice], lights: Lights, light: int, guided: bool) -> RestoredLight | None:
+    """Return what explains the slices around a light clearly better than the ordinary merge, None where nothing does."""
+    zone = lights.zone[box] == light + 1
+    core = lights.core[box] & zone
+    rows, columns = np.nonzero(core if core.any() else zone)
+    areas_px, sharpest = lights.areas_px[:, light], int(lights.sharpest[light])
+    discs = measured_discs(patches, zone, np.array([columns.mean() + 0.5, rows.mean() + 0.5]), areas_px)
+    if not discs.believable.any() or discs.whole.sum() < FEWEST_SLICES:
+        return None
+    share = _soft(zone)[..., None]
+    spread = (1.0 - share) * ordinary + share * patches[sharpest]
+    # In the light's own slice nothing of it lies on its surroundings. Another base has to be clearly better.
+    bases, lost = ((spread, CLEARLY if guided else 1.0), (ordinary, 1.0 if guided else CLEARLY)), _mostly_lost(discs, areas_px, sharpest)
+    compare, ways = _Comparison.of(patches, zone, discs, areas_px, sharpest), []
+    for base, handicap in bases:
+        for picture, drawn in (
+            (_drawn(base, discs, areas_px[sharpest]), True),
+            (_raised(base, core, discs, sharpest), False),
+            (base, False),
+        ):
+            error = compare.error(picture)
+            ways.append((error * handicap * (CLEARLY if lost and not drawn else 1.0), error, picture))
+    _, error, picture = min(ways, key=lambda way: way[0])
+    limit = min(LARGEST_ERROR_SHARE * compare.error(ordinary), (1.0 - LEAST_EXPLAINED) * compare.light)
+    return RestoredLight(box, (picture != ordinary).any(axis=2), picture) if error < limit else None
+
+
+def _mostly_lost(discs: Discs, areas_px: Float[np.ndarray, " slices"], sharpest: int) -> bool:
+    """Return whether a light is small and holds so little of its flux in focus that it does not show its shape either."""
+    flux = np.median(discs.flux[discs.believable].sum(axis=1))
+    return bool(areas_px[sharpest] < LARGEST_DRAWN_PX and discs.flux[sharpest].sum() < LARGEST_DRAWN_SHARE * flux)
+
+
+def _soft(zone: Mask) -> Plane:
+    """Return 1 in a zone and less towards its rim, 0 outside it."""
+    distance = cv2.distanceTransform(zone.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.clip(distance / (RING_PX + 1.0), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """The slices around a light, against which proposals are held. blurs: (luminance of the slice, radius of its blur)."""
+
+    zone: Mask
+    full: float
+    blurs: tuple[tuple[Plane, float], ...]
+    light: float
+
+    @classmethod
+    def of(cls, patches: Patches, zone: Mask, discs: Discs, areas_px: Float[np.ndarray, " slices"], sharpest: int) -> "_Comparison":
+        """Choose slices in which the disc is whole, evenly from the sharpest to the widest."""
+        whole = np.flatnonzero(discs.whole)
+        by_area = whole[np.argsort(areas_px[whole])]
+        chosen = by_area[np.unique(np.linspace(0, len(by_area) - 1, COMPARED_SLICES).round().astype(int))]
+        blurs = [(_grey(patches[i]), float(np.sqrt(max(areas_px[i] - areas_px[sharpest], 0.0) / np.pi))) for i in chosen]
+        light = sum(float(((grey - np.median(grey[~zone] if (~zone).any() else grey)) ** 2)[zone].sum()) for grey, _ in blurs)
+        return cls(zone, float(discs.peak.max()), tuple(blurs), light)
+
+    def error(self, picture: Rgb) -> float:
+        """Return the squared difference, in the light's zone, between the slices and a picture blurred as they are; full is full."""
+        total = 0.0
+        for grey, radius_px in self.blurs:
+            blurred = cv2.merge([cv2.filter2D(each, -1, _disc_kernel(radius_px)) for each in cv2.split(picture)])
+            total += float(((_grey(np.minimum(blurred, self.full)) - grey)[self.zone] ** 2).sum())
+        return total
+
+
+def _grey(rgb: Rgb) -> Plane:
+    return rgb.mean(axis=2)
+
+
+def _disc_kernel(radius_px: float) -> Plane:
+    """Return a disc of sum 1 with soft pixels at its rim."""
+    reach = int(np.ceil(radius_px + 0.5))
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    kernel = np.clip(radius_px + 0.5 - np.hypot(x, y), 0.0, 1.0).astype(np.float32)
+    return kernel / kernel.sum()
+
+
+def _drawn(blank: Rgb, discs: Discs, sharp_area_px: float) -> Rgb:
+    """Return the patch with a disc of the light's flux in place of what is left of it, without its stray light."""
+    use = discs.believable
+    certainty = 1.0 / np.maximum(discs.variance_px2[use], 0.5)
+    xy_px, flux = (np.average(each[use], axis=0, weights=certainty) for each in (discs.xy_px, discs.flux))
+    clear_px = 1.15 * np.sqrt(sharp_area_px / np.pi) + 2.0
+    y, x = np.mgrid[: blank.shape[0], : blank.shape[1]] + 0.5
+    distance = np.hypot(x - xy_px[0], y - xy_px[1])
+    around = (distance > clear_px) & (distance <= clear_px + MARGIN_PX)
+    picture = blank.copy()
+    if not around.any():
+        return picture
+    surroundings = np.median(picture[around], axis=0)
+    drawn = disc_picture(xy_px, _fitting_radius_px(blank, xy_px, distance, clear_px, surroundings, flux), blank.shape[:2])
+    lowest, highest = picture[around].min(axis=0), picture[around].max(axis=0)
+    stray = (distance <= clear_px) & ((picture > highest) | (picture < lowest)).any(axis=2)
+    picture[stray] = surroundings
+    cover = (drawn / drawn.max())[..., None]
+    return ((1.0 - cover) * picture + drawn[..., None] * flux).astype(np.float32)
+
+
+def disc_picture(xy_px: Float[np.ndarray, "2"], radius_px: float, shape: tuple[int, ...]) -> Float[np.ndarray, "height width"]:
+    """Return the share of a disc's light in each pixel; a disc below the grid of subpixels is a point."""
+    left, top = (max(int(each - radius_px) - 1, 0) for each in xy_px)
+    right, bottom = min(int(xy_px[0] + radius_px) + 2, shape[1]), min(int(xy_px[1] + radius_px) + 2, shape[0])
+    y, x = (np.mgrid[: (bottom - top) * SUBPIXELS, : (right - left) * SUBPIXELS] + 0.5) / SUBPIXELS
+    squared = (x + left - xy_px[0]) ** 2 + (y + top - xy_px[1]) ** 2
+    inside = squared <= max(radius_px**2, float(squared.min()))
+    shares = inside.reshape(bottom - top, SUBPIXELS, right - left, SUBPIXELS).sum(axis=(1, 3)) / inside.sum()
+    result = np.zeros(shape)
+    result[top:bottom, left:right] = shares
+    return result
+
+
+def _fitting_radius_px(
+    seen: Rgb, xy_px: Float[np.ndarray, "2"], distance: Float[np.ndarray, "height width"], reach_px: float, surroundings: Flux, flux: Flux
+) -> float:
+    """Return the radius of the disc that explains what is seen of a light where nothing is full."""
+    near = distance <= reach_px + MARGIN_PX
+    unsaturated = np.minimum(seen[near], OVER_RANGE)
+
+    def miss(radius_px: float) -> float:
+        expected = np.minimum(surroundings + disc_picture(xy_px, radius_px, seen.shape[:2])[near][:, None] * flux, OVER_RANGE)
+        return float(((expected - unsaturated) ** 2).sum() + USUAL_WEIGHT * (radius_px - USUAL_RADIUS_PX) ** 2)
+
+    return float(min(RADII_PX, key=miss))
+
+
+def _raised(blank: Rgb, core: Mask, discs: Discs, sharpest: int) -> Rgb:
+    """Return the patch with the light's brightest pixels raised to its flux: larger lamps show their own shape and keep it.
+
+    Channels fill one by one: a lamp that has lost a third of its red may hold all of its blue.
+    """
+    picture = blank.copy()
+    if not core.any():
+        return picture
+    brightness = picture.max(axis=2)
+    brightest = core & (brightness >= CORE_SHARE * brightness[core].max())
+    flux, held = np.median(discs.flux[discs.believable], axis=0), discs.flux[sharpest]
+    missing = np.where(held < LARGEST_HELD_SHARE * flux, np.maximum(flux - held, 0.0), 0.0)
+    picture[brightest] += (missing / np.count_nonzero(brightest)).astype(np.float32)
+    return picture
