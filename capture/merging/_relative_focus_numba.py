@@ -24,7 +24,7 @@ def _bounded(misfit: float) -> float:
     return misfit / (1.0 + misfit / _SPENT)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def sum_curves(
     errors: np.ndarray,
     gaps: np.ndarray,
@@ -39,14 +39,15 @@ def sum_curves(
 ) -> None:
     """Add up, for every pair (slice, bin of cells sharp in a slice) and block of the picture, the misfits at base + candidate.
 
-    errors (cells, slices, rungs), gaps (cells, rungs - 1), base (cells, slices), curves (slices, bins, blocks, candidates).
+    errors (cells, slices, rungs; below 0: silent), gaps (cells, rungs - 1), base (cells, slices), curves (slices, bins, blocks, candidates).
     """
     cells, slices = errors.shape[:2]
+    farthest = np.sqrt(squares[-1])
     for cell in range(cells):
         if weight[cell] <= 0.0:
             continue
         for one in range(slices):
-            if errors[cell, one, 0] < 0.0:
+            if errors[cell, one, 0] < 0.0 or base[cell, one] > farthest:
                 continue
             row = curves[one, nearest[cell], block[cell]]
             for k in range(candidates.shape[0]):

@@ -9,7 +9,7 @@ squares, and with them every place its own.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,6 +23,12 @@ Mask = Bool[np.ndarray, "height width"]
 Positions = Float[np.ndarray, " slices"]
 
 _BLOCKS = 5
+_TOLD_SHARE = 0.9
+"""Blur above this share of the widest rung is too wide to be told."""
+_OWN_SHARE = 0.05
+_NOISE_PERCENTILE = 10.0
+_TEXTURED_FLOORS = 5.0
+_SURFACE_STEP = 0.7
 _MODEL_SHARE = 0.01
 """Of a cell's texture: what a disc does not reproduce of real blur, whatever its size."""
 _ROUNDS = 4
@@ -62,65 +68,75 @@ def solve_relative_focus(
     focus_index, confidence: of the merge. valid: where slice i has data. excluded: pixels that were full in some slice.
     """
     evidence = blur_evidence(slices, all_in_focus, count, valid, excluded)
-    places = _Places.of(evidence, focus_index, confidence, count)
-    positions, errors = _positions(places)
+    places = _Places.of(evidence, focus_index, confidence)
+    positions, errors = _positions(places.thinned())
     offset, cell_error = _offsets(places, positions)
     return RelativeFocus(positions, errors, *_dense(places, positions, offset, cell_error, focus_index))
 
 
 @dataclass(frozen=True)
 class _Places:
-    """Cells: errors in units of their variance; index: fractional; nearest: slice; own: the slices that their sharp picture is of."""
+    """Cells of the evidence, whose errors and gaps are in units of their variance.
 
-    evidence: BlurEvidence
+    index: fractional; nearest: slice; own: shares of the slices that their sharp picture is of, which it fits for no reason.
+    """
+
     errors: Float32[np.ndarray, "cells slices rungs"]
     gaps: Float32[np.ndarray, "cells steps"]
+    squares_px2: Float[np.ndarray, " rungs"]
+    shape: tuple[int, int]
     index: Float32[np.ndarray, " cells"]
-    nearest: Int[np.ndarray, " cells"]
     own: Float32[np.ndarray, "cells slices"]
     weight: Float32[np.ndarray, " cells"]
-    block: Int[np.ndarray, " cells"]
 
     @classmethod
-    def of(cls, evidence: BlurEvidence, focus_index: Plane, confidence: Plane, count: int) -> "_Places":
-        index, trust = evidence.at_cells(focus_index).astype(np.float32), evidence.at_cells(confidence)
-        own = np.clip(1.0 - np.abs(index[:, None] - np.arange(count)), 0.0, 1.0).astype(np.float32)
-        own = np.clip((own - 0.25) * 2.0, 0.0, 1.0)
+    def of(cls, evidence: BlurEvidence, focus_index: Plane, confidence: Plane) -> "_Places":
+        errors, count = evidence.errors, evidence.errors.shape[1]
+        index = evidence.at_cells(focus_index).astype(np.float32)
+        own = np.clip(2.0 * (0.75 - np.abs(index[:, None] - np.arange(count, dtype=np.float32))), 0.0, 1.0)
         own /= own.sum(axis=1, keepdims=True)
-        known = evidence.errors[:, :, 0] >= 0
-        lowest = np.where(known, evidence.errors.min(axis=2), np.inf)
-        lowest[own > 0.05] = np.inf
-        finite = np.isfinite(lowest)
-        floor = float(np.percentile(lowest[finite], 10)) + 1e-9 if finite.any() else 1e-9
-        variance = floor + _MODEL_SHARE * evidence.texture
-        errors = evidence.errors / variance[:, None, None]
-        errors[~known | (own > 0.05)] = -1.0
-        grid = index.reshape(evidence.shape)
-        box = np.ones((5, 5), np.uint8)
+        silent = (errors[:, :, 0] < 0) | (own > _OWN_SHARE)
+        lowest = errors.min(axis=2)[~silent]
+        floor = float(np.percentile(lowest, _NOISE_PERCENTILE)) + 1e-9 if len(lowest) else 1e-9
+        variance = np.float32(floor) + np.float32(_MODEL_SHARE) * evidence.texture
+        np.divide(errors, variance[:, None, None], out=errors)
+        errors[silent] = -1.0
+        grid, box = index.reshape(evidence.shape), np.ones((5, 5), np.uint8)
         jump = (cv2.dilate(grid, box) - cv2.erode(grid, box)).ravel()
-        weight = trust / (1.0 + (jump / 0.7) ** 2) * (evidence.texture > 5.0 * floor)
-        rows, columns = np.indices(evidence.shape)
-        block = (rows * _BLOCKS // evidence.shape[0]) * _BLOCKS + columns * _BLOCKS // evidence.shape[1]
-        nearest = np.rint(index).astype(np.int64)
-        return cls(
-            evidence,
-            errors,
-            (evidence.gaps / variance[:, None]).astype(np.float32),
-            index,
-            nearest,
-            own,
-            weight.astype(np.float32),
-            block.ravel().astype(np.int64),
-        )
+        weight = evidence.at_cells(confidence) / (1.0 + (jump / _SURFACE_STEP) ** 2) * (evidence.texture > _TEXTURED_FLOORS * floor)
+        gaps = evidence.gaps / variance[:, None]
+        return cls(errors, gaps, evidence.diameters_px**2, evidence.shape, index, own, weight.astype(np.float32))
+
+    def thinned(self) -> "_Places":
+        """Every second cell of every second row: windows overlap, so that little is lost."""
+        chosen = np.arange(len(self.index)).reshape(self.shape)[::2, ::2]
+        picked = {name: getattr(self, name)[chosen.ravel()] for name in ("errors", "gaps", "index", "own", "weight")}
+        return replace(self, shape=(chosen.shape[0], chosen.shape[1]), **picked)
 
     @property
     def count(self) -> int:
         return self.errors.shape[1]
 
+    @property
+    def widest_px(self) -> float:
+        return float(np.sqrt(self.squares_px2[-1]))
+
+    @property
+    def nearest(self) -> Int[np.ndarray, " cells"]:
+        return np.rint(self.index).astype(np.int64)
+
+    @property
+    def block(self) -> Int[np.ndarray, " cells"]:
+        rows, columns = np.indices(self.shape)
+        return ((rows * _BLOCKS // self.shape[0]) * _BLOCKS + columns * _BLOCKS // self.shape[1]).ravel().astype(np.int64)
+
 
 def _positions(places: _Places) -> tuple[Positions, Positions]:
-    """By least squares of the diameters of all pairs, first as they are and then of what is left of them."""
-    widest = float(places.evidence.diameters_px[-1])
+    """By least squares of the diameters of all pairs, first as they are and then of what is left of them.
+
+    Moving one slice or one surface at a time would never undo a common stretch; pairs do.
+    """
+    widest = places.widest_px
     sharp = np.abs(places.index - places.nearest) <= 0.3
     diameters = np.arange(0.0, widest + 0.01, widest / 60.0)
     no_base = np.zeros((len(places.index), places.count))
@@ -132,7 +148,7 @@ def _positions(places: _Places) -> tuple[Positions, Positions]:
         place = np.interp(places.index, np.arange(places.count), positions) + offset
         base = np.abs(positions[None, :] - place[:, None])
         own_blur = (places.own * base**2).sum(axis=1)
-        base[base > 0.9 * widest] = 1e6
+        base[base > _TOLD_SHARE * widest] = np.inf
         measured = _measured(places, places.weight, base, own_blur, offsets)
         positions, errors = _solved(measured, positions, places.count)
     return positions, errors
@@ -158,9 +174,8 @@ def _measured(
     from capture.merging._relative_focus_numba import sum_curves
 
     curves = np.zeros((places.count, places.count, _BLOCKS**2, len(candidates)))
-    usable = np.where(base[:, :, None] > 1e5, np.float32(-1.0), places.errors) if base.max() > 1e5 else places.errors
-    squares = places.evidence.diameters_px**2
-    sum_curves(usable, places.gaps, squares, weight.astype(np.float32), places.nearest, places.block, base, own_blur, candidates, curves)
+    cells = (weight.astype(np.float32), places.nearest, places.block, base, own_blur)
+    sum_curves(places.errors, places.gaps, places.squares_px2, *cells, candidates, curves)
     total = curves.sum(axis=2)
     best = np.clip(total.argmin(axis=2), 1, len(candidates) - 2)
     inside = (total.argmin(axis=2) < len(candidates) - 1) & (total.max(axis=2) > 0)
@@ -170,7 +185,9 @@ def _measured(
     slope = (after - before) / (2.0 * step)
     shift = np.where(bend > 0, -slope.sum(axis=2) / np.maximum(bend, 1e-12), 0.0)
     shift = np.clip(shift, -step, step)
-    error = np.sqrt((slope - slope.mean(axis=2, keepdims=True)).__pow__(2).sum(axis=2)) / np.maximum(bend, 1e-12)
+    # How much the blocks of the picture disagree says how far chance goes, not the number of pixels.
+    scatter = ((slope - slope.mean(axis=2, keepdims=True)) ** 2).sum(axis=2)
+    error = np.sqrt(scatter) / np.maximum(bend, 1e-12)
     one, other = np.nonzero(inside & (bend > 0) & ~np.eye(places.count, dtype=bool))
     value = candidates[best] + shift
     return _Diameters(one, other, value[one, other], error[one, other])
@@ -215,7 +232,7 @@ def _offsets(places: _Places, positions: Positions) -> tuple[Float[np.ndarray, "
     best_offsets(
         places.errors,
         places.gaps,
-        places.evidence.diameters_px**2,
+        places.squares_px2,
         positions,
         start,
         _WIDEST_OFFSET_STEPS * local / _REACH,
@@ -226,7 +243,7 @@ def _offsets(places: _Places, positions: Positions) -> tuple[Float[np.ndarray, "
         bends,
     )
     information = 0.5 * bends * _WINDOW_SAMPLES + 1e-9
-    shape = places.evidence.shape
+    shape = places.shape
     trust = information.reshape(shape).astype(np.float32)
     summed = cv2.GaussianBlur((offsets.reshape(shape) * trust).astype(np.float32), (0, 0), _SPREAD_STEPS)
     smooth = summed / cv2.GaussianBlur(trust, (0, 0), _SPREAD_STEPS)
@@ -237,7 +254,7 @@ def _dense(
     places: _Places, positions: Positions, offset: Float[np.ndarray, " cells"], error: Float[np.ndarray, " cells"], focus_index: Plane
 ) -> tuple[Plane, Plane]:
     height, width = focus_index.shape
-    shape = places.evidence.shape
+    shape = places.shape
     along = np.arange(places.count)
     fine = np.interp(focus_index, along, positions)
     moved = cv2.resize(offset.reshape(shape).astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)

@@ -13,8 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from capture.merging.focus_direction import Direction
-from capture.merging.relative_focus import RelativeFocus
+from capture.merging.depth_from_focus import FocusMap
+from capture.merging.focus_direction import Contours, Direction
+from capture.merging.focus_order import focus_order
+from capture.merging.registered_slices import RegisteredSlices, read_slice, source_path
+from capture.merging.relative_focus import RelativeFocus, solve_relative_focus
 from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_from_json, camera_to_json
 from mrbokeh.exr_io import ExrPart, write_exr
@@ -27,12 +30,16 @@ METRES = "metres"
 STATED = "stated_before_guessing"
 STATED_DISTANCE = "stated_focus_distance_m"
 POSITION = "blur_position_px"
+ORDER = "order_by_focus"
+"""Key in a stack's metadata: said in words that its slices were put in the order of their focus, which their names are not."""
+GIVEN_INDEX = "given_index"
 _NEAREST_DIOPTRES, _FARTHEST_DIOPTRES = 1.0, 0.5
 _FAR_OVER_NEAR = 2.0
 _LEAST_DIOPTRES = 1e-3
 _LEAST_RANGE_PX = 0.5
 _SENSOR_MM, _FOCAL_LENGTH_MM = 36.0, 35.0
 
+Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 
@@ -57,7 +64,8 @@ class Gauge:
 
 
 def as_stated(stack: FocalStack) -> FocalStack:
-    """The stack with nothing in it that an earlier merge guessed."""
+    """The stack with nothing in it that an earlier merge guessed, and its slices in the order in which they came."""
+    stack = _in_given_order(stack)
     if STATED not in stack.metadata:
         return stack
     kept: Mapping[str, Any] = stack.metadata[STATED]
@@ -76,6 +84,53 @@ def _stated_slice(each: Slice) -> Slice:
     stated = each.metadata.get(STATED_DISTANCE)
     metadata = {key: value for key, value in each.metadata.items() if key not in ours}
     return replace(each, focus_distance_m=None if stated is None else float(stated), metadata=metadata)
+
+
+def in_focus_order(stack: FocalStack) -> FocalStack:
+    """The slices, as ingested, sorted by their focus where pictures say that they came in another order."""
+    if stack.is_metric:
+        return stack
+    found = focus_order(lambda index: read_slice(stack.folder / source_path(stack.slices[index]))[0], len(stack))
+    if found.as_given:
+        return stack
+    slices = tuple(replace(stack.slices[i], metadata=stack.slices[i].metadata | {GIVEN_INDEX: i}) for i in found.order)
+    names = ", ".join(str(each.metadata.get("source", each.path)) for each in slices)
+    why = f"the slices were not in the order of their focus and have been put in it, as the pictures tell: {names}"
+    reference = found.order.index(stack.reference)
+    return replace(stack, slices=slices, reference=reference, metadata=stack.metadata | {ORDER: why})
+
+
+def _in_given_order(stack: FocalStack) -> FocalStack:
+    if ORDER not in stack.metadata:
+        return stack
+    order = sorted(range(len(stack)), key=lambda index: stack.slices[index].metadata[GIVEN_INDEX])
+    slices = tuple(
+        replace(each, metadata={key: value for key, value in each.metadata.items() if key != GIVEN_INDEX})
+        for each in (stack.slices[index] for index in order)
+    )
+    metadata = {key: value for key, value in stack.metadata.items() if key != ORDER}
+    return replace(stack, slices=slices, reference=order.index(stack.reference), metadata=metadata)
+
+
+def with_solved_blur(merged: FocalStack, slices: RegisteredSlices, all_in_focus: Rgb, focus: FocusMap) -> FocalStack:
+    """Solve the blur of registered slices and write it to depth.exr; the stack that comes back has it and guessed metres."""
+    index, confidence = focus.focus_index, focus.confidence
+    contours = Contours.of(index)
+    passing = lambda: contours.watching(slices.passing())  # noqa: E731
+    relative = solve_relative_focus(passing, all_in_focus, index, confidence, len(merged), slices.valid, slices.saturated)
+    direction = told_direction(merged, relative) or contours.direction(relative.positions_px, [each.scale for each in merged.slices])
+    guessed = with_guessed_metres(merged, relative, direction, (all_in_focus.shape[1], all_in_focus.shape[0]))
+    write_relative_depth(guessed, index, confidence, relative, direction)
+    return guessed
+
+
+def told_direction(stack: FocalStack, relative: RelativeFocus) -> Direction | None:
+    """The one that two or more stated distances tell."""
+    told = [(p, 1.0 / d) for p, d in zip(relative.positions_px, stack.focus_distances_m, strict=True) if d is not None]
+    if len(told) < 2 or np.ptp([d for _, d in told]) == 0.0:
+        return None
+    slope = np.polyfit([p for p, _ in told], [d for _, d in told], 1)[0]
+    return Direction(near_first=bool(slope < 0), source="stated distances", sure=True)
 
 
 def with_guessed_metres(stack: FocalStack, relative: RelativeFocus, direction: Direction, size_px: tuple[int, int]) -> FocalStack:
