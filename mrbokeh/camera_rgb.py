@@ -63,13 +63,20 @@ def write_camera_rgb(
 
     saturated: the share of each pixel that was full, 0 to 1. valid: where the slice has data. Both are left out if None.
     """
-    dtype = np.float16 if half else np.float32
-    channels = {name: rgb[..., index].astype(dtype) for index, name in enumerate("RGB")}
+    channels = dict(zip("RGB", _planes(rgb, half), strict=True))
     masks = {SATURATED: saturated, VALID: valid}
     channels |= {name: mask.astype(np.float16) for name, mask in masks.items() if mask is not None}
     primaries = None if rec709_from_camera is None else chromaticities(rec709_from_camera)
     header = dict(attributes or {}) | ({} if primaries is None else {"chromaticities": primaries})
     write_exr(path, ExrPart(channels, attributes=header))
+
+
+def _planes(rgb: Float[np.ndarray, "height width 3"], half: bool) -> tuple[Float[np.ndarray, "height width"], ...]:
+    """The channels apart; by OpenCV, which rounds to half as NumPy does in a quarter of its time."""
+    import cv2
+
+    rgb = np.ascontiguousarray(rgb, np.float32)
+    return tuple(cv2.split(cv2.multiply(rgb, 1.0, dtype=cv2.CV_16F) if half else rgb))  # type: ignore[call-overload]
 
 
 def read_camera_rgb(path: Path) -> Float32[np.ndarray, "height width 3"]:
