@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from capture.dataset.split import slices_of_a_single_stack
@@ -17,7 +18,7 @@ from mrbokeh.image_io import write_image
 from mrbokeh.image_metrics import psnr
 from mrbokeh.renderers._onnx_facts import facts_from_json
 from tests.test_train import DEMO_LIKE, LENS
-from training import train
+from training import held_out, train
 from training.blur_functions import blur_of
 from training.classical_blur import scatter_reference
 from training.cli import app
@@ -221,3 +222,23 @@ def test_crops_are_wider_than_the_rim_that_does_not_count(scene: Path, tmp_path:
     halo_px = int(np.ceil(read_facts(tmp_path / "run").largest_coc_px / 2.0))
     assert halo_px == 3
     assert all(weight.shape[2:] == (12, 12) and float(weight.mean()) >= 0.25 for weight in seen)
+
+
+def test_looks_are_at_the_middle_of_large_pictures(monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
+    """Of 40 x 56 px the middle 24 x 24 where that is the most, without the 3 px that get light from outside; a network that gives the
+    sharp picture has the score of that part."""
+    monkeypatch.setattr(held_out, "SIDE_PX", 24)
+    stacks, shapes = training_data([scene]).stacks, []
+
+    class Sharp(torch.nn.Module):
+        def forward(self, rgb: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+            shapes.append(tuple(rgb.shape[2:]))
+            return rgb
+
+    slices = {stack_name(stacks[0]): (2,)}
+    look = held_out.HeldOutSlices(stacks, slices).look(Sharp(), torch.device("cpu"))
+    pair = PairSet(stacks, slices=slices)[0]
+    halo_px = int(np.ceil(np.abs(pair.coc_px).max() / 2.0))
+    inside = np.s_[8 + halo_px : 32 - halo_px, 16 + halo_px : 40 - halo_px]
+    assert shapes == [(24, 24)]
+    assert look.psnr_db == pytest.approx(psnr(pair.all_in_focus[inside], pair.target[inside]), abs=0.01)
