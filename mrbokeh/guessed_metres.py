@@ -12,15 +12,31 @@ from mrbokeh.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 
 KEY = "metres"
 GUESSED = "guessed metres"
+BEFORE = "stated_before_guessing"
+"""Key in a stack's metadata: the lens and camera that it stated, or None."""
 POSITION, POSITION_ERROR = "blur_position", "blur_position_error"
 """Channels of depth.exr: where the surface lies in pixels of blur, growing towards the camera, and its standard error."""
-_WHY = "no focus distance is known"
+_WHY = "blur in pixels is solved from the slices, and no focus distance is known"
 
 
 def metres_facts(stack: FocalStack) -> Mapping[str, Any]:
     """known: whether metres are; why: in words; guessed: what else is a guess where they are known. Empty for stacks that state theirs."""
     facts = stack.metadata.get(KEY)
     return facts if isinstance(facts, Mapping) else {}
+
+
+def is_lens_guessed(stack: FocalStack) -> bool:
+    """Whether its focal length and f-number only stand for the blur that was measured."""
+    gauge = metres_facts(stack).get("gauge")
+    if not gauge:
+        return False
+    stated = gauge["scale_from"] == "lens" or bool((stack.metadata.get(BEFORE) or {}).get("lens"))
+    return not stated
+
+
+def is_view_guessed(stack: FocalStack) -> bool:
+    """Whether nobody knows the field of view."""
+    return is_lens_guessed(stack) and not (stack.metadata.get(BEFORE) or {}).get("camera")
 
 
 def unit_of(stack: FocalStack) -> str:
@@ -33,7 +49,7 @@ def metres_note(stack: FocalStack) -> str:
     facts = metres_facts(stack)
     if not stack.metres_known:
         return (
-            f"{stack.folder}: metres are guessed ({facts.get('why') or _WHY}): blur is measured from the slices; "
+            f"{stack.folder}: metres are guessed: {facts.get('why') or _WHY}; "
             f"give one known length by `mrbokeh capture scale {stack.folder} --ruler X1,Y1,X2,Y2,METRES`"
         )
     return f"{stack.folder}: {facts.get('why')}; still guessed: {facts['guessed']}" if facts.get("guessed") else ""

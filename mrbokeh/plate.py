@@ -12,6 +12,7 @@ from mrbokeh.depth_sources.depth_settings import DepthSettings
 from mrbokeh.depth_sources.open_depth import open_depth
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
+from mrbokeh.guessed_metres import is_lens_guessed
 from mrbokeh.held_lens import lens_as_held
 from mrbokeh.image_io import read_image
 from mrbokeh.lens import Lens
@@ -26,7 +27,8 @@ class Plate:
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
-    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same.
+    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. lens_guessed: the lens has its blur,
+    but its focal length and f-number are made up.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -37,6 +39,7 @@ class Plate:
     near_alpha: Float32[np.ndarray, "height width"] | None = None
     alpha: Float32[np.ndarray, "height width"] | None = None
     metres_guessed: bool = False
+    lens_guessed: bool = False
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -127,8 +130,9 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     rgb = stack.slice_rgb(slice_index)
     camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
-    upright, guessed = replace(camera, camera_from_world=np.eye(4)), not stack.metres_known
-    return Plate(rgb, stack.depth_m(), focused, upright, stack.all_in_focus(), metres_guessed=guessed)
+    upright = replace(camera, camera_from_world=np.eye(4))
+    plate = Plate(rgb, stack.depth_m(), focused, upright, stack.all_in_focus())
+    return replace(plate, metres_guessed=not stack.metres_known, lens_guessed=lens is None and is_lens_guessed(stack))
 
 
 def _pinhole(lens: Lens, rgb: Float32[np.ndarray, "height width 3"]) -> Camera:

@@ -58,7 +58,7 @@ def test_blur_in_pixels_is_that_of_the_true_metres(known: FocalStack, guessed: F
 
 def test_the_note_names_what_is_guessed_and_the_way_out(known: FocalStack, guessed: FocalStack) -> None:
     assert metres_note(known) == ""
-    assert "metres are guessed (no focus distance is stated)" in metres_note(guessed) and "--ruler" in metres_note(guessed)
+    assert "metres are guessed: no focus distance is stated;" in metres_note(guessed) and "--ruler" in metres_note(guessed)
     assert "\n" not in metres_note(guessed) and metres_notes([known, guessed]) == metres_note(guessed)
     assert "in 2 of the stacks" in metres_notes([guessed, guessed])
 

@@ -19,13 +19,14 @@ from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.guessed_metres import KEY, POSITION, metres_facts
+from mrbokeh.guessed_metres import KEY, POSITION, is_lens_guessed, is_view_guessed, metres_facts
 from mrbokeh.lens import Lens
 
 FACTS = "told"
-_BEFORE = "stated_before_guessing"
 _SLICE_POSITION = "blur_position_px"
 _NEAR_PIXEL_PX = 2
+_FARTHEST_SHARE = 0.01
+"""Of the picture's width: from no farther away a surface is taken for what is at a pixel, where nothing tells the depth there."""
 _LEAST_CONFIDENCE = 0.1
 _LEAST_SPREAD_PX = 3.0
 """Facts whose surfaces differ in blur by less lie at one depth: they cannot tell how deep the scene is."""
@@ -92,7 +93,9 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
             f"{stack.folder} knows its metres from its focus distances{' (' + sizes + ')' if sizes else ''}: to correct them state focus "
             f"distances in lens.toml and merge again, or find the scale of camera poses with --board or --distance"
         )
-    solving = _Solving(tuple(_Equation.of(each, depth_m, confidence, camera) for each in facts), _stated_dioptres(stack), _gauge(stack))
+    solving = _Solving(
+        tuple(_Equation.of(each, depth_m, confidence, camera) for each in facts), _stated_dioptres(stack), metres_facts(stack)["gauge"]
+    )
     found = solving.solution()
     changed = _regauged(stack, found, facts)
     _write_depth(changed, found.p, found.q)
@@ -211,11 +214,12 @@ def _depth_at(depth_m: Float32[np.ndarray, "height width"], confidence: Float32[
     height, width = depth_m.shape
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(f"pixel {x:g},{y:g} lies outside the picture of {width}x{height} px: read it off the all-in-focus picture")
-    rows, columns = (slice(max(int(at) - _NEAR_PIXEL_PX, 0), int(at) + _NEAR_PIXEL_PX + 1) for at in (y, x))
-    near = depth_m[rows, columns][(confidence[rows, columns] >= _LEAST_CONFIDENCE) & np.isfinite(depth_m[rows, columns])]
-    if not len(near):
-        raise InputError(f"nothing at pixel {x:g},{y:g} tells how far away it is: choose a place with texture")
-    return float(np.median(near))
+    known = (confidence >= _LEAST_CONFIDENCE) & np.isfinite(depth_m)
+    for radius_px in range(_NEAR_PIXEL_PX, max(round(_FARTHEST_SHARE * width), _NEAR_PIXEL_PX) + 1):
+        rows, columns = (slice(max(int(at) - radius_px, 0), int(at) + radius_px + 1) for at in (y, x))
+        if known[rows, columns].any():
+            return float(np.median(depth_m[rows, columns][known[rows, columns]]))
+    raise InputError(f"nothing at pixel {x:g},{y:g} tells how far away it is: choose a place with texture")
 
 
 def _now(fact: Fact, depth_m: np.ndarray, confidence: np.ndarray, camera: Camera) -> float:
@@ -228,22 +232,14 @@ def _stated_dioptres(stack: FocalStack) -> Float[np.ndarray, " slices"]:
     return np.array([1.0 / each for each in told if each], np.float64)
 
 
-def _gauge(stack: FocalStack) -> dict[str, Any]:
-    """Of merging; with where lens and field of view come from."""
-    gauge = dict(metres_facts(stack)["gauge"])
-    stated = stack.metadata.get(_BEFORE) or {}
-    known = gauge["scale_from"] == "lens" or bool(stated.get("lens"))
-    return {"lens_from": "stated" if known else "guess", "view_from": "stated" if known or stated.get("camera") else "guess"} | gauge
-
-
-def _told(gauge: Mapping[str, Any], facts: Sequence[Fact], deep: bool) -> dict[str, Any]:
+def _told(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fact], deep: bool) -> dict[str, Any]:
     """The stack's facts about metres, as they are now."""
     guessed = []
     if not deep:
         guessed.append("how deep the scene is for its distance, as all that was told lies at one depth")
     if not gauge.get("near_first_sure", True):
         guessed.append(f"that the {'first' if gauge.get('near_first') else 'last'} slice is the nearest")
-    if gauge["view_from"] == "guess":
+    if is_view_guessed(stack):
         guessed.append("the field of view, so that distances stand beside lengths in a guessed proportion")
     count = f"{len(facts)} known lengths and distances" if len(facts) > 1 else str(facts[0])
     told = [asdict(each) for each in facts]
@@ -253,15 +249,15 @@ def _told(gauge: Mapping[str, Any], facts: Sequence[Fact], deep: bool) -> dict[s
 def _regauged(stack: FocalStack, found: _Solution, facts: Sequence[Fact]) -> FocalStack:
     slices = tuple(_regauged_slice(stack, each, found.p, found.q) for each in stack.slices)
     distances_m = [float(each.focus_distance_m or 0.0) for each in slices]
-    gauge = _gauge(stack)
+    gauge = dict(metres_facts(stack)["gauge"])
     gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / abs(found.q), "offset_dioptres": found.p + found.q * gauge["offset_dioptres"]}
     gauge |= {"offset_from": "told"} | ({} if gauge["scale_from"] == "lens" else {"scale_from": "told"})
     gauge |= {"nearest_m": min(distances_m), "farthest_m": max(distances_m)}
     if found.directed:
         near_first = bool(gauge.get("near_first", True)) == (found.q > 0.0)
         gauge |= {"near_first": near_first, "near_first_from": "told", "near_first_sure": True}
-    lens = _lens_at(stack, gauge["lens_from"], distances_m)
-    return replace(stack, slices=slices, lens=lens, metadata=stack.metadata | {KEY: _told(gauge, facts, found.deep)})
+    lens = _lens_at(stack, distances_m)
+    return replace(stack, slices=slices, lens=lens, metadata=stack.metadata | {KEY: _told(stack, gauge, facts, found.deep)})
 
 
 def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
@@ -274,10 +270,10 @@ def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice
     return replace(each, focus_distance_m=1.0 / dioptres, metadata=metadata)
 
 
-def _lens_at(stack: FocalStack, lens_from: str, distances_m: list[float]) -> Lens | None:
+def _lens_at(stack: FocalStack, distances_m: list[float]) -> Lens | None:
     """A stated lens keeps its length; a nominal one is scaled like the world, so that it can focus there and sees the same."""
     lens = stack.lens
-    if lens is None or lens_from == "stated":
+    if lens is None or not is_lens_guessed(stack):
         return None if lens is None else lens.focused_at(distances_m[stack.reference])
     factor = min(new / float(old) for new, old in zip(distances_m, stack.focus_distances_m, strict=True) if old is not None)
     return replace(

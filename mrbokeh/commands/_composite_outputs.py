@@ -34,17 +34,19 @@ def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None],
 def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
     """The lens that blurred, and how much; where metres are guessed, what was measured: pixels."""
     lens, width_px = plate.lens, plate.rgb.shape[1]
-    told = f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g} focused at {lens.focus_distance_m:.3g} m"
-    if plate.metres_guessed:
-        told = f"blur as measured in the slices, focused at {lens.focus_distance_m:.3g} {GUESSED}"
+    unit = GUESSED if plate.metres_guessed else "m"
+    told = "blur as measured in the slices," if plate.lens_guessed else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
+    told += f" focused at {lens.focus_distance_m:.3g} {unit}"
     seen_m = np.concatenate(
         [np.empty(0, np.float32), *(layer.depth_m[(layer.alpha > 0.5) & np.isfinite(layer.depth_m)] for layer in sharp)]
     )
     if not len(seen_m):
         return told
     coc_px = np.abs(lens.coc_px(np.array([seen_m.min(), np.median(seen_m), seen_m.max()]), width_px))
-    unit = f"{GUESSED}, {_size_px(sharp)} px" if plate.metres_guessed else "m"
-    return f"{told}; put in at {seen_m.min():.3g} to {seen_m.max():.3g} {unit}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
+    size = f", {_size_px(sharp)} px" if plate.metres_guessed else ""
+    return (
+        f"{told}; put in at {seen_m.min():.3g} to {seen_m.max():.3g} {unit}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
+    )
 
 
 def _size_px(sharp: Sequence[Layer]) -> str:
