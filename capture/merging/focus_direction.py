@@ -86,13 +86,18 @@ class Contours:
             self._strength.append(self._step_strength(rgb))
             yield rgb
 
-    def direction(self, positions_px: Float[np.ndarray, " slices"], scales: Sequence[float]) -> Direction:
-        """From the slices that have passed; positions_px: where they are focused; scales: how much registration enlarged each."""
+    def direction(self, positions_px: Float[np.ndarray, " slices"], scales: Sequence[float], as_given: bool = True) -> Direction:
+        """From the slices that have passed; positions_px: where they are focused; scales: how much registration enlarged each.
+
+        as_given: slices are in the order of their names, which tends to be near first.
+        """
         z = self._z(positions_px)
         # What registration enlarges least sees the narrowest field.
-        field = float(np.log(scales[0] / scales[-1])) * -np.sign(z)
+        field = float(np.log(scales[-1] / scales[0]) * np.sign(z))
         sure = abs(z) >= (_SURE_Z_WITH_FIELD if field >= _FIELD_AGREES else _SURE_Z) and field > -_FIELD_CONTRADICTS
-        return Direction(near_first=z > 0, source="contours", sure=True, z=z) if sure else replace(FILE_ORDER, z=z)
+        if sure or not as_given:
+            return Direction(near_first=z >= 0, source="contours", sure=sure, z=z)
+        return replace(FILE_ORDER, z=z)
 
     def _z(self, positions_px: Float[np.ndarray, " slices"]) -> float:
         """Standard errors, from blocks of the picture, by which the low side's slice shows contours sharper than the high side's."""

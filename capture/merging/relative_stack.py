@@ -45,7 +45,7 @@ Plane = Float32[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Gauge:
-    """dioptres = offset_dioptres + position_px / px_per_dioptre (below 0 where the last slice is the nearest... signed).
+    """dioptres = offset_dioptres + position_px / px_per_dioptre, for positions that grow towards the camera.
 
     scale_from, offset_from: "distances", "lens" or "guess".
     """
@@ -118,7 +118,8 @@ def with_solved_blur(merged: FocalStack, slices: RegisteredSlices, all_in_focus:
     contours = Contours.of(index)
     passing = lambda: contours.watching(slices.passing())  # noqa: E731
     relative = solve_relative_focus(passing, all_in_focus, index, confidence, len(merged), slices.valid, slices.saturated)
-    direction = told_direction(merged, relative) or contours.direction(relative.positions_px, [each.scale for each in merged.slices])
+    scales, as_given = [each.scale for each in merged.slices], ORDER not in merged.metadata
+    direction = told_direction(merged, relative) or contours.direction(relative.positions_px, scales, as_given)
     guessed = with_guessed_metres(merged, relative, direction, (all_in_focus.shape[1], all_in_focus.shape[0]))
     write_relative_depth(guessed, index, confidence, relative, direction)
     return guessed
@@ -133,9 +134,11 @@ def told_direction(stack: FocalStack, relative: RelativeFocus) -> Direction | No
     return Direction(near_first=bool(slope < 0), source="stated distances", sure=True)
 
 
-def with_guessed_metres(stack: FocalStack, relative: RelativeFocus, direction: Direction, size_px: tuple[int, int]) -> FocalStack:
-    """The merged stack with a focus distance for every slice, a lens that blurs as was solved and a camera. size_px: (width, height)."""
-    stated = as_stated(stack)
+def with_guessed_metres(stated: FocalStack, relative: RelativeFocus, direction: Direction, size_px: tuple[int, int]) -> FocalStack:
+    """The merged stack, in which nothing is guessed yet, with a focus distance for every slice, a lens that blurs as solved and a camera.
+
+    size_px: (width, height).
+    """
     positions_px = nearness_px(relative.positions_px, direction)
     gauge = gauge_of(stated, positions_px, size_px)
     dioptres = gauge.dioptres(positions_px)
@@ -157,7 +160,7 @@ def with_guessed_metres(stack: FocalStack, relative: RelativeFocus, direction: D
         )
         for each, distance_m, position, error in zip(stated.slices, distances_m, positions_px, relative.errors_px, strict=True)
     )
-    lens = _nominal_lens(stated, size_px, growth, distances_m[stack.reference])
+    lens = _nominal_lens(stated, size_px, growth, distances_m[stated.reference])
     before = {
         "lens": None if stated.lens is None else lens_to_json(stated.lens),
         "camera": None if stated.camera is None else camera_to_json(stated.camera),
@@ -274,6 +277,7 @@ def _gauge_json(gauge: Gauge, direction: Direction, distances_m: list[float]) ->
         "near_first": direction.near_first,
         "near_first_from": direction.source,
         "near_first_sure": direction.sure,
+        "near_first_z": direction.z,
     }
 
 
