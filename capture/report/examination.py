@@ -53,8 +53,8 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
     found, disagreements, evidence = [], [], DepthEvidence()
     picture, places = PictureEvidence(), PlaceEvidence()
     for index in track(range(len(view)), f"{view.stack.folder.name}: examine"):
-        rgb, masks = view.stored(index)
-        picture.add(rgb, masks.valid)
+        stored = view.stored(index)
+        picture.add(stored.rgb, stored.camera_rgb, stored.masks.valid)
         places.add(view.slice_rgb(index), view.usable(index))
         of_slice, kept = _examine_slice(view, index, reblur, evidence, watch)
         found.append(of_slice)
@@ -62,7 +62,8 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
             disagreements.append(kept)
     depth = evidence.check() if view.is_explained else None
     moved = None if depth is None else moving(disagreements, depth.off_px)
-    look = picture.look(view.stack.all_in_focus())
+    camera_rgb = view.stack.all_in_focus_camera_rgb()
+    look = picture.look(view.stack.to_rec709(camera_rgb), camera_rgb)
     curve = focus_curve(view.focus_index, view.confidence, len(view))
     findings = StackFindings(
         view.stack,

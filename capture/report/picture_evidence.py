@@ -22,7 +22,7 @@ class PictureFindings:
     """Numbers of a picture beside its slices (see `detail.Sharpness`).
 
     lost: None where the picture has no textured blocks. flat: None where it has fewer than FEWEST_FLAT flat ones. top, slices_top: largest
-    linear value of the picture and of all slices. seen_px: width and height of what was looked at.
+    value of the picture and of all slices, in the RGB in which they are stored. seen_px: width and height of what was looked at.
     """
 
     lost: float | None
@@ -43,18 +43,18 @@ class PictureEvidence:
     _details: list[Blocks] = field(default_factory=list)
     _brightest: list[AllBlocks] = field(default_factory=list)
 
-    def add(self, rgb: Rgb, valid: Mask) -> None:
-        """A slice as it is stored; blocks in which it lacks data do not count as sharp."""
+    def add(self, rgb: Rgb, camera_rgb: Rgb, valid: Mask) -> None:
+        """A slice at the size of its file, in Rec.709 and as it is stored; blocks in which it lacks data do not count as sharp."""
         detail = block_detail(rgb)
         self._details.append(detail if valid.all() else np.where(inner_blocks(valid).all(axis=(1, 3)), detail, np.float32(0.0)))
-        self._brightest.append(_largest_of_blocks(rgb))
+        self._brightest.append(_largest_of_blocks(camera_rgb))
 
-    def look(self, picture: Rgb) -> "PictureLook":
-        """picture: all in focus, of the slices' size."""
+    def look(self, picture: Rgb, camera_rgb: Rgb) -> "PictureLook":
+        """picture, camera_rgb: all in focus, of the slices' size."""
         of_slices = np.stack(self._brightest)
         sharpest = SharpestSlices.of_details(self._details, float(of_slices.max()))
         sharpness = sharpest.measure(picture) if sharpest.detail.size else None
-        return PictureLook(sharpest, sharpness, picture, _largest_of_blocks(picture), of_slices.max(axis=0), of_slices.argmax(axis=0))
+        return PictureLook(sharpest, sharpness, picture, _largest_of_blocks(camera_rgb), of_slices.max(axis=0), of_slices.argmax(axis=0))
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class PictureLook:
         sharpness, size_px = self.sharpness, (self.picture.shape[1], self.picture.shape[0])
         lost = sharpness.lost if sharpness is not None and self.sharpest.textured.any() else None
         flat = sharpness.flat if sharpness is not None and self.sharpest.flat.sum() >= FEWEST_FLAT else None
-        return PictureFindings(lost, flat, float(self.picture.max()), self.sharpest.largest, size_px)
+        return PictureFindings(lost, flat, float(self.brightest.max()), self.sharpest.largest, size_px)
 
     def corner_px(self, row: int, column: int) -> tuple[int, int]:
         """x, y of the first pixel of a block of `sharpest`."""

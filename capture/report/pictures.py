@@ -57,7 +57,8 @@ def slice_triple(index: int, rgb: Rgb, prediction: Rgb) -> list[Shown]:
 def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *, enhance: bool, overlay: bool) -> list[Shown]:
     """Crops at 100 %, each with its name; block: x, y and side of a square to be framed in all of them.
 
-    enhance: raise the contrast of all alike, until the first fills the range. overlay: add the last two crops in red and cyan.
+    enhance: raise the contrast of all alike, until what lies around the square in the first fills the range. overlay: add the last two
+    crops in red and cyan.
     """
     levels = [display_rgb8(np.clip(rgb, 0.0, 1e4).astype(np.float32)).astype(np.float32) for _, rgb in crops]
     names, contrast = [name for name, _ in crops], 1.0
@@ -66,8 +67,10 @@ def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *
         levels.append(np.stack([red, cyan, cyan], axis=2))
         names.append(f"{names[-2]} in red, {names[-1]} in cyan")
     if enhance:
-        middle = levels[0].mean(axis=(0, 1))
-        contrast = float(np.clip(110.0 / max(np.percentile(np.abs(levels[0] - middle), 99.0), 1e-3), 1.0, _MOST_CONTRAST))
+        x, y, side = block
+        around = levels[0][max(y - side // 2, 0) : y + 3 * side // 2, max(x - side // 2, 0) : x + 3 * side // 2]
+        middle = around.mean(axis=(0, 1))
+        contrast = float(np.clip(110.0 / max(np.percentile(np.abs(around - middle), 99.0), 1e-3), 1.0, _MOST_CONTRAST))
         levels = [127.0 + contrast * (each - middle) for each in levels]
     suffix = f", contrast {contrast:.1f} times" if contrast > 1.0 else ""
     return [

@@ -24,6 +24,7 @@ details { margin: 1rem 0; border-top: 1px solid #ddd; padding-top: .6rem; } summ
 @media (max-width: 640px) {
   .gates tr:first-child { display: none; } .gates tr { display: block; padding: .5rem 0; border-bottom: 1px solid #ccc; }
   .gates td { display: block; border: 0; padding: 0; } .gates td.name { font-weight: bold; }
+  .place { display: block; margin-right: 0; }
   .gates td.wanted::before { content: "wanted: "; } .gates td.why { color: #667; font-size: 13px; }
 }
 """

@@ -6,10 +6,10 @@ much reads as 9.6 % of blur. The merged stacks of the demo's desk, which are rig
 calibrated focus, but -3.3 to -3.5 % before calibration and second pass: blur that merging leaves in the all-in-focus picture, and depth
 from focus. 7 % leaves twice that, and is below a tenth.
 
-The gates that need no lens were set on 14 real stacks. Registered slices, measured where both are sharp, lie 0.0 to 0.6 px apart (standard
-errors 0.01 to 0.4); those of a phone held by hand 1.4 px at a width of 1600. 1 px tells them apart, and is what one sees at 100 %. Where too
-little is sharp in both, what is left is how far pairs of the registration disagree at a corner: at most 0.17 % of the width on 30 stacks
-from a light field camera, whose slices cannot move, and 0.25 % on others, but 0.4 % on one of these stacks whose slices were put 1 % apart.
+The gates that need no lens were set on 14 real stacks. Registered slices, measured where both are sharp, lie 0.0 to 0.6 px apart
+(standard errors 0.01 to 0.4); those of a phone held by hand 1.4 px at a width of 1600. 1 px tells them apart, and is what one sees at 100%.
+Where too little is sharp in both, what is left is how far pairs of the registration disagree at a corner: at most 0.17% of the width on 30
+stacks from a light field camera, whose slices cannot move, and 0.25% on others, but 0.4% on one of these whose slices were put 1% apart.
 """
 
 from capture.report.detail import KEPT_DETAIL

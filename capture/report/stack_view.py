@@ -22,6 +22,15 @@ _UNTOUCHED = 0.999
 
 
 @dataclass(frozen=True)
+class StoredSlice:
+    """A slice as its file has it: in Rec.709, in the RGB of the file, and its masks."""
+
+    rgb: Rgb
+    camera_rgb: Rgb
+    masks: SliceMasks
+
+
+@dataclass(frozen=True)
 class StackView:
     """Pictures of a merged stack, at most `widest_px` wide. Circles of confusion shrink with the pictures.
 
@@ -39,29 +48,29 @@ class StackView:
     def all_in_focus(self) -> Rgb:
         return self._shrunk(self.stack.all_in_focus())
 
-    def stored(self, index: int) -> tuple[Rgb, SliceMasks]:
-        """A slice at the size of its file, in Rec.709, and its masks. The last one that was asked for is held."""
+    def stored(self, index: int) -> "StoredSlice":
+        """A slice at the size of its file. The last one that was asked for is held."""
         return self._read(index)
 
     def slice_rgb(self, index: int) -> Rgb:
-        return self._shrunk(self.stored(index)[0])
+        return self._shrunk(self.stored(index).rgb)
 
     def usable(self, index: int) -> Mask:
         """Where a slice has data and none of it is saturated."""
-        masks = self.stored(index)[1]
+        masks = self.stored(index).masks
         return self._shrunk_mask(masks.valid & ~masks.saturated)
 
     def saturated(self, index: int) -> Mask:
-        return ~self._shrunk_mask(~self.stored(index)[1].saturated)
+        return ~self._shrunk_mask(~self.stored(index).masks.saturated)
 
     @cached_property
-    def _read(self) -> Callable[[int], tuple[Rgb, SliceMasks]]:
+    def _read(self) -> Callable[[int], "StoredSlice"]:
         # Not self: a view that refers to itself would outlive its use.
         stack = self.stack
 
-        def read(index: int) -> tuple[Rgb, SliceMasks]:
+        def read(index: int) -> StoredSlice:
             camera_rgb, masks = read_slice(stack.folder / stack.slices[index].path)
-            return stack.to_rec709(camera_rgb), masks
+            return StoredSlice(stack.to_rec709(camera_rgb), camera_rgb, masks)
 
         return lru_cache(maxsize=1)(read)
 

@@ -14,6 +14,7 @@ from capture.report.stack_rules import LARGEST_FLAT, LARGEST_LOST, LARGEST_TOP, 
 from mrbokeh.focal_stack import FocalStack
 
 Rgb = Float32[np.ndarray, "height width 3"]
+Crop = Float32[np.ndarray, "crop_height crop_width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 CROP_PX = 160
@@ -49,7 +50,7 @@ def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[Neighbou
 
 def shown_places(stack: FocalStack, picture: Rgb, places: Sequence[Place]) -> list[ShownPlace]:
     """Crops of the all-in-focus picture and of the slices, each of which is read once."""
-    cuts: dict[tuple[int, int], Rgb] = {}
+    cuts: dict[tuple[int, int], Crop] = {}
     for index in sorted({index for place in places for index, _ in place.slices}):
         rgb = stack.slice_rgb(index)
         for number, place in enumerate(places):
@@ -136,7 +137,7 @@ def _merged_from(focus_index: Plane, at_px: tuple[int, int]) -> list[int]:
     return sorted(int(each) for each in indices[np.argsort(-counts, kind="stable")][:2])
 
 
-def _cut(rgb: Rgb, at_px: tuple[int, int]) -> tuple[Rgb, tuple[int, int]]:
+def _cut(rgb: Rgb, at_px: tuple[int, int]) -> tuple[Crop, tuple[int, int]]:
     """CROP_PX around a block, inside the picture, and x, y of the block in it."""
     height, width = rgb.shape[:2]
     left, top = (
