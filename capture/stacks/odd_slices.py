@@ -15,6 +15,7 @@ _BLACK = 0.002
 _TIMES_AS_BRIGHT = 30.0
 _SAME_FOCUS = 1e-3
 _ASKED_OF_EACH = 6
+_MOST_SCENES = 12
 ALL_THE_SAME = "--group none takes all"
 
 Odd = dict[int, str]
@@ -87,13 +88,18 @@ def strangers(candidates: Sequence[Candidate]) -> Odd:
 
 
 def _scenes(looks: Sequence[SliceLook]) -> list[list[int]]:
-    """Indices of what hangs together: first each with the one before it, then what that leaves apart with some of every other scene."""
+    """Indices of what hangs together: first each with the one before it, then what that leaves apart with some of every other scene.
+
+    Many scenes are not asked: that is a folder of stacks, not a stack with one or two strangers.
+    """
     scenes: list[list[int]] = []
     for index, look in enumerate(looks):
         if scenes and one_scene(looks[scenes[-1][-1]], look):
             scenes[-1].append(index)
         else:
             scenes.append([index])
+    if len(scenes) > _MOST_SCENES:
+        return scenes
     joined: list[list[int]] = []
     for scene in scenes:
         related = [other for other in joined if _hang_together(looks, scene, other)]

@@ -78,9 +78,10 @@ def look_at(
     """rgb: in the RGB that rec709_from_camera leads from, None where it is Rec.709."""
     import cv2
 
-    shrink = min(1.0, _LONG_SIDE_PX / max(rgb.shape[:2]))
-    size = max(1, round(rgb.shape[1] * shrink)), max(1, round(rgb.shape[0] * shrink))
-    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA) if shrink < 1.0 else rgb
+    # A whole number, for which area averages take a third of the time.
+    shrink = max(1, round(max(rgb.shape[:2]) / _LONG_SIDE_PX))
+    size = max(1, rgb.shape[1] // shrink), max(1, rgb.shape[0] // shrink)
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA) if shrink > 1 else rgb
     light = luminance(small if rec709_from_camera is None else convert(small, np.array(rec709_from_camera)))
     codes = cv2.convertScaleAbs(np.sqrt(np.clip(light, 0.0, 1.0)), alpha=255.0)
     return SliceLook(low_frequency(small, saturated, rec709_from_camera), codes, full)
