@@ -62,8 +62,10 @@ def attempted(command: list[str], timeout_s: float | None = None) -> Cost:
     )
     try:
         counted, said = launcher.communicate(timeout=timeout_s)
-    except subprocess.TimeoutExpired:
+    except BaseException as stopped:
         os.killpg(launcher.pid, signal.SIGKILL)
+        if not isinstance(stopped, subprocess.TimeoutExpired):
+            raise
         _, said = launcher.communicate()
         return Cost(float("nan"), float("nan"), 124, f"{said}\nno end after {timeout_s:.0f} s")
     cpu_s, memory_kb = counted.split()[-2:]

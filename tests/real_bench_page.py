@@ -20,7 +20,7 @@ RENDERED_BAR_DB, RESIDUALS_BAR_DB = 33.0, 36.0
 CORRELATION_BAR = 0.99
 STYLE = """
 .crops { display: flex; flex-wrap: wrap; gap: 6px; margin: .3rem 0 1rem; } .crops figure { margin: 0; max-width: none; }
-.crops img { max-width: none; display: block; } td { font-variant-numeric: tabular-nums; }
+.crops img { max-width: none; display: block; } td { font-variant-numeric: tabular-nums; } .wide td { min-width: 2.5rem; }
 """
 
 
@@ -133,7 +133,7 @@ def write_bench_page(path: Path, bench: Bench) -> None:
     blocks.append(section("Stacks", f"CPU seconds are those of ingest and merge, the report's apart. {speeds}", [_stack_table(bench)]))
     if bench.ranking:
         blocks.append(_pairs_section(bench.ranking, bench.agreements))
-    blocks.append(section("Worst places", "Crops at 100 %, of each stack that has some.", _crops(bench)))
+    blocks.append(section("Stack by stack", "Crops at 100 % of the worst places, beside the sharpest slice and the peers.", _crops(bench)))
     write_page(path, "Real focus stacks", blocks, STYLE)
 
 
@@ -149,7 +149,7 @@ def _stack_table(bench: Bench) -> str:
     headings = ["stack", "slices", "size"]
     for name in (OURS, *bench.peers):
         headings += [f"{name}: lost %", "flat", "top", "CPU s", "MB"]
-    headings += ["report CPU s", "gates judged", "gates failed", "left out dB", "with residuals", "focus"]
+    headings += ["report CPU s", "gates judged", "failed", "left out dB", "with residuals", "focus"]
     return table(headings, [_stack_row(result, bench.peers) for result in bench.results])
 
 
@@ -162,23 +162,23 @@ def _stack_row(result: StackResult, peers: Sequence[str]) -> list[str]:
     report, gates, refocus, focus = result.costs.get("process"), result.gates, result.refocus, result.focus
     cells.append(cell(f"{report[0]:.1f}" if report else "-", "number"))
     cells.append(cell(f"{gates['judged']} of {gates['gates']}" if gates else "-"))
-    cells.append(cell(", ".join(gates["failed"]) if gates else "-"))
-    cells.append(cell(_number(refocus.rendered_db, ".1f", refocus.said) if refocus else "-"))
-    cells.append(cell(_number(refocus.with_residuals_db, ".1f") if refocus else "-"))
-    cells.append(cell(f"{_number(focus.correlation, '.4f')} ({focus.said})" if focus else "-"))
+    cells.append(cell(str(len(gates["failed"])) if gates else "-", "number"))
+    cells.append(cell(_number(refocus.rendered_db, ".1f") if refocus else "-", "number"))
+    cells.append(cell(_number(refocus.with_residuals_db, ".1f") if refocus else "-", "number"))
+    cells.append(cell(_number(focus.correlation, ".4f") if focus else "-", "number"))
     return cells
 
 
 def _figure_cells(figures: Figures, met: tuple[bool | None, bool | None, bool | None]) -> Iterator[str]:
     lost = None if figures.lost is None else 100.0 * figures.lost
     for value, style, verdict in zip((lost, figures.flat, figures.top), (".2f", ".2f", ".2f"), met, strict=True):
-        yield cell(_number(value, style, figures.said if value is lost else ""), _kind(verdict) if verdict is not None else "number")
+        yield cell(_number(value, style), _kind(verdict) if verdict is not None else "number")
     yield cell(_number(figures.cpu_s, ".1f"), "number")
     yield cell(_number(figures.memory_mb, ".0f"), "number")
 
 
-def _number(value: float | None, style: str, instead: str = "") -> str:
-    return (instead or "-") if value is None else format(value, style)
+def _number(value: float | None, style: str) -> str:
+    return "-" if value is None else format(value, style)
 
 
 def _pairs_section(ranking: Ranking, agreements: Sequence[Agreement]) -> str:
@@ -202,12 +202,23 @@ def _agreement_row(each: Agreement) -> list[str]:
 
 def _crops(bench: Bench) -> Iterator[str]:
     for result in bench.results:
-        if result.shown:
-            yield f"<h3>{html.escape(result.name)}</h3>"
+        if notes := list(_notes(result)):
+            yield f'<h3>{html.escape(result.name)}</h3><div class="muted">{html.escape("; ".join(notes))}</div>'
         for shown in result.shown:
             figures = (_crop(bench.crops / crop.file, crop.name) for crop in shown.crops)
             place = f"{shown.place.said}, at ({shown.place.x}, {shown.place.y})"
             yield f'<div class="muted">{html.escape(place)}</div><div class="crops">{"".join(figures)}</div>'
+
+
+def _notes(result: StackResult) -> Iterator[str]:
+    """What does not go into the table."""
+    if result.gates:
+        yield f"gates failed: {', '.join(result.gates['failed']) or 'none'}"
+    if result.refocus:
+        yield f"left out: {result.refocus.said}"
+    if result.focus:
+        yield f"focus positions: {result.focus.said}"
+    yield from (f"{name}: {figures.said}" for name, figures in result.figures.items() if figures.said)
 
 
 def _crop(path: Path, name: str) -> str:
