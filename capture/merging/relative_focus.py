@@ -38,7 +38,8 @@ _WINDOW_SAMPLES = 12.0
 """Independent pixels in a window, for the uncertainty of a place."""
 _PRIOR_STEPS = 0.5
 _SPREAD_STEPS = 1.0
-_LEAST_ERROR_PX, _LEAST_ERROR_SHARE = 0.05, 0.02
+_LEAST_ERROR_PX2, _LEAST_ERROR_SHARE = 0.4, 0.02
+"""Blur below a pixel shows by its square alone."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,8 @@ def _solved(measured: _Diameters, before: Positions, count: int) -> tuple[Positi
     rows = np.zeros((len(wanted), count))
     rows[np.arange(len(wanted)), measured.one] += 1.0
     rows[np.arange(len(wanted)), measured.other] -= 1.0
-    sigma = np.sqrt(measured.error_px**2 + _LEAST_ERROR_PX**2 + (_LEAST_ERROR_SHARE * wanted) ** 2)
+    least = _LEAST_ERROR_PX2 / np.maximum(np.abs(wanted), 0.5)
+    sigma = np.sqrt(measured.error_px**2 + least**2 + (_LEAST_ERROR_SHARE * wanted) ** 2)
     typical = float(np.median(np.abs(wanted) / np.abs(measured.one - measured.other))) if len(wanted) else 1.0
     bends = np.diff(np.eye(count), 2, axis=0) / (2.0 * max(typical, 0.1))
     robust = np.ones(len(wanted))
@@ -217,6 +219,7 @@ def _solved(measured: _Diameters, before: Positions, count: int) -> tuple[Positi
     excess = max(1.0, float((robust * off**2).sum()) / max(len(wanted) - count + 1, 1))
     steps = np.diff(np.eye(count), axis=0)
     step_error = np.sqrt(np.einsum("ij,jk,ik->i", steps, covariance, steps) * excess)
+    step_error = np.hypot(step_error, 0.5 * _LEAST_ERROR_PX2 / np.maximum(steps @ positions, 0.5))
     return positions, np.array([max(step_error[max(i - 1, 0)], step_error[min(i, count - 2)]) for i in range(count)])
 
 

@@ -1,0 +1,192 @@
+"""Blur solved from slices alone: positions in pixels against those that the slices were rendered with, order and near end of the sweep."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.merging.all_in_focus import all_in_focus
+from capture.merging.focus_direction import Contours
+from capture.merging.focus_order import focus_order
+from capture.merging.merge import merge_scene
+from capture.merging.relative_focus import solve_relative_focus
+from mrbokeh.camera_rgb import write_camera_rgb
+from mrbokeh.exr_io import read_exr
+from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.layer import opaque
+from mrbokeh.lens import Lens
+from mrbokeh.renderers.polygon_differences import PolygonDifferences
+
+SIZE = (200, 280)
+# Uneven steps of focus, in dioptres, nearest first; 30 px of blur to each: 2.4 to 6 px from one slice to the next.
+DIOPTRES = (1.5, 1.3, 1.22, 1.05, 0.9, 0.75)
+GROWTH = 30.0
+# A card in front of a wall that leans back.
+CARD_DIOPTRES = 1.38
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """slices, nearest focus first; sharp: all-in-focus truth; dioptres: (H, W) of its surfaces."""
+
+    slices: tuple[np.ndarray, ...]
+    sharp: np.ndarray
+    dioptres: np.ndarray
+
+    @property
+    def index(self) -> np.ndarray:
+        """(H, W) the fractional index of the slice in which each pixel is sharp."""
+        return np.interp(-self.dioptres, [-each for each in DIOPTRES], np.arange(len(DIOPTRES))).astype(np.float32)
+
+
+@cache
+def rendered(noise: float = 0.0) -> Rendered:
+    rng = np.random.default_rng(3)
+    height, width = SIZE
+    texture = 0.25 * rng.random((height, width, 3)) + 0.35 * cv2.resize(
+        rng.random((height // 5, width // 5, 3)), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+    dioptres = np.broadcast_to(np.linspace(0.72, 1.25, width), SIZE).copy()
+    card = np.s_[40:150, 60:150]
+    texture[card] = texture[card] + 0.3
+    dioptres[card] = CARD_DIOPTRES
+    # A photograph's pixels are means over their area.
+    sharp = cv2.GaussianBlur(texture, (0, 0), 0.5).astype(np.float32)
+    renderer, layer = PolygonDifferences(threads=1), opaque(sharp, (1.0 / dioptres).astype(np.float32))
+    lens = Lens(35.0, 1.0, 1.0, 36.0)
+    slices = []
+    for each in DIOPTRES:
+        focused = lens.focused_at(1.0 / each)
+        focused = Lens(35.0, focused.coc_px_per_dioptre(width) / GROWTH, 1.0 / each, 36.0)
+        slices.append((renderer.render([layer], focused).rgb + noise * rng.standard_normal((height, width, 3))).astype(np.float32))
+    return Rendered(tuple(slices), sharp, dioptres.astype(np.float32))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_positions_and_surfaces_are_those_of_the_lens(noise: float) -> None:
+    scene = rendered(noise)
+    merged = all_in_focus(scene.slices, scene.index)
+    solved = solve_relative_focus(lambda: scene.slices, merged, scene.index, np.ones(SIZE, np.float32), len(DIOPTRES))
+    true_px = -GROWTH * np.array(DIOPTRES)
+    # The growth of blur is met to a few per cent, and each slice to a seventh of a pixel besides.
+    scale, offset = np.polyfit(solved.positions_px, true_px, 1)
+    assert scale == pytest.approx(1.0, abs=0.03)
+    assert np.abs(scale * solved.positions_px + offset - true_px).max() < 0.15
+    assert (solved.errors_px < 0.5).all()
+    off_px = np.abs(scale * solved.focus_px + offset + GROWTH * scene.dioptres)[20:-20, 20:-20]
+    assert np.median(off_px) < 0.2, "a twentieth of the mean step"
+    assert np.median(off_px / solved.error_px[20:-20, 20:-20]) < 1.5, "errors are of the size that is stated"
+
+
+def test_a_slice_too_many_does_no_harm() -> None:
+    """The same photograph twice: two slices of one position, as far as blur below a pixel can be told."""
+    scene = rendered()
+    twice = (*scene.slices[:3], scene.slices[2], *scene.slices[3:])
+    index = np.interp(scene.index, [0, 1, 2, 3, 4, 5], [0, 1, 2.5, 4, 5, 6]).astype(np.float32)
+    solved = solve_relative_focus(lambda: twice, all_in_focus(twice, index), index, np.ones(SIZE, np.float32), len(twice))
+    assert solved.positions_px[3] - solved.positions_px[2] < 1.0
+    true_px = -GROWTH * np.array([*DIOPTRES[:3], DIOPTRES[2], *DIOPTRES[3:]])
+    assert np.corrcoef(solved.positions_px, true_px)[0, 1] > 0.998
+
+
+def test_where_a_slice_has_no_data_it_says_nothing() -> None:
+    scene = rendered()
+    broken = list(scene.slices)
+    broken[1] = broken[1].copy()
+    broken[1][:, :100] = 0.0
+    known = np.ones(SIZE, bool)
+    known[:, :100] = False
+    solved = solve_relative_focus(
+        lambda: broken,
+        scene.sharp,
+        scene.index,
+        np.ones(SIZE, np.float32),
+        len(broken),
+        lambda index: known | (index != 1),
+    )
+    assert np.corrcoef(solved.positions_px, -GROWTH * np.array(DIOPTRES))[0, 1] > 0.998
+
+
+@pytest.mark.parametrize("far_first", [False, True])
+def test_contours_tell_which_end_is_near(far_first: bool) -> None:
+    """The card hides the wall: its outline is sharp with the card, whichever slice comes first."""
+    scene = rendered()
+    slices = scene.slices[::-1] if far_first else scene.slices
+    index = (len(DIOPTRES) - 1 - scene.index if far_first else scene.index).astype(np.float32)
+    contours = Contours.of(index)
+    list(contours.watching(slices))
+    positions_px = GROWTH * np.array(DIOPTRES[::-1] if far_first else [-each for each in DIOPTRES])
+    found = contours.direction(np.sort(positions_px), [1.0] * len(slices))
+    assert found.near_first is not far_first
+    assert found.sure and found.source == "contours"
+
+
+def test_without_contours_the_order_of_files_stands_and_is_called_a_guess() -> None:
+    index = np.broadcast_to(np.linspace(0.0, 5.0, SIZE[1], dtype=np.float32), SIZE).copy()
+    contours = Contours.of(index)
+    list(contours.watching(rendered().slices))
+    found = contours.direction(np.arange(6.0), [1.0] * 6)
+    assert found.near_first and not found.sure and found.source == "file order"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_shuffled_slices_are_put_in_order(seed: int) -> None:
+    order = np.random.default_rng(seed).permutation(len(DIOPTRES))
+    slices = [rendered(0.01).slices[each] for each in order]
+    found = focus_order(lambda index: slices[index], len(slices)).order
+    sorted_as = [int(order[each]) for each in found]
+    assert sorted_as in (sorted(sorted_as), sorted(sorted_as)[::-1])
+
+
+def test_a_right_order_and_a_sweep_there_and_back() -> None:
+    slices = rendered(0.01).slices
+    assert focus_order(lambda index: slices[index], len(slices)).as_given
+    assert focus_order(lambda index: slices[::-1][index], len(slices)).as_given, "far first is an order too"
+    there_and_back = [0, 2, 4, 5, 3, 1]
+    found = focus_order(lambda index: slices[there_and_back[index]], len(slices)).order
+    assert [there_and_back[each] for each in found] in ([0, 1, 2, 3, 4, 5], [5, 4, 3, 2, 1, 0])
+    assert focus_order(lambda index: slices[index], 2).as_given
+
+
+def unmerged(folder: Path, order: tuple[int, ...], distances_m: dict[int, float] | None = None, **metadata: object) -> None:
+    """A stack as ingested: slices of `rendered` in an order, most or all of them without a distance."""
+    slices = []
+    for place, each in enumerate(order):
+        write_camera_rgb(folder / f"slices/{place:02d}.exr", rendered(0.003).slices[each], None)
+        slices.append(Slice(f"slices/{place:02d}.exr", (distances_m or {}).get(each), metadata={"source": f"{each}.jpg"}))
+    write_focal_stack(FocalStack(folder, tuple(slices), metadata=dict(metadata)))
+
+
+def test_a_stack_without_distances_gets_its_blur_and_says_that_metres_are_guessed(tmp_path: Path) -> None:
+    unmerged(tmp_path, (3, 0, 5, 1, 4, 2))
+    stack = merge_scene(tmp_path)[0]
+    assert [each.metadata["source"] for each in stack.slices] in ([f"{i}.jpg" for i in range(6)], [f"{i}.jpg" for i in range(5, -1, -1)])
+    assert not stack.metres_known and stack.is_metric
+    assert "no focus distance is stated" in stack.metadata["metres"]["why"]
+    # Nearest and farthest plane of focus as guessed, and the nearest is the nearest.
+    near = [each.metadata["source"] for each in stack.slices].index("0.jpg")
+    assert stack.focus_distances_m[near] == pytest.approx(1.0) and stack.focus_distances_m[5 - near] == pytest.approx(2.0)
+    # Blur is that of the lens the slices were rendered with, though metres are not: 22.5 px from the first focus to the last.
+    channels = read_exr(stack.depth_path)[0].channels
+    for index, each in enumerate(stack.slices):
+        from_depth = stack.coc_px(index, stack.depth_m())
+        from_position = each.metadata["blur_position_px"] - channels["blur_position"]
+        np.testing.assert_allclose(from_depth, from_position, atol=0.02)
+    positions_px = [each.metadata["blur_position_px"] for each in stack.slices]
+    assert np.ptp(positions_px) == pytest.approx(GROWTH * np.ptp(DIOPTRES), rel=0.06)
+    again = merge_scene(tmp_path, overwrite=True)[0]
+    assert again.focus_distances_m == stack.focus_distances_m, "nothing guessed is taken for stated"
+    assert [each.metadata["source"] for each in again.slices] == [each.metadata["source"] for each in stack.slices]
+
+
+def test_two_stated_distances_give_metres(tmp_path: Path) -> None:
+    """Far first, as the distances tell; the other slices follow by their blur."""
+    unmerged(tmp_path, (5, 4, 3, 2, 1, 0), {0: 1.0 / DIOPTRES[0], 4: 1.0 / DIOPTRES[4]})
+    stack = merge_scene(tmp_path)[0]
+    assert stack.metres_known and stack.metadata["metres"]["gauge"]["near_first_from"] == "stated distances"
+    dioptres = [1.0 / float(each or np.inf) for each in stack.focus_distances_m]
+    np.testing.assert_allclose(dioptres, DIOPTRES[::-1], atol=0.03)
+    assert stack.focus_distances_m[5] == 1.0 / DIOPTRES[0], "a stated distance stays as stated"
