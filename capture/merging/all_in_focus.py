@@ -5,12 +5,15 @@ stays that of the sharp slice, brightness and tint within a few dozen. The resul
 bands add no halo and no light of their own.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
+
+from capture.merging.focus_volume import BLOCK_PX, FocusVolume, block_detail
+from mrbokeh.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -18,6 +21,9 @@ Plane = Float32[np.ndarray, "height width"]
 NARROW_CROSSOVER = 0.5
 # Up to this blur between neighbouring slices both are sharp enough to be mixed anywhere between them.
 SHARP_STEP_COC_PX = 2.0
+# A block that keeps less of the detail of its sharpest slice is blended again; the gate of the report is at 0.6.
+KEPT_DETAIL = 0.7
+_AROUND_PX = 8
 # The coarsest band changes slices within about 2^(BANDS + 1) pixels.
 BANDS = 4
 
@@ -44,6 +50,53 @@ def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float
     for index, rgb in enumerate(registered):
         blend.add(rgb, slice_weight(focus_index, index, crossover))
     return blend.result()
+
+
+def sharp_all_in_focus(
+    slices: Callable[[], Iterable[Rgb]], focus_index: Plane, volume: FocusVolume, crossover: float = NARROW_CROSSOVER
+) -> Rgb:
+    """Blend registered slices, and again where a block has lost detail that one of them has.
+
+    The focus index is smooth over places that decide little; where a slice shows clearly more detail than came out, pixels are taken
+    from their sharpest slice, and if that does not help, the block from its own. slices: gives a fresh pass over them.
+    """
+    blend, taken = BandBlend(focus_index.shape), focus_index
+    for index, rgb in enumerate(track(slices(), "all in focus", len(volume.energies))):
+        blend.add(rgb, slice_weight(focus_index, index, crossover))
+    for choice in (_sharpest_pixels, _sharpest_blocks):
+        lost = _lost_blocks(blend.result(), volume)
+        if not lost.any():
+            break
+        before, taken = taken, _taken_from(choice(volume), lost, taken)
+        for index, rgb in enumerate(slices()):
+            blend.add(rgb, slice_weight(taken, index, crossover) - slice_weight(before, index, crossover))
+    return blend.result()
+
+
+def _lost_blocks(merged: Rgb, volume: FocusVolume) -> Bool[np.ndarray, "rows columns"]:
+    sharpest = np.max(volume.details, axis=0)
+    return (sharpest > 0.5 * np.median(sharpest)) & (block_detail(np.sqrt(np.maximum(merged, 0.0))) < KEPT_DETAIL * sharpest)
+
+
+def _taken_from(choice: Plane, lost: Bool[np.ndarray, "rows columns"], focus_index: Plane) -> Plane:
+    """Return the focus index with another choice in the lost blocks and as far around them as fine bands reach."""
+    chosen = np.full(focus_index.shape, -1.0, np.float32)
+    grown = np.kron(lost, np.ones((BLOCK_PX, BLOCK_PX), bool))[: chosen.shape[0], : chosen.shape[1]]
+    chosen[: grown.shape[0], : grown.shape[1]][grown] = choice[: grown.shape[0], : grown.shape[1]][grown]
+    around = cv2.dilate(chosen, np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8))
+    chosen = np.where(chosen >= 0, chosen, around)
+    return np.where(chosen >= 0, chosen, focus_index)
+
+
+def _sharpest_pixels(volume: FocusVolume) -> Plane:
+    return volume.enlarged(volume.energies.argmax(axis=0).astype(np.float32), 0.0)
+
+
+def _sharpest_blocks(volume: FocusVolume) -> Plane:
+    blocks = np.argmax(volume.details, axis=0).astype(np.float32)
+    grown = np.kron(blocks, np.ones((BLOCK_PX, BLOCK_PX), np.float32))
+    missing = [(0, max(full - size, 0)) for full, size in zip(volume.shape, grown.shape, strict=True)]
+    return np.pad(grown, missing, "edge")[: volume.shape[0], : volume.shape[1]]
 
 
 @dataclass

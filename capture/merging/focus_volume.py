@@ -11,6 +11,7 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 Volume = Float32[np.ndarray, "slices height width"]
+Blocks = Float32[np.ndarray, "rows columns"]
 Levels = UInt8[np.ndarray, "height width"]
 
 # The window of the energy is wide enough that every second pixel holds all of it.
@@ -18,6 +19,9 @@ LEAST_SHRINK = 2
 LARGEST_VOLUME_BYTES = 300e6
 # Where the strongest energy of a pixel is this many times that of noise, its slices need no averaging.
 CALM_NOISE_FLOORS = 1000.0
+# Blocks in which a merged picture is held against its slices (capture.report.detail).
+BLOCK_PX = 24
+DETAIL_SIGMA_PX = 1.5
 # Noise is measured at so many brightnesses, each on at least so many pixels, as a low percentile of their energies.
 _LEVELS = 24
 _FEWEST_PIXELS = 200
@@ -31,11 +35,12 @@ _LEAST_OF_MEDIAN = 0.25
 class FocusVolume:
     """energies (slices, h, w): local energy of fine detail in every slice, over that of noise at this brightness.
 
-    shape: (H, W) of the pictures, h = ceil(H / shrink).
+    shape: (H, W) of the pictures, h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
     """
 
     energies: Volume
     shape: tuple[int, int]
+    details: tuple[Blocks, ...] = ()
 
     def calmed(self) -> Volume:
         """Return energies with the noise of single slices averaged out where it matters: weights 1, 2, 1 along the slices.
@@ -79,9 +84,11 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
     """
     energies: list[Plane] = []
     levels: list[Levels] = []
+    details: list[Blocks] = []
     for index, rgb in enumerate(registered):
         encoded = np.sqrt(np.maximum(rgb, 0.0))
         energy = _energy(encoded)
+        details.append(block_detail(encoded))
         if valid is not None:
             energy[~valid(index)] = 0.0
         height, width = _reduced_size(energy.shape, count)
@@ -92,7 +99,7 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
     floors = noise_floors(volume, levels)
     for energy, level in zip(volume, levels, strict=True):
         energy /= floors[level]
-    return FocusVolume(volume, (rgb.shape[0], rgb.shape[1]))
+    return FocusVolume(volume, (rgb.shape[0], rgb.shape[1]), tuple(details))
 
 
 def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
@@ -104,6 +111,15 @@ def _energy(encoded: Rgb, window_px: float = 2.5) -> Plane:
     detail = cv2.Laplacian(cv2.GaussianBlur(encoded, (0, 0), 0.7), cv2.CV_32F, ksize=1)
     squared = cv2.transform(cv2.multiply(detail, detail, dst=detail), np.ones((1, 3)))
     return cv2.GaussianBlur(squared, (0, 0), window_px)
+
+
+def block_detail(encoded: Rgb) -> Blocks:
+    """Return the root mean square of fine detail in blocks of BLOCK_PX of a picture in square roots of light; the rest is cut off."""
+    grey = cv2.transform(encoded, np.array([[0.2126, 0.7152, 0.0722]]))
+    fine = cv2.subtract(grey, cv2.GaussianBlur(grey, (0, 0), DETAIL_SIGMA_PX))
+    rows, columns = (max(side // BLOCK_PX, 1) for side in grey.shape)
+    squared = cv2.multiply(fine, fine)[: rows * BLOCK_PX, : columns * BLOCK_PX]
+    return np.sqrt(cv2.resize(squared, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
 def noise_floors(energies: Volume, levels: list[Levels]) -> Float32[np.ndarray, " levels"]:

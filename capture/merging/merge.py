@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.merging.alignment import Registration, register_stack
-from capture.merging.all_in_focus import NARROW_CROSSOVER, all_in_focus, crossover_of
+from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
 from capture.merging.depth_from_focus import FocusMap, focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights
@@ -57,8 +57,7 @@ def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path |
     made = extremes.watching(track(slices.made(keep=not overwrite), f"{name}: register", len(stack)))
     volume = focus_volume(made, slices.valid, len(stack))
     merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
-    passing = track(slices.passing(), f"{name}: all in focus", len(stack))
-    sharp = all_in_focus(passing, focus.focus_index, _crossover(merged, volume.shape[1]))
+    sharp = sharp_all_in_focus(slices.passing, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
     lights, restored = restored_lights(slices.passing, sharp, extremes)
     if restored:
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)

@@ -36,6 +36,11 @@ COMPARED_SLICES = 5
 LARGEST_DRAWN_PX = 30.0
 LARGEST_DRAWN_SHARE = 0.65
 CLEARLY = 1.3
+# Lights are small, and what else there is within their reach has at most this share of their contrast (squared).
+LARGEST_LIGHT_PX = 120.0
+LARGEST_SHARE_AROUND = 0.1
+# What is brighter than the light's own slice by this share of its widest disc was added by a disc.
+RING_SHARE = 0.3
 # Lights that hold this share of their flux in focus need no restoring.
 LARGEST_HELD_SHARE = 0.9
 CORE_SHARE = 0.7
@@ -145,38 +150,50 @@ def _restored(patches: Patches, ordinary: Rgb, box: tuple[slice, slice], lights:
     zone = lights.zone[box] == light + 1
     core = lights.core[box] & zone
     rows, columns = np.nonzero(core if core.any() else zone)
+    centre_px = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
     areas_px, sharpest = lights.areas_px[:, light], int(lights.sharpest[light])
-    discs = measured_discs(patches, zone, np.array([columns.mean() + 0.5, rows.mean() + 0.5]), areas_px)
+    if not _stands_alone(patches[sharpest], zone, centre_px, areas_px[sharpest]):
+        return None
+    discs = measured_discs(patches, zone, centre_px, areas_px)
     if not discs.believable.any() or discs.whole.sum() < FEWEST_SLICES:
         return None
-    share = _soft(zone)[..., None]
-    spread = (1.0 - share) * ordinary + share * patches[sharpest]
+    spread = _without_rings(ordinary, patches[sharpest], zone, discs, areas_px)
     # In the light's own slice nothing of it lies on its surroundings. Another base has to be clearly better.
     bases, lost = ((spread, CLEARLY if guided else 1.0), (ordinary, 1.0 if guided else CLEARLY)), _mostly_lost(discs, areas_px, sharpest)
     compare, ways = _Comparison.of(patches, zone, discs, areas_px, sharpest), []
     for base, handicap in bases:
-        for picture, drawn in (
-            (_drawn(base, discs, areas_px[sharpest]), True),
-            (_raised(base, core, discs, sharpest), False),
-            (base, False),
-        ):
+        drawn = _drawn(base, discs, areas_px[sharpest])
+        for picture in (drawn, _raised(base, core, discs, sharpest), base):
             error = compare.error(picture)
-            ways.append((error * handicap * (CLEARLY if lost and not drawn else 1.0), error, picture))
+            ways.append((error * handicap * (CLEARLY if lost and picture is not drawn else 1.0), error, picture))
     _, error, picture = min(ways, key=lambda way: way[0])
     limit = min(LARGEST_ERROR_SHARE * compare.error(ordinary), (1.0 - LEAST_EXPLAINED) * compare.light)
     return RestoredLight(box, (picture != ordinary).any(axis=2), picture) if error < limit else None
+
+
+def _stands_alone(sharp: Rgb, zone: Mask, centre_px: Float[np.ndarray, "2"], area_px: float) -> bool:
+    """Return whether a small light is all that there is in its zone, in its sharpest slice: no edge, no print, no shining metal."""
+    y, x = np.mgrid[: zone.shape[0], : zone.shape[1]] + 0.5
+    near = np.hypot(x - centre_px[0], y - centre_px[1]) < _radius_px(area_px)
+    around = zone & ~near
+    if area_px > LARGEST_LIGHT_PX or not around.any():
+        return False
+    squared = (_grey(sharp) - np.median(_grey(sharp)[around])) ** 2
+    return bool(squared[around].sum() < LARGEST_SHARE_AROUND * squared[near & zone].sum())
+
+
+def _without_rings(ordinary: Rgb, sharp: Rgb, zone: Mask, discs: Discs, areas_px: Float[np.ndarray, " slices"]) -> Rgb:
+    """Return the ordinary merge with what discs have added to it taken from the light's own slice, over which none of it is spread."""
+    disc = np.median(discs.flux[discs.believable], axis=0).mean() / areas_px.max()
+    added = zone & (_grey(ordinary) - _grey(sharp) > RING_SHARE * disc)
+    grown = cv2.dilate(added.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return np.where((grown & zone)[..., None], sharp, ordinary)
 
 
 def _mostly_lost(discs: Discs, areas_px: Float[np.ndarray, " slices"], sharpest: int) -> bool:
     """Return whether a light is small and holds so little of its flux in focus that it does not show its shape either."""
     flux = np.median(discs.flux[discs.believable].sum(axis=1))
     return bool(areas_px[sharpest] < LARGEST_DRAWN_PX and discs.flux[sharpest].sum() < LARGEST_DRAWN_SHARE * flux)
-
-
-def _soft(zone: Mask) -> Plane:
-    """Return 1 in a zone and less towards its rim, 0 outside it."""
-    distance = cv2.distanceTransform(zone.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    return np.clip(distance / (RING_PX + 1.0), 0.0, 1.0)
 
 
 @dataclass(frozen=True)
