@@ -186,7 +186,7 @@ def test_a_finished_run_is_left_alone_and_another_needs_its_own_folder(scene: Pa
 def test_a_time_budget_is_kept(scene: Path, tmp_path: Path) -> None:
     """0.05 minutes are 3 s; one step of this size takes well under half a second."""
     settings = dataclasses.replace(DEMO_LIKE, epochs=None, minutes=0.05)
-    progress = train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
+    progress = train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"], least_steps=1)
     assert 3.0 <= progress.elapsed_s < 4.5
 
 
