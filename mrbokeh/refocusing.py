@@ -23,8 +23,10 @@ Rgb = Float32[np.ndarray, "height width 3"]
 CAPTURED_DIOPTRES = 1e-6
 RESIDUAL_REACH_PX = 24.0
 """A residual counts fully where the blur is that of its slice, and 1/e where the circle of confusion differs by this."""
-RESIDUAL_LIGHT = 0.95
-"""Of white: what is brighter, in the slice or as rendered, belongs to lights, whose discs change with the focus. It is left out."""
+RESIDUAL_LIGHT, RESIDUAL_LIGHT_REACH_PX = 0.95, 6.0
+"""Of white: what is brighter, in the slice or as rendered, belongs to lights, whose discs change with the focus: it reaches less far."""
+RESIDUAL_WHITE = 0.98
+"""Of white: what a slice shows brighter was not measured, so that it can only tell that rendering is too dark."""
 RESIDUAL_BLUR, RESIDUAL_LARGEST_BLUR_PX = 0.85, 2.0
 """Detail of a residual finer than this share of the difference in blur, 2 px at most, is not carried over: it is noise or another's."""
 
@@ -53,6 +55,7 @@ class _Carry(NamedTuple):
     """How much of a slice's residual goes over; its circles of confusion differ from the new ones by coc_step_px everywhere."""
 
     weight: np.float32
+    light_weight: np.float32
     coc_step_px: float
 
     @property
@@ -85,7 +88,9 @@ class Refocusing:
                 return self.stack.slice_rgb(index)
         rendered = self.rendered(focus_m)
         for index, carry in self._carried(captured, focus_m).items():
-            rendered = rendered + carry.weight * _smoothed(self.residual(index), carry.sigma_px)
+            plain, light = self.residuals_of(index)
+            weighted = carry.weight * plain + carry.light_weight * light
+            rendered = rendered + _smoothed(weighted, carry.sigma_px)
         return rendered
 
     def lens_at(self, focus_m: float) -> Lens:
@@ -94,12 +99,16 @@ class Refocusing:
     def rendered(self, focus_m: float) -> Rgb:
         return self.renderer.render([self._sharp()], self.lens_at(focus_m)).rgb
 
-    def residual(self, index: int) -> Rgb:
-        """What a captured slice has that rendering it does not give; 0 where the slice has no data and at lights."""
+    def residuals_of(self, index: int) -> tuple[Rgb, Rgb]:
+        """What a captured slice has that rendering it does not give, and the same at lights; each 0 elsewhere, and without data."""
         masks, captured = self.stack.slice_masks(index), self.stack.slice_rgb(index)
         rendered = self.rendered(float(self._captured(None)[index]))
-        known = masks.valid & ~masks.saturated & (np.maximum(captured, rendered).max(axis=2) < RESIDUAL_LIGHT)
-        return np.where(known[..., None], captured - rendered, np.float32(0.0))
+        residual = np.where(masks.valid[..., None], captured - rendered, np.float32(0.0))
+        peak = captured.max(axis=2)
+        full = (masks.saturated | (peak >= RESIDUAL_WHITE))[..., None]
+        light = (masks.saturated | (np.maximum(peak, rendered.max(axis=2)) >= RESIDUAL_LIGHT))[..., None]
+        at_lights = np.where(full, np.maximum(residual, np.float32(0.0)), residual)
+        return np.where(light, np.float32(0.0), residual), np.where(light, at_lights, np.float32(0.0))
 
     def _sharp(self) -> Layer:
         return opaque(self.stack.all_in_focus(), self.stack.depth_m())
@@ -120,8 +129,15 @@ class Refocusing:
         per_dioptre = lens_at(self.stack, focus_m).coc_px_per_dioptre(self._width_px())
         total = sum(steps.values())
         share = {index: 1.0 - step / total if len(sides) == 2 and total > 0 else 1.0 for index, step in steps.items()}
-        fade = {index: np.exp(-((step * per_dioptre / RESIDUAL_REACH_PX) ** 2)) for index, step in steps.items()}
-        return {index: _Carry(np.float32(share[index] * fade[index]), step * per_dioptre) for index, step in steps.items()}
+        steps_px = {index: step * per_dioptre for index, step in steps.items()}
+
+        def weight(index: int, reach_px: float) -> np.float32:
+            return np.float32(share[index] * np.exp(-((steps_px[index] / reach_px) ** 2)))
+
+        return {
+            index: _Carry(weight(index, RESIDUAL_REACH_PX), weight(index, RESIDUAL_LIGHT_REACH_PX), step_px)
+            for index, step_px in steps_px.items()
+        }
 
     def _width_px(self) -> int:
         return self.stack.slice_camera_rgb(self.stack.reference).shape[1]
