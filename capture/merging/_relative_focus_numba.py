@@ -19,6 +19,12 @@ def _misfit(errors: np.ndarray, gaps: np.ndarray, squares: np.ndarray, wanted: f
 
 
 @njit(cache=True, fastmath=True)
+def _lessened(misfit: float) -> float:
+    """Cauchy's cost: what fits badly everywhere still tells the better from the worse."""
+    return np.log(1.0 + misfit)
+
+
+@njit(cache=True, fastmath=True)
 def _bounded(misfit: float) -> float:
     """Outliers cost no more than _SPENT."""
     return misfit / (1.0 + misfit / _SPENT)
@@ -53,7 +59,7 @@ def sum_curves(
             for k in range(candidates.shape[0]):
                 diameter = max(base[cell, one] + candidates[k], 0.0)
                 wanted = max(diameter * diameter - own_blur[cell], 0.0)
-                row[k] += weight[cell] * _bounded(_misfit(errors[cell, one], gaps[cell], squares, wanted))
+                row[k] += weight[cell] * _lessened(_misfit(errors[cell, one], gaps[cell], squares, wanted))
 
 
 @njit(cache=True, fastmath=True)

@@ -24,11 +24,13 @@ Small = Float32[np.ndarray, "rows columns"]
 LARGEST_WORKING_PX = 1.2e6
 """Larger pictures are compared at this size."""
 _DIAMETERS_PX = (0.0, 1.25, 1.75, 2.25, 3.0, 4.0, 5.25, 7.0, 9.25, 12.0, 16.0, 21.0)
+_WIDE_SHRINK = 3.0
 _CELL_PX = 4
 _WINDOW_CELLS = 1.25
 _COARSE_PX = 10.0
 _DARK = 0.02
 _LEAST_KNOWN = 0.3
+_MEAN_OF_CHANNELS = np.full((1, 3), 1.0 / 3.0, np.float32)
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class BlurEvidence:
     """errors (cells, slices, rungs): mean squared difference between a slice and the blurred picture; -1 where the slice has no data.
 
     gaps (cells, rungs - 1): the same between neighbouring rungs. diameters_px: of the rungs, in pixels of the stack.
-    shape: (rows, columns) of the grid of cells. full: (H, W) of the stack. noise: what the difference is where both are alike.
+    shape: (rows, columns) of the grid of cells. full: (H, W) of the stack, which was compared `shrink` times smaller.
     """
 
     errors: Float32[np.ndarray, "cells slices rungs"]
@@ -44,6 +46,7 @@ class BlurEvidence:
     diameters_px: Float[np.ndarray, " rungs"]
     shape: tuple[int, int]
     full: tuple[int, int]
+    shrink: float
 
     def at_cells(self, plane: np.ndarray) -> np.ndarray:
         """(cells,) a picture's value in the middle of each cell."""
@@ -64,45 +67,73 @@ def blur_evidence(
     count: int,
     valid: Callable[[int], Mask] | None = None,
     excluded: Mask | None = None,
-) -> BlurEvidence:
-    """Compare every slice, read once, with every rung; excluded: (H, W) what is saturated in some slice."""
+) -> tuple[BlurEvidence, BlurEvidence]:
+    """(fine, wide): compare every slice, read once, with every rung; wide: on a smaller picture, for larger blur.
+
+    excluded: (H, W) what is saturated in some slice.
+    """
     full = (all_in_focus.shape[0], all_in_focus.shape[1])
-    shrink = max(1.0, np.sqrt(full[0] * full[1] / LARGEST_WORKING_PX))
-    size = (round(full[1] / shrink), round(full[0] / shrink))
-    grey = _grey(all_in_focus, size)
-    ladder = [grey if each == 0 else _blurred(grey, each) for each in _DIAMETERS_PX]
-    grid = (-(-size[0] // _CELL_PX), -(-size[1] // _CELL_PX))
-    usable = np.ones(size[::-1], np.float32) if excluded is None else _share(~excluded, size)
-    light = _summed(grey, grid) + np.float32(_DARK)
-    fine = [each - _coarse(each) for each in ladder]
-    gaps = [_summed((b - a) ** 2 * usable, grid) / light for a, b in pairwise(fine)]
-    errors = np.empty((grid[0] * grid[1], count, len(fine)), np.float32)
-    base = _summed(usable, grid)
-    gaps = [each / np.maximum(base, _LEAST_KNOWN) for each in gaps]
+    shrink = max(1.0, float(np.sqrt(full[0] * full[1] / LARGEST_WORKING_PX)))
+    fine, wide = (_Comparison.of(all_in_focus, count, excluded, shrink * each) for each in (1.0, _WIDE_SHRINK))
     for index, rgb in enumerate(slices()):
-        plane = _grey(rgb, size)
-        plane -= _coarse(plane)
-        known = usable if valid is None or (here := valid(index)).all() else usable * _share(here, size)
-        share = base if known is usable else _summed(known, grid)
-        for rung, blurred in enumerate(fine):
-            difference = cv2.subtract(plane, blurred)
-            cv2.multiply(difference, difference, dst=difference)
-            if known is not usable or excluded is not None:
-                cv2.multiply(difference, known, dst=difference)
-            errors[:, index, rung] = (_summed(difference, grid) / (light * np.maximum(share, _LEAST_KNOWN))).ravel()
-        errors[(share < _LEAST_KNOWN).ravel(), index] = -1.0
-    return BlurEvidence(
-        errors, np.stack([each.ravel() for each in gaps], axis=1), np.array(_DIAMETERS_PX) * shrink, (grid[1], grid[0]), full
-    )
+        known = None if valid is None or (here := valid(index)).all() else here
+        grey = cv2.transform(np.ascontiguousarray(rgb), _MEAN_OF_CHANNELS)
+        fine.add(index, grey, known)
+        wide.add(index, grey, known)
+    return fine.evidence(full), wide.evidence(full)
 
 
-def _grey(rgb: Rgb, size: tuple[int, int]) -> Small:
-    grey = cv2.transform(np.ascontiguousarray(rgb), np.full((1, 3), 1.0 / 3.0, np.float32))
-    return grey if size == (rgb.shape[1], rgb.shape[0]) else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+@dataclass(frozen=True)
+class _Comparison:
+    """ladder: the all-in-focus picture blurred to every rung, without its coarse light; usable: share of a pixel that is not excluded."""
+
+    ladder: tuple[Small, ...]
+    light: Float32[np.ndarray, "cell_rows cell_columns"]
+    usable: Small
+    errors: Float32[np.ndarray, "cells slices rungs"]
+    shrink: float
+
+    @classmethod
+    def of(cls, all_in_focus: Rgb, count: int, excluded: Mask | None, shrink: float) -> "_Comparison":
+        size = (max(8, round(all_in_focus.shape[1] / shrink)), max(8, round(all_in_focus.shape[0] / shrink)))
+        grey = _resized(cv2.transform(np.ascontiguousarray(all_in_focus), _MEAN_OF_CHANNELS), size)
+        ladder = tuple(each - _coarse(each) for each in (grey if rung == 0 else _blurred(grey, rung) for rung in _DIAMETERS_PX))
+        grid = (-(-size[0] // _CELL_PX), -(-size[1] // _CELL_PX))
+        usable = np.ones_like(grey) if excluded is None else _resized((~excluded).astype(np.float32), size)
+        errors = np.empty((grid[0] * grid[1], count, len(ladder)), np.float32)
+        return cls(ladder, _summed(grey, grid) + np.float32(_DARK), usable, errors, shrink)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        return self.light.shape[1], self.light.shape[0]
+
+    def add(self, index: int, grey: Plane, known: Mask | None) -> None:
+        """Compare a slice; known: where it has data, None for everywhere."""
+        size = (self.usable.shape[1], self.usable.shape[0])
+        plane = _resized(grey, size)
+        plane = plane - _coarse(plane)
+        weight = self.usable if known is None else self.usable * _resized(known.astype(np.float32), size)
+        share = _summed(weight, self.grid)
+        for rung, blurred in enumerate(self.ladder):
+            self.errors[:, index, rung] = self._mean_square(cv2.subtract(plane, blurred), weight, share).ravel()
+        self.errors[(share < _LEAST_KNOWN).ravel(), index] = -1.0
+
+    def evidence(self, full: tuple[int, int]) -> BlurEvidence:
+        share = _summed(self.usable, self.grid)
+        gaps = [self._mean_square(cv2.subtract(a, b), self.usable, share).ravel() for a, b in pairwise(self.ladder)]
+        diameters_px = np.array(_DIAMETERS_PX) * self.shrink
+        return BlurEvidence(
+            self.errors, np.stack(gaps, axis=1), diameters_px, (self.light.shape[0], self.light.shape[1]), full, self.shrink
+        )
+
+    def _mean_square(self, difference: Small, weight: Small, share: np.ndarray) -> np.ndarray:
+        cv2.multiply(difference, difference, dst=difference)
+        cv2.multiply(difference, weight, dst=difference)
+        return _summed(difference, self.grid) / (self.light * np.maximum(share, _LEAST_KNOWN))
 
 
-def _share(mask: Mask, size: tuple[int, int]) -> Small:
-    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+def _resized(plane: Plane, size: tuple[int, int]) -> Small:
+    return plane if size == (plane.shape[1], plane.shape[0]) else cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
 
 
 def _blurred(grey: Plane, diameter_px: float) -> Plane:

@@ -8,8 +8,8 @@ What is sharp in slice j is blurred in slice i by the disc that explains i best;
 squares, and with them every place its own.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,9 @@ Positions = Float[np.ndarray, " slices"]
 _BLOCKS = 5
 _TOLD_SHARE = 0.9
 """Blur above this share of the widest rung is too wide to be told."""
+_NEAR_A_SLICE = 0.3
+_LEAST_FILLED = 0.003
+_FEWEST_BLOCKS = 3
 _OWN_SHARE = 0.05
 _NOISE_PERCENTILE = 10.0
 _TEXTURED_FLOORS = 5.0
@@ -68,9 +71,9 @@ def solve_relative_focus(
 
     focus_index, confidence: of the merge. valid: where slice i has data. excluded: pixels that were full in some slice.
     """
-    evidence = blur_evidence(slices, all_in_focus, count, valid, excluded)
-    places = _Places.of(evidence, focus_index, confidence)
-    positions, errors = _positions(places.thinned())
+    fine, wide = blur_evidence(slices, all_in_focus, count, valid, excluded)
+    places = _Places.of(fine, focus_index, confidence)
+    positions, errors = _positions((places.thinned(), _Places.of(wide, focus_index, confidence)))
     offset, cell_error = _offsets(places, positions)
     return RelativeFocus(positions, errors, *_dense(places, positions, offset, cell_error, focus_index))
 
@@ -85,6 +88,7 @@ class _Places:
     errors: Float32[np.ndarray, "cells slices rungs"]
     gaps: Float32[np.ndarray, "cells steps"]
     squares_px2: Float[np.ndarray, " rungs"]
+    shrink: float
     shape: tuple[int, int]
     index: Float32[np.ndarray, " cells"]
     own: Float32[np.ndarray, "cells slices"]
@@ -106,7 +110,7 @@ class _Places:
         jump = (cv2.dilate(grid, box) - cv2.erode(grid, box)).ravel()
         weight = evidence.at_cells(confidence) / (1.0 + (jump / _SURFACE_STEP) ** 2) * (evidence.texture > _TEXTURED_FLOORS * floor)
         gaps = evidence.gaps / variance[:, None]
-        return cls(errors, gaps, evidence.diameters_px**2, evidence.shape, index, own, weight.astype(np.float32))
+        return cls(errors, gaps, evidence.diameters_px**2, evidence.shrink, evidence.shape, index, own, weight.astype(np.float32))
 
     def thinned(self) -> "_Places":
         """Every second cell of every second row: windows overlap, so that little is lost."""
@@ -132,37 +136,51 @@ class _Places:
         return ((rows * _BLOCKS // self.shape[0]) * _BLOCKS + columns * _BLOCKS // self.shape[1]).ravel().astype(np.int64)
 
 
-def _positions(places: _Places) -> tuple[Positions, Positions]:
+def _positions(levels: Sequence[_Places]) -> tuple[Positions, Positions]:
     """By least squares of the diameters of all pairs, first as they are and then of what is left of them.
 
     Moving one slice or one surface at a time would never undo a common stretch; pairs do.
     """
-    widest = places.widest_px
-    sharp = np.abs(places.index - places.nearest) <= 0.3
-    diameters = np.arange(0.0, widest + 0.01, widest / 60.0)
-    no_base = np.zeros((len(places.index), places.count))
-    measured = _measured(places, places.weight * sharp, no_base, np.zeros(len(places.index)), diameters)
-    positions, errors = _solved(measured, np.zeros(places.count), places.count)
-    offsets = np.linspace(-0.15, 0.15, 31) * widest
+    count = levels[0].count
+    positions, errors = _solved([_measured_whole(each) for each in levels], np.zeros(count))
     for _ in range(_ROUNDS):
-        offset, _ = _offsets(places, positions)
-        place = np.interp(places.index, np.arange(places.count), positions) + offset
-        base = np.abs(positions[None, :] - place[:, None])
-        own_blur = (places.own * base**2).sum(axis=1)
-        base[base > _TOLD_SHARE * widest] = np.inf
-        measured = _measured(places, places.weight, base, own_blur, offsets)
-        positions, errors = _solved(measured, positions, places.count)
+        positions, errors = _solved([_measured_rest(each, positions) for each in levels], positions)
     return positions, errors
+
+
+def _measured_whole(places: _Places) -> "_Diameters":
+    """The diameters in all slices of what is sharp near the middle of one."""
+    sharp = np.abs(places.index - places.nearest) <= _NEAR_A_SLICE
+    nothing = np.zeros((len(places.index), places.count))
+    return _measured(places, places.weight * sharp, nothing, nothing[:, 0], np.linspace(0.0, places.widest_px, 61))
+
+
+def _measured_rest(places: _Places, positions: Positions) -> "_Diameters":
+    """What to add to the diameters that follow from positions."""
+    offset, _ = _offsets(places, positions)
+    place = np.interp(places.index, np.arange(places.count), positions) + offset
+    base = np.abs(positions[None, :] - place[:, None])
+    own_blur = (places.own * base**2).sum(axis=1)
+    base[base > _TOLD_SHARE * places.widest_px] = np.inf
+    return _measured(places, places.weight, base, own_blur, np.linspace(-0.15, 0.15, 31) * places.widest_px)
 
 
 @dataclass(frozen=True)
 class _Diameters:
-    """Of pairs: slice, the slice in which its cells are sharp, what to add to the diameter so far, and how sure that is."""
+    """Of pairs: slice, the slice in which its cells are sharp, what to add to the diameter so far, and how sure that is.
+
+    least_px2: error of a squared diameter, below which a small blur cannot be told.
+    """
 
     one: Int[np.ndarray, " pairs"]
     other: Int[np.ndarray, " pairs"]
     value_px: Float[np.ndarray, " pairs"]
     error_px: Float[np.ndarray, " pairs"]
+    least_px2: Float[np.ndarray, " pairs"]
+
+    @classmethod
+    def joined(cls, parts: Sequence["_Diameters"]) -> "_Diameters":
+        return cls(*(np.concatenate([getattr(each, one.name) for each in parts]) for one in fields(cls)))
 
 
 def _measured(
@@ -189,19 +207,24 @@ def _measured(
     # How much the blocks of the picture disagree says how far chance goes, not the number of pixels.
     scatter = ((slope - slope.mean(axis=2, keepdims=True)) ** 2).sum(axis=2)
     error = np.sqrt(scatter) / np.maximum(bend, 1e-12)
-    one, other = np.nonzero(inside & (bend > 0) & ~np.eye(places.count, dtype=bool))
+    # A slice in which next to nothing is sharp tells by chance only.
+    filled = np.bincount(places.nearest, weight, places.count) > _LEAST_FILLED * weight.sum()
+    spread = (curves.max(axis=3) > 0).sum(axis=2) >= _FEWEST_BLOCKS
+    one, other = np.nonzero(inside & spread & filled[None, :] & (bend > 0) & ~np.eye(places.count, dtype=bool))
     value = candidates[best] + shift
-    return _Diameters(one, other, value[one, other], error[one, other])
+    least_px2 = np.full(len(one), _LEAST_ERROR_PX2 * places.shrink**2)
+    return _Diameters(one, other, value[one, other], error[one, other], least_px2)
 
 
-def _solved(measured: _Diameters, before: Positions, count: int) -> tuple[Positions, Positions]:
+def _solved(parts: Sequence[_Diameters], before: Positions) -> tuple[Positions, Positions]:
     """Robust weighted least squares; bends of the positions over the index cost a little, so that nothing stays open."""
+    measured, count = _Diameters.joined(parts), len(before)
     sign = np.where(measured.one > measured.other, 1.0, -1.0)
     wanted = (before[measured.one] - before[measured.other]) + sign * measured.value_px
     rows = np.zeros((len(wanted), count))
     rows[np.arange(len(wanted)), measured.one] += 1.0
     rows[np.arange(len(wanted)), measured.other] -= 1.0
-    least = _LEAST_ERROR_PX2 / np.maximum(np.abs(wanted), 0.5)
+    least = measured.least_px2 / np.maximum(np.abs(wanted), 0.5)
     sigma = np.sqrt(measured.error_px**2 + least**2 + (_LEAST_ERROR_SHARE * wanted) ** 2)
     typical = float(np.median(np.abs(wanted) / np.abs(measured.one - measured.other))) if len(wanted) else 1.0
     bends = np.diff(np.eye(count), 2, axis=0) / (2.0 * max(typical, 0.1))
