@@ -236,7 +236,7 @@ def test_data_sets_record_it_and_networks_train(guessed: FocalStack, tmp_path: P
         tmp_path / "run",
         tmp_path / "set",
         "--renderer",
-        "polygon",
+        "none",
         "--no-reference",
         "--pull",
         0,

@@ -103,6 +103,16 @@ def test_residuals_carry_what_the_lens_model_misses(tmp_path: Path) -> None:
         assert left_out.with_residuals_db > left_out.nearest_slice_db
 
 
+def test_residuals_hold_the_light_that_an_all_in_focus_picture_lost(tmp_path: Path) -> None:
+    """Lights of radiance 20 that the all-in-focus picture has clipped to 1: their discs are in the slices, 1.8 px of blur apart."""
+    stack = card_stack(tmp_path / "stack")
+    distances = tuple(float(each) for each in 1.0 / np.linspace(1 / 0.5, 1 / 0.56, 4))
+    captured = make_card_stack(tmp_path / "close", 3, distances)
+    write_camera_rgb(captured.all_in_focus_path, np.minimum(stack.all_in_focus(), 1.0), None, half=False)
+    for left_out in leave_one_out(captured, ScatterReference(threads=1)):
+        assert left_out.with_residuals_db > left_out.rendered_db + 6.0
+
+
 @pytest.mark.slow
 def test_residuals_gain_on_a_traced_stack(tmp_path: Path) -> None:
     """Path-traced slices with noise, left out one by one: at least 0.5 dB more with residuals in each, and far above the nearest slice."""
