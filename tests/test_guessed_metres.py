@@ -220,7 +220,7 @@ def test_a_lens_is_fitted_in_pixels(guessed: FocalStack, tmp_path: Path, run: Ru
     assert "metres are guessed" in told and "needs no metres" in told and (tmp_path / "bank" / "kernels.png").is_file()
 
 
-def test_data_sets_record_it_and_networks_train(guessed: FocalStack, tmp_path: Path, run: Run) -> None:
+def test_data_sets_record_it_and_networks_train(guessed: FocalStack, tmp_path: Path, run: Run, caplog: pytest.LogCaptureFixture) -> None:
     guessed_twin(make_card_stack(tmp_path / "other", 4), guessed.folder.parent / "second")
     told = run("capture", "dataset", guessed.folder.parent, "--out", tmp_path / "set", "--licence", "CC0", "--renderer", "scatter")
     assert "metres are guessed" in told
@@ -243,6 +243,12 @@ def test_data_sets_record_it_and_networks_train(guessed: FocalStack, tmp_path: P
         "--out",
         tmp_path / "eval",
     )
+    run("train", "export", tmp_path / "run", "--out", tmp_path / "net.onnx")
+    arguments = ("refocus", guessed.folder, "--focus", "#1", "--no-residuals", "--out")
+    run(*arguments, tmp_path / "by_stack", "--renderer", tmp_path / "net.onnx")
+    assert "is a guess too" not in caplog.text
+    run(*arguments, tmp_path / "by_lens", "--lens", tmp_path / "net.onnx")
+    assert "net.onnx was trained on stacks whose metres are guessed" in caplog.text
 
 
 # ---- metres

@@ -73,6 +73,7 @@ def network_facts_of(network: BlurNetwork, settings: NetworkSettings, facts: Run
         reach_px=network.reach_px,
         trained_on=facts.trained_on,
         held_out_slices=facts.held_out_slices,
+        lens_guessed=facts.lens_guessed,
         commit=facts.commit,
         field_position=settings.field_position,
         f_numbers=facts.lens_ranges[0] if settings.lens_inputs else None,

@@ -29,7 +29,7 @@ class RunFacts:
 
     largest_coc_px: diameter; radiance_scale: the radiance at the upper end of the network's range;
     trained_on, held_out: names of stacks; held_out_slices: of the only stack, where there is one.
-    commit: of the source, or None where git is absent.
+    commit: of the source, or None where git is absent. lens_guessed: see NetworkFacts.
     f_numbers, focal_lengths_mm: (lowest, highest) of the data; None: those of `lens` alone.
     """
 
@@ -44,6 +44,7 @@ class RunFacts:
     f_numbers: tuple[float, float] | None = None
     focal_lengths_mm: tuple[float, float] | None = None
     held_out_slices: tuple[int, ...] = ()
+    lens_guessed: bool = False
 
     @property
     def lens_ranges(self) -> LensRanges:

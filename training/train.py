@@ -6,6 +6,7 @@ from contextlib import closing
 from pathlib import Path
 
 from mrbokeh.errors import InputError
+from mrbokeh.guessed_metres import is_lens_guessed
 from training.checkpoint import Progress
 from training.dataset import PairSet
 from training.distributed import Ranks, joined
@@ -96,6 +97,7 @@ def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainS
         trained_on=tuple(stack_name(stack) for stack in pairs.stacks),
         held_out=() if split.held_out_slices else tuple(stack_name(stack) for stack in split.test),
         held_out_slices=split.held_out_slices,
+        lens_guessed=any(is_lens_guessed(stack) and not stack.metres_known for stack in pairs.stacks),
         commit=source_commit(),
         f_numbers=found.f_numbers,
         focal_lengths_mm=found.focal_lengths_mm,

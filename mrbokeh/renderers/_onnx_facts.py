@@ -23,7 +23,8 @@ class NetworkFacts:
     reach_px: how far from a pixel the network looks. commit: of the training code, or None.
     trained_on: names of the stacks. held_out_slices: those of the only one that were not.
     field_position: the place in the frame is an input. f_numbers, focal_lengths_mm: (lowest, highest) trained on, where the lens is an
-    input, else None. These and held_out_slices are missing in older files.
+    input, else None. These, held_out_slices and lens_guessed are missing in older files.
+    lens_guessed: it was trained on blur in pixels, in metres that nobody knows: the lens stands for no length.
     """
 
     lens: Lens
@@ -41,6 +42,7 @@ class NetworkFacts:
     f_numbers: tuple[float, float] | None = None
     focal_lengths_mm: tuple[float, float] | None = None
     held_out_slices: tuple[int, ...] = ()
+    lens_guessed: bool = False
 
     @property
     def lens_inputs(self) -> bool:

@@ -1,5 +1,6 @@
 """A renderer by its name on the command line; the only module that knows them all."""
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ from mrbokeh.layering import Layering
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
+
+_log = logging.getLogger(__name__)
 
 DEFAULT = "polygon"
 
@@ -76,5 +79,10 @@ def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | N
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
         network = OnnxNetwork(lens)
+        if network.facts.lens_guessed:
+            _log.warning(
+                f"{lens} was trained on stacks whose metres are guessed: how large its blur is at a distance is a guess too; "
+                f"as --renderer it blurs by the lens of the stack or photograph"
+            )
         return network.lens, network if renderer is None else make_renderer(renderer)
     return None if lens is None else read_lens(lens), make_renderer(renderer or DEFAULT)
