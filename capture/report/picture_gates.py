@@ -42,17 +42,17 @@ def _light(findings: StackFindings) -> Gate:
         return LIGHT.absent(findings.name, NO_BLOCKS)
     supported = largest_supported(findings)
     measured = f"largest value {picture.top:.3g}, {picture.top_ratio:.2f} times that of the slices"
-    if supported is not None:
+    if supported > 0.0:
         measured += f"; measured flux supports {supported:.3g}"
-    allowed = max(LARGEST_TOP * picture.slices_top, supported or 0.0)
+    allowed = max(LARGEST_TOP * picture.slices_top, supported)
     return LIGHT.judge(findings.name, picture.top_ratio, measured, picture.top <= allowed)
 
 
-def largest_supported(findings: StackFindings) -> float | None:
-    """The largest value that the flux of discs in the slices speaks for, as merging left it in the metadata; None where it did not."""
+def largest_supported(findings: StackFindings) -> float:
+    """The largest value that the flux of discs in the slices speaks for, as merging left it in the metadata; 0 where it left none."""
     drawn = findings.stack.metadata.get(HIGHLIGHTS)
     value = drawn.get("largest_supported") if isinstance(drawn, dict) else None
-    return float(value) if isinstance(value, int | float) else None
+    return float(value) if isinstance(value, int | float) else 0.0
 
 
 def _places(findings: StackFindings) -> Gate:
