@@ -144,9 +144,10 @@ class Run:
         if self.ranks.first:
             self._record.note_if_due(self._done())
         if self.settings.validate_every_s and now_s - self._looked_s >= self.settings.validate_every_s:
-            # The next look is due an interval after this one ended, and never takes more than a tenth of the time.
+            # The next look is due an interval after this one ended; of a budget in minutes looks take a tenth at most.
             self.progress.stopped_early, self._looked_s = self.ranks.from_first(lambda: (self._record.look(), self._now_s()))
-            self._looked_s += max(0.0, 9.0 * (self._looked_s - now_s) - self.settings.validate_every_s)
+            if self.settings.minutes is not None:
+                self._looked_s += max(0.0, 9.0 * (self._looked_s - now_s) - self.settings.validate_every_s)
         if now_s - self._saved_s >= self.settings.checkpoint_every_s:
             self._save()
             self._saved_s = now_s
