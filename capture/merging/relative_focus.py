@@ -28,13 +28,15 @@ _TOLD_SHARE = 0.9
 _NEAR_A_SLICE = 0.3
 _LEAST_FILLED = 0.003
 _FEWEST_BLOCKS = 3
+_LEAST_WEIGHT = 0.03
 _OWN_SHARE = 0.05
 _NOISE_PERCENTILE = 10.0
 _TEXTURED_FLOORS = 5.0
 _SURFACE_STEP = 0.7
 _MODEL_SHARE = 0.01
 """Of a cell's texture: what a disc does not reproduce of real blur, whatever its size."""
-_ROUNDS = 4
+_ROUNDS = 3
+_ENOUGH_CELLS = 10000
 _REACH = 5
 _WIDEST_OFFSET_STEPS = 0.8
 _WINDOW_SAMPLES = 12.0
@@ -73,7 +75,7 @@ def solve_relative_focus(
     """
     fine, wide = blur_evidence(slices, all_in_focus, count, valid, excluded)
     places = _Places.of(fine, focus_index, confidence)
-    positions, errors = _positions((places.thinned(), _Places.of(wide, focus_index, confidence)))
+    positions, errors = _positions((places.thinned(), _Places.of(wide, focus_index, confidence).thinned()))
     offset, cell_error = _offsets(places, positions)
     return RelativeFocus(positions, errors, *_dense(places, positions, offset, cell_error, focus_index))
 
@@ -113,8 +115,9 @@ class _Places:
         return cls(errors, gaps, evidence.diameters_px**2, evidence.shrink, evidence.shape, index, own, weight.astype(np.float32))
 
     def thinned(self) -> "_Places":
-        """Every second cell of every second row: windows overlap, so that little is lost."""
-        chosen = np.arange(len(self.index)).reshape(self.shape)[::2, ::2]
+        """Every second or third cell of such rows: windows overlap, and slices need fewer places than surfaces do."""
+        step = int(np.ceil(np.sqrt(len(self.index) / _ENOUGH_CELLS)))
+        chosen = np.arange(len(self.index)).reshape(self.shape)[::step, ::step]
         picked = {name: getattr(self, name)[chosen.ravel()] for name in ("errors", "gaps", "index", "own", "weight")}
         return replace(self, shape=(chosen.shape[0], chosen.shape[1]), **picked)
 
@@ -193,6 +196,7 @@ def _measured(
     from capture.merging._relative_focus_numba import sum_curves
 
     curves = np.zeros((places.count, places.count, _BLOCKS**2, len(candidates)))
+    weight = np.where(weight > _LEAST_WEIGHT * weight.max(), weight, 0.0)
     cells = (weight.astype(np.float32), places.nearest, places.block, base, own_blur)
     sum_curves(places.errors, places.gaps, places.squares_px2, *cells, candidates, curves)
     total = curves.sum(axis=2)
