@@ -13,6 +13,7 @@ from capture.merging.focus_direction import Contours
 from capture.merging.focus_order import focus_order
 from capture.merging.merge import merge_scene
 from capture.merging.relative_focus import solve_relative_focus
+from capture.merging.relative_stack import gauge_of
 from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
@@ -190,3 +191,26 @@ def test_two_stated_distances_give_metres(tmp_path: Path) -> None:
     dioptres = [1.0 / float(each or np.inf) for each in stack.focus_distances_m]
     np.testing.assert_allclose(dioptres, DIOPTRES[::-1], atol=0.03)
     assert stack.focus_distances_m[5] == 1.0 / DIOPTRES[0], "a stated distance stays as stated"
+
+
+def test_what_is_known_fixes_the_gauge() -> None:
+    """Positions that grow towards the camera, 30 px apart, in a picture of 3600 px."""
+    positions_px, size_px = np.array([15.0, 5.0, -15.0]), (3600, 2400)
+
+    def gauged(*distances_m: float | None, **metadata: object) -> tuple[list[float], bool]:
+        stack = FocalStack(Path(), tuple(Slice("", each) for each in distances_m), metadata=dict(metadata))
+        gauge = gauge_of(stack, positions_px, size_px)
+        return gauge.dioptres(positions_px).tolist(), gauge.known
+
+    optics = {"focal_length_mm": 50.0, "f_number": 2.5, "sensor_width_mm": 36.0}
+    nothing, one, two = gauged(None, None, None), gauged(2.0, None, None), gauged(0.5, None, 2.0)
+    assert nothing == (pytest.approx([1.0, 5.0 / 6.0, 0.5]), False)
+    # Stated at 2 m: the farthest is put at twice that.
+    assert one == (pytest.approx([0.5, 5.0 / 12.0, 0.25]), False)
+    assert two == (pytest.approx([2.0, 1.5, 0.5]), True)
+    # 100 px per mm times 50^2 / 2.5 / 1000 mm m: 100 px per dioptre, 0.3 dioptres from the first to the last.
+    assert gauged(None, None, None, optics=optics) == (pytest.approx([0.6, 0.5, 0.3]), False)
+    assert gauged(None, None, 5.0, optics=optics) == (pytest.approx([0.5, 0.4, 0.2]), True)
+    # No lens of 800 mm focuses at 0.6 m: what it states cannot be meant.
+    far_off = optics | {"focal_length_mm": 800.0, "f_number": 640.0 * 2.5}
+    assert gauged(None, None, None, optics=far_off) == nothing

@@ -28,12 +28,16 @@ def merge_command(
 ) -> None:
     from capture.merging.merge import merge_scene
     from capture.merging.merged_pictures import readable_names
+    from capture.merging.relative_stack import METRES, ORDER
     from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.stack_pictures import SHEET_NAME
 
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         stacks = merge_scene(scene, overwrite, registration)
     for stack in stacks:
-        depth = "depth in metres" if stack.is_metric else "focus distances unknown: depth is the index of the sharpest slice, not metres"
+        depth = "depth in metres" if stack.metres_known else "depth in guessed metres"
         files = ", ".join([*readable_names(stack), SHEET_NAME])
         typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {files}")
+        for told in (stack.metadata.get(ORDER), (stack.metadata.get(METRES) or {}).get("why")):
+            if told:
+                typer.echo(f"  {told}")

@@ -37,6 +37,8 @@ _NEAREST_DIOPTRES, _FARTHEST_DIOPTRES = 1.0, 0.5
 _FAR_OVER_NEAR = 2.0
 _LEAST_DIOPTRES = 1e-3
 _LEAST_RANGE_PX = 0.5
+_NEAREST_SHARE = 0.8
+"""Of the reciprocal of the focal length: nearer a lens is not taken to focus."""
 _SENSOR_MM, _FOCAL_LENGTH_MM = 36.0, 35.0
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -160,7 +162,7 @@ def with_guessed_metres(stated: FocalStack, relative: RelativeFocus, direction: 
         )
         for each, distance_m, position, error in zip(stated.slices, distances_m, positions_px, relative.errors_px, strict=True)
     )
-    lens = _nominal_lens(stated, size_px, growth, distances_m[stated.reference])
+    lens = _nominal_lens(stated, size_px, growth, distances_m[stated.reference], min(distances_m))
     before = {
         "lens": None if stated.lens is None else lens_to_json(stated.lens),
         "camera": None if stated.camera is None else camera_to_json(stated.camera),
@@ -185,9 +187,9 @@ def gauge_of(stated: FocalStack, positions_px: Float[np.ndarray, " slices"], siz
         if slope > 0:
             return Gauge(1.0 / float(slope), float(offset), "distances", "distances")
     growth = _stated_growth(stated, size_px[0])
-    if growth is not None:
-        if told:
-            return Gauge(growth, float(np.mean([d - p / growth for p, d in told])), "lens", "distances")
+    if growth is not None and told:
+        return Gauge(growth, float(np.mean([d - p / growth for p, d in told])), "lens", "distances")
+    if growth is not None and _focuses(stated, _FAR_OVER_NEAR / (_FAR_OVER_NEAR - 1.0) * spread_px / growth):
         return Gauge(growth, spread_px / growth / (_FAR_OVER_NEAR - 1.0) - farthest_px / growth, "lens", "guess")
     if told:
         # The farthest plane is at D, the nearest at twice that; the stated one lies between them as its position does.
@@ -226,22 +228,28 @@ def _stated_growth(stated: FocalStack, width_px: int) -> float | None:
     return width_px / facts["sensor_width_mm"] * facts["focal_length_mm"] ** 2 / facts["f_number"] / 1000.0
 
 
+def _focuses(stated: FocalStack, dioptres: float) -> bool:
+    """Whether the stated lens can be focused so near at all."""
+    facts = _stated_lens(stated)
+    return facts is not None and dioptres * facts["focal_length_mm"] < _NEAREST_SHARE * 1000.0
+
+
 def _stated_lens(stated: FocalStack) -> dict[str, float] | None:
     """focal_length_mm, f_number and sensor_width_mm, where all are known."""
     if stated.lens is not None:
         return {name: getattr(stated.lens, name) for name in ("focal_length_mm", "f_number", "sensor_width_mm")}
     facts = stated.metadata.get("optics") or {}
-    return facts if all(facts.get(name) for name in ("focal_length_mm", "f_number", "sensor_width_mm")) else None
+    names = ("focal_length_mm", "f_number", "sensor_width_mm")
+    return {name: float(facts[name]) for name in names} if all(facts.get(name) for name in names) else None
 
 
-def _nominal_lens(stated: FocalStack, size_px: tuple[int, int], growth: float, focus_m: float) -> Lens:
+def _nominal_lens(stated: FocalStack, size_px: tuple[int, int], growth: float, focus_m: float, nearest_m: float) -> Lens:
     facts = _stated_lens(stated)
-    if stated.lens is not None:
-        return stated.lens.focused_at(focus_m)
-    if facts is not None:
-        return Lens(facts["focal_length_mm"], facts["f_number"], max(focus_m, 0.00101 * facts["focal_length_mm"]), facts["sensor_width_mm"])
+    if facts is not None and _focuses(stated, 1.0 / nearest_m):
+        lens = stated.lens or Lens(facts["focal_length_mm"], facts["f_number"], focus_m, facts["sensor_width_mm"])
+        return lens.focused_at(focus_m)
     sensor_mm = _SENSOR_MM * min(1.0, size_px[0] / size_px[1])
-    guess = Lens(_FOCAL_LENGTH_MM, 1.0, max(focus_m, 0.00101 * _FOCAL_LENGTH_MM), sensor_mm)
+    guess = Lens(min(_FOCAL_LENGTH_MM, _NEAREST_SHARE * 1000.0 * nearest_m), 1.0, focus_m, sensor_mm)
     return replace(guess, f_number=guess.coc_px_per_dioptre(size_px[0]) / growth)
 
 

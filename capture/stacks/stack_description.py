@@ -13,7 +13,7 @@ from capture.stacks.sentinel_focus import bounded_focus_records
 from capture.stacks.session import CameraChoice
 from capture.stacks.slice_files import FOLDER, arrange_slices, source_record
 from capture.stacks.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
-from capture.stacks.stack_lens import camera_of_lens, lens_of_photo, reference_index
+from capture.stacks.stack_lens import camera_of_lens, lens_of_photo, optics_of_photo, reference_index
 from capture.stacks.stack_remarks import stack_remarks
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack
@@ -77,6 +77,7 @@ def finish_stack(name: str, work: StackWork, digest: str) -> StackReport:
     width_px, height_px = chosen.record["size_px"]
     native_width_px, native_height_px = chosen.record["native_size_px"]
     lens, missing = lens_of_photo(chosen.photo, (native_width_px, native_height_px))
+    optics = optics_of_photo(chosen.photo, (native_width_px, native_height_px))
     remarks = stack_remarks(work, chosen.photo, lens, missing)
     if was_merged:
         remarks.append("the stack changed since it was merged: merge it again")
@@ -86,7 +87,7 @@ def finish_stack(name: str, work: StackWork, digest: str) -> StackReport:
         lens=lens,
         camera=None if lens is None else camera_of_lens(lens, width_px, height_px),
         reference=reference,
-        metadata=_stack_metadata(work, digest, remarks),
+        metadata=_stack_metadata(work, digest, remarks) | {"optics": optics},
         rec709_from_camera=work.rec709_from_camera,
     )
     write_focal_stack(stack)

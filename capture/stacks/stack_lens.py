@@ -11,24 +11,23 @@ from mrbokeh.lens_file import lens_to_json
 
 def lens_of_photo(photo: Photo, native_size_px: tuple[int, int]) -> tuple[Lens | None, str | None]:
     """The lens as it was focused for a photograph of native_size_px (width, height) before any reduction; or None and why."""
-    metadata, sidecar = photo.metadata, photo.sidecar
-    sensor_width_mm = sidecar.sensor_width_mm
-    if sensor_width_mm is None and metadata.sensor is not None:
-        sensor_width_mm = metadata.sensor.width_mm(*native_size_px)
-    focus_m = photo.focus_distance_m
-    wanted = {
-        "focal_length_mm": metadata.focal_length_mm,
-        "f_number": metadata.f_number,
-        "sensor_width_mm": sensor_width_mm,
-        "focus_distances_m": focus_m,
-    }
-    missing = [name for name, value in wanted.items() if value is None]
-    if metadata.focal_length_mm is None or metadata.f_number is None or sensor_width_mm is None or focus_m is None:
+    focus_m, optics = photo.focus_distance_m, optics_of_photo(photo, native_size_px)
+    missing = [name for name, value in (optics | {"focus_distances_m": focus_m}).items() if value is None]
+    focal_length_mm, f_number, sensor_width_mm = optics.values()
+    if focal_length_mm is None or f_number is None or sensor_width_mm is None or focus_m is None:
         return None, f"{photo.path.name} does not tell {', '.join(missing)}{_why_no_focus(photo)}"
     try:
-        return Lens(metadata.focal_length_mm, metadata.f_number, focus_m, sensor_width_mm, sidecar.aperture), None
+        return Lens(focal_length_mm, f_number, focus_m, sensor_width_mm, photo.sidecar.aperture), None
     except InputError as error:
         return None, f"{photo.path.name}: {error}"
+
+
+def optics_of_photo(photo: Photo, native_size_px: tuple[int, int]) -> dict[str, float | None]:
+    """focal_length_mm, f_number and sensor_width_mm, as far as they are known."""
+    metadata, sensor_width_mm = photo.metadata, photo.sidecar.sensor_width_mm
+    if sensor_width_mm is None and metadata.sensor is not None:
+        sensor_width_mm = metadata.sensor.width_mm(*native_size_px)
+    return {"focal_length_mm": metadata.focal_length_mm, "f_number": metadata.f_number, "sensor_width_mm": sensor_width_mm}
 
 
 def _why_no_focus(photo: Photo) -> str:
@@ -65,7 +64,7 @@ def lens_remarks(photos: Sequence[Photo]) -> list[str]:
     if unknown:
         remarks.append(
             f"no focus distance for {len(unknown)} of {len(photos)} slices ({', '.join(unknown[:4])}{' ...' if len(unknown) > 4 else ''}): "
-            f"depth will be the index of the sharpest slice, in the order of the file names, not metres"
+            f"merging finds their blur in pixels and their order from the pictures, and guesses metres"
         )
     return remarks + sentinel_remarks(photos)
 

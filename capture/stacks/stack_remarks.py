@@ -38,7 +38,8 @@ def _order_remarks(photos: Sequence[Photo]) -> list[str]:
     known = [time for time in times if time is not None]
     if len(known) == len(times) and known != sorted(known) and any(photo.focus_distance_m is None for photo in photos):
         remarks.append(
-            "slices are in the order of the file names, which is not that in which they were taken: check that it follows the focus"
+            "slices are in the order of the file names, which is not that in which they were taken: merging sorts them by their focus "
+            "where pictures tell it"
         )
     return remarks
 
