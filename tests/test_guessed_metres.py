@@ -12,7 +12,7 @@ from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.focal_stack_dataset import read_focal_stack_dataset
 from mrbokeh.focus_places import Seen, parse_focus, slice_names
-from mrbokeh.guessed_metres import POSITION, metres_note, metres_notes
+from mrbokeh.guessed_metres import POSITION, POSITION_ERROR, metres_note, metres_notes
 from mrbokeh.image_io import read_image, write_layer
 from mrbokeh.layer import Layer
 from mrbokeh.lens_file import write_lens
@@ -355,11 +355,18 @@ def test_what_cannot_be_told_is_refused(known: FocalStack, guessed: FocalStack, 
             run("capture", "scale", folder, *arguments)
 
 
-def test_no_depth_no_metres(guessed: FocalStack, run: Run) -> None:
-    part = read_exr(guessed.depth_path)[0]
-    write_exr(guessed.depth_path, replace(part, channels=dict(part.channels) | {"confidence": np.zeros(SIZE, np.float32)}))
-    with pytest.raises(AssertionError, match="choose a place with texture"):
-        run("capture", "scale", guessed.folder, "--distance-at", "9,9,1")
+def test_depth_counts_where_slices_tell_it(known: FocalStack, guessed: FocalStack, run: Run) -> None:
+    """By its confidence, or by the error of its position: 10 px of 14 that the slices span is none."""
+    for error_px, tells in ((10.0, False), (0.2, True)):
+        part = read_exr(guessed.depth_path)[0]
+        unsure = {"confidence": np.zeros(SIZE, np.float32), POSITION_ERROR: np.full(SIZE, error_px, np.float32)}
+        write_exr(guessed.depth_path, replace(part, channels=dict(part.channels) | unsure))
+        if tells:
+            run("capture", "scale", guessed.folder, "--distance-at", f"{ON_CARD},0.5", "--distance-at", f"{ON_WALL},0.7")
+            assert true_m(read_focal_stack(guessed.folder), known) < 1e-4
+        else:
+            with pytest.raises(AssertionError, match="choose a place with texture"):
+                run("capture", "scale", guessed.folder, "--distance-at", "9,9,1")
 
 
 def test_a_stated_focus_counts_as_a_fact(known: FocalStack, guessed: FocalStack, run: Run) -> None:

@@ -19,7 +19,7 @@ from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.guessed_metres import KEY, POSITION, is_lens_guessed, is_view_guessed, metres_facts
+from mrbokeh.guessed_metres import KEY, POSITION, POSITION_ERROR, is_lens_guessed, is_view_guessed, metres_facts
 from mrbokeh.lens import Lens
 
 FACTS = "told"
@@ -28,6 +28,8 @@ _NEAR_PIXEL_PX = 2
 _FARTHEST_SHARE = 0.01
 """Of the picture's width: from no farther away a surface is taken for what is at a pixel, where nothing tells the depth there."""
 _LEAST_CONFIDENCE = 0.1
+_SURE_PX, _SURE_SHARE = 1.0, 0.05
+"""A place is known whose position is known to so many pixels of blur, or that share of the range of the slices."""
 _LEAST_SPREAD_PX = 3.0
 """Facts whose surfaces differ in blur by less lie at one depth: they cannot tell how deep the scene is."""
 _CONTRADICTS = 0.1
@@ -84,18 +86,16 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
 
     Raises InputError where the stack's metres are known already, or facts contradict one another.
     """
-    depth_m, confidence = stack.depth_m(), stack.depth_confidence()
+    depth_m = _told_depth_m(stack)
     facts = _with_earlier(stack, told, overwrite)
     camera = stack.camera
     if not metres_facts(stack) or camera is None or (metres_facts(stack).get("known") and FACTS not in metres_facts(stack)):
-        sizes = "; ".join(f"{each} is {_now(each, depth_m, confidence, camera):.4g} m by them" for each in told if camera is not None)
+        sizes = "; ".join(f"{each} is {_now(each, depth_m, camera):.4g} m by them" for each in told if camera is not None)
         raise InputError(
             f"{stack.folder} knows its metres from its focus distances{' (' + sizes + ')' if sizes else ''}: to correct them state focus "
             f"distances in lens.toml and merge again, or find the scale of camera poses with --board or --distance"
         )
-    solving = _Solving(
-        tuple(_Equation.of(each, depth_m, confidence, camera) for each in facts), _stated_dioptres(stack), metres_facts(stack)["gauge"]
-    )
+    solving = _Solving(tuple(_Equation.of(each, depth_m, camera) for each in facts), _stated_dioptres(stack), metres_facts(stack)["gauge"])
     found = solving.solution()
     changed = _regauged(stack, found, facts)
     _write_depth(changed, found.p, found.q)
@@ -150,11 +150,9 @@ class _Equation:
     dioptres: Float[np.ndarray, " pixels"]
 
     @classmethod
-    def of(
-        cls, fact: Fact, depth_m: Float32[np.ndarray, "height width"], confidence: Float32[np.ndarray, "height width"], camera: Camera
-    ) -> "_Equation":
+    def of(cls, fact: Fact, depth_m: Float32[np.ndarray, "height width"], camera: Camera) -> "_Equation":
         rays = [camera.unproject(np.array(each), np.array(1.0)) for each in fact.pixels]
-        return cls(fact, np.array(rays), np.array([1.0 / _depth_at(depth_m, confidence, *each) for each in fact.pixels]))
+        return cls(fact, np.array(rays), np.array([1.0 / _depth_at(depth_m, *each) for each in fact.pixels]))
 
     def metres(self, p: float, q: float) -> float:
         depth_m = 1.0 / np.maximum(p + q * self.dioptres, _LEAST_DIOPTRES)
@@ -210,20 +208,29 @@ class _Solving:
         return of(least_squares(off, start, x_scale="jac").x)
 
 
-def _depth_at(depth_m: Float32[np.ndarray, "height width"], confidence: Float32[np.ndarray, "height width"], x: float, y: float) -> float:
+def _told_depth_m(stack: FocalStack) -> Float32[np.ndarray, "height width"]:
+    """Depth where the slices tell it, by its confidence or the error of its position in blur; nan elsewhere."""
+    depth_m, told = stack.depth_m(), stack.depth_valid(_LEAST_CONFIDENCE)
+    channels, gauge = read_exr(stack.depth_path)[0].channels, metres_facts(stack).get("gauge")
+    if gauge and POSITION_ERROR in channels:
+        range_px = gauge["px_per_dioptre"] * np.ptp([1.0 / each for each in stack.focus_distances_m if each is not None])
+        told |= channels[POSITION_ERROR] < max(_SURE_PX, _SURE_SHARE * range_px)
+    return np.where(told & np.isfinite(depth_m), depth_m, np.float32(np.nan))
+
+
+def _depth_at(depth_m: Float32[np.ndarray, "height width"], x: float, y: float) -> float:
     height, width = depth_m.shape
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(f"pixel {x:g},{y:g} lies outside the picture of {width}x{height} px: read it off the all-in-focus picture")
-    known = (confidence >= _LEAST_CONFIDENCE) & np.isfinite(depth_m)
     for radius_px in range(_NEAR_PIXEL_PX, max(round(_FARTHEST_SHARE * width), _NEAR_PIXEL_PX) + 1):
         rows, columns = (slice(max(int(at) - radius_px, 0), int(at) + radius_px + 1) for at in (y, x))
-        if known[rows, columns].any():
-            return float(np.median(depth_m[rows, columns][known[rows, columns]]))
+        if np.isfinite(depth_m[rows, columns]).any():
+            return float(np.nanmedian(depth_m[rows, columns]))
     raise InputError(f"nothing at pixel {x:g},{y:g} tells how far away it is: choose a place with texture")
 
 
-def _now(fact: Fact, depth_m: np.ndarray, confidence: np.ndarray, camera: Camera) -> float:
-    return _Equation.of(fact, depth_m, confidence, camera).metres(0.0, 1.0)
+def _now(fact: Fact, depth_m: Float32[np.ndarray, "height width"], camera: Camera) -> float:
+    return _Equation.of(fact, depth_m, camera).metres(0.0, 1.0)
 
 
 def _stated_dioptres(stack: FocalStack) -> Float[np.ndarray, " slices"]:
