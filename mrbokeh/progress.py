@@ -23,10 +23,12 @@ class PlainLines(Progress):
         super().__init__(console=console, auto_refresh=False, **settings)
         self._told: dict[TaskID, tuple[float, float]] = {}
         self._ended: set[TaskID] = set()
+        self._begun_with: dict[TaskID, float] = {}
 
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
         task = super().add_task(description, *args, **fields)
         self._told[task] = self.get_time(), -1.0
+        self._begun_with[task] = self._tasks[task].completed  # not 0 where an earlier run is gone on with
         return task
 
     def advance(self, task_id: TaskID, advance: int | float = 1) -> None:
@@ -56,15 +58,16 @@ class PlainLines(Progress):
                 return
             self._told[task_id] = now, task.completed
             self._ended |= {task_id} if ended else set()
-        self.console.print(_line(task, now - began), markup=False, highlight=False, soft_wrap=True)
+        self.console.print(_line(task, now - began, self._begun_with[task_id]), markup=False, highlight=False, soft_wrap=True)
 
 
-def _line(task: Task, took_s: float) -> str:
+def _line(task: Task, took_s: float, begun_with: float = 0.0) -> str:
     """slices: 3 of 12, 0:01:30, about 0:04:30 left"""
     line = f"{task.description}: {task.completed:.0f}{f' of {task.total:.0f}' if task.total else ''}, {timedelta(seconds=round(took_s))}"
-    if not task.total or not 0 < task.completed < task.total:
+    done = task.completed - begun_with
+    if not task.total or done <= 0 or task.completed >= task.total:
         return line
-    return f"{line}, about {timedelta(seconds=round(took_s / task.completed * (task.total - task.completed)))} left"
+    return f"{line}, about {timedelta(seconds=round(took_s / done * (task.total - task.completed)))} left"
 
 
 @contextmanager

@@ -49,6 +49,15 @@ def test_lines_come_every_ten_seconds_and_at_the_end(clock: Clock, said: io.Stri
     ]
 
 
+def test_work_that_is_gone_on_with_is_timed_from_there(clock: Clock, said: io.StringIO) -> None:
+    """80 of 100 were done before; 10 more in 20 s leave as many for another 20 s."""
+    with progress.progress_bars() as bars:
+        task = bars.add_task("train", total=100, completed=80)
+        for _ in slow(clock, 10, 2.0):
+            bars.advance(task)
+    assert said.getvalue().splitlines()[-1] == "train: 90 of 100, 0:00:20, about 0:00:20 left"
+
+
 def test_long_work_is_told_less_and_less_often(clock: Clock, said: io.StringIO) -> None:
     """An hour in seconds: ten lines in the first 100 s, and one for each twentieth of the time from 200 s on, 1.05^n."""
     list(track(slow(clock, 3600, 1.0), "train", 3600))
