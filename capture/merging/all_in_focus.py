@@ -39,9 +39,8 @@ def slice_weight(focus_index: Plane, index: int, crossover: float = NARROW_CROSS
     The weights of all slices sum to 1. The cross-over takes the given share of a step, where both slices are about equally
     sharp, so that it lessens the noise there and leaves no seam; 1 is linear interpolation.
     """
-    weight = cv2.absdiff(focus_index, np.full((), index, np.float32))
-    cv2.subtract(0.5 + 0.5 * crossover, weight, dst=weight)
-    return np.clip(weight / np.float32(crossover), 0.0, 1.0)
+    distance = np.abs(focus_index - np.float32(index))
+    return np.clip((0.5 - distance) / np.float32(crossover) + np.float32(0.5), 0.0, 1.0)
 
 
 def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float = NARROW_CROSSOVER, bands: int = BANDS) -> Rgb:
