@@ -166,11 +166,11 @@ def test_a_stopped_table_goes_on(scene: Path, small_base: Path, tmp_path: Path, 
     fit, trained = train.fit, list[str]()
 
     def counting(stop_at: int) -> Callable[..., object]:
-        def counted(data: object, folder: Path, *rest: object) -> object:
+        def counted(data: object, folder: Path, *rest: object, **named: object) -> object:
             trained.append(folder.parent.name)
             if len(trained) == stop_at:
                 raise KeyboardInterrupt
-            return fit(data, folder, *rest)  # type: ignore[arg-type]
+            return fit(data, folder, *rest, **named)  # type: ignore[arg-type]
 
         return counted
 
