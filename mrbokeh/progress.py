@@ -28,7 +28,7 @@ class PlainLines(Progress):
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
         task = super().add_task(description, *args, **fields)
         self._told[task] = self.get_time(), -1.0
-        self._begun_with[task] = self._tasks[task].completed  # not 0 where an earlier run is gone on with
+        self._begun_with[task] = float(self._tasks[task].completed)  # not 0 where an earlier run is gone on with
         return task
 
     def advance(self, task_id: TaskID, advance: int | float = 1) -> None:
