@@ -45,7 +45,8 @@ def sum_curves(
 ) -> None:
     """Add up, for every pair (slice, bin of cells sharp in a slice) and block of the picture, the misfits at base + candidate.
 
-    errors (cells, slices, rungs; below 0: silent), gaps (cells, rungs - 1), base (cells, slices), curves (slices, bins, blocks, candidates).
+    errors (cells, slices, rungs; below 0: silent), gaps (cells, rungs - 1), base (cells, slices),
+    curves (slices, bins, blocks, candidates).
     """
     cells, slices = errors.shape[:2]
     farthest = np.sqrt(squares[-1])
