@@ -3,6 +3,8 @@
 import json
 import time
 from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -11,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.layer import clear
 from mrbokeh.overlay import Overlay, code_tables
@@ -33,6 +36,7 @@ from viewfinder.frames import CameraFrame
 from viewfinder.newest import Newest
 from viewfinder.sources.pattern import PatternSource
 from viewfinder.sources.video_file import VideoFileSource
+from viewfinder.still_layer import StillLayer
 
 
 @pytest.fixture
@@ -91,6 +95,19 @@ def test_the_focus_changes_the_object_and_nothing_else(plate: tuple[Path, np.nda
         assert change[:15].max() == change[81:].max() == 0
 
     in_time(work)
+
+
+def test_a_blur_that_ends_while_a_frame_is_made_is_told_of_with_the_next() -> None:
+    """Or a header would state a focus that its picture does not show."""
+    camera = Camera(WIDTH, HEIGHT, (float(WIDTH), float(WIDTH)), (WIDTH / 2, HEIGHT / 2))
+    nearer = replace(LENS, focus_distance_m=1.0)
+    with closing(StillLayer(bright_square(), LENS, ScatterReference())) as still:
+        before = still.overlay(None, camera, nearer, 0.0)
+        while still.shown.overlay is before:
+            time.sleep(0.001)
+        assert still.status.lens == LENS and still.pending
+        assert still.overlay(None, camera, nearer, 0.0) is not before
+        assert still.status.lens == nearer and not still.pending
 
 
 def test_a_failing_camera_says_so() -> None:

@@ -37,7 +37,8 @@ class Blurred:
 class StillLayer:
     """A Scenery. Lenses that come while a blur is under way replace one another, so that the last one wins.
 
-    sharp: the all-in-focus layer, in the size of the frames. `shown` is the newest finished blur.
+    sharp: the all-in-focus layer, in the size of the frames. `shown` is the newest finished blur. Picture and status are of the blur
+    that `overlay` gave last, so that a blur finished while a frame is composited is told of with the next frame.
     """
 
     views: tuple[str, ...] = ("final", "plate", "virtual")
@@ -49,19 +50,20 @@ class StillLayer:
         self._wanted: Newest[tuple[Lens, Renderer]] = Newest()
         self._stopping, self._busy = Event(), Event()
         self._problem: str | None = None
-        self.shown = self._blurred(lens, renderer)
+        self.shown = self._given = self._blurred(lens, renderer)
         self._worker = Thread(target=self._work, name="still layer", daemon=True)
         self._worker.start()
 
     @property
     def pending(self) -> bool:
         """Whether a blur was asked for that is not shown yet."""
-        return self._busy.is_set() or self._wanted.waiting
+        return self._busy.is_set() or self._wanted.waiting or self._given is not self.shown
 
     @property
     def status(self) -> StageStatus:
-        age_ms = 1e3 * (time.monotonic() - self.shown.at_s)
-        return StageStatus(age_ms, self.shown.lens, self.pending, 0.0, self._busy.is_set(), 1.0, 1.0, 0, self._renderer_name, self._problem)
+        given = self._given
+        age_ms = 1e3 * (time.monotonic() - given.at_s)
+        return StageStatus(age_ms, given.lens, self.pending, 0.0, self._busy.is_set(), 1.0, 1.0, 0, self._renderer_name, self._problem)
 
     def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:  # noqa: ARG002
         """InputError where the frames are not of the layer's size."""
@@ -74,12 +76,13 @@ class StillLayer:
         if asked_for != self._asked_for:
             self._asked_for = asked_for
             self._wanted.put(asked_for)
-        return self.shown.overlay
+        self._given = self.shown
+        return self._given.overlay
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
         if view == "plate":
             return plate_bgr
-        return self.shown.overlay.over_codes(plate_bgr if view == "final" else np.zeros_like(plate_bgr), tables)
+        return self._given.overlay.over_codes(plate_bgr if view == "final" else np.zeros_like(plate_bgr), tables)
 
     def depth_at_m(self, x_px: float, y_px: float) -> float:
         depth_m = float(self.sharp.depth_m[int(y_px), int(x_px)])
