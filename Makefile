@@ -15,7 +15,7 @@ gallery: $(READY)
 	$(RUN)/python -m datasets_scripts.gallery gallery_out --demo $(OUT)
 
 test: $(READY)
-	$(RUN)/python -m pytest -n 2 -m "not slow and not browser"
+	$(RUN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser"
 
 test-slow: $(READY)
 	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,datasets]"
@@ -29,7 +29,7 @@ check: $(READY)
 	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
-	$(RUN)/python -m pytest -n 2 -m "not slow and not browser"
+	$(RUN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser"
 
 bench: $(READY)
 	for bench in tests/bench_*.py; do $(RUN)/python -m tests.$$(basename $$bench .py) || exit 1; done

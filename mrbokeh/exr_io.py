@@ -27,11 +27,15 @@ class ExrPart:
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def stacked(self, names: Sequence[str]) -> Float[np.ndarray, "height width channels"]:
-        """The named channels as one (H, W, C) float32 array."""
+        """Return the named channels as one (H, W, C) float32 array."""
+        return np.stack(self.planes(names), axis=-1).astype(np.float32)
+
+    def planes(self, names: Sequence[str]) -> list[Float[np.ndarray, "height width"]]:
+        """Return the named channels, each (H, W) as the file has it; InputError where one is missing."""
         missing = [name for name in names if name not in self.channels]
         if missing:
             raise InputError(f"expected the EXR channels {list(names)}, but {missing} are missing; the part has {sorted(self.channels)}")
-        return np.stack([self.channels[name] for name in names], axis=-1).astype(np.float32)
+        return [self.channels[name] for name in names]
 
 
 def read_exr(path: Path | str) -> list[ExrPart]:
@@ -57,15 +61,22 @@ def read_exr(path: Path | str) -> list[ExrPart]:
     return parts
 
 
-def write_exr(path: Path | str, parts: Sequence[ExrPart] | ExrPart) -> None:
-    """Write one or more parts with ZIP compression; float16 channels are stored as half, float32 as float."""
+def write_exr(path: Path | str, parts: Sequence[ExrPart] | ExrPart, *, compress: bool = True) -> None:
+    """Write one or more parts with ZIP compression; float16 channels are stored as half, float32 as float.
+
+    compress: False for float32 planes of photographs, which ZIP makes a tenth smaller in ten times the time.
+    """
     import OpenEXR
 
     parts = [parts] if isinstance(parts, ExrPart) else list(parts)
     several = len(parts) > 1
     converted = []
     for index, part in enumerate(parts):
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **part.attributes}
+        header = {
+            "compression": OpenEXR.ZIP_COMPRESSION if compress else OpenEXR.NO_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            **part.attributes,
+        }
         channels = {name: np.ascontiguousarray(pixels) for name, pixels in part.channels.items()}
         name = part.name or (f"part{index}" if several else "")
         converted.append(OpenEXR.Part(header, channels, name) if name else OpenEXR.Part(header, channels))

@@ -172,9 +172,13 @@ class FocalStack:
         """Signed circle of confusion (diameter) of a registered slice."""
         return (self.lens_of(index).coc_px(depth_m, depth_m.shape[1]) * self.slices[index].scale).astype(np.float32)
 
-    def _depth_channel(self, name: str) -> Float32[np.ndarray, "height width"]:
+    def depth_planes(self, *names: str) -> list[Float32[np.ndarray, "height width"]]:
+        """Return channels of depth.exr (Z, focus_index, confidence, ...), the file read once."""
         self._require_merged()
-        return read_exr(self.depth_path)[0].stacked([name])[..., 0]
+        return [np.asarray(plane, np.float32) for plane in read_exr(self.depth_path)[0].planes(names)]
+
+    def _depth_channel(self, name: str) -> Float32[np.ndarray, "height width"]:
+        return self.depth_planes(name)[0]
 
     def _require_merged(self) -> None:
         if not self.merged:
@@ -195,7 +199,7 @@ def write_merged(
     """
     write_camera_rgb(folder / "all_in_focus.exr", all_in_focus, rec709_from_camera, half=False)
     channels = {"focus_index": focus_index, "confidence": confidence} | ({} if depth_m is None else {"Z": depth_m})
-    write_exr(folder / "depth.exr", ExrPart(channels))
+    write_exr(folder / "depth.exr", ExrPart(channels), compress=False)
 
 
 def write_focal_stack(stack: FocalStack) -> None:

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Shaped, UInt8
 
 from mrbokeh.color import srgb_to_linear
-from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
+from mrbokeh.contact_sheet import WIDEST_PX, SheetRow, write_contact_sheet
 from mrbokeh.focal_stack import FocalStack
 from mrbokeh.image_io import write_preview
 
@@ -20,15 +20,31 @@ _COLOURS = (18, 240)
 
 Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]
+Rgb8 = UInt8[np.ndarray, "height width 3"]
 
 
-def write_merge_sheet(stack: FocalStack) -> Path:
-    """merge.png in the folder of the stack: some slices, the all-in-focus picture and the depth side by side."""
-    captions = [f"slice {index}{_focus_text(stack, index)}" for index in shown_slices(stack)]
-    slices = dict(zip(captions, (stack.slice_rgb(index) for index in shown_slices(stack)), strict=True))
+def write_merge_sheet(stack: FocalStack, camera_rgb: Rgb | None = None, depth_rgb8: Rgb8 | None = None) -> Path:
+    """Write merge.png into the folder of the stack: some slices, the all-in-focus picture and the depth side by side.
+
+    camera_rgb: the all-in-focus picture as it is stored. depth_rgb8: `depth_codes`. What is None is read.
+    """
+    slices = {f"slice {index}{_focus_text(stack, index)}": _small(stack.slice_camera_rgb(index)) for index in shown_slices(stack)}
+    slices["all in focus"] = _small(stack.all_in_focus_camera_rgb() if camera_rgb is None else camera_rgb)
+    depth = _small(depth_codes(stack) if depth_rgb8 is None else depth_rgb8)
+    pictures = {caption: stack.to_rec709(rgb) for caption, rgb in slices.items()} | {"depth": _shown_alike(depth)}
     path = stack.folder / SHEET_NAME
-    write_contact_sheet(path, [SheetRow(stack.folder.name, slices | {"all in focus": stack.all_in_focus(), "depth": depth_picture(stack)})])
+    write_contact_sheet(path, [SheetRow(stack.folder.name, pictures)])
     return path
+
+
+def _small(picture: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, "small_height small_width 3"]:
+    """Return a picture no wider than a sheet shows it."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    if width <= WIDEST_PX:
+        return picture
+    return cv2.resize(picture, (WIDEST_PX, round(height * WIDEST_PX / width)), interpolation=cv2.INTER_AREA)
 
 
 def write_stack_pictures(stack: FocalStack, out: Path) -> list[tuple[Path, str]]:
@@ -51,7 +67,11 @@ def shown_slices(stack: FocalStack) -> list[int]:
 
 def depth_picture(stack: FocalStack) -> Rgb:
     """`depth_codes` as scene-linear light, a little dimmed so that a tone curve for people leaves it as it is."""
-    return 0.8 * srgb_to_linear(depth_codes(stack).astype(np.float32) / 255.0)
+    return _shown_alike(depth_codes(stack))
+
+
+def _shown_alike(codes: Rgb8) -> Rgb:
+    return 0.8 * srgb_to_linear(codes.astype(np.float32) / 255.0)
 
 
 def depth_codes(stack: FocalStack) -> UInt8[np.ndarray, "height width 3"]:
@@ -61,8 +81,8 @@ def depth_codes(stack: FocalStack) -> UInt8[np.ndarray, "height width 3"]:
     """
     import cv2
 
-    nearness: Plane = (1.0 / stack.depth_m() if stack.is_metric else -stack.focus_index()).astype(np.float32)
-    confidence = stack.depth_confidence()
+    depth, confidence = stack.depth_planes("Z" if stack.is_metric else "focus_index", "confidence")
+    nearness: Plane = (1.0 / depth if stack.is_metric else -depth).astype(np.float32)
     trusted = nearness[confidence >= TRUSTED]
     low, high = np.percentile(trusted if trusted.size > _LEAST_TRUSTED * nearness.size else nearness, [1, 99])
     dark, bright = _COLOURS

@@ -1,10 +1,14 @@
 """Shapes and types of array annotations are checked while tests run (jaxtyping + beartype); shared places of test data."""
 
+import functools
+import inspect
 import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
 ROOT = Path(__file__).resolve().parent.parent
@@ -18,7 +22,41 @@ def _modules() -> list[str]:
     return [name for name in names if not name.endswith("__init__")]
 
 
-install_import_hook(_modules(), "beartype.beartype")
+class _ChecksOfFirstCalls:
+    """Check each function on its first calls in every test; checking all calls, as jaxtyping does, takes 40 % of the time."""
+
+    MOST_CALLS = 3
+
+    def __init__(self) -> None:
+        self.test, self._always = 0, jaxtyping.jaxtyped
+
+    def __call__(self, *, typechecker: Any) -> Callable[[Any], Any]:
+        check = self._always(typechecker=typechecker)
+        return lambda decorated: self._checked_at_first(decorated, check(decorated)) if inspect.isfunction(decorated) else check(decorated)
+
+    def _checked_at_first(self, plain: Callable[..., Any], checked: Callable[..., Any]) -> Callable[..., Any]:
+        test, calls = -1, 0
+
+        @functools.wraps(plain)
+        def either(*args: Any, **kwargs: Any) -> Any:
+            nonlocal test, calls
+            if test != self.test:
+                test, calls = self.test, 0
+            calls += 1
+            return (checked if calls <= self.MOST_CALLS else plain)(*args, **kwargs)
+
+        return either
+
+
+_checks = _ChecksOfFirstCalls()
+jaxtyping.jaxtyped = _checks
+jaxtyping.install_import_hook(_modules(), "beartype.beartype")
+
+
+@pytest.fixture(autouse=True)
+def _new_checks() -> None:
+    _checks.test += 1
+
 
 # Tests send Ctrl-C to themselves and to programs they start; what runs in the background of a shell is deaf to it, and so are its children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -119,6 +119,7 @@ def test_one_split_for_all_rows_and_seeds(scene: Path, tmp_path: Path) -> None:
         read_data_sets([scene, scene])
 
 
+@pytest.mark.slow
 def test_the_numbers_of_the_table_are_those_of_the_networks(scene: Path, done: Path) -> None:
     """In the order of the paper's table, computed again from the networks on the stack that was held out."""
     with (done / "table_1.csv").open(newline="") as file:

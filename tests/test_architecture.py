@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -112,18 +113,22 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+@cache
+def imports_of(path: Path) -> list[ast.Import | ast.ImportFrom]:
+    """Every import statement of a file, also those within functions."""
+    return [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, (ast.Import, ast.ImportFrom))]
+
+
 def imported(path: Path) -> Iterator[str]:
     """Dotted names of our own modules that a file imports."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in imports_of(path):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             assert node.level == 0, f"{path}: relative import"
             names = [
                 f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in MODULES else str(node.module) for alias in node.names
             ]
-        else:
-            continue
         yield from (name for name in names if name.split(".")[0] in PACKAGES)
 
 
@@ -210,9 +215,8 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
     users = {
         module
         for module, path in MODULES.items()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, (ast.Import, ast.ImportFrom))
-        and library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
+        for node in imports_of(path)
+        if library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
     twins = ("mrbokeh.renderers.torch_", "mrbokeh.torch_device", "mrbokeh.psf_models.torch_tracing", "capture.views.torch_plane_sweep")
     assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= homes

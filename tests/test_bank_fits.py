@@ -150,6 +150,7 @@ def test_low_rank_terms_state_what_they_miss() -> None:
         assert terms.relative_error < 0.105  # the weights' correction for light costs up to 5 %
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_bank_for_every_method_that_spreads(tmp_path: Path) -> None:
     discs = discs_bank()
     write_bank(tmp_path / "bank", discs)

@@ -138,6 +138,7 @@ def test_what_is_behind_a_vignetted_object_does_not_shine_through() -> None:
     np.testing.assert_allclose(alone.alpha[inside], 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_lens_with_rims_shades_a_white_picture_as_its_throughput_says() -> None:
     """Two achromats about a stop whose rims cut the beam to a quarter in the corners: the picture gets what is measured ray by ray."""
     front = (Surface(60.0, 6.0, 1.6204, 13.0, 60.3), Surface(-60.0, 2.0, 1.62, 13.0, 36.4), Surface(300.0, 12.0, 1.0, 13.0))

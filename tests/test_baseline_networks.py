@@ -88,6 +88,7 @@ def test_neural_camera_learns_a_gaussian() -> None:
     assert _psnr_db(_trained("neural_camera")(x), target) > 38.0
 
 
+@pytest.mark.slow
 def test_deepfocus_learns_to_blur() -> None:
     """Measured 29.0 dB, 11.0 over no blur, in 500 steps."""
     x, target = _picture(100, (0.0, 1.0))
@@ -164,6 +165,7 @@ def test_several_tiles_are_refused(form: str) -> None:
 
 
 @both_forms
+@pytest.mark.slow
 def test_onnx_runtime_computes_the_same_at_any_size(form: str, tmp_path: Path) -> None:
     """Odd and even sizes, none that of the tracing. A small circle of confusion keeps the bank, and so the tracing, short."""
     network = FORMS[form](SETTINGS, largest_coc_px=2.0, tiles=1).eval()

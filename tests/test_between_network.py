@@ -50,6 +50,7 @@ def card() -> Layer:
     return Layer(np.repeat(0.9 * alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, depth_for(-3.0), np.inf).astype(np.float32))
 
 
+@pytest.mark.slow
 def test_the_network_puts_it_behind_the_post_as_the_exact_renderer_does(network: OnnxNetwork) -> None:
     photo, _ = plate()
     exact, found = (insertion_of("between").insert(photo, [card()], renderer) for renderer in (ScatterReference(), network))

@@ -146,6 +146,7 @@ def test_depth_of_another_focus_does_not_go_into_a_data_set(deepened: Path) -> N
         require_usable(replace(stack, slices=moved))
 
 
+@pytest.mark.slow
 def test_a_stack_without_a_pose_keeps_its_depth_from_focus(merged: Path, truths: list[ViewTruth], tmp_path: Path) -> None:
     scene = tmp_path / "desk"
     shutil.copytree(merged, scene)

@@ -62,6 +62,7 @@ def test_scores_do_not_depend_on_the_band_of_rows() -> None:
     np.testing.assert_allclose(pieces, whole, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_planes_step_by_so_many_pixels_in_the_widest_neighbour() -> None:
     """Sideways motion b shifts a point by f b pixels per dioptre: 170 px * 0.06 m = 10.2 px."""
     scene = tilted_wall()

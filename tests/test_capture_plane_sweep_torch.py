@@ -58,6 +58,7 @@ def test_a_device_that_is_not_there_is_refused() -> None:
         plane_sweep_on("cpu", view, [], np.array([1.0]))
 
 
+@pytest.mark.slow
 def test_the_sweep_of_a_device_may_stand_in() -> None:
     """A cost may be rounded the other way, and where two planes are as good as one another the other may win."""
     scene = traced((wall(1.6, tilt=0.3), card(0.8, -0.1, 0.06)), noise=0.01)

@@ -57,6 +57,7 @@ def with_slices(stack: FocalStack, order: list[int]) -> FocalStack:
     return replace(stack, slices=tuple(replace(each, path=stack.slices[i].path) for each, i in zip(stack.slices, order, strict=True)))
 
 
+@pytest.mark.slow
 def test_the_prediction_is_what_the_renderer_makes_of_depth_and_lens(right: FocalStack) -> None:
     """Reblur takes a map of diameters and invents a lens for it; the plain way is to render depth with the lens of the slice."""
     view = StackView(right)

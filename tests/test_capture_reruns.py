@@ -40,6 +40,7 @@ def test_a_rerun_keeps_everything_and_a_merged_stack_too(shoot: Path, tmp_path: 
     assert all(path.stat().st_mtime_ns > before[path] for path in (stack.folder / "slices").iterdir())
 
 
+@pytest.mark.slow
 def test_the_whole_way_is_made_again_only_when_asked_to(shoot: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
 

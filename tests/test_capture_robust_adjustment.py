@@ -103,6 +103,7 @@ def test_a_model_that_was_asked_for_keeps_its_terms() -> None:
     assert camera.model == pycolmap.CameraModelId.RADIAL and np.abs(camera.params[3:]).max() > 0.0
 
 
+@pytest.mark.slow
 def test_needless_terms_cost_scale() -> None:
     """Root mean square over 24 draws of the noise, as measured: 0.060 % without the terms, 0.082 % with them."""
     error: dict[bool, list[float]] = {True: [], False: []}

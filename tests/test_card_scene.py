@@ -138,6 +138,7 @@ def test_a_ring_is_weighted_by_its_outlines() -> None:
     assert len(samples) == starts[-1] and len(samples) / 4 >= 1600
 
 
+@pytest.mark.slow
 def test_twice_the_lens_points_change_little(scene: cards.CardScene) -> None:
     lens = cards.lens_of_radius(12.0, 192)
     once, twice = cards.truth(scene, lens), cards.truth(scene, lens, 3200)

@@ -90,6 +90,7 @@ def test_records_of_earlier_versions_hold_for_nothing(tmp_path: Path) -> None:
     assert record is not None and not record.still_holds(("lens",), {"plan": "run 1"})
 
 
+@pytest.mark.slow
 def test_the_demo_goes_on_without_an_optional_stage_and_finds_it_later(tmp_path: Path) -> None:
     lens, console = tmp_path / "found" / "lens.json", Console(quiet=True)
     picture, sheet = tmp_path / "found" / "lens.png", tmp_path / "sheet.png"

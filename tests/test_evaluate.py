@@ -242,6 +242,7 @@ def read_numbers(path: Path) -> list[Score]:
     return [Score(row["stack"], int(row["slice_index"]), row["method"], **{name: float(row[name]) for name in MEASURES}) for row in rows]
 
 
+@pytest.mark.slow
 def test_many_networks_on_stacks_that_none_has_seen(scene: Path, runs: list[Path], tmp_path: Path) -> None:
     """The table's numbers are those computed here from the runs, and both come back from the CSV."""
     write_distance(tmp_path / "distance.onnx")

@@ -64,6 +64,7 @@ def test_the_shipped_truth_is_what_it_should_be(traced: list[Case], baselines: d
 
 
 @pytest.mark.parametrize("method", ON_TRACED)
+@pytest.mark.slow
 def test_traced_scenes_from_a_picture_with_depth(traced: list[Case], plain: list[dict[str, float]], method: str) -> None:
     """32.7 and 37.0 dB, 2.0 and 1.4 dB over scatter without order (discs at 640 px: 32.9 and 38.4). With a cat-eye it is 5 dB, because
     that one does not know it; so each shape alone must gain, over the frame and around lights, where errors of kernels show."""
@@ -109,6 +110,7 @@ def check_cards(cases: list[Case], method: str, *wanted_db: tuple[float, float])
         assert np.abs(energy - 1.0).max() < (0.006 if kind == 0 else 0.005)
 
 
+@pytest.mark.slow
 def test_cards_blurred_by_12_px() -> None:
     """37.4 / 32.5, 39.4 / 34.8 and 39.2 / 35.4 dB."""
     cases = [next(cards([0], 12))]

@@ -73,6 +73,7 @@ def test_the_papers_filters_beat_the_raw_samples_where_texture_is_smooth(screen_
     assert psnr(result, exact) > psnr(samples.raw_picture(), exact) + gain_db
 
 
+@pytest.mark.slow
 def test_merging_and_sparse_statistics_cost_at_most_1_db() -> None:
     for planes in (FENCE, (Plane(checker(16.0), 2.0, gradient=(0.15, 0.05)),)):
         exact, samples = known_truth(planes), sample_planes(planes, SIZE_PX, 8)
@@ -101,6 +102,7 @@ def test_a_lamp_that_no_chosen_sample_saw_is_there() -> None:
         assert result.sum() == pytest.approx(light, rel=0.25)
 
 
+@pytest.mark.slow
 def test_a_resting_lamp_among_leaves_that_move_at_its_depth_stays_round() -> None:
     """By depth alone both were one partition, and the lamp was drawn out along the leaf's 40 px."""
     lamp = Plane(even(5.0), -8.0, covers=lambda x, y: (np.abs(x - 32.5) < 1.5) & (np.abs(y - 20.5) < 1.5))
@@ -129,6 +131,7 @@ def test_parts_that_are_never_alike_are_all_there() -> None:
     np.testing.assert_allclose(picture(FENCE, 4, Settings(part_tolerance=1e-9)), picture(FENCE, 4, Settings(part_tolerance=0.0)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_parts_are_merged_where_that_shows_least() -> None:
     """Bars hide a texture: in one part 9 dB are lost (the test below). With merged parts at most one of them is; coarse pixels alone,
     which an endless tolerance leaves, lie between."""

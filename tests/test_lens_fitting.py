@@ -215,6 +215,7 @@ def test_the_simplest_description_within_the_standard_error_is_taken() -> None:
     assert simplest_of([[], []]) == 1
 
 
+@pytest.mark.slow
 def test_bright_rims_stay(tmp_path: Path) -> None:
     """Over-corrected spherical aberration of 0.7 is 1.7 / 0.3 times as bright at the rim as in the middle behind the focus; a plain disc
     is 1. Found between 0.8 and 0.95 of the radius and below 0.4 of it, where truth is (0.3 + 1.4 rho^2) on average: 3.4.
@@ -265,6 +266,7 @@ def lights_frame(aperture: Aperture, diameter_px: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("aperture", "least"), [(HEPTAGON, 0.99), (Aperture.ring(0.5), 0.97)])
+@pytest.mark.slow
 def test_lights_alone_suffice(aperture: Aperture, least: float) -> None:
     """In pixels, at the diameter that was measured, which is within 3 % of the true one."""
     lights = find_lights(lights_frame(aperture, 24.0), in_front=False)
@@ -278,6 +280,7 @@ def test_lights_alone_suffice(aperture: Aperture, least: float) -> None:
     assert found > least
 
 
+@pytest.mark.slow
 def test_lights_help_a_stack(tmp_path: Path) -> None:
     """Their diameters are corrected by what the stack tells: told 8 % too large, they come out as the stack has them."""
     stack = make_stack(tmp_path / "stack", HEPTAGON)

@@ -86,6 +86,7 @@ def turn_apart_deg(angle_rad: float, wanted_deg: float, blades: int) -> float:
 
 
 @pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.slow
 def test_heptagon_turned_by_12_degrees(side: int) -> None:
     opening = matched(HEPTAGON, side).choice.fit.opening
     assert opening.blades == 7
@@ -131,6 +132,7 @@ def test_anamorphic_squeeze() -> None:
 
 
 @pytest.mark.parametrize("strength", [-0.4, 0.4])
+@pytest.mark.slow
 def test_everything_at_once_with_soft_and_bright_rims(strength: float) -> None:
     aperture = Aperture(Aperture.blades(6, 0.3, 0.4).squeezed(1.33).outlines, (1.0,), 0.5, strength)
     found = matched(aperture, brightness=100.0)  # few are full

@@ -69,6 +69,7 @@ def test_a_brighter_middle_lowers_the_error_and_a_darker_one_raises_it(blades: i
 
 
 @pytest.mark.parametrize("diameter_px", SIDES_PX)
+@pytest.mark.slow
 def test_straighter_blades_raise_the_error_of_odd_counts_and_lower_that_of_even_ones(diameter_px: float) -> None:
     """Fig. 9 right: 5 to 9 blades and 60 at rank 3. All meet at the disc at blade radius 1; from 1.5 on every step (of a
     quarter or more; finer ones show the raster) goes the paper's way, from 3 on the disc lies between odd and even."""
@@ -87,6 +88,7 @@ def test_straighter_blades_raise_the_error_of_odd_counts_and_lower_that_of_even_
     assert (np.minimum(np.minimum(error[5], error[7]), error[9])[straight] > disc).all()
 
 
+@pytest.mark.slow
 def test_blades_that_are_nearly_round_differ_from_the_disc_as_straight_ones_do_but_for_six() -> None:
     """Fig. 9 right below radius 1.5, at 481 px, where the dips that the raster puts there at 65 and 121 px (of up to 1 %) are gone.
     Six blades first rise above the disc, by 0.6 %, which the paper's text does not say; they lie below it from 1.7 on."""

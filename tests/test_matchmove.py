@@ -122,6 +122,7 @@ def test_one_known_end_is_enough() -> None:
     assert np.linalg.norm(found[0].camera.world_from_camera[:3, 3] - cameras[0].world_from_camera[:3, 3]) < 0.01
 
 
+@pytest.mark.slow
 def test_turning_is_told_from_walking() -> None:
     """Corners off by 0.1 px: turning explains a turning camera to that noise, a walking one not."""
     still, moved = (model_of(cameras, 0.1) for cameras in (turning(6), walking(6)))

@@ -182,6 +182,7 @@ def _check(
 
 
 @pytest.mark.parametrize(("pan_rad_s", "least_db", "gain_db"), [(0.0, 35.0, 3.0), (1.5, 36.0, 12.0)])
+@pytest.mark.slow
 def test_a_running_fox(shared_data: Path, pan_rad_s: float, least_db: float, gain_db: float) -> None:
     """A skin: every pixel follows its triangle. Its legs run unevenly, by at most 0.36 px here."""
     asset = GltfAsset(shared_data / "objects" / "Fox.glb")

@@ -76,6 +76,7 @@ def test_the_lens_changes_the_result_and_must_be_given(settings: NetworkSettings
         network(rgb, coc_px, place)
 
 
+@pytest.mark.slow
 def test_lenses_within_the_trained_range_are_rendered_as_they_are(exported: OnnxNetwork) -> None:
     """The aperture of the lens given chooses the kernels: f/1.8 and f/4 of the same picture differ, and each is what PyTorch says."""
     rgb = np.random.default_rng(0).random((*SIZE, 3), dtype=np.float32)

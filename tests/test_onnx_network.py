@@ -182,6 +182,7 @@ def test_other_widths_work_while_the_blur_fits(network: OnnxNetwork) -> None:
         network.render([wide], LENS)
 
 
+@pytest.mark.slow
 def test_tiles_belong_to_one_size(tmp_path: Path) -> None:
     tiled = _exported(replace(demo_settings().network, tile_px=40, overlap_px=10), tmp_path)
     assert tiled.render([card(3.0)], LENS).alpha.sum() == pytest.approx(400.0, rel=0.01)

@@ -101,6 +101,7 @@ class Hands:
                 time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_calibration_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Traced pictures of both, detected and solved in real threads; the issue's bounds for a pose are 0.3 degrees and 3 mm."""
     write_files(tmp_path)

@@ -266,6 +266,7 @@ def blocked_and_free(model: PhysicalLens, depth_m: float, eccentricity: float, s
     return 2.0 * free * (24.0 / steps) ** 2 / chief[4]
 
 
+@pytest.mark.slow
 def test_open_share_is_the_count_of_unblocked_rays() -> None:
     """The grid of 120 x 120 rays finds an area of about 100 mm^2 to 1 %."""
     model = lens(22.0)
@@ -371,6 +372,7 @@ def test_prefiltering_is_the_mean_over_the_box() -> None:
     assert whole.sum() == pytest.approx(total.sum(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_rays_are_spread_more_evenly_than_chance_would() -> None:
     """Against four times as many rays of another seed, half a million rays miss a third of what as many pseudo-random ones do.
 

@@ -215,6 +215,7 @@ def test_one_frame_and_two_of_a_real_clip_agree(shared_data: Path, name: str, fa
         assert 1.0 / factor < standard_deviation(alone, level) / standard_deviation(pair, level) < factor
 
 
+@pytest.mark.slow
 def test_grain_of_a_real_photograph(shared_data: Path) -> None:
     """A Canon 450D at ISO 100: a photosite of 5.2 micrometres holds some 30000 electrons, so at a tenth of that shot noise alone is
     1 / sqrt(3000) = 1.8 % of the level. A JPEG has been smoothed and its neighbours hang together. A part agrees with the whole."""

@@ -59,6 +59,7 @@ def test_as_many_cells_as_asked_for_and_no_more(cells: int, highs_px: tuple[floa
     assert 0.95 * cells <= len(grid) <= cells
 
 
+@pytest.mark.slow
 def test_the_default_bank_is_nearer_to_exact_kernels_than_the_papers() -> None:
     """At 60 places each, even over the range and over octaves from half a pixel on: a third less light lies elsewhere, with no more cells.
 

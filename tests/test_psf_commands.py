@@ -216,6 +216,7 @@ def test_spreadlets_of_a_bank_that_has_changed_are_noticed(tmp_path: Path) -> No
     assert not (tmp_path / "bank" / "spreadlets.npz").exists()
 
 
+@pytest.mark.slow
 def test_interrupted_spreadlets_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped at the third of four kernels, then a kernel changes: of the two that are there only the other one is kept."""
     run("psf", "simple", "--out", tmp_path / "bank", *SMALL)

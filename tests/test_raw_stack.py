@@ -156,6 +156,7 @@ def test_a_flat_colour_comes_back_at_its_own_scale(tmp_path: Path) -> None:
     np.testing.assert_allclose(decoded[8:-8, 8:-8], np.tile(colour, (48, 48, 1)), atol=1.6e-4)
 
 
+@pytest.mark.slow
 def test_a_traced_slice_survives_the_camera(tmp_path: Path, desk: Scene) -> None:
     """Decoded by LibRaw (AAHD) and taken to Rec.709, a slice without lamps equals what was traced but for demosaicing.
 
@@ -268,6 +269,7 @@ def test_the_shipped_stack_is_the_one_this_program_makes() -> None:
 
 
 @pytest.mark.parametrize("view", [0, 1, 2])
+@pytest.mark.slow
 def test_the_shipped_truth_is_what_the_tracer_sees(view: int, desk: Scene) -> None:
     """Traced again with few rays: depth to the half float's 2^-11 except where the centre of a pixel grazes an edge."""
     document = shipped_truth()

@@ -262,6 +262,7 @@ def test_openings_that_rays_cannot_take_are_refused() -> None:
 
 
 @pytest.mark.parametrize("name", list(SCENES))
+@pytest.mark.slow
 def test_a_scene_follows_from_its_seed(name: str) -> None:
     plan = TruthPlan(64, 36)
     one, same, other = (pack(make_scene(name, seed), plan.camera(0)) for seed in (1, 1, 2))

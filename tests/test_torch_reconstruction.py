@@ -132,6 +132,7 @@ def test_lamps_and_pixels_without_samples_are_the_same() -> None:
         pytest.param((70, 40), 500, 0.3, 3.0, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_few_samples_and_bare_background_are_the_same(size_px: tuple[int, int], count: int, nearest_m: float, farthest_m: float) -> None:
     """One sample, nothing but background, and less than a sample a pixel with depth and motion all by chance."""
     rng = np.random.default_rng(4)

@@ -110,6 +110,7 @@ def assert_no_flip_is_called_certain(track: Tracking, seeds: tuple[int, ...]) ->
 
 
 @pytest.mark.parametrize("track", [live, of_clip])
+@pytest.mark.slow
 def test_no_pose_that_is_far_off_is_called_certain(track: Tracking) -> None:
     """1260 frames from 90 (head on) to 20 degrees above the board, which spans 20 to 85 px. The right pose is said to be certain
     where it can be: at 60 degrees and less, at 1 m, in more than 4 of 5 frames live."""

@@ -98,6 +98,7 @@ def test_the_network_learns_the_lens(scene: Path, run: Path, tmp_path: Path) -> 
     assert result.gain_db(NETWORK, result.better_gaussian) > 3.0
 
 
+@pytest.mark.slow
 def test_the_published_form_learns_too(scene: Path, tmp_path: Path) -> None:
     """With tiles, over the reassembled picture, lights out of its range left out: it ends clearly nearer to the truth than the sharp
     picture is. (How far it comes with the published size of data is not for a test to show.)"""

@@ -49,6 +49,7 @@ def largest_difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -
     return max(float((a[name] - b[name]).abs().max()) for name in a)
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_with_twice_the_batch_learns(scene: Path, tmp_path: Path) -> None:
     """Gradients are sums over pictures, whoever computes them: the same weights but for the order of these sums."""
     process = torchrun(*arguments(scene, tmp_path / "two", TWO))

@@ -104,6 +104,7 @@ def test_a_data_set_of_one_stack_holds_slices_out_and_one_of_two_does_not() -> N
     assert slices_of_a_single_stack({"scene/a": stack, "scene/b": stack}) == {}
 
 
+@pytest.mark.slow
 def test_training_does_not_look_at_held_out_slices(scene: Path, tmp_path: Path) -> None:
     """With the held-out slice white instead of what it was, training ends with the same weights, to the last bit."""
     (tmp_path / "other").mkdir()

@@ -95,6 +95,7 @@ def test_a_signal_that_was_ignored_stays_so() -> None:
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 def test_sigkill_costs_at_most_one_interval_and_the_run_goes_on_to_the_same_weights(scene: Path, tmp_path: Path) -> None:
     """The last checkpoint is at most one interval and two steps (the one that made it due, and the one under way) older than the end."""
     interval_s = 0.05
@@ -247,6 +248,7 @@ class _Sharp(torch.nn.Module):
         return rgb
 
 
+@pytest.mark.slow
 def test_half_precision_learns_the_same(scene: Path, tmp_path: Path) -> None:
     """bfloat16 has 8 bits of mantissa: results differ, by little against what is learnt; weights stay in float32."""
     full, half = (

@@ -76,6 +76,7 @@ def weights_after_training(data: Path, run: Path, settings: TrainSettings = FEW_
     return load_run(run)[0].state_dict()
 
 
+@pytest.mark.slow
 def test_scale_and_network_size_come_from_the_manifest(small: Path, tmp_path: Path) -> None:
     """Largest blur: 2 m in the slice focused at 0.8 m, 0.75 dioptres; N is the least with 2 N + 1 at least that wide.
 
@@ -188,6 +189,7 @@ def traced(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data"
 
 
+@pytest.mark.slow
 def test_the_commands_take_a_data_set(traced: Path, tmp_path: Path) -> None:
     """Ten epochs of six slices of view_0; on view_1, which the manifest holds out, the network beats no blur by 3 dB."""
     settings = tmp_path / "settings.json"

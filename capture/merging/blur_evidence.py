@@ -21,7 +21,7 @@ Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 Small = Float32[np.ndarray, "rows columns"]
 
-LARGEST_WORKING_PX = 1.2e6
+LARGEST_WORKING_PX = 0.6e6
 """Larger pictures are compared at this size."""
 _DIAMETERS_PX = (0.0, 1.25, 1.75, 2.25, 3.0, 4.0, 5.25, 7.0, 9.25, 12.0, 16.0, 21.0)
 _WIDE_SHRINK = 3.0
@@ -92,16 +92,17 @@ class _Comparison:
     usable: Small
     errors: Float32[np.ndarray, "cells slices rungs"]
     shrink: float
+    excludes: bool
 
     @classmethod
     def of(cls, all_in_focus: Rgb, count: int, excluded: Mask | None, shrink: float) -> "_Comparison":
-        size = (max(8, round(all_in_focus.shape[1] / shrink)), max(8, round(all_in_focus.shape[0] / shrink)))
+        size = (_whole_cells(all_in_focus.shape[1] / shrink), _whole_cells(all_in_focus.shape[0] / shrink))
         grey = _resized(cv2.transform(np.ascontiguousarray(all_in_focus), _MEAN_OF_CHANNELS), size)
         ladder = tuple(each - _coarse(each) for each in (grey if rung == 0 else _blurred(grey, rung) for rung in _DIAMETERS_PX))
-        grid = (-(-size[0] // _CELL_PX), -(-size[1] // _CELL_PX))
+        grid = (size[0] // _CELL_PX, size[1] // _CELL_PX)
         usable = np.ones_like(grey) if excluded is None else _resized((~excluded).astype(np.float32), size)
         errors = np.empty((grid[0] * grid[1], count, len(ladder)), np.float32)
-        return cls(ladder, _summed(grey, grid) + np.float32(_DARK), usable, errors, shrink)
+        return cls(ladder, _summed(grey, grid) + np.float32(_DARK), usable, errors, shrink, excluded is not None)
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -111,7 +112,7 @@ class _Comparison:
         """Compare a slice; known: where it has data, None for everywhere."""
         size = (self.usable.shape[1], self.usable.shape[0])
         plane = _resized(grey, size)
-        plane = plane - _coarse(plane)
+        plane = cv2.subtract(plane, _coarse(plane))
         weight = self.usable if known is None else self.usable * _resized(known.astype(np.float32), size)
         share = _summed(weight, self.grid)
         for rung, blurred in enumerate(self.ladder):
@@ -128,12 +129,20 @@ class _Comparison:
 
     def _mean_square(self, difference: Small, weight: Small, share: np.ndarray) -> np.ndarray:
         cv2.multiply(difference, difference, dst=difference)
-        cv2.multiply(difference, weight, dst=difference)
+        if weight is not self.usable or self.excludes:
+            cv2.multiply(difference, weight, dst=difference)
         return _summed(difference, self.grid) / (self.light * np.maximum(share, _LEAST_KNOWN))
 
 
+def _whole_cells(length_px: float) -> int:
+    return max(2, int(length_px) // _CELL_PX) * _CELL_PX
+
+
 def _resized(plane: Plane, size: tuple[int, int]) -> Small:
-    return plane if size == (plane.shape[1], plane.shape[0]) else cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+    """What is a few pixels larger is cut, for resampling would blur it."""
+    if max(plane.shape[1] - size[0], plane.shape[0] - size[1]) < _CELL_PX:
+        return np.ascontiguousarray(plane[: size[1], : size[0]])
+    return cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
 
 
 def _blurred(grey: Plane, diameter_px: float) -> Plane:

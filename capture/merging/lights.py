@@ -51,9 +51,16 @@ class Lights:
 
     @cached_property
     def _boxes(self) -> list[tuple[slice, slice]]:
-        from scipy.ndimage import find_objects
-
-        return find_objects(self.zone, len(self))
+        members = np.flatnonzero(self.zone)
+        numbers = self.zone.ravel()[members]
+        order = np.argsort(numbers, kind="stable")
+        starts = np.searchsorted(numbers[order], np.arange(1, len(self) + 1))
+        sides = []
+        for along in np.divmod(members[order], self.zone.shape[1]):
+            sides.append(
+                [slice(int(a), int(b) + 1) for a, b in zip(*(f.reduceat(along, starts) for f in (np.minimum, np.maximum)), strict=True)]
+            )
+        return list(zip(*sides, strict=True))
 
     def box(self, light: int, margin_px: int = 0) -> tuple[slice, slice]:
         """Return the rows and columns of a light's zone with a margin, as far as the picture goes."""

@@ -15,7 +15,7 @@ from capture.merging.depth_from_focus import FocusMap, focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights
 from capture.merging.merged_pictures import write_readable_pictures
-from capture.merging.registered_slices import RegisteredSlices, newer, read_slice, source_path
+from capture.merging.registered_slices import IngestedSlices, RegisteredSlices, newer, source_path
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
 from capture.merging.relative_stack import as_stated, in_focus_order, with_solved_blur
@@ -24,11 +24,12 @@ from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FO
 from capture.merging.slice_optics import SliceOptics
 from capture.stacks.sentinel_focus import stated_by_sentinel
 from mrbokeh.camera import Camera
+from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
 from mrbokeh.lens import Lens
 from mrbokeh.progress import track
-from mrbokeh.stack_pictures import write_merge_sheet
+from mrbokeh.stack_pictures import depth_codes, write_merge_sheet
 
 FEWEST_SLICES = 2
 HIGHLIGHTS = "highlights"
@@ -49,10 +50,11 @@ def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None 
 
 def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None) -> FocalStack:
     """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
-    stack = in_focus_order(as_stated(stack))
+    ingested = IngestedSlices(stack)
+    stack = in_focus_order(as_stated(stack), ingested)
     _require_a_sweep(stack)
     name = stack.folder.name
-    slices = RegisteredSlices(stack, _registration_of(stack, overwrite, registration))
+    slices = RegisteredSlices(stack, _registration_of(stack, ingested, overwrite, registration), ingested)
     extremes = Extremes()
     made = extremes.watching(track(slices.made(keep=not overwrite), f"{name}: register", len(stack)))
     volume = focus_volume(made, slices.valid, len(stack))
@@ -62,13 +64,16 @@ def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path |
     if restored:
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
     merged = _with_highlights(merged, restored)
-    write_merged(stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus), stack.rec709_from_camera)
-    if not stack.is_metric:
+    if stack.is_metric:
+        write_merged(stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus), stack.rec709_from_camera)
+    else:
+        write_camera_rgb(stack.all_in_focus_path, sharp, stack.rec709_from_camera, half=False)
         merged = with_solved_blur(merged, slices, sharp, focus)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
-    write_readable_pictures(merged, sharp)
+    codes = depth_codes(merged)
+    write_readable_pictures(merged, sharp, codes)
     write_focal_stack(merged)
-    write_merge_sheet(merged)
+    write_merge_sheet(merged, sharp, codes)
     return merged
 
 
@@ -102,20 +107,20 @@ def depth_m_of(stack: FocalStack, focus: FocusMap) -> Plane | None:
     return (1.0 / np.maximum(focus.dioptres(dioptres), 1e-6)).astype(np.float32)
 
 
-def _registration_of(stack: FocalStack, overwrite: bool, given: Path | None) -> Registration:
+def _registration_of(stack: FocalStack, ingested: IngestedSlices, overwrite: bool, given: Path | None) -> Registration:
     """As given, as an interrupted run has left it, or found out; in every case it is written beside stack.json."""
     own, sources = stack.folder / REGISTRATION_NAME, [stack.folder / source_path(each) for each in stack.slices]
     if given is None and not overwrite and newer(own, *sources):
         return read_registration(own, len(stack))
-    found = _registered(stack, sources) if given is None else read_registration(given, len(stack))
+    found = _registered(stack, ingested, sources) if given is None else read_registration(given, len(stack))
     write_registration(own, found)
     return found
 
 
-def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
+def _registered(stack: FocalStack, ingested: IngestedSlices, sources: Sequence[Path]) -> Registration:
     knows_lens = stack.lens is not None and stack.is_metric
     prior = [stack.lens_of(i).image_distance_mm for i in range(len(stack))] if knows_lens else None
-    read = lru_cache(maxsize=1)(lambda index: read_slice(sources[index]))
+    read = lru_cache(maxsize=1)(lambda index: ingested.read(sources[index]))
     unknown = np.flatnonzero(stated_by_sentinel(stack)).tolist()
     return register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0, unknown)
 

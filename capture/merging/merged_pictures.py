@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 
 from capture.merging.tiff_writer import BYTE, RATIONAL, SHORT, UNDEFINED, TiffTag, fractions_tag, text_tag, write_tiff
 from mrbokeh.camera_rgb import Matrix3x3
@@ -28,10 +28,13 @@ _BRIGHTEST = 4.0
 _MATRIX_DENOMINATOR, _FINE_DENOMINATOR = 10000, 1000000
 
 Rgb = Float32[np.ndarray, "height width 3"]
+Rgb8 = UInt8[np.ndarray, "height width 3"]
 
 
-def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None) -> list[Path]:
-    """The pictures of a merged stack, beside its EXR. camera_rgb: its all-in-focus picture as it is stored, read where it is None.
+def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None, depth_rgb8: Rgb8 | None = None) -> list[Path]:
+    """Write the pictures of a merged stack, beside its EXR.
+
+    camera_rgb: its all-in-focus picture as it is stored. depth_rgb8: its `depth_codes`. What is None is read.
 
     all_in_focus.png: 8 bits, sRGB, nothing tone-mapped: pixels that one slice gave come out as they were in its 8-bit photograph, unless
     its exposure was evened out. all_in_focus.tif: 16 bits with a profile. all_in_focus.dng: of RAW, linear camera RGB.
@@ -41,7 +44,7 @@ def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None) ->
     rgb, orientation, folder = stack.to_rec709(camera_rgb), orientation_of(stack), stack.folder
     write_stored(folder / PNG_NAME, upright(codes_of(rgb, np.uint8, "srgb"), orientation))
     _write_srgb_tiff(folder / TIFF_NAME, upright(codes_of(rgb, np.uint16, "srgb"), orientation))
-    write_stored(folder / DEPTH_NAME, upright(depth_codes(stack), orientation))
+    write_stored(folder / DEPTH_NAME, upright(depth_codes(stack) if depth_rgb8 is None else depth_rgb8, orientation))
     names = readable_names(stack)
     if DNG_NAME in names and stack.rec709_from_camera is not None:
         model = next((model for each in stack.slices if (model := each.metadata.get("camera_model"))), "unknown camera")

@@ -1,4 +1,4 @@
-"""Slices resampled to the geometry of the reference: written once, read again in as many passes as merging needs."""
+"""Slices as ingested, and resampled to the geometry of the reference: written once, read again in as many passes as merging needs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -6,12 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float16, Float32
+from jaxtyping import Bool, Float, Float16, Float32
 
 from capture.merging.alignment import Registration, warp, warped_validity
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.similarity import Similarity, to_opencv_centres
-from mrbokeh.camera_rgb import SATURATED, write_camera_rgb
+from mrbokeh.camera_rgb import SATURATED, half_of, single_of, write_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FocalStack, Slice
@@ -21,8 +21,33 @@ LARGEST_HELD_BYTES = 256e6
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Half = Float16[np.ndarray, "height width 3"]
+Stored = Float[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
+
+
+@dataclass
+class IngestedSlices:
+    """The slices of a stack as they were ingested. Those of a small stack are read once and held as their files are."""
+
+    stack: FocalStack
+    _held: dict[Path, tuple[Stored, Plane | None]] = field(default_factory=dict)
+
+    def read(self, path: Path) -> tuple[Rgb, Plane]:
+        """Return (camera RGB, share of each pixel that was full) of a file of the stack."""
+        if path not in self._held:
+            rgb, saturated = _read_stored(path)
+            if rgb.nbytes * len(self.stack) > LARGEST_HELD_BYTES:
+                return _single(rgb), saturated
+            self._held[path] = rgb, saturated if saturated.any() else None
+        rgb, held = self._held[path]
+        return _single(rgb), np.zeros(rgb.shape[:2], np.float32) if held is None else held
+
+    def taken(self, path: Path) -> tuple[Rgb, Plane]:
+        """Return what `read` does, for the last time."""
+        found = self.read(path)
+        self._held.pop(path, None)
+        return found
 
 
 @dataclass
@@ -35,6 +60,7 @@ class RegisteredSlices:
 
     stack: FocalStack
     registration: Registration
+    ingested: IngestedSlices
     saturated: Mask | None = None
     _valid: tuple[int, Mask] | None = None
     _held: list[Half] = field(default_factory=list)
@@ -46,24 +72,19 @@ class RegisteredSlices:
             kept = keep and newer(path, *sources)
             rgb, saturated = read_slice(path) if kept else self._resampled(index)
             # Half float keeps 11 bits, far below the noise of a photograph. Rounded at once, a resumed run gives the same.
-            half = rgb.astype(np.float16)
+            half = half_of(rgb)
             self._remember(half, saturated)
             if not kept:
                 self._write(index, half, saturated)
-            yield half.astype(np.float32)
+            yield single_of(half)
 
     def _write(self, index: int, half: Half, saturated: Plane) -> None:
-        import OpenEXR
-
-        # Wavelets make half floats smaller than ZIP does, in half the time.
-        header = {"compression": OpenEXR.PIZ_COMPRESSION}
-        matrix = self.stack.rec709_from_camera
-        write_camera_rgb(self.path(index), half, matrix, saturated=saturated, valid=self.valid(index), attributes=header)
+        write_camera_rgb(self.path(index), half, self.stack.rec709_from_camera, saturated=saturated, valid=self.valid(index))
 
     def passing(self) -> Iterator[Rgb]:
         """The slices once more, after they were all made."""
         for index in range(len(self.stack)):
-            yield self._held[index].astype(np.float32) if self._held else read_slice(self.path(index))[0]
+            yield single_of(self._held[index]) if self._held else read_slice(self.path(index))[0]
 
     def valid(self, index: int) -> Mask:
         """(H, W) where a slice has data, once the first has been made."""
@@ -90,7 +111,7 @@ class RegisteredSlices:
         )
 
     def _resampled(self, index: int) -> tuple[Rgb, Plane]:
-        rgb, saturated = read_slice(self.stack.folder / source_path(self.stack.slices[index]))
+        rgb, saturated = self.ingested.taken(self.stack.folder / source_path(self.stack.slices[index]))
         size_px = (rgb.shape[1], rgb.shape[0])
         if self.registration.size_px not in (None, size_px):
             raise InputError(
@@ -114,9 +135,19 @@ def source_path(each: Slice) -> str:
 
 def read_slice(path: Path) -> tuple[Rgb, Plane]:
     """(camera RGB, share of each pixel that was full) of one file, read once."""
+    rgb, saturated = _read_stored(path)
+    return _single(rgb), saturated
+
+
+def _read_stored(path: Path) -> tuple[Stored, Plane]:
+    """Return what `read_slice` does with the colours as the file has them, mostly in half floats."""
     part = read_exr(path)[0]
-    rgb = part.stacked("RGB")
+    rgb = cv2.merge(part.planes("RGB"))
     return rgb, part.channels[SATURATED].astype(np.float32) if SATURATED in part.channels else np.zeros(rgb.shape[:2], np.float32)
+
+
+def _single(rgb: Stored) -> Rgb:
+    return single_of(rgb) if rgb.dtype == np.float16 else rgb.copy()
 
 
 def _warped_share(saturated: Plane, reference_from_slice: Similarity) -> Plane:

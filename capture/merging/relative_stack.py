@@ -16,10 +16,11 @@ from jaxtyping import Float, Float32
 from capture.merging.depth_from_focus import FocusMap
 from capture.merging.focus_direction import Contours, Direction
 from capture.merging.focus_order import focus_order
-from capture.merging.registered_slices import RegisteredSlices, read_slice, source_path
+from capture.merging.registered_slices import IngestedSlices, RegisteredSlices, source_path
 from capture.merging.relative_focus import RelativeFocus, solve_relative_focus
 from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_from_json, camera_to_json
+from mrbokeh.camera_rgb import half_of
 from mrbokeh.exr_io import ExrPart, write_exr
 from mrbokeh.focal_stack import FocalStack, Slice
 from mrbokeh.lens import Lens
@@ -88,11 +89,11 @@ def _stated_slice(each: Slice) -> Slice:
     return replace(each, focus_distance_m=None if stated is None else float(stated), metadata=metadata)
 
 
-def in_focus_order(stack: FocalStack) -> FocalStack:
+def in_focus_order(stack: FocalStack, ingested: IngestedSlices) -> FocalStack:
     """The slices, as ingested, sorted by their focus where pictures say that they came in another order."""
     if stack.is_metric:
         return stack
-    found = focus_order(lambda index: read_slice(stack.folder / source_path(stack.slices[index]))[0], len(stack))
+    found = focus_order(lambda index: ingested.read(stack.folder / source_path(stack.slices[index]))[0], len(stack))
     if found.as_given:
         return stack
     slices = tuple(replace(stack.slices[i], metadata=stack.slices[i].metadata | {GIVEN_INDEX: i}) for i in found.order)
@@ -208,12 +209,12 @@ def write_relative_depth(stack: FocalStack, focus_index: Plane, confidence: Plan
     dioptres = np.maximum(gauge["offset_dioptres"] + position_px / gauge["px_per_dioptre"], _LEAST_DIOPTRES)
     channels = {
         "focus_index": focus_index,
-        "confidence": confidence,
+        "confidence": half_of(confidence),
         "Z": (1.0 / dioptres).astype(np.float32),
         "blur_position": position_px,
-        "blur_position_error": relative.error_px,
+        "blur_position_error": half_of(relative.error_px),
     }
-    write_exr(Path(stack.folder) / "depth.exr", ExrPart(channels))
+    write_exr(Path(stack.folder) / "depth.exr", ExrPart(channels), compress=False)
 
 
 def _paired(dioptres: Float[np.ndarray, " slices"], stated: FocalStack) -> zip:

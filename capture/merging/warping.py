@@ -2,13 +2,14 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
 from capture.merging.similarity import Similarity, inverse, moved, to_opencv_centres
 
 _STRIP_ROWS = 128
 _MARGIN_PX = 3  # what the cubic kernel and the box around it reach
 _BOX = np.ones((3, 3), np.uint8)
+_NO_SLOPE = 1e-12
 
 Rgb = Float32[np.ndarray, "height width 3"]
 
@@ -29,13 +30,21 @@ def warp(rgb: Rgb, reference_from_slice: Similarity) -> Rgb:
 def warped_validity(shape: tuple[int, int], reference_from_slice: Similarity) -> Bool[np.ndarray, "height width"]:
     """(H, W) where the reference's pixel centres fall inside the slice, so that `warp` has data there."""
     height, width = shape
-    back = inverse(reference_from_slice)
+    back, y = inverse(reference_from_slice), np.arange(height) + 0.5
     # The slice's pixel centres span 0.5 to width - 0.5; a hair more, so that rounding drops no pixel of an unmoved slice.
-    x, y = (np.arange(n) + 0.5 for n in (width, height))
-    column, row = back[:, 0][:, None] * x, back[:, 1][:, None] * y
-    inside_x = np.abs(column[0] + row[0][:, None] + back[0, 2] - width / 2) <= (width - 1) / 2 + 1e-6
-    inside_y = np.abs(column[1] + row[1][:, None] + back[1, 2] - height / 2) <= (height - 1) / 2 + 1e-6
-    return inside_x & inside_y
+    along_x = _run_inside(back[0, 0], back[0, 1] * y + back[0, 2] - width / 2, (width - 1) / 2 + 1e-6)
+    along_y = _run_inside(back[1, 0], back[1, 1] * y + back[1, 2] - height / 2, (height - 1) / 2 + 1e-6)
+    first = np.ceil(np.maximum(along_x[0], along_y[0]) - 0.5).clip(0, width).astype(np.int32)
+    last = np.floor(np.minimum(along_x[1], along_y[1]) - 0.5).clip(-1, width - 1).astype(np.int32)
+    columns = np.arange(width, dtype=np.int32)
+    return (columns >= first[:, None]) & (columns <= last[:, None])
+
+
+def _run_inside(slope: float, offsets: Float[np.ndarray, " rows"], reach: float) -> tuple[Float[np.ndarray, " rows"], ...]:
+    """Return the least and the greatest x of each row with |slope x + offset| <= reach."""
+    slope = float(slope) if abs(slope) > _NO_SLOPE else _NO_SLOPE
+    ends = (-reach - offsets) / slope, (reach - offsets) / slope
+    return ends if slope > 0 else ends[::-1]
 
 
 def _warp_rows(rgb: Rgb, reference_from_slice: Similarity, top: int, out: Float32[np.ndarray, "rows width 3"]) -> None:

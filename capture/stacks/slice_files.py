@@ -14,7 +14,6 @@ from mrbokeh.camera_rgb import Matrix3x3, write_camera_rgb
 
 FOLDER = "slices"
 _ATTRIBUTE = "mrbokehIngest"
-_LARGEST_UNCOMPRESSED_BYTES = 32 * 2**20
 
 
 def source_record(path: Path) -> dict[str, Any]:
@@ -32,19 +31,9 @@ def write_slice(
     *,
     half: bool,
 ) -> None:
-    """A linear slice with its saturation mask (where anything is saturated) and its record, atomically. Raises DiskFullError.
-
-    Small ones are not compressed, which is nine times as quick to write as ZIP and five times to read. Large ones are by PIZ, as lossless
-    as ZIP: half of its size for 8-bit photographs in 2/5 of its time, 3/4 and 1/2 for RAW.
-    """
-    import OpenEXR
-
-    mask = saturated if saturated.any() else None
-    large = rgb.size * (2 if half else 4) > _LARGEST_UNCOMPRESSED_BYTES
-    compression = OpenEXR.PIZ_COMPRESSION if large else OpenEXR.NO_COMPRESSION
-    attributes = {_ATTRIBUTE: json.dumps(record), "compression": compression}
+    """Write a linear slice with its saturation mask and its record, atomically. Raises DiskFullError."""
     with told_when_full(path, rgb.nbytes + saturated.nbytes):
-        write_camera_rgb(path, rgb, rec709_from_camera, saturated=mask, half=half, attributes=attributes)
+        write_camera_rgb(path, rgb, rec709_from_camera, saturated=saturated, half=half, attributes={_ATTRIBUTE: json.dumps(record)})
 
 
 def read_slice_record(path: Path) -> dict[str, Any] | None:
