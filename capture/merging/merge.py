@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from capture.merging.alignment import Registration, register_stack
 from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
-from capture.merging.depth_from_focus import FocusMap, focus_map
+from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights
 from capture.merging.merged_pictures import write_readable_pictures
@@ -19,7 +19,9 @@ from capture.merging.registered_slices import RegisteredSlices, newer, read_slic
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
 from capture.merging.relative_stack import as_stated, in_focus_order, with_solved_blur
+from capture.merging.replaced_places import depth_m_of
 from capture.merging.restored_lights import RestoredLight, restored_lights, with_restored_lights
+from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
 from capture.merging.slice_optics import SliceOptics
 from capture.stacks.sentinel_focus import stated_by_sentinel
@@ -94,14 +96,6 @@ def _crossover(stack: FocalStack, width_px: int) -> float:
     return crossover_of(float(np.median(np.abs(np.diff(optics.focus_dioptres)))) * max(optics.px_per_dioptre))
 
 
-def depth_m_of(stack: FocalStack, focus: FocusMap) -> Plane | None:
-    """The focus index in metres, interpolated in dioptres; None where a focus distance is unknown."""
-    if not stack.is_metric:
-        return None
-    dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
-    return (1.0 / np.maximum(focus.dioptres(dioptres), 1e-6)).astype(np.float32)
-
-
 def _registration_of(stack: FocalStack, overwrite: bool, given: Path | None) -> Registration:
     """As given, as an interrupted run has left it, or found out; in every case it is written beside stack.json."""
     own, sources = stack.folder / REGISTRATION_NAME, [stack.folder / source_path(each) for each in stack.slices]
@@ -123,7 +117,7 @@ def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:
     """The merged stack in the geometry of its reference: lens focused there, camera of that focus."""
     reference = slices.registration.reference
-    metadata = stack.metadata | {DEPTH_SOURCE: FROM_FOCUS}
+    metadata = {key: value for key, value in stack.metadata.items() if key != RETOUCHES} | {DEPTH_SOURCE: FROM_FOCUS}
     changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference, metadata=metadata)
     if stack.lens is None or stack.slices[reference].focus_distance_m is None:
         return changed
