@@ -11,10 +11,12 @@ from jaxtyping import Float32
 
 from capture.merging.alignment import Registration, register_stack
 from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
-from capture.merging.depth_from_focus import focus_map
+from capture.merging.depth_from_focus import focus_map, vetoed
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights
 from capture.merging.merged_pictures import write_readable_pictures
+from capture.merging.preferred_merge import PREFERRED, Seen, with_preferred
+from capture.merging.preferred_side import Side
 from capture.merging.registered_slices import RegisteredSlices, newer, read_slice, source_path
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
@@ -40,16 +42,17 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 
-def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None = None) -> list[FocalStack]:
+def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> list[FocalStack]:
     """Merge every stack of a scene that is not merged yet (or all, to overwrite).
 
-    registration: a file that says how the slices of every stack fit together, instead of finding it out.
+    registration: a file that says how the slices of every stack fit together, instead of finding it out. prefer: of two things that are
+    seen in one place.
     """
     stacks = find_focal_stacks(scene)
-    return [stack if stack.merged and not overwrite else merge_stack(stack, overwrite, registration) for stack in stacks]
+    return [stack if stack.merged and not overwrite else merge_stack(stack, overwrite, registration, prefer) for stack in stacks]
 
 
-def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None) -> FocalStack:
+def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> FocalStack:
     """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
     stack = in_focus_order(as_stated(stack))
     _require_a_sweep(stack)
@@ -67,6 +70,9 @@ def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path |
     write_merged(stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus), stack.rec709_from_camera)
     if not stack.is_metric:
         merged = with_solved_blur(merged, slices, sharp, focus)
+    if prefer is not None:
+        rims = vetoed(lights.slice_index(), slices.saturated)
+        merged, sharp = with_preferred(merged, sharp, slices.passing, Seen(volume, focus.focus_index, rims), prefer)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
     write_readable_pictures(merged, sharp)
     write_focal_stack(merged)
@@ -117,7 +123,7 @@ def _registered(stack: FocalStack, sources: Sequence[Path]) -> Registration:
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:
     """The merged stack in the geometry of its reference: lens focused there, camera of that focus."""
     reference = slices.registration.reference
-    metadata = {key: value for key, value in stack.metadata.items() if key != RETOUCHES} | {DEPTH_SOURCE: FROM_FOCUS}
+    metadata = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)} | {DEPTH_SOURCE: FROM_FOCUS}
     changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference, metadata=metadata)
     if stack.lens is None or stack.slices[reference].focus_distance_m is None:
         return changed

@@ -23,7 +23,6 @@ RETOUCHES = "retouches"
 PAINTED_CONFIDENCE = 0.5
 """Of a depth that a mask states: it is that of the slice, while the surface under a coarse mask may lean."""
 _HALF = 0.5
-_REACH_PX = 4 << BANDS
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -68,8 +67,7 @@ def painted(picture: Rgb, slice_rgb: Rgb, share: Plane) -> Rgb:
     blend = BandBlend(share.shape, _bands_of(share))
     blend.add(picture, np.float32(1.0) - share)
     blend.add(slice_rgb, share)
-    near = cv2.dilate((share > 0).astype(np.uint8), np.ones((2 * _REACH_PX + 1,) * 2, np.uint8))
-    return np.where(near[..., None] > 0, blend.result(), picture)
+    return np.where(blend.reached(share)[..., None], blend.result(), picture)
 
 
 def retouches_of(stack: FocalStack) -> list[dict[str, object]]:
