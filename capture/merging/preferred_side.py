@@ -1,7 +1,8 @@
 """Where two things at different depths are seen in one place, which of them the merged picture shows: a web or the leaves behind it.
 
 There the focus energy has two clear peaks along the slices. The focus map takes what fits its surroundings; who merges may prefer the near
-or the far one. The window of the energy sees both sides of an edge, so only those pixels are taken that have the detail themselves.
+or the far one. The window of the energy sees a thread from several pixels away, where there is nothing but what lies behind it: a pixel
+takes the preferred slice only if that shows detail in the pixel itself, else the other one on the same condition, else nothing changes.
 """
 
 from collections.abc import Iterable
@@ -30,9 +31,10 @@ _WITHIN = 3.0
 _SMOOTH_PX = 2.0
 _FEWEST_PIXELS = 30
 """Noise of single pixels of the volume has peaks of its own; what crosses has neighbours."""
-_OWN_WINDOW_PX, _WINDOW_PX = 1.0, 2.5
+_OWN_WINDOW_PX, _WINDOW_PX = 1.0, 5.0
 _OWN_SHARE = 0.5
-_GAP_PX = 3
+"""The wide window is that in which peaks are looked for; texture has about as much in the narrow one, and a thread more."""
+_GAP_PX = 5
 
 
 @dataclass(frozen=True)
@@ -46,20 +48,24 @@ class Preferred:
 def preferred_places(
     registered: Iterable[Rgb], volume: FocusVolume, focus_index: Plane, from_first: bool, excluded: Mask | None = None
 ) -> Preferred:
-    """Return where the first of two clear peaks is not the one that was taken. Registered slices are read once.
+    """Return where one of two clear peaks takes the place of what was taken. Registered slices are read once.
 
-    from_first: peaks are looked for from the first slice on, else from the last. excluded: (H, W) where peaks are rims of lights.
+    from_first: the peak that is nearer to the first slice is preferred, else the one nearer to the last. excluded: (H, W) where peaks are
+    rims of lights.
     """
-    peaks = first_of_two_peaks(volume.energies, from_first)
-    label = volume.enlarged(peaks.astype(np.float32), 0.0)
-    candidates = (label >= 0) & (np.abs(label - focus_index) > SURFACE_STEP)
-    if excluded is not None:
-        candidates &= ~excluded
-    where = np.zeros(volume.shape, bool)
+    ends = (from_first, not from_first)
+    wanted, other = (volume.enlarged(first_of_two_peaks(volume.energies, end).astype(np.float32), 0.0) for end in ends)
+    has_wanted, has_other = np.zeros(volume.shape, bool), np.zeros(volume.shape, bool)
     for index, rgb in enumerate(registered):
-        asked = candidates & (label == index)
-        if asked.any():
-            where |= asked & _has_the_detail(rgb)
+        is_wanted, is_other = wanted == index, other == index
+        if is_wanted.any() or is_other.any():
+            detail = _has_the_detail(rgb)
+            has_wanted |= detail & is_wanted
+            has_other |= detail & is_other
+    label = np.where(has_wanted, wanted, np.where(has_other, other, np.float32(-1.0)))
+    where = (label >= 0) & (np.abs(label - focus_index) > SURFACE_STEP)
+    if excluded is not None:
+        where &= ~excluded
     return Preferred(where, np.where(where, label, focus_index).astype(np.float32))
 
 
