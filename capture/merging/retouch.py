@@ -9,14 +9,15 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.merging.all_in_focus import BANDS, BandBlend
-from capture.merging.merged_pictures import orientation_of, write_readable_pictures
+from capture.merging.merged_pictures import orientation_of, readable_names, write_readable_pictures
 from capture.merging.replaced_places import replaced_depth
 from capture.merging.retouch_mask import read_mask
+from mrbokeh.atomic_files import require_safe_outputs
 from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack
-from mrbokeh.stack_pictures import write_merge_sheet
+from mrbokeh.stack_pictures import SHEET_NAME, write_merge_sheet
 
 RETOUCHES = "retouches"
 """Key in a stack's metadata: which slice was put where a mask is white, in the order of the calls (slice, source, mask, share)."""
@@ -45,6 +46,7 @@ def retouch_scene(scene: Path, slices: Sequence[int], masks: Sequence[Path]) -> 
     stack = _only_merged(scene)
     if len(slices) != len(masks):
         raise InputError(f"expected a --mask for each --from-slice, got {len(slices)} of --from-slice and {len(masks)} of --mask")
+    require_safe_outputs(_outputs(stack), masks, overwrite=True)
     wanted = [_retouch(stack, index, mask) for index, mask in zip(slices, masks, strict=True)]
     picture, part = stack.all_in_focus_camera_rgb(), read_exr(stack.depth_path)[0]
     channels = dict(part.channels)
@@ -60,6 +62,10 @@ def retouch_scene(scene: Path, slices: Sequence[int], masks: Sequence[Path]) -> 
     write_focal_stack(changed)
     write_merge_sheet(changed)
     return changed
+
+
+def _outputs(stack: FocalStack) -> list[Path]:
+    return [stack.all_in_focus_path, stack.depth_path, *(stack.folder / name for name in (*readable_names(stack), SHEET_NAME))]
 
 
 def painted(picture: Rgb, slice_rgb: Rgb, share: Plane) -> Rgb:
