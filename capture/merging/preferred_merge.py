@@ -16,7 +16,7 @@ from mrbokeh.focal_stack import FocalStack
 from mrbokeh.guessed_metres import metres_facts
 
 PREFERRED = "preferred"
-"""Key in a stack's metadata: the side that was asked for, the share of the picture that took it, and whether near is known."""
+"""Key in a stack's metadata: the side that was asked for, the share of the picture that changed, and whether near is known."""
 
 Rgb = Float32[np.ndarray, "height width 3"]
 
@@ -66,9 +66,9 @@ def preferred_lines(stack: FocalStack) -> list[str]:
     record: dict[str, Any] | None = stack.metadata.get(PREFERRED)
     if record is None:
         return []
-    taken = f"the {record['side']} one of two things was taken in {record['share']:.2%} of the picture" if record["share"] else ""
+    taken = f"{record['share']:.2%} of the picture changed, around things that cross" if record["share"] else ""
     lines = [f"--prefer {record['side']}: {taken or 'nothing changed, no place shows the other of two things in focus'}"]
-    if not record["sure"]:
+    if record["share"] and not record["sure"]:
         end, other = "first" if record["first_is_near"] else "last", "far" if record["side"] == "near" else "near"
         lines.append(
             f"--prefer {record['side']}: that the {end} slice is the nearest is a guess; if it is the farthest, use --prefer {other}"
