@@ -27,15 +27,21 @@ def depth_command(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
 ) -> None:
+    from capture.merging.retouch import retouched_stacks, retouches_text
     from capture.views.dense_depth import DenseSettings
     from capture.views.scene_depth import SceneDepthSettings, deepen_scene
     from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.stack_pictures import SHEET_NAME
 
+    retouched = retouched_stacks(scene)
     settings = SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device))
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         result = deepen_scene(scene, settings)
     for stack in result.stacks:
         typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
+        if stack.folder in retouched and not retouches_text(stack):
+            typer.echo(
+                f"  made anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask to `capture merge` again"
+            )
     if result.left_out:
         typer.echo(f"without a pose or with guessed metres, depth from focus only: {', '.join(result.left_out)}")

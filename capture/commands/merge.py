@@ -1,9 +1,14 @@
 """`mrbokeh capture merge`: registered slices, all-in-focus picture and depth of every stack."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+from mrbokeh.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.focal_stack import FocalStack
 
 HELP = "\n\n".join(
     (
@@ -13,8 +18,15 @@ HELP = "\n\n".join(
         "Stacks that are merged already are left alone unless --overwrite is given; an interrupted run goes on where it stopped. "
         "registration.json in the folder of each stack says how its slices fit together. --registration uses such a file for all "
         "stacks instead: those taken with the same lens and the same focus distances from a firm tripod.",
+        "--from-slice K --mask FILE retouches a stack that is merged: where the mask is white, picture and depth become those of slice K, "
+        "and nothing is registered or merged anew. Slices count from 0, as in merge.png and stack.json; paint the mask over "
+        "all_in_focus.png (PNG, TIFF or EXR; grey blends). Both may be given several times, in pairs, and later calls add to earlier ones.",
+        "--prefer near (or far) decides where two things at different depths are both seen sharp in one place: a web before leaves, legs "
+        "that cross, a scratch on glass. Elsewhere nothing changes.",
         "Example:  mrbokeh capture merge scene/",
         "Example:  mrbokeh capture merge scene/ --registration scene/view_0/registration.json --overwrite",
+        "Example:  mrbokeh capture merge scene/ --prefer near --overwrite",
+        "Example:  mrbokeh capture merge scene/view_0 --from-slice 3 --mask web.png --from-slice 11 --mask leaves.png",
     )
 )
 
@@ -24,20 +36,57 @@ def merge_command(
     registration: Annotated[
         Path | None, typer.Option(metavar="FILE", help="a registration.json to use for every stack instead of finding one")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="merge again what is merged already")] = False,
+    prefer: Annotated[
+        Literal["near", "far"] | None,
+        typer.Option(help="where a near and a far thing are both seen sharp in one place, as a web before leaves, show this one"),
+    ] = None,
+    from_slice: Annotated[
+        list[int] | None, typer.Option(metavar="K", help="slice to put where the --mask after it is white; may be repeated")
+    ] = None,
+    mask: Annotated[list[Path] | None, typer.Option(metavar="FILE", help="white where the --from-slice before it is to be taken")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="merge again what is merged already; retouches are dropped")] = False,
 ) -> None:
     from capture.merging.merge import merge_scene
-    from capture.merging.merged_pictures import readable_names
+    from capture.merging.preferred_merge import preferred_lines, preferred_side
     from capture.merging.relative_stack import METRES, ORDER
+    from capture.merging.retouch import retouched_stacks
     from mrbokeh.interrupts import kept_when_interrupted
-    from mrbokeh.stack_pictures import SHEET_NAME
 
+    if from_slice or mask:
+        if overwrite or registration is not None or prefer is not None:
+            raise InputError(
+                "--from-slice and --mask retouch what is merged: leave out --overwrite, --registration and --prefer, or merge first"
+            )
+        _retouch(scene, from_slice or [], mask or [])
+        return
+    retouched = retouched_stacks(scene) if overwrite else {}
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
-        stacks = merge_scene(scene, overwrite, registration)
+        stacks = merge_scene(scene, overwrite, registration, prefer)
     for stack in stacks:
-        depth = "depth in metres" if stack.metres_known else "depth in guessed metres"
-        files = ", ".join([*readable_names(stack), SHEET_NAME])
-        typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {files}")
+        _tell(stack)
         for told in (stack.metadata.get(ORDER), (stack.metadata.get(METRES) or {}).get("why")):
             if told:
                 typer.echo(f"  {told}")
+        for line in preferred_lines(stack):
+            typer.echo(f"  {line}")
+        if prefer is not None and preferred_side(stack) != prefer:
+            typer.echo(f"  merged before, without --prefer {prefer}: --overwrite merges it again")
+        if stack.folder in retouched:
+            typer.echo(f"  merged anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask again")
+
+
+def _tell(stack: "FocalStack") -> None:
+    from capture.merging.merged_pictures import readable_names
+    from mrbokeh.stack_pictures import SHEET_NAME
+
+    depth = "depth in metres" if stack.metres_known else "depth in guessed metres"
+    files = ", ".join([*readable_names(stack), SHEET_NAME])
+    typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {files}")
+
+
+def _retouch(scene: Path, slices: list[int], masks: list[Path]) -> None:
+    from capture.merging.retouch import retouch_scene, retouches_text
+
+    stack = retouch_scene(scene, slices, masks)
+    _tell(stack)
+    typer.echo(f"  retouched: {retouches_text(stack)}")

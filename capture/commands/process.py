@@ -1,7 +1,7 @@
 """`mrbokeh capture process`: everything from photographs to a report in one go."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -25,6 +25,9 @@ def process_command(
     square_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a square as measured on the print")] = None,
     marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
     distance: Annotated[str | None, typer.Option(metavar="VIEW_A,VIEW_B,METRES", help="between two camera centres")] = None,
+    prefer: Annotated[
+        Literal["near", "far"] | None, typer.Option(help="of two things that are both seen sharp in one place, for `capture merge`")
+    ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 1 when a gate fails or is not judged")] = False,
     allow_absent: Annotated[
         list[str] | None, typer.Option("--allow-absent", metavar="NAME", help="a gate that --strict may leave unjudged (repeatable)")
@@ -52,7 +55,7 @@ def process_command(
     if (out / SESSION_NAME).exists() and not overwrite:
         typer.echo(f"{out} is there already: what is finished is kept, the rest goes on (--overwrite makes all of it again)")
     ingest_command(photographs, out, sidecar=sidecar, max_width=max_width, overwrite=overwrite)
-    merge_command(out, overwrite=overwrite)
+    merge_command(out, prefer=prefer, overwrite=overwrite)
     if len(find_focal_stacks(out)) < 2:
         typer.echo("one viewpoint: depth comes from focus alone (photograph five or more for depth from several views)")
     else:

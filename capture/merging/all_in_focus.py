@@ -142,6 +142,11 @@ class BandBlend:
         picture = np.maximum(picture, 0.0)
         return np.clip(picture * picture, self.darkest, self.brightest)
 
+    def reached(self, share: Plane) -> Bool[np.ndarray, "height width"]:
+        """Return where a picture of this weight (H, W) can have changed anything."""
+        size = 2 * (4 << self.bands) + 1
+        return cv2.dilate((share > 0).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+
     def _widen(self, rgb: Rgb) -> None:
         if self.darkest is None or self.brightest is None:
             self.darkest, self.brightest = rgb.copy(), rgb.copy()

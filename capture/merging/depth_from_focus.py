@@ -72,7 +72,7 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     index = volume.enlarged(np.where(volume.reduced(by_light) >= 0, labels, labels + offset).astype(np.float32), SURFACE_STEP)
     trust = share_above(strongest, CONFIDENCE_NOISE_FLOORS) * _confidence(volume, labels)
     trust = volume.enlarged(trust) * _share_of_one_surface(index)
-    confidence = np.where(_vetoed(by_light, saturated), 0.0, trust).astype(np.float32)
+    confidence = np.where(vetoed(by_light, saturated), 0.0, trust).astype(np.float32)
     index[lights.core] = lights.focus_index[lights.zone[lights.core] - 1]
     return FocusMap(index, confidence)
 
@@ -89,7 +89,8 @@ def _let_lights_decide(costs: Volume, by_light: Labels, core: Bool[np.ndarray, "
     costs[:, core] = LARGEST_COST * (np.arange(len(costs))[:, None] != by_light[core])
 
 
-def _vetoed(by_light: Labels, saturated: Bool[np.ndarray, "height width"] | None) -> Bool[np.ndarray, "height width"]:
+def vetoed(by_light: Labels, saturated: Bool[np.ndarray, "height width"] | None) -> Bool[np.ndarray, "height width"]:
+    """Return where energy is that of rims: within the reach of lights (`by_light` >= 0) and beside pixels that are full."""
     if saturated is None or not saturated.any():
         return by_light >= 0
     size = 2 * SATURATION_REACH_PX + 1

@@ -11,15 +11,19 @@ from jaxtyping import Float32
 
 from capture.merging.alignment import Registration, register_stack
 from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
-from capture.merging.depth_from_focus import FocusMap, focus_map
+from capture.merging.depth_from_focus import focus_map, vetoed
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights
 from capture.merging.merged_pictures import write_readable_pictures
+from capture.merging.preferred_merge import PREFERRED, Seen, with_preferred
+from capture.merging.preferred_side import Side
 from capture.merging.registered_slices import IngestedSlices, RegisteredSlices, newer, source_path
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration_file import read_registration, write_registration
 from capture.merging.relative_stack import as_stated, in_focus_order, with_solved_blur
+from capture.merging.replaced_places import depth_m_of
 from capture.merging.restored_lights import RestoredLight, restored_lights, with_restored_lights
+from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
 from capture.merging.slice_optics import SliceOptics
 from capture.stacks.sentinel_focus import stated_by_sentinel
@@ -39,16 +43,17 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 
-def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None = None) -> list[FocalStack]:
+def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> list[FocalStack]:
     """Merge every stack of a scene that is not merged yet (or all, to overwrite).
 
-    registration: a file that says how the slices of every stack fit together, instead of finding it out.
+    registration: a file that says how the slices of every stack fit together, instead of finding it out. prefer: of two things that are
+    seen in one place.
     """
     stacks = find_focal_stacks(scene)
-    return [stack if stack.merged and not overwrite else merge_stack(stack, overwrite, registration) for stack in stacks]
+    return [stack if stack.merged and not overwrite else merge_stack(stack, overwrite, registration, prefer) for stack in stacks]
 
 
-def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None) -> FocalStack:
+def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> FocalStack:
     """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
     ingested = IngestedSlices(stack)
     stack = in_focus_order(as_stated(stack), ingested)
@@ -69,6 +74,9 @@ def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path |
     else:
         write_camera_rgb(stack.all_in_focus_path, sharp, stack.rec709_from_camera, half=False)
         merged = with_solved_blur(merged, slices, sharp, focus)
+    if prefer is not None:
+        rims = vetoed(lights.slice_index(), slices.saturated)
+        merged, sharp = with_preferred(merged, sharp, slices.passing, Seen(volume, focus.focus_index, rims), prefer)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
     codes = depth_codes(merged)
     write_readable_pictures(merged, sharp, codes)
@@ -99,14 +107,6 @@ def _crossover(stack: FocalStack, width_px: int) -> float:
     return crossover_of(float(np.median(np.abs(np.diff(optics.focus_dioptres)))) * max(optics.px_per_dioptre))
 
 
-def depth_m_of(stack: FocalStack, focus: FocusMap) -> Plane | None:
-    """The focus index in metres, interpolated in dioptres; None where a focus distance is unknown."""
-    if not stack.is_metric:
-        return None
-    dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
-    return (1.0 / np.maximum(focus.dioptres(dioptres), 1e-6)).astype(np.float32)
-
-
 def _registration_of(stack: FocalStack, ingested: IngestedSlices, overwrite: bool, given: Path | None) -> Registration:
     """As given, as an interrupted run has left it, or found out; in every case it is written beside stack.json."""
     own, sources = stack.folder / REGISTRATION_NAME, [stack.folder / source_path(each) for each in stack.slices]
@@ -128,7 +128,7 @@ def _registered(stack: FocalStack, ingested: IngestedSlices, sources: Sequence[P
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:
     """The merged stack in the geometry of its reference: lens focused there, camera of that focus."""
     reference = slices.registration.reference
-    metadata = stack.metadata | {DEPTH_SOURCE: FROM_FOCUS}
+    metadata = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)} | {DEPTH_SOURCE: FROM_FOCUS}
     changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference, metadata=metadata)
     if stack.lens is None or stack.slices[reference].focus_distance_m is None:
         return changed

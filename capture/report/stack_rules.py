@@ -46,13 +46,15 @@ SHARP = Rule(
     "as sharp as its slices",
     f"at most {LARGEST_LOST:.1%} of the textured blocks with less than {KEPT_DETAIL:.0%} of the detail of their sharpest slice",
     "What is sharp in a slice and not in the all-in-focus picture was lost by merging.",
-    "Look at the crops. Where slices do not match there (movement, wind), leave out the slice; else merge again with --overwrite.",
+    "Look at the crops. Where slices do not match there (movement, wind), leave out the slice; where one slice shows the place as it "
+    "should be, put it in by hand (`mrbokeh capture merge STACK --from-slice K --mask FILE`); else merge again with --overwrite.",
 )
 SEAMS = Rule(
     "no seams",
     f"95% of the flat blocks with at most {LARGEST_FLAT:g} times the detail of their sharpest slice",
     "Detail that no slice has comes from borders between slices of different tint or brightness, or from noise.",
-    "Look at the crops. Lock exposure and white balance, avoid flickering lamps; merge again with --overwrite.",
+    "Look at the crops. Lock exposure and white balance, avoid flickering lamps; merge again with --overwrite, or put one slice over a "
+    "seam by hand (`mrbokeh capture merge STACK --from-slice K --mask FILE`).",
 )
 LIGHT = Rule(
     "no invented light",

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture.merging.merged_pictures import write_readable_pictures
+from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, first_pass_path, second_pass
 from capture.views.dense_finish import DenseDepth
 from mrbokeh.camera_rgb import read_camera_rgb
@@ -23,8 +24,9 @@ _SEAM_PX = 1.5
 
 
 def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, object]) -> FocalStack:
-    """Pictures first, stack.json last. record: what the depth was made from."""
-    deepened = replace(stack, metadata=stack.metadata | {DEPTH_SOURCE: record})
+    """Pictures first, stack.json last; retouches are of the first picture. record: what the depth was made from."""
+    kept = {key: value for key, value in stack.metadata.items() if key != RETOUCHES}
+    deepened = replace(stack, metadata=kept | {DEPTH_SOURCE: record})
     write_merged(
         stack.folder,
         _picture(deepened, found),

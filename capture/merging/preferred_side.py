@@ -1,0 +1,131 @@
+"""Where two things at different depths are seen in one place, which of them the merged picture shows: a web or the leaves behind it.
+
+There the focus energy has two clear peaks along the slices. The focus map takes what fits its surroundings; who merges may prefer the near
+or the far one. The window of the energy sees a thread from several pixels away, where there is nothing but what lies behind it: a pixel
+takes the preferred slice only if that shows detail in the pixel itself, else the other one on the same condition, else nothing changes.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+from capture.merging.all_in_focus import BandBlend
+from capture.merging.depth_from_focus import SURFACE_STEP
+from capture.merging.focus_volume import FocusVolume, focus_energy
+
+Side = Literal["near", "far"]
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Labels = Int[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+
+_DROP = 0.7
+"""E-folds by which the energy falls behind one peak and rises to the next: the slices between show half of what either shows."""
+_LEAST_NOISE_FLOORS = 30.0
+_WITHIN = 3.0
+"""E-folds by which the two peaks may differ: less than a quarter of the contrast is what blurred rims reach."""
+_SMOOTH_PX = 2.0
+_FEWEST_PIXELS = 30
+"""Noise of single pixels of the volume has peaks of its own; what crosses has neighbours."""
+_OWN_WINDOW_PX, _WINDOW_PX = 1.0, 5.0
+_OWN_SHARE = 0.5
+"""The wide window is that in which peaks are looked for; texture has about as much in the narrow one, and a thread more."""
+_GAP_PX = 5
+
+
+@dataclass(frozen=True)
+class Preferred:
+    """where: (H, W) pixels that show something else now. index: (H, W) the slices of all; of those that changed a whole number."""
+
+    where: Mask
+    index: Plane
+
+
+def preferred_places(
+    registered: Iterable[Rgb], volume: FocusVolume, focus_index: Plane, from_first: bool, excluded: Mask | None = None
+) -> Preferred:
+    """Return where one of two clear peaks takes the place of what was taken. Registered slices are read once.
+
+    from_first: the peak that is nearer to the first slice is preferred, else the one nearer to the last. excluded: (H, W) where peaks are
+    rims of lights.
+    """
+    ends = (from_first, not from_first)
+    wanted, other = (volume.enlarged(first_of_two_peaks(volume.energies, end).astype(np.float32), 0.0) for end in ends)
+    has_wanted, has_other = np.zeros(volume.shape, bool), np.zeros(volume.shape, bool)
+    for index, rgb in enumerate(registered):
+        is_wanted, is_other = wanted == index, other == index
+        if is_wanted.any() or is_other.any():
+            detail = _has_the_detail(rgb)
+            has_wanted |= detail & is_wanted
+            has_other |= detail & is_other
+    label = np.where(has_wanted, wanted, np.where(has_other, other, np.float32(-1.0)))
+    where = (label >= 0) & (np.abs(label - focus_index) > SURFACE_STEP)
+    if excluded is not None:
+        where &= ~excluded
+    return Preferred(where, np.where(where, label, focus_index).astype(np.float32))
+
+
+def blended(picture: Rgb, registered: Iterable[Rgb], preferred: Preferred) -> Rgb:
+    """Blend the preferred slices into a picture; where nothing is preferred nearby it stays bit for bit."""
+    if not preferred.where.any():
+        return picture
+    share = preferred.where.astype(np.float32)
+    blend = BandBlend(share.shape)
+    blend.add(picture, np.float32(1.0) - share)
+    for index, rgb in enumerate(registered):
+        chosen = share * (preferred.index == index)
+        if chosen.any():
+            blend.add(rgb, chosen.astype(np.float32))
+    return np.where(blend.reached(share)[..., None], blend.result(), picture)
+
+
+def first_of_two_peaks(energies: Float32[np.ndarray, "slices height width"], from_first: bool) -> Labels:
+    """Return the slice of the first clear peak that a second one follows, -1 where there is one peak or none."""
+    order = range(len(energies)) if from_first else range(len(energies) - 1, -1, -1)
+    climb = _Climb.at_foot(energies.shape[1:])
+    for index in order:
+        climb.pass_slice(index, np.log1p(cv2.GaussianBlur(energies[index], (0, 0), _SMOOTH_PX)))
+    return np.where(_without_specks(climb.is_double()), climb.label, -1)
+
+
+@dataclass
+class _Climb:
+    """The walk along the slices at every pixel: up to a peak (label), down until it is left, through the valley and up again."""
+
+    label: Labels
+    peak: Plane
+    valley: Plane
+    second: Plane
+    left: Mask
+
+    @classmethod
+    def at_foot(cls, shape: tuple[int, ...]) -> "_Climb":
+        low, high = np.full(shape, -1.0, np.float32), np.full(shape, np.inf, np.float32)
+        return cls(np.full(shape, -1), low, high, low.copy(), np.zeros(shape, bool))
+
+    def pass_slice(self, index: int, height: Plane) -> None:
+        rises = ~self.left & (height > self.peak)
+        self.label[rises], self.peak[rises] = index, height[rises]
+        self.left |= (self.peak > np.log1p(_LEAST_NOISE_FLOORS)) & (height < self.peak - _DROP)
+        self.valley[self.left] = np.minimum(self.valley, height)[self.left]
+        climbs = self.left & (height > np.maximum(self.valley + _DROP, np.log1p(_LEAST_NOISE_FLOORS)))
+        self.second[climbs] = np.maximum(self.second, height)[climbs]
+
+    def is_double(self) -> Mask:
+        return (self.second > 0) & (np.abs(self.second - self.peak) < _WITHIN)
+
+
+def _without_specks(found: Mask) -> Mask:
+    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, parts, facts, _ = cv2.connectedComponentsWithStats(opened)
+    return (opened > 0) & (facts[:, cv2.CC_STAT_AREA] >= _FEWEST_PIXELS)[parts]
+
+
+def _has_the_detail(rgb: Rgb) -> Mask:
+    """Return where detail lies in the pixel itself and not only beside it; small gaps within are filled."""
+    own = focus_energy(rgb, _OWN_WINDOW_PX) >= _OWN_SHARE * focus_energy(rgb, _WINDOW_PX)
+    return cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_GAP_PX, _GAP_PX), np.uint8)) > 0
