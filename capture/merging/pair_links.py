@@ -9,6 +9,8 @@ from capture.merging.corner_tracks import CornerTracks
 from capture.merging.pair_matching import PairMatch
 from capture.merging.similarity import Similarity, about_centre, moved, scale_of
 
+_LAID_SCATTER_PX = 0.01
+
 
 def with_links(
     count: int, held: Mapping[Pair, CornerTracks], matches: Mapping[Pair, PairMatch], breathing: Breathing, size_px: tuple[int, int]
@@ -40,6 +42,10 @@ def _missing_links(count: int, pairs: Iterable[Pair]) -> list[Pair]:
 
 
 def _laid_tracks(target_from_source: Similarity, size_px: tuple[int, int]) -> CornerTracks:
-    """The corners of the picture, as a transform moves them."""
+    """The corners of the picture, as a transform moves them.
+
+    They alone hold two groups of slices together: trusted like tracks, they would give way, and a group shrink to a point, where its own
+    tracks disagree by nothing.
+    """
     source_px = np.array([[x, y] for x in (0.0, size_px[0]) for y in (0.0, size_px[1])])
-    return CornerTracks(moved(target_from_source, source_px), source_px)
+    return CornerTracks(moved(target_from_source, source_px), source_px, _LAID_SCATTER_PX)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float, Float16, Float32
 from capture.merging.alignment import Registration, warp, warped_validity
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.similarity import Similarity, to_opencv_centres
+from capture.merging.tint import Gains, SmallSlice, tint_gains
 from mrbokeh.camera_rgb import SATURATED, half_of, single_of, write_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
@@ -32,16 +34,24 @@ class IngestedSlices:
 
     stack: FocalStack
     _held: dict[Path, tuple[Stored, Plane | None]] = field(default_factory=dict)
+    _small: dict[Path, SmallSlice] = field(default_factory=dict)
 
     def read(self, path: Path) -> tuple[Rgb, Plane]:
         """Return (camera RGB, share of each pixel that was full) of a file of the stack."""
         if path not in self._held:
             rgb, saturated = _read_stored(path)
+            self._small[path] = SmallSlice.of(_single(rgb), saturated)
             if rgb.nbytes * len(self.stack) > LARGEST_HELD_BYTES:
                 return _single(rgb), saturated
             self._held[path] = rgb, saturated if saturated.any() else None
         rgb, held = self._held[path]
         return _single(rgb), np.zeros(rgb.shape[:2], np.float32) if held is None else held
+
+    def small(self, path: Path) -> SmallSlice:
+        """Return what is left of a slice at the size of large areas; it is read if it was not before."""
+        if path not in self._small:
+            self.read(path)
+        return self._small[path]
 
     def taken(self, path: Path) -> tuple[Rgb, Plane]:
         """Return what `read` does, for the last time."""
@@ -54,7 +64,8 @@ class IngestedSlices:
 class RegisteredSlices:
     """The slices of a stack in the geometry of its reference, as files in `registered/`.
 
-    A small stack is held in memory as half floats, as the files are, so that further passes read nothing.
+    A small stack is held in memory as half floats, as the files are, so that further passes read nothing. Their gain and tint are those of
+    the reference.
     saturated: (H, W) full in some slice, once all have been made.
     """
 
@@ -105,7 +116,11 @@ class RegisteredSlices:
                 path=f"{REGISTERED_FOLDER}/{index:02d}.exr",
                 scale=self.registration.scales[index],
                 metadata=each.metadata
-                | {"ingested": source_path(each), "reference_from_slice": self.registration.reference_from_slice[index].tolist()},
+                | {
+                    "ingested": source_path(each),
+                    "reference_from_slice": self.registration.reference_from_slice[index].tolist(),
+                    "tint_gain": self.tint_gains[index].tolist(),
+                },
             )
             for index, each in enumerate(self.stack.slices)
         )
@@ -118,8 +133,16 @@ class RegisteredSlices:
                 f"the registration is for pictures of {self.registration.size_px} px, but slice {index} of {self.stack.folder} has "
                 f"{size_px}: leave --registration out, and the slices are registered anew"
             )
-        transform = self.registration.reference_from_slice[index]
+        transform, gain = self.registration.reference_from_slice[index], self.tint_gains[index]
+        if (gain != 1.0).any():
+            rgb = cv2.multiply(rgb, (*gain.tolist(), 1.0))
         return warp(rgb, transform), _warped_share(saturated, transform)
+
+    @cached_property
+    def tint_gains(self) -> Gains:
+        """(slices, 3) what the light of each slice was multiplied with."""
+        small = [self.ingested.small(self.stack.folder / source_path(each)) for each in self.stack.slices]
+        return tint_gains(small, self.registration.reference_from_slice, self.registration.reference)
 
     def _remember(self, half: Half, saturated: Plane) -> None:
         full = saturated > 0

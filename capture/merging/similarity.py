@@ -51,8 +51,13 @@ def farthest_corner_px(a: Similarity, b: Similarity, width_px: int, height_px: i
 
 def at_level(transform: Similarity, level: int) -> Similarity:
     """The same transform in pixels of a picture 2^level times smaller (negative: larger)."""
+    return at_scale(transform, 2.0**-level)
+
+
+def at_scale(transform: Similarity, scale: float) -> Similarity:
+    """Return the same transform in pixels of a picture of another size."""
     result = np.array(transform, np.float64)
-    result[:, 2] *= 2.0**-level
+    result[:, 2] *= scale
     return result
 
 

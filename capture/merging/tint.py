@@ -1,0 +1,84 @@
+"""Gain and tint of slices brought to those of the reference: one number per slice and colour.
+
+Lamps warm up, and cameras set exposure and white balance anew. Blur moves light around and conserves it, so that means over large areas are
+compared, neighbour by neighbour. A field in place of a number is not fitted: over a whole frame the light that blur carries across depth
+edges looks like shading (up to 16 % at the corners of a circuit board whose neighbours differ by less than 1 %).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from capture.merging.similarity import Similarity, at_scale, to_opencv_centres
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Gains = Float[np.ndarray, "slices 3"]
+
+DEAD_ZONE = 0.02
+"""A stack whose slices all differ by less than this share of the light stays: codes, noise and blur do as much, and nobody sees it."""
+LARGEST_SCATTER = 0.02
+"""Neighbours whose large areas differ by more than this beside the number do not tell it."""
+_LONG_SIDE_PX = 64
+_SIGMA_PX = 2.5
+_DARK = 0.002
+_LARGEST_SATURATED_SHARE = 0.02
+_FEWEST_PIXELS = 400
+_ROUNDS = 10
+_LEAST_SCATTER = 1e-3
+
+
+@dataclass(frozen=True)
+class SmallSlice:
+    """A slice as it was ingested, at the size of large areas: mean light (rows, columns, 3), and the share of them that was full."""
+
+    light: Float32[np.ndarray, "rows columns 3"]
+    full: Float32[np.ndarray, "rows columns"]
+    shrink: float
+
+    @classmethod
+    def of(cls, rgb: Rgb, saturated: Plane) -> "SmallSlice":
+        shrink = max(rgb.shape[:2]) / _LONG_SIDE_PX
+        size = (max(8, round(rgb.shape[1] / shrink)), max(8, round(rgb.shape[0] / shrink)))
+        light, full = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (rgb, saturated))
+        return cls(light, full, shrink)
+
+
+def tint_gains(slices: Sequence[SmallSlice], reference_from_slice: Sequence[Similarity], reference: int) -> Gains:
+    """Return what each slice is to be multiplied with, 1 for all where none leaves the dead zone."""
+    areas = [_areas(small, transform) for small, transform in zip(slices, reference_from_slice, strict=True)]
+    steps = np.array([_step(one, other) for one, other in zip(areas, areas[1:], strict=False)]).reshape(-1, 3)
+    logarithms = np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    logarithms -= logarithms[reference]
+    return np.exp(logarithms) if np.abs(logarithms).max() > DEAD_ZONE else np.ones_like(logarithms)
+
+
+def _areas(small: SmallSlice, transform: Similarity) -> tuple[Rgb, Bool[np.ndarray, "rows columns"]]:
+    """Return logarithms of light over large areas in the geometry of the reference, and which are known and not full."""
+    size = small.full.shape[::-1]
+    matrix = to_opencv_centres(at_scale(transform, 1.0 / small.shrink))
+    light = cv2.warpAffine(small.light, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    full = cv2.warpAffine(small.full, matrix, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
+    logarithms = np.log(np.maximum(cv2.GaussianBlur(light, (0, 0), _SIGMA_PX), 0.0) + np.float32(_DARK))
+    return logarithms, cv2.dilate(full, np.ones((3, 3), np.uint8)) < _LARGEST_SATURATED_SHARE
+
+
+def _step(one: tuple[Rgb, Bool[np.ndarray, "rows columns"]], other: tuple[Rgb, Bool[np.ndarray, "rows columns"]]) -> Float[np.ndarray, "3"]:
+    """Return the logarithms of what brings the light of a slice to that of the one before it, 0 where they do not tell."""
+    both = one[1] & other[1]
+    if both.sum() < _FEWEST_PIXELS:
+        return np.zeros(3)
+    found = [_robust_mean(each) for each in (one[0] - other[0])[both].T]
+    return np.array([mean if scatter <= LARGEST_SCATTER else 0.0 for mean, scatter in found])
+
+
+def _robust_mean(values: Float32[np.ndarray, " cells"]) -> tuple[float, float]:
+    """Return a mean that outliers do not move (Geman and McClure 1985), and the scatter about it."""
+    mean, scatter = float(np.median(values)), _LEAST_SCATTER
+    for _ in range(_ROUNDS):
+        scatter = max(1.4826 * float(np.median(np.abs(values - mean))), _LEAST_SCATTER)
+        mean = float(np.average(values, weights=1.0 / (1.0 + ((values - mean) / scatter) ** 2) ** 2))
+    return mean, scatter
