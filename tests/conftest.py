@@ -32,18 +32,21 @@ class _ChecksOfFirstCalls:
 
     def __call__(self, *, typechecker: Any) -> Callable[[Any], Any]:
         check = self._always(typechecker=typechecker)
-        return lambda decorated: self._checked_at_first(decorated, check(decorated)) if inspect.isfunction(decorated) else check(decorated)
+        return lambda decorated: self._checked_at_first(decorated, check) if inspect.isfunction(decorated) else check(decorated)
 
-    def _checked_at_first(self, plain: Callable[..., Any], checked: Callable[..., Any]) -> Callable[..., Any]:
-        test, calls = -1, 0
+    def _checked_at_first(self, plain: Callable[..., Any], check: Callable[..., Any]) -> Callable[..., Any]:
+        test, calls, checked = -1, 0, None
 
         @functools.wraps(plain)
         def either(*args: Any, **kwargs: Any) -> Any:
-            nonlocal test, calls
+            nonlocal test, calls, checked
             if test != self.test:
                 test, calls = self.test, 0
             calls += 1
-            return (checked if calls <= self.MOST_CALLS else plain)(*args, **kwargs)
+            if calls > self.MOST_CALLS:
+                return plain(*args, **kwargs)
+            checked = checked or check(plain)
+            return checked(*args, **kwargs)
 
         return either
 

@@ -86,6 +86,7 @@ ROWS = (
         "atomic_files",
         "progress",
         "interrupts",
+        "malloc_settings",
         "workers",
         "zeroed_memory",
         "torch_device",

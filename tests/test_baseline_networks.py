@@ -82,6 +82,7 @@ def _trained(form: str) -> nn.Module:
     return network.eval().requires_grad_(False)
 
 
+@pytest.mark.slow
 def test_neural_camera_learns_a_gaussian() -> None:
     """The truth is in its family but for the steps of its bank: measured 46.2 dB, from 31.9 at its start."""
     x, target = _picture(100, (0.0, 1.0))
@@ -96,6 +97,7 @@ def test_deepfocus_learns_to_blur() -> None:
 
 
 @pytest.mark.parametrize(("form", "least_db"), [("deepfocus", 22.5), ("neural_camera", 50.0)])
+@pytest.mark.slow
 def test_what_is_in_focus_stays(form: str, least_db: float) -> None:
     """A picture without blur comes out as it went in (measured 24.9 and 66.7 dB); a quarter of the largest blur costs more, 21.6 dB."""
     x, _ = _picture(101, (0.0, 0.0))

@@ -62,6 +62,7 @@ def test_a_failing_stage_names_its_command(tmp_path: Path) -> None:
         run_stages([draw_stage(tmp_path / "none.json", tmp_path / "a.png")], tmp_path, Console(quiet=True))
 
 
+@pytest.mark.slow
 def test_a_result_is_stale_where_its_input_was_made_anew_by_a_run_that_got_no_further(tmp_path: Path) -> None:
     lens, picture, console = tmp_path / "lens.json", tmp_path / "lens.png", Console(quiet=True)
     run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console)

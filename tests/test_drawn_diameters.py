@@ -90,6 +90,7 @@ def fitted(aperture: Aperture) -> SliceFit:
 
 
 @pytest.mark.parametrize("aperture", APERTURES[:3])
+@pytest.mark.slow
 def test_a_slice_at_its_focus_is_found_there(aperture: Aperture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawn without regard to the pixels, the very same slice seems to be focused elsewhere, and blurred by another lens."""
     right = fitted(aperture)

@@ -282,6 +282,7 @@ def test_the_shipped_truth_is_what_the_tracer_sees(view: int, desk: Scene) -> No
 
 
 @pytest.mark.parametrize(("view", "index"), [(0, 1), (1, 3), (2, 5)])
+@pytest.mark.slow
 def test_the_shipped_slices_are_sharp_where_truth_json_says(view: int, index: int, desk: Scene) -> None:
     """Where a slice's blur is below 1 px it equals a pinhole's picture with that slice's focal length, noise and demosaicing included."""
     document = shipped_truth()

@@ -146,6 +146,7 @@ def test_a_lamp_keeps_its_energy_however_blurred_and_moved(coc: float, motion: t
     assert tracer(lamp).mean(1024)[..., 0].sum() == pytest.approx(expected, rel=0.005)
 
 
+@pytest.mark.slow
 def test_lamps_found_by_rays_gathered_and_followed_give_one_picture() -> None:
     """Three ways to one integral, half hidden by a card in front: rays through the lens (the samples themselves) are the plain one."""
     movers = [Mover(STAGE.card((-0.4, 0.0, -0.05), (0.4, 0.9), GREY))]
@@ -160,6 +161,7 @@ def test_lamps_found_by_rays_gathered_and_followed_give_one_picture() -> None:
     assert by_rays.sum() == pytest.approx(by_lamps.sum(), rel=0.003)
 
 
+@pytest.mark.slow
 def test_still_scenes_look_as_the_tracer_of_still_scenes_renders_them() -> None:
     """Another implementation of the same lens, with other samples: the picture agrees, the one through the turned triangle does not."""
     movers = (

@@ -21,7 +21,7 @@ from viewfinder.frames import OutputFrame
 from viewfinder.lens_book import LensBook
 from viewfinder.live_compositor import LiveCompositor, Moment
 from viewfinder.live_controls import LiveControls
-from viewfinder.malloc_arenas import keep_few_arenas
+from mrbokeh.malloc_settings import keep_few_arenas
 from viewfinder.pipeline import FrameSink, Pipeline
 from viewfinder.scenery import Scenery
 from viewfinder.server.access import Access

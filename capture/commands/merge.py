@@ -51,6 +51,7 @@ def merge_command(
     from capture.merging.relative_stack import METRES, ORDER
     from capture.merging.retouch import retouched_stacks
     from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.malloc_settings import keep_freed_pictures
 
     if from_slice or mask:
         if overwrite or registration is not None or prefer is not None:
@@ -59,6 +60,7 @@ def merge_command(
             )
         _retouch(scene, from_slice or [], mask or [])
         return
+    keep_freed_pictures()
     retouched = retouched_stacks(scene) if overwrite else {}
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         stacks = merge_scene(scene, overwrite, registration, prefer)

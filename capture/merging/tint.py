@@ -7,6 +7,7 @@ edges looks like shading (up to 16 % at the corners of a circuit board whose nei
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ class SmallSlice:
 def tint_gains(slices: Sequence[SmallSlice], reference_from_slice: Sequence[Similarity], reference: int) -> Gains:
     """Return what each slice is to be multiplied with, 1 for all where none leaves the dead zone."""
     areas = [_areas(small, transform) for small, transform in zip(slices, reference_from_slice, strict=True)]
-    steps = np.array([_step(one, other) for one, other in zip(areas, areas[1:], strict=False)]).reshape(-1, 3)
+    steps = np.array([_step(one, other) for one, other in pairwise(areas)]).reshape(-1, 3)
     logarithms = np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     logarithms -= logarithms[reference]
     return np.exp(logarithms) if np.abs(logarithms).max() > DEAD_ZONE else np.ones_like(logarithms)
