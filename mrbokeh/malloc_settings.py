@@ -10,7 +10,7 @@ _KEPT_BYTES = 1 << 30
 
 
 def keep_few_arenas() -> None:
-    """Keep to two arenas for the process as it goes on: codecs come with threads, and each new thread gets an arena, which keeps what was in it.
+    """Keep to two arenas: codecs come with threads, and glibc gives each new thread an arena, which keeps what was in it.
 
     Ten minutes with a recording every 15 s grew by 65 MB between the medians of their thirds (tests/test_viewfinder_soak.py); with two
     arenas the same memory is used again.

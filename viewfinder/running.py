@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from mrbokeh.camera import Camera
 from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.lens import Lens
+from mrbokeh.malloc_settings import keep_few_arenas
 from mrbokeh.overlay import Overlay
 from viewfinder.assembly import MakeRenderer
 from viewfinder.captures import Captures
@@ -21,7 +22,6 @@ from viewfinder.frames import OutputFrame
 from viewfinder.lens_book import LensBook
 from viewfinder.live_compositor import LiveCompositor, Moment
 from viewfinder.live_controls import LiveControls
-from mrbokeh.malloc_settings import keep_few_arenas
 from viewfinder.pipeline import FrameSink, Pipeline
 from viewfinder.scenery import Scenery
 from viewfinder.server.access import Access
