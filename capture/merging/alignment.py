@@ -5,7 +5,7 @@ together give the similarities. The breathing of the lens is the prior: it says 
 holds, and is kept as it is where the camera did not move.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import reduce
 
 import numpy as np
@@ -19,6 +19,7 @@ from capture.merging.pair_matching import PairMatch, match_from, match_neighbour
 from capture.merging.registration import Registration
 from capture.merging.similarity import Similarity, about_centre, chained, farthest_corner_px, inverse, scale_of, scaled_about
 from capture.merging.slice_structure import SliceStructure, structure_of
+from capture.merging.track_fit import distances_px
 from capture.merging.warping import warp, warped_validity
 from mrbokeh.errors import InputError
 from mrbokeh.progress import track
@@ -27,6 +28,9 @@ __all__ = ["Registration", "register_stack", "warp", "warped_validity"]
 
 # Blur that differs at depth edges moves tracks by up to about this much over a stack; less is no movement of the camera.
 LEAST_MOVEMENT_PX = 0.25
+# Slices are moved if that brings corners nearer by this factor, or if it moves them by more than this share of half the diagonal.
+CLEARLY_BETTER = 1.7
+LARGEST_SEEMING_SHARE = 0.0075
 # Besides neighbours, slices this far apart are matched: a longer lever stops drift, and more blur costs little yet.
 _LONG_STRIDE = 3
 
@@ -54,7 +58,7 @@ def register_stack(
     held = {pair: tracks for pair, match in matches.items() if (tracks := match.tracks) and breathing.allows(pair, scales[pair])}
     linked = with_links(count, held, matches, breathing, size_px)
     first_from_slice = joint_similarities(count, linked, size_px)
-    settled, camera_moved = _settled_on_lens(first_from_slice, breathing, held.values(), size_px)
+    settled, camera_moved = _settled(first_from_slice, breathing, held, size_px)
     reference, transforms = _to_narrowest(settled)
     correlations = tuple(matches[i, i + 1].correlation for i in range(count - 1))
     residuals_px = _residuals_px(transforms, {pair: matches[pair] for pair in held}, size_px)
@@ -89,25 +93,38 @@ def _require_same_size(one: SliceStructure, other: SliceStructure, index: int) -
         )
 
 
-def _settled_on_lens(
-    measured: Sequence[Similarity], breathing: Breathing, tracks: Iterable[CornerTracks], size_px: tuple[int, int]
+def _settled(
+    measured: Sequence[Similarity], breathing: Breathing, held: Mapping[Pair, CornerTracks], size_px: tuple[int, int]
 ) -> tuple[Sequence[Similarity], bool]:
-    """(first_from_slice, whether the camera moved): what pictures cannot tell from the lens's own breathing is the lens's.
+    """Return (first_from_slice, whether the camera moved): what pictures cannot tell from the lens's own breathing is the lens's.
 
-    First for all of the transforms, then for their scales alone, which drift most: depth edges pull all tracks the same way.
+    First for all of the transforms, then for their scales alone, which drift most: depth edges pull all tracks the same way. Where no lens
+    is known, slices that lie on one another as they are stay so: resampling blurs.
     """
     count = len(measured)
     if breathing.source != "lens":
-        return measured, True
+        return ([np.eye(2, 3)] * count, False) if _fit_as_they_are(measured, held, size_px) else (measured, True)
     still = [about_centre(breathing.scale(0, i), *size_px) for i in range(count)]
     if _departure_px(measured, still, size_px) < LEAST_MOVEMENT_PX:
         return still, False
-    pivot = np.concatenate([each.source_px for each in tracks]).mean(axis=0)
+    pivot = np.concatenate([each.source_px for each in held.values()]).mean(axis=0)
     half_diagonal_px = 0.5 * float(np.hypot(*size_px))
     scales_px = [half_diagonal_px * abs(scale_of(measured[i]) / breathing.scale(0, i) - 1.0) for i in range(count)]
     if max(scales_px) >= LEAST_MOVEMENT_PX:
         return measured, True
     return [scaled_about(pivot, measured[i], breathing.scale(0, i)) for i in range(count)], True
+
+
+def _fit_as_they_are(measured: Sequence[Similarity], held: Mapping[Pair, CornerTracks], size_px: tuple[int, int]) -> bool:
+    """Return whether corners lie about as well on one another in unmoved slices as in moved ones.
+
+    Depth edges and uneven blur pull corners by half a pixel and more, all of them together, and so a fit always finds a little to move.
+    """
+    if not held or _departure_px(measured, [np.eye(2, 3)] * len(measured), size_px) > LARGEST_SEEMING_SHARE * 0.5 * np.hypot(*size_px):
+        return False
+    moved_px = [np.median(distances_px(tracks, chained(inverse(measured[i]), measured[j]))) for (i, j), tracks in held.items()]
+    unmoved_px = [np.median(distances_px(tracks, np.eye(2, 3))) for tracks in held.values()]
+    return bool(np.all(np.array(unmoved_px) <= CLEARLY_BETTER * np.array(moved_px)))
 
 
 def _to_narrowest(first_from_slice: Sequence[Similarity]) -> tuple[int, tuple[Similarity, ...]]:
