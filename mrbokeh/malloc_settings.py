@@ -6,6 +6,7 @@ import sys
 # malloc.h
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 _MOST_ARENAS = 2
+_LARGEST_MMAP_THRESHOLD_BYTES = 32 << 20  # glibc takes no larger one
 _KEPT_BYTES = 1 << 30
 
 
@@ -20,7 +21,7 @@ def keep_few_arenas() -> None:
 
 def keep_freed_pictures() -> None:
     """Use the memory of freed pictures again instead of giving it back: a new picture of 24 MB costs 6000 page faults, twice its making."""
-    _set(_M_MMAP_THRESHOLD, _KEPT_BYTES)
+    _set(_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD_BYTES)
     _set(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 

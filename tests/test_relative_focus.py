@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from capture.merging.all_in_focus import all_in_focus
+from capture.merging.blur_evidence import DIAMETERS_PX, DRAWN_PX, disc_kernel
 from capture.merging.focus_direction import Contours
 from capture.merging.focus_order import focus_order
 from capture.merging.merge import merge_scene
 from capture.merging.relative_focus import solve_relative_focus
 from capture.merging.relative_stack import gauge_of
+from mrbokeh.aperture import Aperture
 from mrbokeh.camera_rgb import write_camera_rgb
+from mrbokeh.drawn_diameters import drawn_diameters_px
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.layer import opaque
@@ -214,3 +217,12 @@ def test_what_is_known_fixes_the_gauge() -> None:
     # No lens of 800 mm focuses at 0.6 m: what it states cannot be meant.
     far_off = optics | {"focal_length_mm": 800.0, "f_number": 640.0 * 2.5}
     assert gauged(None, None, None, optics=far_off) == nothing
+
+
+def test_discs_of_the_evidence_are_those_that_renderers_draw() -> None:
+    """Diameters are kept as numbers and kernels made by subpixels, for speed; they stand for a table and exact coverage."""
+    disc = Aperture.disc()
+    np.testing.assert_allclose(drawn_diameters_px(np.array([DIAMETERS_PX], np.float32), disc)[0], DRAWN_PX, atol=1e-3)
+    for drawn_px in DRAWN_PX[1:]:
+        kernel = disc_kernel(drawn_px)
+        np.testing.assert_allclose(kernel, disc.rasterize(drawn_px).kernel, atol=0.01 * kernel.max())

@@ -6,15 +6,11 @@ light, in which photons are evenly noisy. Sums over windows are kept on a grid o
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-
-from mrbokeh.aperture import Aperture
-from mrbokeh.drawn_diameters import drawn_diameters_px
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -23,7 +19,10 @@ Small = Float32[np.ndarray, "rows columns"]
 
 LARGEST_WORKING_PX = 0.6e6
 """Larger pictures are compared at this size."""
-_DIAMETERS_PX = (0.0, 1.25, 1.75, 2.25, 3.0, 4.0, 5.25, 7.0, 9.25, 12.0, 16.0, 21.0)
+DIAMETERS_PX = (0.0, 1.25, 1.75, 2.25, 3.0, 4.0, 5.25, 7.0, 9.25, 12.0, 16.0, 21.0)
+DRAWN_PX = (0.0, 1.2407, 1.5986, 1.9489, 2.7846, 3.8978, 5.1770, 6.9342, 9.2071, 11.9664, 15.9751, 20.9811)
+"""Discs to draw for these diameters: `mrbokeh.drawn_diameters`, whose table takes longer to make than all evidence of a stack."""
+_SUBPIXELS = 32
 _WIDE_SHRINK = 3.0
 _CELL_PX = 4
 _WINDOW_CELLS = 1.25
@@ -98,7 +97,7 @@ class _Comparison:
     def of(cls, all_in_focus: Rgb, count: int, excluded: Mask | None, shrink: float) -> "_Comparison":
         size = (_whole_cells(all_in_focus.shape[1] / shrink), _whole_cells(all_in_focus.shape[0] / shrink))
         grey = _resized(cv2.transform(np.ascontiguousarray(all_in_focus), _MEAN_OF_CHANNELS), size)
-        ladder = tuple(each - _coarse(each) for each in (grey if rung == 0 else _blurred(grey, rung) for rung in _DIAMETERS_PX))
+        ladder = tuple(each - _coarse(each) for each in (grey if drawn == 0 else _blurred(grey, drawn) for drawn in DRAWN_PX))
         grid = (size[0] // _CELL_PX, size[1] // _CELL_PX)
         usable = np.ones_like(grey) if excluded is None else _resized((~excluded).astype(np.float32), size)
         errors = np.empty((grid[0] * grid[1], count, len(ladder)), np.float32)
@@ -122,7 +121,7 @@ class _Comparison:
     def evidence(self, full: tuple[int, int]) -> BlurEvidence:
         share = _summed(self.usable, self.grid)
         gaps = [self._mean_square(cv2.subtract(a, b), self.usable, share).ravel() for a, b in pairwise(self.ladder)]
-        diameters_px = np.array(_DIAMETERS_PX) * self.shrink
+        diameters_px = np.array(DIAMETERS_PX) * self.shrink
         return BlurEvidence(
             self.errors, np.stack(gaps, axis=1), diameters_px, (self.light.shape[0], self.light.shape[1]), full, self.shrink
         )
@@ -146,14 +145,16 @@ def _resized(plane: Plane, size: tuple[int, int]) -> Small:
 
 
 def _blurred(grey: Plane, diameter_px: float) -> Plane:
-    return cv2.filter2D(grey, -1, _kernel(diameter_px), borderType=cv2.BORDER_REPLICATE)
+    return cv2.filter2D(grey, -1, disc_kernel(diameter_px), borderType=cv2.BORDER_REPLICATE)
 
 
-@cache
-def _kernel(diameter_px: float) -> Float32[np.ndarray, "size size"]:
-    disc = Aperture.disc()
-    drawn = float(drawn_diameters_px(np.full((1, 1), diameter_px, np.float32), disc)[0, 0])
-    return disc.rasterize(drawn).kernel.astype(np.float32)
+def disc_kernel(diameter_px: float) -> Float32[np.ndarray, "size size"]:
+    """Return the share of a disc in each pixel, of sum 1, by subpixels."""
+    reach = int(np.ceil(0.5 * diameter_px - 0.5))
+    along = (np.arange((2 * reach + 1) * _SUBPIXELS) + 0.5) / _SUBPIXELS - reach - 0.5
+    inside = along[:, None] ** 2 + along**2 <= 0.25 * diameter_px**2
+    kernel = inside.reshape(2 * reach + 1, _SUBPIXELS, 2 * reach + 1, _SUBPIXELS).sum(axis=(1, 3)).astype(np.float32)
+    return kernel / kernel.sum()
 
 
 def _coarse(plane: Plane) -> Plane:

@@ -13,7 +13,7 @@ _WINDOW_PX = 19
 _PYRAMID_LEVELS = 1
 _FARTHEST_PX = 6.0  # from where the first guess puts a corner
 _LARGEST_ROUND_TRIP_PX = 0.15
-_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
+_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 
 Points = Float[np.ndarray, "tracks 2"]
 

@@ -39,11 +39,12 @@ class IngestedSlices:
     def read(self, path: Path) -> tuple[Rgb, Plane]:
         """Return (camera RGB, share of each pixel that was full) of a file of the stack."""
         if path not in self._held:
-            rgb, saturated = _read_stored(path)
-            self._small[path] = SmallSlice.of(_single(rgb), saturated)
-            if rgb.nbytes * len(self.stack) > LARGEST_HELD_BYTES:
-                return _single(rgb), saturated
-            self._held[path] = rgb, saturated if saturated.any() else None
+            stored, saturated = _read_stored(path)
+            if stored.nbytes * len(self.stack) <= LARGEST_HELD_BYTES:
+                self._held[path] = stored, saturated if saturated.any() else None
+            rgb = _single(stored)
+            self._small[path] = SmallSlice.of(rgb, saturated)
+            return rgb, saturated
         rgb, held = self._held[path]
         return _single(rgb), np.zeros(rgb.shape[:2], np.float32) if held is None else held
 
