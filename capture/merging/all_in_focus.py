@@ -17,6 +17,7 @@ from mrbokeh.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
+BlockMask = Bool[np.ndarray, "rows columns"]
 
 NARROW_CROSSOVER = 0.5
 # Up to this blur between neighbouring slices both are sharp enough to be mixed anywhere between them.
@@ -62,27 +63,42 @@ def sharp_all_in_focus(
     blend, taken = BandBlend(focus_index.shape), focus_index
     for index, rgb in enumerate(track(slices(), "all in focus", len(volume.energies))):
         blend.add(rgb, slice_weight(focus_index, index, crossover))
+
+    def blended_as(wanted: Plane) -> Rgb:
+        nonlocal taken
+        for index, rgb in enumerate(slices()):
+            blend.add(rgb, slice_weight(wanted, index, crossover) - slice_weight(taken, index, crossover))
+        taken = wanted
+        return blend.result()
+
     picture = blend.result()
-    for choice in (_sharpest_pixels, _sharpest_blocks):
-        lost = _lost_blocks(picture, volume)
+    for choice in (_sharpest_pixels(volume), _sharpest_blocks(volume)):
+        lost, before = _lost_blocks(picture, volume), taken
         if not lost.any():
             break
-        before, taken = taken, _taken_from(choice(volume), lost, taken)
-        for index, rgb in enumerate(slices()):
-            blend.add(rgb, slice_weight(taken, index, crossover) - slice_weight(before, index, crossover))
-        proposed = blend.result()
-        # Beside strong edges a block may gain the blurred rim of a slice and its neighbours lose what they had.
-        if _lost_blocks(proposed, volume).sum() < lost.sum():
-            picture = proposed
+        proposed = blended_as(_taken_from(choice, lost, before))
+        # Beside strong edges a block may gain the blurred rim of a slice, and its neighbours lose what they had.
+        helped = _helped(lost, _lost_blocks(proposed, volume))
+        if (helped != lost).any():
+            proposed = blended_as(_taken_from(choice, helped, before))
+            if _lost_blocks(proposed, volume).sum() >= lost.sum():
+                proposed = blended_as(before)
+        picture = proposed
     return picture
 
 
-def _lost_blocks(merged: Rgb, volume: FocusVolume) -> Bool[np.ndarray, "rows columns"]:
+def _helped(lost: BlockMask, still_lost: BlockMask) -> BlockMask:
+    """Return the lost blocks that another choice of slices mends without taking detail from a block beside them."""
+    harmed = cv2.dilate((still_lost & ~lost).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return lost & ~still_lost & ~harmed
+
+
+def _lost_blocks(merged: Rgb, volume: FocusVolume) -> BlockMask:
     sharpest = np.max(volume.details, axis=0)
     return (sharpest > 0.5 * np.median(sharpest)) & (block_detail(np.sqrt(np.maximum(merged, 0.0))) < KEPT_DETAIL * sharpest)
 
 
-def _taken_from(choice: Plane, lost: Bool[np.ndarray, "rows columns"], focus_index: Plane) -> Plane:
+def _taken_from(choice: Plane, lost: BlockMask, focus_index: Plane) -> Plane:
     """Return the focus index with another choice in the lost blocks and as far around them as fine bands reach."""
     chosen = np.full(focus_index.shape, -1.0, np.float32)
     grown = np.kron(lost, np.ones((BLOCK_PX, BLOCK_PX), bool))[: chosen.shape[0], : chosen.shape[1]]
