@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.merging.focus_volume import BLOCK_PX, FocusVolume, block_detail
+from capture.merging.focus_volume import BLOCK_PX, Blocks, FocusVolume, block_detail
 from mrbokeh.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -100,9 +100,7 @@ def _lost_blocks(merged: Rgb, volume: FocusVolume) -> BlockMask:
 
 def _taken_from(choice: Plane, lost: BlockMask, focus_index: Plane) -> Plane:
     """Return the focus index with another choice in the lost blocks and as far around them as fine bands reach."""
-    chosen = np.full(focus_index.shape, -1.0, np.float32)
-    grown = np.kron(lost, np.ones((BLOCK_PX, BLOCK_PX), bool))[: chosen.shape[0], : chosen.shape[1]]
-    chosen[: grown.shape[0], : grown.shape[1]][grown] = choice[: grown.shape[0], : grown.shape[1]][grown]
+    chosen = np.where(_per_pixel(lost.astype(np.float32), focus_index.shape) > 0, choice, np.float32(-1.0))
     around = cv2.dilate(chosen, np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8))
     chosen = np.where(chosen >= 0, chosen, around)
     return np.where(chosen >= 0, chosen, focus_index)
@@ -113,10 +111,14 @@ def _sharpest_pixels(volume: FocusVolume) -> Plane:
 
 
 def _sharpest_blocks(volume: FocusVolume) -> Plane:
-    blocks = np.argmax(volume.details, axis=0).astype(np.float32)
+    return _per_pixel(np.argmax(volume.details, axis=0).astype(np.float32), volume.shape)
+
+
+def _per_pixel(blocks: Blocks, shape: tuple[int, ...]) -> Plane:
+    """Return the value of its block for each pixel; what is cut off from the blocks belongs to the last ones."""
     grown = np.kron(blocks, np.ones((BLOCK_PX, BLOCK_PX), np.float32))
-    missing = [(0, max(full - size, 0)) for full, size in zip(volume.shape, grown.shape, strict=True)]
-    return np.pad(grown, missing, "edge")[: volume.shape[0], : volume.shape[1]]
+    missing = [(0, max(full - size, 0)) for full, size in zip(shape, grown.shape, strict=True)]
+    return np.pad(grown, missing, "edge")[: shape[0], : shape[1]]
 
 
 @dataclass

@@ -136,7 +136,7 @@ class RegisteredSlices:
             )
         transform, gain = self.registration.reference_from_slice[index], self.tint_gains[index]
         if (gain != 1.0).any():
-            rgb = cv2.multiply(rgb, (*gain.tolist(), 1.0))
+            rgb = cv2.transform(rgb, np.diag(gain))
         return warp(rgb, transform), _warped_share(saturated, transform)
 
     @cached_property
