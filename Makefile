@@ -29,7 +29,7 @@ check: $(READY)
 	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
-	$(RUN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser"
+	$(MAKE) test
 
 bench: $(READY)
 	for bench in tests/bench_*.py; do $(RUN)/python -m tests.$$(basename $$bench .py) || exit 1; done

@@ -1,11 +1,16 @@
 """Gain and tint of slices: found through blur and breathing, left alone where there is none."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
+from capture.merging.merge import merge_stack
 from capture.merging.similarity import about_centre, inverse
-from capture.merging.tint import SmallSlice, tint_gains
+from capture.merging.tint import SmallSlice, tint_gains, with_gain
+from mrbokeh.camera_rgb import write_camera_rgb
+from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 
 SIZE = (240, 360)
 SCALES = (1.03, 1.02, 1.01, 1.0)
@@ -54,3 +59,72 @@ def test_slices_of_another_scene_tell_nothing(strength: float) -> None:
     slices = slices_of(np.ones((4, 3)))
     slices[1] = strength * np.ascontiguousarray(slices[1][::-1, ::-1])
     np.testing.assert_array_equal(gains_of(slices, np.zeros(SIZE, np.float32)), 1.0)
+
+
+def test_one_colour_that_does_not_tell_leaves_the_slice_without_a_tint() -> None:
+    slices, rng = slices_of(np.full((4, 3), 1.0)), np.random.default_rng(1)
+    slices[3] *= 0.92
+    patches = cv2.resize(rng.uniform(0.8, 1.2, (12, 18)).astype(np.float32), SIZE[::-1], interpolation=cv2.INTER_NEAREST)
+    slices[3][..., 0] *= patches
+    np.testing.assert_array_equal(gains_of(slices, np.zeros(SIZE, np.float32)), 1.0)
+
+
+def test_light_too_dark_to_tell_is_left_alone() -> None:
+    dark = [each * np.float32(0.01) for each in slices_of(TINTS)]
+    np.testing.assert_array_equal(gains_of(dark, np.zeros(SIZE, np.float32)), 1.0)
+
+
+def test_what_is_full_stays_full_and_white() -> None:
+    codes = np.linspace(0.0, 1.0, 101, dtype=np.float32)
+    rgb = np.repeat(codes[None, :, None], 3, axis=2)
+    found = with_gain(rgb, np.array([0.9, 1.0, 1.08]))[0]
+    np.testing.assert_array_equal(found[98:], rgb[0, 98:])
+    np.testing.assert_allclose(found[:85], rgb[0, :85] * [0.9, 1.0, 1.08], rtol=1e-6)
+    assert (np.diff(found, axis=0) > -1e-6).all(), "brighter light stays brighter"
+
+
+def made_stack(folder: Path, slices: list[np.ndarray]) -> FocalStack:
+    for index, rgb in enumerate(slices):
+        write_camera_rgb(folder / f"slices/{index:02d}.exr", rgb, None)
+    stack = FocalStack(folder, tuple(Slice(f"slices/{index:02d}.exr", None) for index in range(len(slices))))
+    write_focal_stack(stack)
+    return stack
+
+
+def test_merged_slices_have_the_light_of_the_reference_also_after_an_interruption(tmp_path: Path) -> None:
+    """A file that an earlier version left without a gain is made again."""
+    stack = made_stack(tmp_path, slices_of(TINTS))
+
+    def spread(merged: FocalStack) -> float:
+        means = np.array([each[60:180, 90:270].mean(axis=(0, 1)) for each in merged.iter_rgb()])
+        return float((means.max(axis=0) / means.min(axis=0)).max())
+
+    assert spread(merge_stack(stack)) < 1.02
+    write_camera_rgb(tmp_path / "registered/00.exr", stack.slice_camera_rgb(0), None)
+    assert spread(merge_stack(stack)) < 1.02
+
+
+def test_flat_slices_merge_without_a_number_that_is_none(tmp_path: Path) -> None:
+    merge_stack(made_stack(tmp_path, [np.full((*SIZE, 3), 0.3, np.float32)] * 3))
+    assert "NaN" not in (tmp_path / "stack.json").read_text()
+
+
+def test_an_interrupted_overwrite_does_not_say_that_the_stack_is_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    merged = merge_stack(made_stack(tmp_path, slices_of(np.ones((4, 3)))))
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("capture.merging.merge.focus_volume", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        merge_stack(merged, overwrite=True)
+    assert not read_focal_stack(tmp_path).merged
+
+
+def test_light_above_the_largest_half_float_stays_finite(tmp_path: Path) -> None:
+    slices = slices_of(np.ones((4, 3)))
+    slices[2][100:104, 100:104] = 2e5
+    for index, rgb in enumerate(slices):
+        write_camera_rgb(tmp_path / f"slices/{index:02d}.exr", rgb, None, half=False)
+    stack = FocalStack(tmp_path, tuple(Slice(f"slices/{index:02d}.exr", None) for index in range(len(slices))))
+    assert np.isfinite(merge_stack(stack).all_in_focus()).all()

@@ -91,7 +91,7 @@ def violations_of(maps: Sequence[Maps]) -> Violations:
     logs = np.log(energies + np.float32(2.0) * floor).astype(np.float32)
     weight = (np.sqrt(energies.max(axis=0)) * np.ptp(logs, axis=0)).ravel()
     cells = np.argsort(weight)[-_MOST_CELLS:]
-    logs, weight = logs.reshape(len(maps), -1)[:, cells], weight[cells] / weight[cells].sum()
+    logs, weight = logs.reshape(len(maps), -1)[:, cells], weight[cells] / max(float(weight[cells].sum()), 1e-12)
     found = np.zeros((len(maps),) * 3)
     for a in range(len(maps)):
         for c in range(a):
@@ -119,7 +119,7 @@ def best_order(violations: Violations) -> list[int]:
             for moved in range(count):
                 order = _inserted(violations, [each for each in order if each != moved], moved)
             better = cost_of(violations, order)
-            if better >= cost - 1e-12:
+            if not better < cost - 1e-12:
                 break
             cost = better
         found.append((cost, order))

@@ -26,6 +26,7 @@ from capture.merging.restored_lights import RestoredLight, restored_lights, with
 from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
 from capture.merging.slice_optics import SliceOptics
+from capture.stacks.disk_space import told_when_full
 from capture.stacks.sentinel_focus import stated_by_sentinel
 from mrbokeh.camera import Camera
 from mrbokeh.camera_rgb import write_camera_rgb
@@ -55,11 +56,20 @@ def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None 
 
 def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> FocalStack:
     """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
-    ingested = IngestedSlices(stack)
+    with told_when_full(stack.all_in_focus_path):
+        return _merged(stack, overwrite, registration, prefer)
+
+
+def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefer: Side | None) -> FocalStack:
+    ingested, given = IngestedSlices(stack), stack
     stack = in_focus_order(as_stated(stack), ingested)
     _require_a_sweep(stack)
     name = stack.folder.name
     slices = RegisteredSlices(stack, _registration_of(stack, ingested, overwrite, registration), ingested)
+    slices.require_size()
+    if given.merged:
+        # Its pictures change from here on; an interrupted run must not leave a stack that says it is merged.
+        write_focal_stack(replace(given, merged=False))
     extremes = Extremes()
     made = extremes.watching(track(slices.made(keep=not overwrite), f"{name}: register", len(stack)))
     volume = focus_volume(made, slices.valid, len(stack))

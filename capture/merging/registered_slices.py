@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float16, Float32
 from capture.merging.alignment import Registration, warp, warped_validity
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.similarity import Similarity, to_opencv_centres
-from capture.merging.tint import Gains, SmallSlice, tint_gains
+from capture.merging.tint import Gains, SmallSlice, tint_gains, with_gain
 from mrbokeh.camera_rgb import SATURATED, half_of, single_of, write_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
@@ -20,6 +20,8 @@ from mrbokeh.focal_stack import FocalStack, Slice
 
 REGISTERED_FOLDER = "registered"
 LARGEST_HELD_BYTES = 256e6
+_LARGEST_HALF = np.float32(np.finfo(np.float16).max)
+_GAIN_ATTRIBUTE = "mrbokehTintGain"
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Half = Float16[np.ndarray, "height width 3"]
@@ -81,17 +83,24 @@ class RegisteredSlices:
         """Resample and write every slice, and give it. keep: a file that is newer than slice and registration is read instead."""
         for index, each in enumerate(self.stack.slices):
             path, sources = self.path(index), (self.stack.folder / source_path(each), self.stack.folder / REGISTRATION_NAME)
-            kept = keep and newer(path, *sources)
+            kept = keep and newer(path, *sources) and self._has_gain(path, index)
             rgb, saturated = read_slice(path) if kept else self._resampled(index)
             # Half float keeps 11 bits, far below the noise of a photograph. Rounded at once, a resumed run gives the same.
-            half = half_of(rgb)
+            half = half_of(np.minimum(rgb, _LARGEST_HALF))
             self._remember(half, saturated)
             if not kept:
                 self._write(index, half, saturated)
             yield single_of(half)
 
     def _write(self, index: int, half: Half, saturated: Plane) -> None:
-        write_camera_rgb(self.path(index), half, self.stack.rec709_from_camera, saturated=saturated, valid=self.valid(index))
+        gain = {_GAIN_ATTRIBUTE: str(self.tint_gains[index].tolist())}
+        write_camera_rgb(
+            self.path(index), half, self.stack.rec709_from_camera, saturated=saturated, valid=self.valid(index), attributes=gain
+        )
+
+    def _has_gain(self, path: Path, index: int) -> bool:
+        """Return whether a file of an earlier run was made with the gain that its slice has now."""
+        return read_exr(path)[0].attributes.get(_GAIN_ATTRIBUTE) == str(self.tint_gains[index].tolist())
 
     def passing(self) -> Iterator[Rgb]:
         """The slices once more, after they were all made."""
@@ -105,6 +114,16 @@ class RegisteredSlices:
             height, width = self.saturated.shape
             self._valid = (index, warped_validity((height, width), self.registration.reference_from_slice[index]))
         return self._valid[1]
+
+    def require_size(self) -> None:
+        """Raise InputError where the registration is of pictures of another size."""
+        rgb = self.ingested.read(self.stack.folder / source_path(self.stack.slices[0]))[0]
+        size_px = (rgb.shape[1], rgb.shape[0])
+        if self.registration.size_px not in (None, size_px):
+            raise InputError(
+                f"the registration is for pictures of {self.registration.size_px} px, but the slices of {self.stack.folder} have "
+                f"{size_px}: leave --registration out, and the slices are registered anew"
+            )
 
     def path(self, index: int) -> Path:
         return self.stack.folder / REGISTERED_FOLDER / f"{index:02d}.exr"
@@ -128,15 +147,9 @@ class RegisteredSlices:
 
     def _resampled(self, index: int) -> tuple[Rgb, Plane]:
         rgb, saturated = self.ingested.taken(self.stack.folder / source_path(self.stack.slices[index]))
-        size_px = (rgb.shape[1], rgb.shape[0])
-        if self.registration.size_px not in (None, size_px):
-            raise InputError(
-                f"the registration is for pictures of {self.registration.size_px} px, but slice {index} of {self.stack.folder} has "
-                f"{size_px}: leave --registration out, and the slices are registered anew"
-            )
         transform, gain = self.registration.reference_from_slice[index], self.tint_gains[index]
         if (gain != 1.0).any():
-            rgb = cv2.transform(rgb, np.diag(gain))
+            rgb = with_gain(rgb, gain)
         return warp(rgb, transform), _warped_share(saturated, transform)
 
     @cached_property

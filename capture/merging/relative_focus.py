@@ -242,10 +242,10 @@ def _solved(parts: Sequence[_Diameters], before: Positions) -> tuple[Positions, 
         off = np.abs(rows @ positions - wanted) / sigma
         robust = np.minimum(1.0, 1.5 / np.maximum(off, 1e-9))
     positions = np.maximum.accumulate(positions)
-    covariance = np.linalg.inv(system.T @ system)
+    covariance = np.linalg.pinv(system.T @ system)
     excess = max(1.0, float((robust * off**2).sum()) / max(len(wanted) - count + 1, 1))
     steps = np.diff(np.eye(count), axis=0)
-    step_error = np.sqrt(np.einsum("ij,jk,ik->i", steps, covariance, steps) * excess)
+    step_error = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", steps, covariance, steps) * excess, 0.0))
     step_error = np.hypot(step_error, 0.5 * _LEAST_ERROR_PX2 / np.maximum(steps @ positions, 0.5))
     return positions, np.array([max(step_error[max(i - 1, 0)], step_error[min(i, count - 2)]) for i in range(count)])
 

@@ -77,14 +77,39 @@ def restored_lights(
     candidates = find_lights(slices, extremes)
     if len(candidates) == 0:
         return candidates, []
-    boxes = [candidates.box(light, int(np.ceil(RING_PX)) + 1) for light in range(len(candidates))]
-    cut = [[rgb[box].copy() for box in boxes] for rgb in slices()]
-    found = [
-        _restored(np.stack([each[light] for each in cut]), merged[boxes[light]], boxes[light], candidates, light, guided)
-        for light in range(len(candidates))
-    ]
-    kept = np.array([each is not None for each in found])
-    return candidates.only(kept), [each for each in found if each is not None]
+    alone = [_Place.of(candidates, light) for light in range(len(candidates))]
+    alone = [each for index, rgb in enumerate(slices()) for each in alone if each.sharpest == index and _stands_alone(rgb[each.box], each)]
+    cut = [[rgb[each.box].copy() for each in alone] for rgb in slices()]
+    found = {
+        place.light: drawn
+        for place, patches in zip(alone, zip(*cut, strict=True), strict=True)
+        if (drawn := _restored(np.stack(patches), merged[place.box], place, candidates.areas_px[:, place.light], guided))
+    }
+    kept = np.isin(np.arange(len(candidates)), list(found))
+    return candidates.only(kept), [found[light] for light in sorted(found)]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A candidate in its box: zone and core (h, w) of this light, centre_px (x, y) of the core, area_px in its sharpest slice."""
+
+    light: int
+    box: tuple[slice, slice]
+    zone: Mask
+    core: Mask
+    centre_px: Float[np.ndarray, "2"]
+    sharpest: int
+    area_px: float
+
+    @classmethod
+    def of(cls, lights: Lights, light: int) -> "_Place":
+        box = lights.box(light, int(np.ceil(RING_PX)) + 1)
+        zone = lights.zone[box] == light + 1
+        core = lights.core[box] & zone
+        rows, columns = np.nonzero(core if core.any() else zone)
+        centre_px = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+        sharpest = int(lights.sharpest[light])
+        return cls(light, box, zone, core, centre_px, sharpest, float(lights.areas_px[sharpest, light]))
 
 
 def with_restored_lights(merged: Rgb, restored: Sequence[RestoredLight]) -> Rgb:
@@ -145,16 +170,10 @@ def _radius_px(area_px: float) -> float:
     return 1.15 * float(np.sqrt(area_px / np.pi)) + 2.0
 
 
-def _restored(patches: Patches, ordinary: Rgb, box: tuple[slice, slice], lights: Lights, light: int, guided: bool) -> RestoredLight | None:
+def _restored(patches: Patches, ordinary: Rgb, place: _Place, areas_px: Float[np.ndarray, " slices"], guided: bool) -> RestoredLight | None:
     """Return what explains the slices around a light clearly better than the ordinary merge, None where nothing does."""
-    zone = lights.zone[box] == light + 1
-    core = lights.core[box] & zone
-    rows, columns = np.nonzero(core if core.any() else zone)
-    centre_px = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-    areas_px, sharpest = lights.areas_px[:, light], int(lights.sharpest[light])
-    if not _stands_alone(patches[sharpest], zone, centre_px, areas_px[sharpest]):
-        return None
-    discs = measured_discs(patches, zone, centre_px, areas_px)
+    zone, core, sharpest = place.zone, place.core, place.sharpest
+    discs = measured_discs(patches, zone, place.centre_px, areas_px)
     if not discs.believable.any() or discs.whole.sum() < FEWEST_SLICES:
         return None
     spread = _without_rings(ordinary, patches[sharpest], zone, discs, areas_px)
@@ -168,18 +187,18 @@ def _restored(patches: Patches, ordinary: Rgb, box: tuple[slice, slice], lights:
             ways.append((error * handicap * (CLEARLY if lost and picture is not drawn else 1.0), error, picture))
     _, error, picture = min(ways, key=lambda way: way[0])
     limit = min(LARGEST_ERROR_SHARE * compare.error(ordinary), (1.0 - LEAST_EXPLAINED) * compare.light)
-    return RestoredLight(box, (picture != ordinary).any(axis=2), picture) if error < limit else None
+    return RestoredLight(place.box, (picture != ordinary).any(axis=2), picture) if error < limit else None
 
 
-def _stands_alone(sharp: Rgb, zone: Mask, centre_px: Float[np.ndarray, "2"], area_px: float) -> bool:
+def _stands_alone(sharp: Rgb, place: _Place) -> bool:
     """Return whether a small light is all that there is in its zone, in its sharpest slice: no edge, no print, no shining metal."""
-    y, x = np.mgrid[: zone.shape[0], : zone.shape[1]] + 0.5
-    near = np.hypot(x - centre_px[0], y - centre_px[1]) < _radius_px(area_px)
-    around = zone & ~near
-    if area_px > LARGEST_LIGHT_PX or not around.any():
+    y, x = np.mgrid[: place.zone.shape[0], : place.zone.shape[1]] + 0.5
+    near = np.hypot(x - place.centre_px[0], y - place.centre_px[1]) < _radius_px(place.area_px)
+    around = place.zone & ~near
+    if place.area_px > LARGEST_LIGHT_PX or not around.any():
         return False
     squared = (_grey(sharp) - np.median(_grey(sharp)[around])) ** 2
-    return bool(squared[around].sum() < LARGEST_SHARE_AROUND * squared[near & zone].sum())
+    return bool(squared[around].sum() < LARGEST_SHARE_AROUND * squared[near & place.zone].sum())
 
 
 def _without_rings(ordinary: Rgb, sharp: Rgb, zone: Mask, discs: Discs, areas_px: Float[np.ndarray, " slices"]) -> Rgb:

@@ -25,7 +25,9 @@ LARGEST_SCATTER = 0.02
 """Neighbours whose large areas differ by more than this beside the number do not tell it."""
 _LONG_SIDE_PX = 64
 _SIGMA_PX = 2.5
-_DARK = 0.002
+_DARKEST = 0.008
+"""Below it codes are too coarse and blacks too far from zero to tell a share of the light."""
+_NEARLY_FULL, _FULL = 0.85, 0.98
 _LARGEST_SATURATED_SHARE = 0.02
 _FEWEST_PIXELS = 400
 _ROUNDS = 10
@@ -57,23 +59,36 @@ def tint_gains(slices: Sequence[SmallSlice], reference_from_slice: Sequence[Simi
     return np.exp(logarithms) if np.abs(logarithms).max() > DEAD_ZONE else np.ones_like(logarithms)
 
 
+def with_gain(rgb: Rgb, gain: Float[np.ndarray, "3"]) -> Rgb:
+    """Return a slice with its gain, which fades out towards what fills the sensor: full is full, and white stays white."""
+    red, green, blue = cv2.split(rgb)
+    room = (np.float32(_FULL) - cv2.max(cv2.max(red, green), blue)) / np.float32(_FULL - _NEARLY_FULL)
+    share = np.clip(room, 0.0, 1.0, out=room)
+    return cv2.merge([each + each * share * np.float32(factor - 1.0) for each, factor in zip((red, green, blue), gain, strict=True)])
+
+
 def _areas(small: SmallSlice, transform: Similarity) -> tuple[Rgb, Bool[np.ndarray, "rows columns"]]:
     """Return logarithms of light over large areas in the geometry of the reference, and which are known and not full."""
     size = small.full.shape[::-1]
     matrix = to_opencv_centres(at_scale(transform, 1.0 / small.shrink))
     light = cv2.warpAffine(small.light, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     full = cv2.warpAffine(small.full, matrix, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
-    logarithms = np.log(np.maximum(cv2.GaussianBlur(light, (0, 0), _SIGMA_PX), 0.0) + np.float32(_DARK))
-    return logarithms, cv2.dilate(full, np.ones((3, 3), np.uint8)) < _LARGEST_SATURATED_SHARE
+    light = cv2.GaussianBlur(light, (0, 0), _SIGMA_PX)
+    usable = (light > _DARKEST).all(axis=2) & (cv2.dilate(full, np.ones((3, 3), np.uint8)) < _LARGEST_SATURATED_SHARE)
+    return np.log(np.maximum(light, np.float32(_DARKEST))), usable
 
 
 def _step(one: tuple[Rgb, Bool[np.ndarray, "rows columns"]], other: tuple[Rgb, Bool[np.ndarray, "rows columns"]]) -> Float[np.ndarray, "3"]:
-    """Return the logarithms of what brings the light of a slice to that of the one before it, 0 where they do not tell."""
+    """Return the logarithms of what brings the light of a slice to that of the one before it.
+
+    0 where one of the colours does not tell: two slices then stay to one another as they are, and no tint is made.
+    """
     both = one[1] & other[1]
     if both.sum() < _FEWEST_PIXELS:
         return np.zeros(3)
     found = [_robust_mean(each) for each in (one[0] - other[0])[both].T]
-    return np.array([mean if scatter <= LARGEST_SCATTER else 0.0 for mean, scatter in found])
+    told = all(scatter <= LARGEST_SCATTER for _, scatter in found)
+    return np.array([mean for mean, _ in found]) if told else np.zeros(3)
 
 
 def _robust_mean(values: Float32[np.ndarray, " cells"]) -> tuple[float, float]:
