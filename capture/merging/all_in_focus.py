@@ -22,8 +22,10 @@ BlockMask = Bool[np.ndarray, "rows columns"]
 NARROW_CROSSOVER = 0.5
 # Up to this blur between neighbouring slices both are sharp enough to be mixed anywhere between them.
 SHARP_STEP_COC_PX = 2.0
-# A block that keeps less of the detail of its sharpest slice is blended again; the gate of the report is at 0.6.
-KEPT_DETAIL = 0.7
+# A block that keeps less of the detail of its sharpest slice is blended again; the gate of the report is at 0.6. Blur conserves light: a
+# choice of slices that moves the brightness of a block by more than this, in square roots of light, puts a blurred slice in place.
+KEPT_DETAIL = 0.66
+LARGEST_MOVE = 0.04
 _AROUND_PX = 8
 # The coarsest band changes slices within about 2^(BANDS + 1) pixels.
 BANDS = 4
@@ -78,7 +80,7 @@ def sharp_all_in_focus(
             break
         proposed = blended_as(_taken_from(choice, lost, before))
         # Beside strong edges a block may gain the blurred rim of a slice, and its neighbours lose what they had.
-        helped = _helped(lost, _lost_blocks(proposed, volume))
+        helped = _helped(lost, _lost_blocks(proposed, volume), _moved_blocks(picture, proposed))
         if (helped != lost).any():
             proposed = blended_as(_taken_from(choice, helped, before))
             if _lost_blocks(proposed, volume).sum() >= lost.sum():
@@ -87,10 +89,16 @@ def sharp_all_in_focus(
     return picture
 
 
-def _helped(lost: BlockMask, still_lost: BlockMask) -> BlockMask:
-    """Return the lost blocks that another choice of slices mends without taking detail from a block beside them."""
-    harmed = cv2.dilate((still_lost & ~lost).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+def _helped(lost: BlockMask, still_lost: BlockMask, moved: BlockMask) -> BlockMask:
+    """Return the lost blocks that another choice of slices mends without harm to a block beside them, in detail or in brightness."""
+    harmed = cv2.dilate(((still_lost & ~lost) | moved).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return lost & ~still_lost & ~harmed
+
+
+def _moved_blocks(before: Rgb, after: Rgb) -> BlockMask:
+    rows, columns = (max(side // BLOCK_PX, 1) for side in before.shape[:2])
+    change = cv2.subtract(*(cv2.sqrt(np.maximum(each[: rows * BLOCK_PX, : columns * BLOCK_PX], 0.0)) for each in (before, after)))
+    return np.abs(cv2.resize(change, (columns, rows), interpolation=cv2.INTER_AREA)).max(axis=2) > LARGEST_MOVE
 
 
 def _lost_blocks(merged: Rgb, volume: FocusVolume) -> BlockMask:
