@@ -6,7 +6,7 @@ from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -76,6 +76,7 @@ class CarriedAudio:
             self._feed.flush(time_s)
 
 
+@runtime_checkable
 class _Feed(Protocol):
     def copy_until(self, time_s: float) -> None: ...
 

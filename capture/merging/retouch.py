@@ -86,8 +86,12 @@ def retouches_text(stack: FocalStack) -> str:
 
 
 def retouched_stacks(scene: Path) -> dict[Path, str]:
-    """Return what was painted into the stacks of a scene, by their folders."""
-    return {stack.folder: text for stack in find_focal_stacks(scene) if (text := retouches_text(stack))}
+    """Return what was painted into the stacks of a scene, by their folders; nothing where it has no stacks, which the merge says itself."""
+    try:
+        stacks = find_focal_stacks(scene)
+    except InputError:
+        return {}
+    return {stack.folder: text for stack in stacks if (text := retouches_text(stack))}
 
 
 def _bands_of(share: Plane) -> int:
