@@ -74,4 +74,5 @@ def test_a_camera_is_let_go_when_a_shoot_is_stopped(
     shoot = ["--plan", f"{tmp_path}/plan.json", "--camera", "simulated", "--out", f"{tmp_path}/view_0", "--settle", "0"]
     code, told = said_at(monkeypatch, capsys, "capture", "shoot", *shoot)
     assert code == 130 and closed == [True]
-    assert told == f"stopped: what was shot is kept in {tmp_path}/view_0; the same command goes on from there\n"
+    # On a busy machine a line of progress comes before it.
+    assert told.endswith(f"stopped: what was shot is kept in {tmp_path}/view_0; the same command goes on from there\n")
