@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from capture.merging.similarity import Similarity, at_scale, to_opencv_centres
+from capture.merging.track_fit import robust_weights
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -96,5 +97,5 @@ def _robust_mean(values: Float32[np.ndarray, " cells"]) -> tuple[float, float]:
     mean, scatter = float(np.median(values)), _LEAST_SCATTER
     for _ in range(_ROUNDS):
         scatter = max(1.4826 * float(np.median(np.abs(values - mean))), _LEAST_SCATTER)
-        mean = float(np.average(values, weights=1.0 / (1.0 + ((values - mean) / scatter) ** 2) ** 2))
+        mean = float(np.average(values, weights=robust_weights(np.abs(values - mean), scatter)))
     return mean, scatter
