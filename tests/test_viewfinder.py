@@ -32,8 +32,9 @@ from tests.layer_viewfinder import (
     watching,
     write_plate,
 )
-from viewfinder.frames import CameraFrame
+from viewfinder.frames import CameraFrame, FrameStatus, OutputFrame
 from viewfinder.newest import Newest
+from viewfinder.pipeline import Pipeline
 from viewfinder.sources.pattern import PatternSource
 from viewfinder.sources.video_file import VideoFileSource
 from viewfinder.still_layer import StillLayer
@@ -121,11 +122,46 @@ def test_a_failing_camera_says_so() -> None:
 
     async def work() -> None:
         async with running(Unplugged()) as url, watching(url) as viewer:
-            messages = [await viewer.stream.receive(timeout=5) for _ in range(2)]
-            texts = [json.loads(each.data) for each in messages if each.type is aiohttp.WSMsgType.TEXT]
-            assert texts == [{"failure": "camera 7 stopped giving pictures"}]
+            while (message := await viewer.stream.receive(timeout=5)).type is not aiohttp.WSMsgType.TEXT:
+                pass
+            assert json.loads(message.data) == {"failure": "camera 7 stopped giving pictures"}
 
     in_time(work)
+
+
+def test_no_picture_comes_after_the_news_that_the_camera_died() -> None:
+    """A picture says that all is well again, even one that was under way when the camera died."""
+    heard: list[str] = []
+    making = Event()
+
+    class Dying:
+        name, transfer, status = "camera 7", "srgb", None
+
+        def frames(self, stopping: Event) -> Iterator[CameraFrame]:
+            yield CameraFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic(), 0)
+            assert making.wait(5.0) and not stopping.is_set()
+            raise InputError("camera 7 died")
+
+    class Sink:
+        wants_frame = True
+
+        def show(self, frame: OutputFrame) -> None:
+            heard.append(f"picture {frame.sequence}")
+
+        def fail(self, sentence: str) -> None:
+            heard.append(sentence)
+
+    def late(frame: CameraFrame, dropped: int) -> OutputFrame:
+        making.set()
+        while pipeline.failure is None:
+            time.sleep(0.001)
+        return OutputFrame(frame.bgr, frame.captured_s, frame.sequence, FrameStatus(1.0, 2.0, dropped=dropped))
+
+    with Pipeline(Dying(), late, [Sink()]) as pipeline:
+        for thread in pipeline._threads:
+            thread.join(5.0)
+            assert not thread.is_alive()
+    assert heard == ["camera 7 died"]
 
 
 def test_codes_through_the_tables_equal_the_composite_in_linear_light() -> None:

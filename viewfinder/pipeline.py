@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Sequence
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Protocol, runtime_checkable
 
 from mrbokeh.errors import InputError
@@ -51,6 +51,8 @@ class Pipeline:
         self.dropped = 0
         self._newest: Newest[CameraFrame] = Newest()
         self._stopping = Event()
+        # Sinks hear of a dead source after the last picture, which would say that all is well again.
+        self._telling = Lock()
         self._threads = [
             Thread(target=work, name=name, daemon=True) for name, work in (("capture", self._capture), ("composite", self._composite))
         ]
@@ -72,17 +74,19 @@ class Pipeline:
                 self._newest.put(frame)
             return
         except InputError as error:
-            self.failure = str(error)
+            sentence = str(error)
         except Exception:
             log.exception("the source failed")
-            self.failure = f"{self.source.name} failed; see the terminal"
-        for sink in self._sinks:
-            sink.fail(self.failure)
+            sentence = f"{self.source.name} failed; see the terminal"
+        with self._telling:
+            self.failure = sentence
+            for sink in self._sinks:
+                sink.fail(sentence)
 
     def _composite(self) -> None:
         last: CameraFrame | None = None
         shown_s = 0.0
-        while not self._stopping.is_set():
+        while not self._stopping.is_set() and self.failure is None:
             wanting = [sink for sink in self._sinks if sink.wants_frame]
             if not wanting:
                 self._stopping.wait(_POLL_S)
@@ -112,6 +116,8 @@ class Pipeline:
             log.exception("a frame could not be composited")
             self._stopping.wait(_REPEAT_S)
             return
-        self.problem = None
-        for sink in wanting:
-            sink.show(finished)
+        with self._telling:
+            if self.failure is None:
+                self.problem = None
+                for sink in wanting:
+                    sink.show(finished)
