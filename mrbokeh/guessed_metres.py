@@ -45,14 +45,24 @@ def unit_of(stack: FocalStack) -> str:
 
 
 def metres_note(stack: FocalStack) -> str:
-    """One sentence on what is known and what is guessed; empty where all metres are known."""
-    facts = metres_facts(stack)
+    """State what is known and what is guessed in one sentence; empty where all metres are known."""
+    facts, end = metres_facts(stack), guessed_end(stack)
     if not stack.metres_known:
+        turn = f", and if near and far are swapped `--nearest {'last' if end == 'first' else 'first'}`" if end else ""
         return (
-            f"{stack.folder}: metres are guessed: {facts.get('why') or _WHY}; "
-            f"give one known length by `mrbokeh capture scale {stack.folder} --ruler X1,Y1,X2,Y2,METRES`"
+            f"{stack.folder}: metres are guessed: {facts.get('why') or _WHY}{f', the {end} slice nearest' if end else ''}; "
+            f"give one known length by `mrbokeh capture scale {stack.folder} --ruler X1,Y1,X2,Y2,METRES`{turn}"
         )
-    return f"{stack.folder}: {facts.get('why')}; still guessed: {facts['guessed']}" if facts.get("guessed") else ""
+    guessed = [*([facts["guessed"]] if facts.get("guessed") else []), *([f"that the {end} slice is the nearest"] if end else [])]
+    return f"{stack.folder}: {facts.get('why')}; still guessed: {'; '.join(guessed)}" if guessed else ""
+
+
+def guessed_end(stack: FocalStack) -> str | None:
+    """Return "first" or "last": the slice that is taken for the nearest, where that is a guess."""
+    gauge = metres_facts(stack).get("gauge") or {}
+    if gauge.get("near_first_sure", True):
+        return None
+    return "first" if gauge.get("near_first", True) else "last"
 
 
 def metres_notes(stacks: Iterable[FocalStack]) -> str:

@@ -328,6 +328,42 @@ def test_two_distances_tell_which_end_is_near(known: FocalStack, tmp_path: Path,
     assert "nearest" not in metres_note(made)
 
 
+def test_near_and_far_are_turned_by_one_word(known: FocalStack, tmp_path: Path, run: Run) -> None:
+    """The depth comes out as that of the twin, whose order is right, for what is guessed is put at 1 m to 2 m both times."""
+    right = guessed_twin(known, tmp_path / "right")
+    wrong = guessed_twin(known, tmp_path / "wrong")
+    gauge = wrong.metadata["metres"]["gauge"] | {"near_first": False, "near_first_sure": False}
+    _write_exchanged(replace(wrong, metadata=wrong.metadata | {"metres": wrong.metadata["metres"] | {"gauge": gauge}}))
+    assert "the last slice nearest" in metres_note(read_focal_stack(wrong.folder))
+    assert "--nearest first" in metres_note(read_focal_stack(wrong.folder))
+    told = run("capture", "scale", wrong.folder, "--nearest", "first")
+    assert "the first slice is the nearest" in told and (wrong.folder / "depth.png").is_file()
+    made = read_focal_stack(wrong.folder)
+    assert made.focus_distances_m == pytest.approx(right.focus_distances_m, rel=1e-5) and not made.metres_known
+    np.testing.assert_allclose(made.depth_m(), right.depth_m(), rtol=1e-5)
+    for index in range(3):
+        np.testing.assert_allclose(made.coc_px(index, made.depth_m()), known.coc_px(index, known.depth_m()), atol=2e-3)
+    assert "nearest" not in metres_note(made).replace("the nearest plane", "")
+    run("capture", "scale", wrong.folder, "--nearest", "first")
+    np.testing.assert_array_equal(read_focal_stack(wrong.folder).depth_m(), made.depth_m())
+
+
+def test_turning_keeps_a_length_that_was_told(known: FocalStack, tmp_path: Path, run: Run) -> None:
+    twin = guessed_twin(known, tmp_path / "twin")
+    run("capture", "scale", twin.folder, "--distance-at", f"{ON_WALL},0.7")
+    run("capture", "scale", twin.folder, "--nearest", "last")
+    made = read_focal_stack(twin.folder)
+    assert made.depth_m()[24, 50] == pytest.approx(0.7, rel=1e-4)
+    assert made.focus_distances_m[0] > made.focus_distances_m[2]
+
+
+def test_who_states_distances_needs_no_direction(
+    known: FocalStack, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, told = said(capsys, monkeypatch, "capture", "scale", known.folder, "--nearest", "last")
+    assert code == 2 and "--nearest is for stacks that have to guess it" in told
+
+
 def _write_exchanged(stack: FocalStack) -> None:
     """Nearness mirrored in the middle of 0.5 and 1 dioptres: what was at 1 m is taken to be at 2 m."""
     slices = tuple(replace(each, focus_distance_m=1.0 / (1.5 - 1.0 / float(each.focus_distance_m or 0))) for each in stack.slices)

@@ -48,8 +48,9 @@ def merge_command(
 ) -> None:
     from capture.merging.merge import merge_scene
     from capture.merging.preferred_merge import preferred_lines, preferred_side
-    from capture.merging.relative_stack import METRES, ORDER
+    from capture.merging.relative_stack import ORDER
     from capture.merging.retouch import retouched_stacks
+    from mrbokeh.guessed_metres import metres_facts, metres_note
     from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.malloc_settings import keep_freed_pictures
 
@@ -66,7 +67,7 @@ def merge_command(
         stacks = merge_scene(scene, overwrite, registration, prefer)
     for stack in stacks:
         _tell(stack)
-        for told in (stack.metadata.get(ORDER), (stack.metadata.get(METRES) or {}).get("why")):
+        for told in (stack.metadata.get(ORDER), metres_note(stack) or metres_facts(stack).get("why")):
             if told:
                 typer.echo(f"  {told}")
         for line in preferred_lines(stack):

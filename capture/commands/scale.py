@@ -1,7 +1,7 @@
 """`mrbokeh capture scale`: camera poses in metres, and the lens's focus calibrated against them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -18,6 +18,7 @@ HELP = "\n\n".join(
         "(--distance-at), at pixels of its all-in-focus picture. What photographs state stays, what is told fixes the rest, and what is "
         "still guessed is said: two things at different depths tell how deep the scene is.",
         "Example:  mrbokeh capture scale STACK --ruler 310,220,480,224,0.05",
+        "Example:  mrbokeh capture scale STACK --nearest last",
         "Example:  mrbokeh capture scale scene/ --board 8x6 --square-mm 30 --marker-mm 22",
         "Example:  mrbokeh capture scale scene/ --distance view_0,view_3,0.25",
         "Example:  mrbokeh capture scale other_scene/ --lens-calibration scene/lens_calibration.json",
@@ -51,6 +52,10 @@ def scale_command(
         list[str] | None,
         typer.Option(metavar="X,Y,METRES", help="a known distance from the lens to what is seen at a pixel of a stack; may be repeated"),
     ] = None,
+    nearest: Annotated[
+        Literal["first", "last"] | None,
+        typer.Option(help="which slice of a stack is focused nearest; turns its depth where near and far were taken for one another"),
+    ] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="calibrate the focus of the stacks")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find the scale again")] = False,
 ) -> None:
@@ -59,10 +64,12 @@ def scale_command(
     from capture.views.scale_distance import parse_distance
     from capture.views.scale_text import scale_lines
 
-    if ruler or distance_at:
+    if ruler or distance_at or nearest:
         if board or distance or lens_calibration:
-            raise InputError("--ruler and --distance-at are for one stack, --board, --distance and --lens-calibration for a scene: choose")
-        _tell(scene, ruler or [], distance_at or [], overwrite)
+            raise InputError(
+                "--ruler, --distance-at and --nearest are for one stack, --board, --distance and --lens-calibration for a scene: choose"
+            )
+        _tell(scene, ruler or [], distance_at or [], nearest, overwrite)
         return
     if lens_calibration is not None:
         _apply(scene, lens_calibration)
@@ -73,9 +80,10 @@ def scale_command(
         typer.echo(line)
 
 
-def _tell(folder: Path, rulers: list[str], distances: list[str], overwrite: bool) -> None:
-    from capture.views.stack_metres import Fact, lines_of, parse_known_distance, parse_length, tell_metres
+def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | None, overwrite: bool) -> None:
+    from capture.views.stack_metres import Fact, lines_of, parse_known_distance, parse_length, tell_metres, tell_nearest
     from mrbokeh.focal_stack import find_focal_stacks
+    from mrbokeh.guessed_metres import metres_note
 
     facts: list[Fact] = [*[parse_length(each) for each in rulers], *[parse_known_distance(each) for each in distances]]
     stacks = find_focal_stacks(folder)
@@ -83,7 +91,11 @@ def _tell(folder: Path, rulers: list[str], distances: list[str], overwrite: bool
         raise InputError(
             f"{folder} has {len(stacks)} stacks: give the folder of the one whose pixels these are, such as {stacks[0].folder}"
         )
-    for line in lines_of(tell_metres(stacks[0], facts, overwrite)):
+    stack = stacks[0]
+    if nearest is not None:
+        stack = tell_nearest(stack, nearest == "first")
+        typer.echo(f"{stack.folder}: the {nearest} slice is the nearest")
+    for line in lines_of(tell_metres(stack, facts, overwrite)) if facts else filter(None, [metres_note(stack)]):
         typer.echo(line)
 
 

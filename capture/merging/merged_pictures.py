@@ -44,12 +44,18 @@ def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None, de
     rgb, orientation, folder = stack.to_rec709(camera_rgb), orientation_of(stack), stack.folder
     write_stored(folder / PNG_NAME, upright(codes_of(rgb, np.uint8, "srgb"), orientation))
     _write_srgb_tiff(folder / TIFF_NAME, upright(codes_of(rgb, np.uint16, "srgb"), orientation))
-    write_stored(folder / DEPTH_NAME, upright(depth_codes(stack) if depth_rgb8 is None else depth_rgb8, orientation))
+    write_depth_picture(stack, depth_rgb8)
     names = readable_names(stack)
     if DNG_NAME in names and stack.rec709_from_camera is not None:
         model = next((model for each in stack.slices if (model := each.metadata.get("camera_model"))), "unknown camera")
         write_linear_dng(folder / DNG_NAME, camera_rgb, stack.rec709_from_camera, stack.metadata["white_balance"], model, orientation)
     return [folder / name for name in names]
+
+
+def write_depth_picture(stack: FocalStack, depth_rgb8: Rgb8 | None = None) -> None:
+    """Write depth.png, the depth in colours. depth_rgb8: its `depth_codes`, read if None."""
+    codes = depth_codes(stack) if depth_rgb8 is None else depth_rgb8
+    write_stored(stack.folder / DEPTH_NAME, upright(codes, orientation_of(stack)))
 
 
 def readable_names(stack: FocalStack) -> list[str]:

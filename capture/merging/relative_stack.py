@@ -168,7 +168,7 @@ def with_guessed_metres(stated: FocalStack, relative: RelativeFocus, direction: 
         "lens": None if stated.lens is None else lens_to_json(stated.lens),
         "camera": None if stated.camera is None else camera_to_json(stated.camera),
     }
-    facts = {"known": gauge.known, "why": _why(gauge, direction, stated), "gauge": _gauge_json(gauge, direction, distances_m)}
+    facts = {"known": gauge.known, "why": _why(gauge, stated), "gauge": _gauge_json(gauge, direction, distances_m)}
     metadata = stated.metadata | {METRES: facts, STATED: before}
     return replace(stated, slices=slices, lens=lens, camera=stated.camera or _camera(lens, size_px), metadata=metadata)
 
@@ -259,20 +259,19 @@ def _camera(lens: Lens, size_px: tuple[int, int]) -> Camera:
     return Camera(*size_px, (focal_px, focal_px), (size_px[0] / 2.0, size_px[1] / 2.0))
 
 
-def _why(gauge: Gauge, direction: Direction, stated: FocalStack) -> str:
+def _why(gauge: Gauge, stated: FocalStack) -> str:
     told = sum(each is not None for each in stated.focus_distances_m)
     blur = "blur in pixels is solved from the slices"
-    near = "" if direction.sure else f"; that the {'first' if direction.near_first else 'last'} slice is the nearest is a guess"
     match gauge.scale_from, gauge.offset_from:
         case "distances", _:
-            return f"{blur}, metres are those of {told} of {len(stated)} stated focus distances{near}"
+            return f"{blur}, metres are those of {told} of {len(stated)} stated focus distances"
         case "lens", "distances":
-            return f"{blur}, metres follow from the stated lens and {told} of {len(stated)} focus distances{near}"
+            return f"{blur}, metres follow from the stated lens and {told} of {len(stated)} focus distances"
         case "lens", _:
-            return f"{blur} and the lens is stated, but no focus distance: how far away all lies is a guess{near}"
+            return f"{blur} and the lens is stated, but no focus distance: how far away all lies is a guess"
         case _, "distances":
-            return f"{blur} and one focus distance is stated; how deep the scene is remains a guess{near}"
-    return f"{blur}; no focus distance is stated: the nearest plane of focus is put at 1 m and the farthest at 2 m{near}"
+            return f"{blur} and one focus distance is stated; how deep the scene is remains a guess"
+    return f"{blur}; no focus distance is stated: the nearest plane of focus is put at 1 m and the farthest at 2 m"
 
 
 def _gauge_json(gauge: Gauge, direction: Direction, distances_m: list[float]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import least_squares
 
+from capture.merging.merged_pictures import write_depth_picture
 from capture.views.lens_calibration import STATED_KEY
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
@@ -97,14 +98,51 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
         )
     solving = _Solving(tuple(_Equation.of(each, depth_m, camera) for each in facts), _stated_dioptres(stack), metres_facts(stack)["gauge"])
     found = solving.solution()
-    changed = _regauged(stack, found, facts)
-    _write_depth(changed, found.p, found.q)
-    write_focal_stack(changed)
+    changed = _regauged(stack, found.p, found.q)
+    gauge = dict(changed.metadata[KEY]["gauge"]) | {"offset_from": "told"}
+    gauge |= {} if gauge["scale_from"] == "lens" else {"scale_from": "told"}
+    if found.directed:
+        gauge |= {"near_first_from": "told", "near_first_sure": True}
+    changed = replace(changed, metadata=changed.metadata | {KEY: _told(stack, gauge, facts, found.deep)})
+    _write(changed, found.p, found.q)
     return Regauged(changed, tuple((each.fact, each.error(found.p, found.q)) for each in solving.equations))
 
 
+def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
+    """Put what the user knows of the sweep's direction into stack.json and depth.exr: that its first (or last) slice is the nearest.
+
+    Turned in the middle of its planes of focus, or so that a stated distance and lengths told of one depth stay. Raises InputError where
+    stated focus distances, or lengths and distances at several depths, say it already.
+    """
+    facts = metres_facts(stack)
+    gauge, stated = facts.get("gauge"), _stated_dioptres(stack)
+    if not gauge or gauge.get("near_first_from") in (FACTS, "stated distances") or len(stated) > 1:
+        raise InputError(f"{stack.folder} knows its nearest slice from its distances: --nearest is for stacks that have to guess it")
+    turned = bool(gauge.get("near_first", True)) != first
+    p, q = _turn(stack, stated) if turned else (0.0, 1.0)
+    changed = _regauged(stack, p, q)
+    known = dict(changed.metadata[KEY]["gauge"]) | {"near_first_from": "--nearest", "near_first_sure": True}
+    changed = replace(changed, metadata=changed.metadata | {KEY: dict(changed.metadata[KEY]) | {"gauge": known}})
+    _write(changed, p, q)
+    return changed
+
+
+def _turn(stack: FocalStack, stated: Float[np.ndarray, " slices"]) -> tuple[float, float]:
+    """p and q below 0 of the stack turned; what is stated or told stays at its dioptres."""
+    facts, dioptres = metres_facts(stack), [1.0 / each for each in stack.focus_distances_m if each]
+    depth_m = _told_depth_m(stack)
+    told = [1.0 / _depth_at(depth_m, *pixel) for each in facts.get(FACTS, ()) for pixel in _fact(each).pixels]
+    kept, ends = [*stated, *told], min(dioptres) + max(dioptres)
+    if not kept:
+        return ends, -1.0
+    if facts["gauge"]["scale_from"] == "lens":
+        return 2.0 * float(np.mean(kept)), -1.0
+    factor = float(np.mean(kept)) / (ends - float(np.mean(kept)))
+    return ends * factor, -factor
+
+
 def lines_of(done: Regauged) -> list[str]:
-    """What was found, for people."""
+    """Say what was found, for people."""
     distances_m = [each for each in done.stack.focus_distances_m if each is not None]
     facts = metres_facts(done.stack)
     lines = [f"{done.stack.folder}: focused from {min(distances_m):.4g} m to {max(distances_m):.4g} m, {facts['why']}"]
@@ -244,8 +282,6 @@ def _told(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fact], de
     guessed = []
     if not deep:
         guessed.append("how deep the scene is for its distance, as all that was told lies at one depth")
-    if not gauge.get("near_first_sure", True):
-        guessed.append(f"that the {'first' if gauge.get('near_first') else 'last'} slice is the nearest")
     if is_view_guessed(stack):
         guessed.append("the field of view, so that distances stand beside lengths in a guessed proportion")
     count = f"{len(facts)} known lengths and distances" if len(facts) > 1 else str(facts[0])
@@ -253,18 +289,16 @@ def _told(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fact], de
     return {"known": True, "why": f"metres rest on {count}", "guessed": "; ".join(guessed) or None, FACTS: told, "gauge": dict(gauge)}
 
 
-def _regauged(stack: FocalStack, found: _Solution, facts: Sequence[Fact]) -> FocalStack:
-    slices = tuple(_regauged_slice(stack, each, found.p, found.q) for each in stack.slices)
+def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
+    """The stack with dioptres p + q D; what its metres rest on is left to the caller."""
+    slices = tuple(_regauged_slice(stack, each, p, q) for each in stack.slices)
     distances_m = [float(each.focus_distance_m or 0.0) for each in slices]
     gauge = dict(metres_facts(stack)["gauge"])
-    gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / abs(found.q), "offset_dioptres": found.p + found.q * gauge["offset_dioptres"]}
-    gauge |= {"offset_from": "told"} | ({} if gauge["scale_from"] == "lens" else {"scale_from": "told"})
+    gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / abs(q), "offset_dioptres": p + q * gauge["offset_dioptres"]}
     gauge |= {"nearest_m": min(distances_m), "farthest_m": max(distances_m)}
-    if found.directed:
-        near_first = bool(gauge.get("near_first", True)) == (found.q > 0.0)
-        gauge |= {"near_first": near_first, "near_first_from": "told", "near_first_sure": True}
-    lens = _lens_at(stack, distances_m)
-    return replace(stack, slices=slices, lens=lens, metadata=stack.metadata | {KEY: _told(stack, gauge, facts, found.deep)})
+    gauge |= {"near_first": bool(gauge.get("near_first", True)) == (q > 0.0)}
+    facts = dict(metres_facts(stack)) | {"gauge": gauge}
+    return replace(stack, slices=slices, lens=_lens_at(stack, distances_m), metadata=stack.metadata | {KEY: facts})
 
 
 def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
@@ -292,8 +326,11 @@ def _lens_at(stack: FocalStack, distances_m: list[float]) -> Lens | None:
     )
 
 
-def _write_depth(stack: FocalStack, p: float, q: float) -> None:
+def _write(stack: FocalStack, p: float, q: float) -> None:
+    """Depth with dioptres p + q D, its picture, and stack.json."""
     part = read_exr(stack.depth_path)[0]
     dioptres = np.maximum(p + q / part.channels["Z"].astype(np.float64), _LEAST_DIOPTRES)
     turned = {POSITION: -part.channels[POSITION]} if q < 0.0 and POSITION in part.channels else {}
     write_exr(stack.depth_path, replace(part, channels=dict(part.channels) | {"Z": (1.0 / dioptres).astype(np.float32)} | turned))
+    write_focal_stack(stack)
+    write_depth_picture(stack)
