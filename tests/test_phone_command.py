@@ -326,6 +326,25 @@ def test_where_browsers_send_their_cameras() -> None:
     assert needed_role("/phone-whip") is Role.CONTROL
 
 
+def test_a_frame_that_is_still_looked_at_is_not_one_in_which_nothing_was_seen() -> None:
+    """Searching a frame may take longer than a pose is held."""
+    looking, remarks = Event(), list[str | None]()
+
+    class Slow(Known):
+        def track(self, frame: CameraFrame, intrinsics: object) -> TrackedPose:  # noqa: ARG002
+            if tracker._history.newest_s is not None:
+                remarks.append(tracker.remark)
+                looking.set()
+            return TrackedPose(self.poses[0], 1.0, frame.captured_s)
+
+    tracker = PhoneTracker(PatternSource(480, 270, fps=5.0), Slow(PHONE_POSES), PHONE, None)
+    try:
+        assert looking.wait(10.0)
+    finally:
+        tracker.close()
+    assert remarks[0] is None, "the frame before is 0.2 s old, and this one is not done"
+
+
 def test_the_phone_tells_what_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "phone").mkdir()
     cv2.imwrite(str(tmp_path / "phone" / "grey.png"), np.full((270, 480, 3), 90, np.uint8))
@@ -336,14 +355,14 @@ def test_the_phone_tells_what_is_wrong(tmp_path: Path) -> None:
     assert isinstance(tracker, PhoneTracker) and tracker.video_delay_s == 0.08
     try:
         deadline_s = time.monotonic() + 10.0
-        while tracker._shown_s == 0.0 and time.monotonic() < deadline_s:
+        while tracker._looked_s == 0.0 and time.monotonic() < deadline_s:
             time.sleep(0.01)
         assert tracker.remark == "the phone on the camera does not see what it tracks", "grey is no board"
     finally:
         tracker.close()
     turned = PhoneTracker(PatternSource(36, 64), Known(PHONE_POSES), PHONE, None)
     try:
-        while turned._shown_s == 0.0 and time.monotonic() < deadline_s:
+        while turned._wrong_size is None and time.monotonic() < deadline_s:
             time.sleep(0.01)
         assert "its pictures are 36x64 px, those of its camera file 480x270 px" in str(turned.remark)
     finally:

@@ -47,7 +47,7 @@ class PhoneTracker:
         self._wrong_size: str | None = None
         self.source, self._tracker, self._intrinsics = source, phone_tracker, phone_intrinsics
         self._history, self._newest = PoseHistory(joined_s=2.0 * hold_s), (0.0, 0.0, 0)
-        self._shown_s = 0.0
+        self._looked_s = 0.0
         self._stopping = Event()
         self._thread = Thread(target=self._run, name="phone", daemon=True)
         self._thread.start()
@@ -68,7 +68,7 @@ class PhoneTracker:
         if trouble is not None:
             return f"the phone on the camera: {trouble}"
         newest_s = self._history.newest_s
-        unseen = newest_s is None or self._shown_s - newest_s > self._hold_s
+        unseen = newest_s is None or self._looked_s - newest_s > self._hold_s
         return "the phone on the camera does not see what it tracks" if unseen else None
 
     def phone_pose(self, captured_s: float) -> Pose | None:
@@ -93,7 +93,7 @@ class PhoneTracker:
 
     def _take(self, frame: CameraFrame) -> None:
         height_px, width_px = frame.bgr.shape[:2]
-        self._shown_s, self._wrong_size = frame.captured_s, self._objection(width_px, height_px)
+        self._wrong_size = self._objection(width_px, height_px)
         if self._wrong_size is not None:
             return
         pose = self._tracker.track(frame, self._intrinsics.resized(width_px, height_px))
@@ -101,6 +101,8 @@ class PhoneTracker:
         if pose is not None and pose.is_certain and pose.captured_s == frame.captured_s:
             self._newest = (pose.quality, pose.residual_px, pose.points)
             self._history.add(frame.captured_s, TrackingSample(pose.camera_from_world))
+        # Only now: a frame that is still looked at is not one in which nothing was seen.
+        self._looked_s = frame.captured_s
 
     def _objection(self, width_px: int, height_px: int) -> str | None:
         """Intrinsics follow the size of the frames, but not their shape: a phone that is turned shows another part of its sensor."""
