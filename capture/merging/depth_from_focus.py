@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Int, UInt8
 
 from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, focus_volume, share_above
 from capture.merging.lights import Lights
@@ -23,6 +23,17 @@ LARGEST_COST = 4.0
 # Detail has half its say in the labelling, and half its confidence, where its energy is this many times that of the noise.
 LABELLING_NOISE_FLOORS = 30.0
 CONFIDENCE_NOISE_FLOORS = 10.0
+# Plain places follow the detail around them: windows this many times as wide, and more in larger pictures, speak where small ones do not.
+WIDER = (4, 16)
+WIDER_SIGMA = 2.5
+WIDER_NOISE_FLOORS = 10.0
+WIDER_FROM_PX = 0.7e6
+# Weak detail of a slice whose light differs by about this much (square roots, 255 at white) from that of the slice in which the
+# surroundings are sharp is the rim of a blur: it has half its say where it is this share of the detail around it.
+RIM_LIGHT = 5.0
+RIM_SHARE = 0.3
+# Light is compared over a few pixels of the volume.
+_LIGHT_SIGMA_PX = 3.0
 # Pixels this near to one that is full see its clipped rim, not detail.
 SATURATION_REACH_PX = 5
 # Where the log energy bends by this much at its peak it tells depth as well as it can.
@@ -56,6 +67,7 @@ def depth_from_focus(registered: Iterable[Rgb], lights: Lights) -> FocusMap:
 def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "height width"] | None = None) -> FocusMap:
     """Semi-global labelling (Hirschmueller 2008) of log focus energies, then a parabola through the peak.
 
+    Where there is no detail, that of the surroundings decides: beside a sharp edge every other slice shows light that the edge spreads.
     Energies within the reach of a light have no say, but the light's own pixels are known to be sharp in its sharpest slice.
     saturated: (H, W) full in some slice: no confidence there and beside it.
     """
@@ -64,8 +76,8 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     by_light = lights.slice_index()
     energies = volume.calmed()
     strongest = energies.max(axis=0)
+    costs = _costs(_without_rims(energies, volume.lights))
     log_energies = np.log1p(energies, out=energies)
-    costs = _costs(log_energies, share_above(strongest, LABELLING_NOISE_FLOORS))
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     offset, _ = peak_parabola(log_energies, labels)
@@ -77,11 +89,47 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     return FocusMap(index, confidence)
 
 
-def _costs(log_energies: Volume, say: Plane) -> Volume:
-    """How many e-folds the energy of each slice is below the strongest, times the say of the pixel."""
+def _without_rims(energies: Volume, lights: UInt8[np.ndarray, "slices height width"]) -> Volume:
+    """Return energies without those of blurred edges nearby."""
+    wide = _wider(energies, WIDER[-1])
+    around, size = wide.max(axis=0), energies.shape[2:0:-1]
+    sharp = cv2.resize(wide.argmax(axis=0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST).astype(int)
+    around = np.float32(RIM_SHARE) * cv2.resize(around, size, interpolation=cv2.INTER_LINEAR)
+    calm = np.stack([cv2.GaussianBlur(each, (0, 0), _LIGHT_SIGMA_PX) for each in lights])
+    wanted = np.take_along_axis(calm, sharp[None], axis=0)[0].astype(np.float32)
+    result = np.empty_like(energies)
+    for kept, energy, light in zip(result, energies, calm, strict=True):
+        off = cv2.subtract(light.astype(np.float32), wanted) / np.float32(RIM_LIGHT)
+        kept[:] = energy * (1.0 - (1.0 - cv2.exp(-off * off)) * around / (around + energy + np.float32(1e-9)))
+    return result
+
+
+def _costs(energies: Volume) -> Volume:
+    """Return how many e-folds the energy of each slice is below the strongest, times the say of the pixel, then of wider windows."""
+    wider = [_wider(energies, shrink) for shrink in WIDER]
+    say = share_above(energies.max(axis=0), LABELLING_NOISE_FLOORS)
+    costs = _below_strongest(np.log1p(energies, out=energies))
+    costs *= say
+    left, size = 1.0 - say, energies.shape[2:0:-1]
+    for window in wider:
+        say = left * cv2.resize(share_above(window.max(axis=0), WIDER_NOISE_FLOORS), size, interpolation=cv2.INTER_LINEAR)
+        for cost, each in zip(costs, _below_strongest(np.log1p(window)), strict=True):
+            cost += say * cv2.resize(each, size, interpolation=cv2.INTER_LINEAR)
+        left -= say
+    return costs
+
+
+def _wider(energies: Volume, shrink: int) -> Float32[np.ndarray, "slices rows columns"]:
+    """Return energies averaged over wider windows, smaller by `shrink` or more."""
+    height, width = energies.shape[1:]
+    step = max(1.0, np.sqrt(height * width / WIDER_FROM_PX)) * shrink
+    size = tuple(max(1, int(np.ceil(each / step))) for each in (width, height))
+    return np.stack([cv2.GaussianBlur(cv2.resize(each, size, interpolation=cv2.INTER_AREA), (0, 0), WIDER_SIGMA) for each in energies])
+
+
+def _below_strongest(log_energies: Volume) -> Volume:
     costs = log_energies.max(axis=0) - log_energies
-    np.minimum(costs, np.float32(LARGEST_COST), out=costs)
-    return np.multiply(costs, say, out=costs)
+    return np.minimum(costs, np.float32(LARGEST_COST), out=costs)
 
 
 def _let_lights_decide(costs: Volume, by_light: Labels, core: Bool[np.ndarray, "height width"]) -> None:

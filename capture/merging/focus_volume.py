@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Shaped, UInt8
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 Volume = Float32[np.ndarray, "slices height width"]
 Blocks = Float32[np.ndarray, "rows columns"]
-Levels = UInt8[np.ndarray, "height width"]
+Light = UInt8[np.ndarray, "height width"]
 
 # The window of the energy is wide enough that every second pixel holds all of it.
 LEAST_SHRINK = 2
@@ -24,6 +24,7 @@ BLOCK_PX = 24
 DETAIL_SIGMA_PX = 1.5
 # Noise is measured at so many brightnesses, each on at least so many pixels, as a low percentile of their energies.
 _LEVELS = 24
+_WHITE = 255.0
 _FEWEST_PIXELS = 200
 _NOISE_PERCENTILE = 5.0
 _EVERY_PX = 3
@@ -35,10 +36,12 @@ _LEAST_OF_MEDIAN = 0.25
 class FocusVolume:
     """energies (slices, h, w): local energy of fine detail in every slice, over that of noise at this brightness.
 
-    shape: (H, W) of the pictures, h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
+    lights (slices, h, w): mean over the channels of the square root of light, 255 at display white. shape: (H, W) of the pictures,
+    h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
     """
 
     energies: Volume
+    lights: UInt8[np.ndarray, "slices height width"]
     shape: tuple[int, int]
     details: tuple[Blocks, ...] = ()
 
@@ -83,7 +86,7 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
     count: how many slices there will be, for the memory they take.
     """
     energies: list[Plane] = []
-    levels: list[Levels] = []
+    lights: list[Light] = []
     details: list[Blocks] = []
     for index, rgb in enumerate(registered):
         encoded = np.sqrt(np.maximum(rgb, 0.0))
@@ -94,12 +97,12 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
         height, width = _reduced_size(energy.shape, count)
         energies.append(cv2.resize(energy, (width, height), interpolation=cv2.INTER_AREA))
         small = cv2.resize(encoded, (width, height), interpolation=cv2.INTER_AREA)
-        levels.append(np.minimum(cv2.transform(small, np.full((1, 3), _LEVELS / 3.0)), _LEVELS - 1).astype(np.uint8))
+        lights.append(np.minimum(cv2.transform(small, np.full((1, 3), _WHITE / 3.0)), _WHITE).astype(np.uint8))
     volume = np.stack(energies)
-    floors = noise_floors(volume, levels)
-    for energy, level in zip(volume, levels, strict=True):
-        energy /= floors[level]
-    return FocusVolume(volume, (rgb.shape[0], rgb.shape[1]), tuple(details))
+    floors = noise_floors(volume, lights)
+    for energy, light in zip(volume, lights, strict=True):
+        energy /= floors[_level_of(light)]
+    return FocusVolume(volume, np.stack(lights), (rgb.shape[0], rgb.shape[1]), tuple(details))
 
 
 def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
@@ -122,7 +125,11 @@ def block_detail(encoded: Rgb) -> Blocks:
     return np.sqrt(cv2.resize(squared, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def noise_floors(energies: Volume, levels: list[Levels]) -> Float32[np.ndarray, " levels"]:
+def _level_of(light: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
+    return (light.astype(np.uint16) * _LEVELS // 256).astype(np.uint8)
+
+
+def noise_floors(energies: Volume, lights: list[Light]) -> Float32[np.ndarray, " levels"]:
     """Return the energy that noise alone has at each brightness (square root of light, in _LEVELS steps): what the smoothest places show.
 
     Compression and clipping leave less noise in the dark and at white than in between, by a factor of ten in real JPEG: with one
@@ -130,7 +137,7 @@ def noise_floors(energies: Volume, levels: list[Levels]) -> Float32[np.ndarray, 
     """
     every = (slice(None, None, _EVERY_PX),) * 2
     energy = np.concatenate([each[every].ravel() for each in energies])
-    level = np.concatenate([each[every].ravel() for each in levels])
+    level = _level_of(np.concatenate([each[every].ravel() for each in lights]))
     level, energy = level[energy > 0], energy[energy > 0]
     lows = {each: float(np.percentile(energy[level == each], _NOISE_PERCENTILE)) for each in _well_filled(level)}
     if not lows:
