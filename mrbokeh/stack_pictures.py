@@ -1,5 +1,6 @@
 """Pictures of a merged focal stack for people to look at."""
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,11 @@ from jaxtyping import Float32, Shaped, UInt8
 
 from mrbokeh.color import srgb_to_linear
 from mrbokeh.contact_sheet import WIDEST_PX, SheetRow, write_contact_sheet
+from mrbokeh.exif_orientation import known_orientation, upright
 from mrbokeh.focal_stack import FocalStack
+from mrbokeh.guessed_metres import unit_of
 from mrbokeh.image_io import write_preview
+from mrbokeh.picture_codec import codes_of, write_stored
 
 SHEET_NAME = "merge.png"
 TRUSTED = 0.3
@@ -60,6 +64,17 @@ def write_stack_pictures(stack: FocalStack, out: Path) -> list[tuple[Path, str]]
     return written
 
 
+def write_upright_png(path: Path, rgb: Rgb, stack: FocalStack) -> None:
+    """Write a picture of the stack in 8 bits of sRGB, nothing tone-mapped, as its cameras' orientation says."""
+    write_stored(path, upright(codes_of(rgb, np.uint8, "srgb"), orientation_of(stack)))
+
+
+def orientation_of(stack: FocalStack) -> int:
+    """Return EXIF's number that most slices state (a camera that looks straight down changes its mind)."""
+    stated = Counter(known_orientation(each.metadata.get("orientation")) for each in stack.slices)
+    return stated.most_common(1)[0][0]
+
+
 def shown_slices(stack: FocalStack) -> list[int]:
     """The nearest, a middle and the farthest slice."""
     return sorted({0, len(stack) // 2, len(stack) - 1})
@@ -94,4 +109,4 @@ def depth_codes(stack: FocalStack) -> UInt8[np.ndarray, "height width 3"]:
 
 def _focus_text(stack: FocalStack, index: int) -> str:
     distance_m = stack.slices[index].focus_distance_m
-    return "" if distance_m is None else f", focused at {distance_m:.3g} m"
+    return "" if distance_m is None else f", focused at {distance_m:.3g} {unit_of(stack)}"

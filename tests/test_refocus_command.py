@@ -135,7 +135,7 @@ def test_the_command_writes_a_focal_stack(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--overwrite"):
         run(stack.folder, "--focus", "0.52", "--out", tmp_path / "new")
     run(stack.folder, "--focus", "0.6", "--out", tmp_path / "new", "--overwrite", "--renderer", "scatter")
-    assert sorted(each.name for each in (tmp_path / "new").glob("slice*")) == ["slice_0.6000m.exr"]
+    assert sorted(each.name for each in (tmp_path / "new").glob("slice*")) == ["slice_0.6000m.exr", "slice_0.6000m.png"]
     other = make_card_stack(tmp_path / "captured", 4)
     with pytest.raises(InputError, match="not made by refocus"):
         run(stack.folder, "--focus", "0.6", "--out", other.folder, "--overwrite")

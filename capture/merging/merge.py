@@ -103,7 +103,8 @@ def _with_highlights(stack: FocalStack, restored: Sequence[RestoredLight]) -> Fo
 def _require_a_sweep(stack: FocalStack) -> None:
     """Neighbours in order must be neighbours in focus."""
     if len(stack) < FEWEST_SLICES:
-        raise InputError(f"{stack.folder} has {len(stack)} slices: merging needs at least {FEWEST_SLICES}, focused at different distances")
+        count = "1 slice" if len(stack) == 1 else f"{len(stack)} slices"
+        raise InputError(f"{stack.folder} has {count}: merging needs at least {FEWEST_SLICES}, focused at different distances")
     dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
     steps = np.diff(dioptres)
     if stack.is_metric and (steps > 0).any() and (steps < 0).any():

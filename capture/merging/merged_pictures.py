@@ -4,7 +4,6 @@ PNG, TIFF and depth stand upright as the cameras' orientation says; DNG says so 
 """
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,10 +13,10 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 from capture.merging.tiff_writer import BYTE, RATIONAL, SHORT, UNDEFINED, TiffTag, fractions_tag, text_tag, write_tiff
 from mrbokeh.camera_rgb import Matrix3x3
 from mrbokeh.color import rec709_from_XYZ
-from mrbokeh.exif_orientation import known_orientation, upright
+from mrbokeh.exif_orientation import upright
 from mrbokeh.focal_stack import FocalStack
 from mrbokeh.picture_codec import codes_of, write_stored
-from mrbokeh.stack_pictures import depth_codes
+from mrbokeh.stack_pictures import depth_codes, orientation_of, write_upright_png
 
 PNG_NAME, TIFF_NAME, DNG_NAME, DEPTH_NAME = "all_in_focus.png", "all_in_focus.tif", "all_in_focus.dng", "depth.png"
 
@@ -42,7 +41,7 @@ def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None, de
     if camera_rgb is None:
         camera_rgb = stack.all_in_focus_camera_rgb()
     rgb, orientation, folder = stack.to_rec709(camera_rgb), orientation_of(stack), stack.folder
-    write_stored(folder / PNG_NAME, upright(codes_of(rgb, np.uint8, "srgb"), orientation))
+    write_upright_png(folder / PNG_NAME, rgb, stack)
     _write_srgb_tiff(folder / TIFF_NAME, upright(codes_of(rgb, np.uint16, "srgb"), orientation))
     write_depth_picture(stack, depth_rgb8)
     names = readable_names(stack)
@@ -62,12 +61,6 @@ def readable_names(stack: FocalStack) -> list[str]:
     """Of the files that a merge of this stack writes for people."""
     is_raw = stack.rec709_from_camera is not None and stack.metadata.get("white_balance") is not None
     return [PNG_NAME, TIFF_NAME, *([DNG_NAME] if is_raw else []), DEPTH_NAME]
-
-
-def orientation_of(stack: FocalStack) -> int:
-    """EXIF's number that most slices state (a camera that looks straight down changes its mind)."""
-    stated = Counter(known_orientation(each.metadata.get("orientation")) for each in stack.slices)
-    return stated.most_common(1)[0][0]
 
 
 def write_linear_dng(

@@ -13,6 +13,9 @@ from mrbokeh.picture_codec import stored_pixels
 
 MASK_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 _ALPHA, _COLOURS = 3, 3
+_PAINTED = (0.1, 0.9)
+_LARGEST_UNPAINTED = 0.25
+"""Share of pixels that are neither black nor white: soft brushes leave rims, a photograph is nearly all between."""
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -31,6 +34,11 @@ def read_mask(path: Path, shape: tuple[int, int], orientation: int) -> Plane:
     if not np.isfinite(white).all():
         raise InputError(f"{path}: {int((~np.isfinite(white)).sum())} pixels are NaN or infinite: paint the mask from 0 (black) to 1")
     white = np.clip(white, 0.0, 1.0).astype(np.float32)
+    between = float(((white > _PAINTED[0]) & (white < _PAINTED[1])).mean())
+    if between > _LARGEST_UNPAINTED:
+        raise InputError(
+            f"{path}: {between:.0%} of it is neither black nor white: expected white strokes on black, not the photograph itself"
+        )
     upright_shape = upright(np.empty(shape, np.bool_), orientation).shape
     if white.shape == upright_shape and not (is_exr and white.shape == shape):
         return as_stored(white, orientation)

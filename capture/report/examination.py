@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
@@ -52,11 +53,12 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
     height, width = view.all_in_focus.shape[:2]
     found, disagreements, evidence = [], [], DepthEvidence()
     picture, places = PictureEvidence(), PlaceEvidence()
+    clipped = view.clipped() if view.is_explained else None
     for index in track(range(len(view)), f"{view.stack.folder.name}: examine"):
         stored = view.stored(index)
         picture.add(stored.rgb, stored.camera_rgb, stored.masks.valid)
         places.add(view.slice_rgb(index), view.usable(index))
-        of_slice, kept = _examine_slice(view, index, reblur, evidence, watch)
+        of_slice, kept = _examine_slice(view, index, reblur, evidence, clipped, watch)
         found.append(of_slice)
         if kept is not None:
             disagreements.append(kept)
@@ -80,12 +82,12 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
 
 
 def _examine_slice(
-    view: StackView, index: int, reblur: Reblur, evidence: DepthEvidence, watch: Watch | None
+    view: StackView, index: int, reblur: Reblur, evidence: DepthEvidence, clipped: Mask | None, watch: Watch | None
 ) -> tuple[SliceFindings, Disagreement | None]:
     rgb, usable = view.slice_rgb(index), view.usable(index)
     gain = low_frequency_gain(rgb, view.all_in_focus, usable)
     saturated = float(view.saturated(index).mean())
-    if not view.is_explained:
+    if clipped is None:
         return SliceFindings(index, gain, saturated, float(usable.mean())), None
     prediction = predict(view, index, reblur)
     if watch is not None:
@@ -104,7 +106,8 @@ def _examine_slice(
         psnr(view.all_in_focus, rgb, mask=counted) if counted.any() else None,
         fit,
     )
-    return findings, Disagreement(residual, level, per_px, usable & _inside(prediction.coc_px))
+    judged = usable & _inside(prediction.coc_px) & ~_lit_by(clipped, prediction.coc_px)
+    return findings, Disagreement(residual, level, per_px, judged)
 
 
 def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
@@ -114,6 +117,13 @@ def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
     coc_px = view.coc_px(index)
     rgb, less, more = (reblur(view.all_in_focus, coc_px + np.float32(step_px), view.aperture) for step_px in (0.0, -STEP_PX, STEP_PX))
     return Prediction(rgb, less, more, coc_px, STEP_PX)
+
+
+def _lit_by(clipped: Mask, coc_px: Plane) -> Mask:
+    """Pixels that get light of clipped ones, whose predicted discs are too dark; discs grow and shrink between slices as if they moved."""
+    radius = int(np.ceil(0.5 * float(np.abs(coc_px)[clipped].max(initial=0.0)))) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.dilate(clipped.astype(np.uint8), disc) > 0
 
 
 def _inside(coc_px: Plane) -> Mask:

@@ -1,7 +1,10 @@
 """Gates that need neither lens nor focus distances: the all-in-focus picture beside its slices, and the slices beside one another."""
 
+from collections.abc import Sequence
+
 from capture.report.findings import StackFindings
 from capture.report.gates import Gate
+from capture.report.neighbour_places import NeighbourPlace
 from capture.report.stack_rules import (
     HIGHLIGHTS,
     LARGEST_APART,
@@ -61,8 +64,9 @@ def _places(findings: StackFindings) -> Gate:
         return PLACES.absent(findings.name, "there are no neighbouring slices to compare: photograph more than one")
     width_px = findings.full_size_px[0]
     limit_px = max(LARGEST_APART_PX, LARGEST_APART * width_px)
-    measured = [each for each in findings.pairs if each.off_px is not None]
-    residuals = _pair_residuals_px(findings)
+    # A pair that may lie too far apart, and may as well not, was not measured.
+    measured = [each for each in findings.pairs if each.off_px is not None and (each.off_px <= limit_px or each.exceeds(limit_px))]
+    residuals = _pair_residuals_px(findings, measured)
     worst_residual = max(residuals.items(), key=lambda pair: pair[1], default=None)
     parts = []
     if measured:
@@ -71,7 +75,7 @@ def _places(findings: StackFindings) -> Gate:
     if worst_residual is not None:
         first, residual_px = worst_residual
         parts.append(f"pairs of the registration disagree by {residual_px:.1f} px at slices {first} and {first + 1}")
-    unknown = [str(each.first) for each in findings.pairs if each.off_px is None and each.first not in residuals]
+    unknown = [str(each.first) for each in findings.pairs if each not in measured and each.first not in residuals]
     if unknown:
         parts.append(f"slices {', '.join(unknown)} share too little that is sharp with the next, and no pair of the registration held")
     if not measured and worst_residual is None:
@@ -82,14 +86,14 @@ def _places(findings: StackFindings) -> Gate:
     return PLACES.judge(findings.name, value, "; ".join(parts), not (wrong or disagree))
 
 
-def _pair_residuals_px(findings: StackFindings) -> dict[int, float]:
-    """By the first slice of each pair of neighbours that was not measured: the smaller residual, for a pair that is wrong raises both."""
+def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourPlace]) -> dict[int, float]:
+    """Return, by the first slice of each pair that was not measured, the smaller residual, for a pair that is wrong raises both."""
     residuals = () if findings.drift is None else findings.drift.residuals_px
     if len(residuals) != len(findings.slices):
         return {}
     known: dict[int, float] = {}
     for each in findings.pairs:
         both = [residuals[index] for index in (each.first, each.first + 1)]
-        if each.off_px is None and None not in both:
+        if each not in measured and None not in both:
             known[each.first] = min(float(value or 0.0) for value in both)
     return known

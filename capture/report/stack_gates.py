@@ -33,9 +33,12 @@ from capture.report.stack_rules import (
     REGISTRATION,
     RESIDUAL,
     SATURATION,
+    SOLVED_BLUR,
+    SOLVED_FOCUS,
     SPACING,
     TEXTURE,
 )
+from mrbokeh.guessed_metres import metres_facts
 
 
 def stack_gates(findings: StackFindings) -> list[Gate]:
@@ -127,16 +130,23 @@ def _residual(findings: StackFindings) -> Gate:
 
 
 def _focus(findings: StackFindings) -> Gate:
-    return _worst(FOCUS, findings, lambda fit: fit.focus_px, LARGEST_FOCUS_PX, lambda value: f"{value:+.2f} px")
+    return _worst(
+        SOLVED_FOCUS if metres_facts(findings.stack) else FOCUS,
+        findings,
+        lambda fit: fit.focus_px,
+        LARGEST_FOCUS_PX,
+        lambda value: f"{value:+.2f} px",
+    )
 
 
 def _blur(findings: StackFindings) -> Gate:
+    rule = SOLVED_BLUR if metres_facts(findings.stack) else BLUR
     gains = [each.fit.blur_gain for each in findings.slices if each.fit is not None and np.isfinite(each.fit.blur_gain.error)]
     if not gains:
-        return BLUR.absent(findings.name, NO_PREDICTION)
+        return rule.absent(findings.name, NO_PREDICTION)
     gain = mean_change(gains)
     measured = f"{gain.value:+.1%} (standard error {gain.error:.1%})"
-    return BLUR.judge(findings.name, gain.value, measured, not gain.exceeds(LARGEST_BLUR_GAIN))
+    return rule.judge(findings.name, gain.value, measured, not gain.exceeds(LARGEST_BLUR_GAIN))
 
 
 def mean_change(changes: list[Change], floor: float = 0.02) -> Change:

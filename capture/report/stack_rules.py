@@ -12,6 +12,8 @@ Where too little is sharp in both, what is left is how far pairs of the registra
 stacks from a light field camera, whose slices cannot move, and 0.25% on others, but 0.4% on one of these whose slices were put 1% apart.
 """
 
+from dataclasses import replace
+
 from capture.report.detail import KEPT_DETAIL
 from capture.report.gates import Rule
 
@@ -140,6 +142,17 @@ SATURATION = Rule(
     f"at most {LARGEST_SATURATED:.0%} of any slice saturated",
     "Clipped highlights give bokeh discs that are too dark, the most visible part of the blur.",
     "Expose so that the brightest lights just fit where they are out of focus.",
+)
+
+SOLVED_FOCUS = replace(
+    FOCUS,
+    advice="Focus was solved from the slices, as nobody stated it: it errs where blur is large or texture is missing. Refocus between "
+    "slices that are right, or state focus_distances_m in lens.toml and merge again.",
+)
+SOLVED_BLUR = replace(
+    BLUR,
+    why="Blur was solved from the slices; all of it is too small or too large where the all-in-focus picture is not sharp.",
+    advice="Look at the crops of the first gates; smaller focus steps make the all-in-focus picture sharper.",
 )
 
 STACK_RULES = (

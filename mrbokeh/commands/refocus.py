@@ -44,7 +44,8 @@ def refocus(
 ) -> None:
     """Make slices between and beyond the captured ones, from the all-in-focus picture and the depth, through the lens of the stack.
 
-    A captured focus gives the captured slice, unless --no-residuals. OUT is a focal stack again; an interrupted run goes on.
+    A captured focus gives the captured slice, unless --no-residuals. OUT is a focal stack again, with a PNG beside each slice; an
+    interrupted run goes on.
 
     Example: mrbokeh refocus SCENE/view_0 --focus 0.5:inf:12 --out refocused
 
@@ -102,7 +103,8 @@ def _make_room(out: Path, overwrite: bool) -> None:
     if not overwrite:
         raise InputError(f"{out} exists already: give another name, or --overwrite to replace it")
     for each in read_focal_stack(out).slices:
-        (out / each.path).unlink(missing_ok=True)
+        for path in (out / each.path, (out / each.path).with_suffix(".png")):
+            path.unlink(missing_ok=True)
     (out / FILE_NAME).unlink()
 
 
@@ -123,6 +125,7 @@ def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, se
     from mrbokeh.focus_places import slice_names
     from mrbokeh.image_io import write_image
     from mrbokeh.progress import track
+    from mrbokeh.stack_pictures import write_upright_png
 
     kept = not overwrite and (out / _SETTINGS).is_file() and read_json(out / _SETTINGS, "settings of refocus") == settings
     write_json(out / _SETTINGS, settings)
@@ -132,7 +135,9 @@ def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, se
     )
     for each, distance_m in track(list(zip(slices, distances_m, strict=True)), "refocusing"):
         if not (kept and (out / each.path).is_file()):
-            write_image(out / each.path, way.slice_at(distance_m), half=False)
+            rgb = way.slice_at(distance_m)
+            write_upright_png((out / each.path).with_suffix(".png"), rgb, way.stack)
+            write_image(out / each.path, rgb, half=False)
     return slices
 
 
@@ -152,6 +157,7 @@ def _times_as_fast(way: Refocusing) -> float:
 
 def _write_sheet(path: Path, made: FocalStack) -> None:
     from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
+    from mrbokeh.guessed_metres import unit_of
 
-    pictures = {f"{each.focus_distance_m:.5g} m": made.slice_rgb(index) for index, each in enumerate(made.slices)}
+    pictures = {f"{each.focus_distance_m:.5g} {unit_of(made)}": made.slice_rgb(index) for index, each in enumerate(made.slices)}
     write_contact_sheet(path, [SheetRow("focus", pictures)])
