@@ -140,6 +140,7 @@ def test_bad_input_is_one_sentence_and_nothing_changes(stack: FocalStack, tmp_pa
     good = painted_upright(tmp_path / "good.png", white(np.uint8))
     black = painted_upright(tmp_path / "black.png", np.zeros(SIZE, np.uint8))
     small = painted_upright(tmp_path / "small.png", np.zeros((40, 40), np.uint8))
+    photograph = painted_upright(tmp_path / "photograph.png", np.random.default_rng(0).integers(0, 256, SIZE, np.uint8))
     write_exr(tmp_path / "nan.exr", ExrPart({"Y": np.full(SIZE, np.nan, np.float32)}))
     (tmp_path / "broken.png").write_bytes(b"no picture")
     (tmp_path / "mask.jpg").write_bytes(b"")
@@ -155,6 +156,7 @@ def test_bad_input_is_one_sentence_and_nothing_changes(stack: FocalStack, tmp_pa
         ([0], [tmp_path / "broken.png"], "cannot be read"),
         ([0], [tmp_path / "mask.jpg"], r"\.png or \.tif"),
         ([0], [tmp_path / "nan.exr"], "NaN"),
+        ([0], [photograph], "neither black nor white: expected white strokes on black"),
         ([0], [stack.folder / "depth.png"], "read and would be written over"),
     ):
         with pytest.raises(InputError, match=match):

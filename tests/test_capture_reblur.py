@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from capture.report.depth_check import DepthEvidence
-from capture.report.examination import Examination, examine, predict
+from capture.report.examination import Examination, _lit_by, examine, predict
 from capture.report.findings import StackFindings
 from capture.report.moving_objects import noise_deviation
 from capture.report.reblur import Reblur
@@ -194,6 +194,17 @@ def test_what_moved_is_found_where_it_moved(truth: TracedStack, tmp_path: Path) 
         assert found[differs].mean() > 0.75
         # Blur of up to 10 px carries the change beyond its outline; farther off nothing is marked.
         assert found.mean() < 3.0 * differs.mean()
+
+
+def test_discs_of_clipped_lights_are_not_judged_for_movement() -> None:
+    """A disc of 20 px reaches 10 px; where nothing is clipped all is judged."""
+    clipped = np.zeros((60, 80), bool)
+    assert not _lit_by(clipped, np.full((60, 80), 20.0, np.float32)).any()
+    clipped[30, 40] = True
+    lit = _lit_by(clipped, np.full((60, 80), -20.0, np.float32))
+    y, x = np.indices(lit.shape)
+    away_px = np.hypot(y - 30, x - 40)
+    assert lit[away_px <= 10.0].all() and not lit[away_px > 12.0].any()
 
 
 @pytest.mark.slow

@@ -262,13 +262,25 @@ UNKNOWN = float("inf")
     [
         ([0.3, 0.3, 0.2], ((0.2, 0.1), (1.4, 0.3)), "failed"),
         ([0.3, 0.3, 0.2], ((0.2, 0.1), (1.4, 0.6)), "passed"),
+        ([0.3, 4.0, 4.0], ((0.2, 0.1), (5.8, 2.5)), "failed"),
+        ([None, None, None], ((5.8, 2.5), (5.8, 2.5)), "absent"),
         ([9.0, 9.0, 9.0], ((0.2, 0.1), (0.3, 0.1)), "passed"),
         ([0.3, 4.0, 4.0], ((0.2, 0.1), (None, UNKNOWN)), "failed"),
         ([4.0, 4.0, 0.5], ((0.2, 0.1), (None, UNKNOWN)), "passed"),
         ([None, None, None], ((None, UNKNOWN), (None, UNKNOWN)), "absent"),
         ([0.3, 0.3, None], ((0.2, 0.1), (None, UNKNOWN)), "passed"),
     ],
-    ids=["apart", "by chance", "measured wins", "pairs disagree", "another pair is wrong", "by the model alone", "one by the model"],
+    ids=[
+        "apart",
+        "by chance",
+        "not told by patches",
+        "told by nothing",
+        "measured wins",
+        "pairs disagree",
+        "another pair is wrong",
+        "by the model alone",
+        "one by the model",
+    ],
 )
 def test_the_residual_of_the_registration_stands_in_where_nothing_is_sharp_in_both(
     residuals_px: list[float | None], pairs: tuple[tuple[float | None, float], ...], verdict: str, tmp_path: Path
