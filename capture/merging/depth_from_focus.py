@@ -25,13 +25,15 @@ LABELLING_NOISE_FLOORS = 30.0
 CONFIDENCE_NOISE_FLOORS = 10.0
 # Plain places follow the detail around them: windows this many times as wide, and more in larger pictures, speak where small ones do not.
 WIDER = (4, 16)
+# Of the detail of the median block: below the first a block is plain, above the second it speaks for itself.
+PLAIN = (0.4, 0.9)
 WIDER_SIGMA = 2.5
 WIDER_NOISE_FLOORS = 10.0
 WIDER_FROM_PX = 0.7e6
-# Weak detail of a slice whose light differs by about this much (square roots, 255 at white) from that of the slice in which the
-# surroundings are sharp is the rim of a blur: it has half its say where it is this share of the detail around it.
+# In plain places, detail of a slice whose light differs by about this much (square roots, 255 at white) from that of the slice in which
+# the surroundings are sharp is the rim of a blur, unless it is many times as strong as this multiple of what is around it.
 RIM_LIGHT = 5.0
-RIM_SHARE = 0.3
+RIM_STRENGTH = 3.0
 # Light is compared over a few pixels of the volume.
 _LIGHT_SIGMA_PX = 3.0
 # Pixels this near to one that is full see its clipped rim, not detail.
@@ -76,7 +78,8 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     by_light = lights.slice_index()
     energies = volume.calmed()
     strongest = energies.max(axis=0)
-    costs = _costs(_without_rims(energies, volume.lights))
+    plain = _plainness(volume)
+    costs = _costs(_without_rims(energies, volume.lights, plain), plain)
     log_energies = np.log1p(energies, out=energies)
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
@@ -89,28 +92,36 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     return FocusMap(index, confidence)
 
 
-def _without_rims(energies: Volume, lights: UInt8[np.ndarray, "slices height width"]) -> Volume:
+def _plainness(volume: FocusVolume) -> Plane:
+    """Return 1 where blocks are plain beside the median block of the stack, 0 where they are textured, at the size of the volume."""
+    sharpest = np.max(volume.details, axis=0)
+    low, high = (share * float(np.median(sharpest)) for share in PLAIN)
+    plain = np.clip((high - sharpest) / max(high - low, 1e-9), 0.0, 1.0).astype(np.float32)
+    return cv2.resize(plain, volume.size[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def _without_rims(energies: Volume, lights: UInt8[np.ndarray, "slices height width"], plain: Plane) -> Volume:
     """Return energies without those of blurred edges nearby."""
     wide = _wider(energies, WIDER[-1])
     around, size = wide.max(axis=0), energies.shape[2:0:-1]
     sharp = cv2.resize(wide.argmax(axis=0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST).astype(int)
-    around = np.float32(RIM_SHARE) * cv2.resize(around, size, interpolation=cv2.INTER_LINEAR)
+    around = np.float32(RIM_STRENGTH) * cv2.resize(around, size, interpolation=cv2.INTER_LINEAR)
     calm = np.stack([cv2.GaussianBlur(each, (0, 0), _LIGHT_SIGMA_PX) for each in lights])
     wanted = np.take_along_axis(calm, sharp[None], axis=0)[0].astype(np.float32)
     result = np.empty_like(energies)
     for kept, energy, light in zip(result, energies, calm, strict=True):
         off = cv2.subtract(light.astype(np.float32), wanted) / np.float32(RIM_LIGHT)
-        kept[:] = energy * (1.0 - (1.0 - cv2.exp(-off * off)) * around / (around + energy + np.float32(1e-9)))
+        kept[:] = energy * (1.0 - plain * (1.0 - cv2.exp(-off * off)) * around / (around + energy + np.float32(1e-9)))
     return result
 
 
-def _costs(energies: Volume) -> Volume:
+def _costs(energies: Volume, plain: Plane) -> Volume:
     """Return how many e-folds the energy of each slice is below the strongest, times the say of the pixel, then of wider windows."""
     wider = [_wider(energies, shrink) for shrink in WIDER]
     say = share_above(energies.max(axis=0), LABELLING_NOISE_FLOORS)
     costs = _below_strongest(np.log1p(energies, out=energies))
     costs *= say
-    left, size = 1.0 - say, energies.shape[2:0:-1]
+    left, size = plain * (1.0 - say), energies.shape[2:0:-1]
     for window in wider:
         say = left * cv2.resize(share_above(window.max(axis=0), WIDER_NOISE_FLOORS), size, interpolation=cv2.INTER_LINEAR)
         for cost, each in zip(costs, _below_strongest(np.log1p(window)), strict=True):
