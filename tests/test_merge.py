@@ -157,7 +157,7 @@ def test_a_second_pass_with_true_depth_keeps_the_first(desk: FocalStack, tmp_pat
     np.testing.assert_array_equal(second_pass(stack, true_depth_m, optics), stored, err_msg="it works on what is stored")
     second = stack.to_rec709(stored)
     # Measured 40.64; the first pass has 40.75 since plain places follow their surroundings, and had 40.69 before.
-    assert psnr(second, truth) > 40.6
+    assert psnr(second, truth) > max(40.6, psnr(stack.all_in_focus(), truth) - 0.15)
     edges = depth_edge_mask(true_depth_m, 3)
     assert psnr(second, truth, mask=edges) > 37.3, "where the first pass had 36.1 dB before it blended in bands, and has 37.6 dB since"
     keep_first_pass(stack)

@@ -328,16 +328,18 @@ def test_where_browsers_send_their_cameras() -> None:
 
 def test_a_frame_that_is_still_looked_at_is_not_one_in_which_nothing_was_seen() -> None:
     """Searching a frame may take longer than a pose is held."""
-    looking, remarks = Event(), list[str | None]()
+    looking, made, remarks = Event(), Event(), list[str | None]()
 
     class Slow(Known):
         def track(self, frame: CameraFrame, intrinsics: object) -> TrackedPose:  # noqa: ARG002
+            assert made.wait(10.0)
             if tracker._history.newest_s is not None:
                 remarks.append(tracker.remark)
                 looking.set()
             return TrackedPose(self.poses[0], 1.0, frame.captured_s)
 
     tracker = PhoneTracker(PatternSource(480, 270, fps=5.0), Slow(PHONE_POSES), PHONE, None)
+    made.set()
     try:
         assert looking.wait(10.0)
     finally:

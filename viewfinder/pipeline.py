@@ -105,10 +105,11 @@ class Pipeline:
         try:
             finished = self._compositor(frame, self.dropped)
         except InputError as error:
-            if self.problem != str(error):
-                self.problem = str(error)
-                for sink in self._sinks:
-                    sink.fail(self.problem)
+            with self._telling:
+                if self.failure is None and self.problem != str(error):
+                    self.problem = str(error)
+                    for sink in self._sinks:
+                        sink.fail(self.problem)
             self._stopping.wait(_REPEAT_S)
             return
         except Exception:

@@ -26,7 +26,9 @@ SHARP_STEP_COC_PX = 2.0
 # choice of slices that moves the brightness of a block by more than this, in square roots of light, puts a blurred slice in place.
 KEPT_DETAIL = 0.66
 LARGEST_MOVE = 0.04
+# A mended block changes slices as far around it as fine bands reach; closer where that spoils the blocks beside it.
 _AROUND_PX = 8
+_CLOSE_PX = 3
 # The coarsest band changes slices within about 2^(BANDS + 1) pixels.
 BANDS = 4
 
@@ -74,15 +76,16 @@ def sharp_all_in_focus(
         return blend.result()
 
     picture = blend.result()
-    for choice in (_sharpest_pixels(volume), _sharpest_blocks(volume)):
+    pixels, blocks = _sharpest_pixels(volume), _sharpest_blocks(volume)
+    for choice, around_px in ((pixels, _AROUND_PX), (blocks, _AROUND_PX), (blocks, _CLOSE_PX)):
         lost, before = _lost_blocks(picture, volume), taken
         if not lost.any():
             break
-        proposed = blended_as(_taken_from(choice, lost, before))
+        proposed = blended_as(_taken_from(choice, lost, before, around_px))
         # Beside strong edges a block may gain the blurred rim of a slice, and its neighbours lose what they had.
         helped = _helped(lost, _lost_blocks(proposed, volume), _moved_blocks(picture, proposed))
         if (helped != lost).any():
-            proposed = blended_as(_taken_from(choice, helped, before))
+            proposed = blended_as(_taken_from(choice, helped, before, around_px))
             if _lost_blocks(proposed, volume).sum() >= lost.sum():
                 proposed = blended_as(before)
         picture = proposed
@@ -106,10 +109,10 @@ def _lost_blocks(merged: Rgb, volume: FocusVolume) -> BlockMask:
     return (sharpest > 0.5 * np.median(sharpest)) & (block_detail(np.sqrt(np.maximum(merged, 0.0))) < KEPT_DETAIL * sharpest)
 
 
-def _taken_from(choice: Plane, lost: BlockMask, focus_index: Plane) -> Plane:
-    """Return the focus index with another choice in the lost blocks and as far around them as fine bands reach."""
+def _taken_from(choice: Plane, lost: BlockMask, focus_index: Plane, around_px: int) -> Plane:
+    """Return the focus index with another choice in the lost blocks and around them."""
     chosen = np.where(_per_pixel(lost.astype(np.float32), focus_index.shape) > 0, choice, np.float32(-1.0))
-    around = cv2.dilate(chosen, np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8))
+    around = cv2.dilate(chosen, np.ones((2 * around_px + 1,) * 2, np.uint8))
     chosen = np.where(chosen >= 0, chosen, around)
     return np.where(chosen >= 0, chosen, focus_index)
 

@@ -43,7 +43,7 @@ class FocusVolume:
     energies: Volume
     lights: UInt8[np.ndarray, "slices height width"]
     shape: tuple[int, int]
-    details: tuple[Blocks, ...] = ()
+    details: tuple[Blocks, ...]
 
     def calmed(self) -> Volume:
         """Return energies with the noise of single slices averaged out where it matters: weights 1, 2, 1 along the slices.

@@ -14,7 +14,7 @@ from mrbokeh.picture_codec import stored_pixels
 MASK_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 _ALPHA, _COLOURS = 3, 3
 _PAINTED = (0.1, 0.9)
-_LARGEST_UNPAINTED = 0.25
+_LARGEST_UNPAINTED = 0.6
 """Share of pixels that are neither black nor white: soft brushes leave rims, a photograph is nearly all between."""
 
 Plane = Float32[np.ndarray, "height width"]

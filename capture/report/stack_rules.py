@@ -146,7 +146,7 @@ SATURATION = Rule(
 
 SOLVED_FOCUS = replace(
     FOCUS,
-    advice="Focus was solved from the slices, as nobody stated it: it errs where blur is large or texture is missing. Refocus between "
+    advice="Focus was solved from the slices, as not all of it is stated: it errs where blur is large or texture is missing. Refocus between "
     "slices that are right, or state focus_distances_m in lens.toml and merge again.",
 )
 SOLVED_BLUR = replace(

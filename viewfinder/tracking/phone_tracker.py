@@ -67,8 +67,9 @@ class PhoneTracker:
         trouble = self.failure or self.source.status or self._wrong_size
         if trouble is not None:
             return f"the phone on the camera: {trouble}"
-        newest_s = self._history.newest_s
-        unseen = newest_s is None or self._looked_s - newest_s > self._hold_s
+        # In this order: a pose that comes in between is only newer than what was looked at.
+        looked_s, newest_s = self._looked_s, self._history.newest_s
+        unseen = looked_s - (newest_s or 0.0) > self._hold_s
         return "the phone on the camera does not see what it tracks" if unseen else None
 
     def phone_pose(self, captured_s: float) -> Pose | None:
