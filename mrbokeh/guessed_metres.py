@@ -46,23 +46,35 @@ def unit_of(stack: FocalStack) -> str:
 
 def metres_note(stack: FocalStack) -> str:
     """State what is known and what is guessed in one sentence; empty where all metres are known."""
-    facts, end = metres_facts(stack), guessed_end(stack)
+    facts, end = metres_facts(stack), _guessed_end(stack)
     if not stack.metres_known:
         turn = f", and if near and far are swapped `--nearest {'last' if end == 'first' else 'first'}`" if end else ""
         return (
             f"{stack.folder}: metres are guessed: {facts.get('why') or _WHY}{f', the {end} slice nearest' if end else ''}; "
             f"give one known length by `mrbokeh capture scale {stack.folder} --ruler X1,Y1,X2,Y2,METRES`{turn}"
         )
-    guessed = [*([facts["guessed"]] if facts.get("guessed") else []), *([f"that the {end} slice is the nearest"] if end else [])]
-    return f"{stack.folder}: {facts.get('why')}; still guessed: {'; '.join(guessed)}" if guessed else ""
+    guessed = guesses(stack)
+    return f"{stack.folder}: {facts.get('why')}; still guessed: {guessed}" if guessed else ""
 
 
-def guessed_end(stack: FocalStack) -> str | None:
+def guesses(stack: FocalStack) -> str:
+    """Name what is guessed of a stack whose metres are known; empty where nothing is."""
+    end, guessed = _guessed_end(stack), metres_facts(stack).get("guessed")
+    return "; ".join([*([guessed] if guessed else []), *([f"that the {end} slice is the nearest (else tell --nearest)"] if end else [])])
+
+
+def is_near_first(stack: FocalStack) -> bool:
+    """Whether its first slice is focused nearer than its last."""
+    first, last = (stack.focus_distances_m[index] for index in (0, -1))
+    return float(first or 0.0) < float(last or 0.0)
+
+
+def _guessed_end(stack: FocalStack) -> str | None:
     """Return "first" or "last": the slice that is taken for the nearest, where that is a guess."""
     gauge = metres_facts(stack).get("gauge") or {}
     if gauge.get("near_first_sure", True):
         return None
-    return "first" if gauge.get("near_first", True) else "last"
+    return "first" if is_near_first(stack) else "last"
 
 
 def metres_notes(stacks: Iterable[FocalStack]) -> str:

@@ -317,12 +317,12 @@ def test_facts_add_up_over_calls_and_can_be_taken_back(known: FocalStack, guesse
 def test_two_distances_tell_which_end_is_near(known: FocalStack, tmp_path: Path, run: Run) -> None:
     """Blur looks alike on both sides: the twin of a stack taken for one with near and far exchanged."""
     twin = guessed_twin(known, tmp_path / "twin")
-    gauge = twin.metadata["metres"]["gauge"] | {"near_first": True, "near_first_sure": False}
+    gauge = twin.metadata["metres"]["gauge"] | {"near_first": False, "near_first_sure": False}
     _write_exchanged(replace(twin, metadata=twin.metadata | {"metres": twin.metadata["metres"] | {"gauge": gauge}}))
     assert read_focal_stack(twin.folder).focus_distances_m[0] == pytest.approx(2.0)
     run("capture", "scale", twin.folder, "--distance-at", f"{ON_CARD},0.5", "--distance-at", f"{ON_WALL},0.7")
     made = read_focal_stack(twin.folder)
-    assert true_m(made, known) < 1e-4 and made.metadata["metres"]["gauge"]["near_first"] is False
+    assert true_m(made, known) < 1e-4 and made.metadata["metres"]["gauge"]["near_first"] is True
     for index in range(3):
         np.testing.assert_allclose(made.coc_px(index, made.depth_m()), known.coc_px(index, known.depth_m()), atol=1e-3)
     assert "nearest" not in metres_note(made)
@@ -344,8 +344,12 @@ def test_near_and_far_are_turned_by_one_word(known: FocalStack, tmp_path: Path, 
     for index in range(3):
         np.testing.assert_allclose(made.coc_px(index, made.depth_m()), known.coc_px(index, known.depth_m()), atol=2e-3)
     assert "nearest" not in metres_note(made).replace("the nearest plane", "")
-    run("capture", "scale", wrong.folder, "--nearest", "first")
-    np.testing.assert_array_equal(read_focal_stack(wrong.folder).depth_m(), made.depth_m())
+    for turn in ("first", "last", "first"):
+        run("capture", "scale", wrong.folder, "--nearest", turn)
+    again = read_focal_stack(wrong.folder)
+    np.testing.assert_allclose(again.depth_m(), made.depth_m(), rtol=1e-5)
+    assert again.lens is not None and made.lens is not None
+    assert again.lens.focal_length_mm == pytest.approx(made.lens.focal_length_mm, rel=1e-6)
 
 
 def test_turning_keeps_a_length_that_was_told(known: FocalStack, tmp_path: Path, run: Run) -> None:

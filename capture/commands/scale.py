@@ -95,8 +95,10 @@ def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | 
     if nearest is not None:
         stack = tell_nearest(stack, nearest == "first")
         typer.echo(f"{stack.folder}: the {nearest} slice is the nearest")
-    for line in lines_of(tell_metres(stack, facts, overwrite)) if facts else filter(None, [metres_note(stack)]):
-        typer.echo(line)
+    if facts:
+        typer.echo("\n".join(lines_of(tell_metres(stack, facts, overwrite))))
+    elif note := metres_note(stack):
+        typer.echo(note)
 
 
 def _apply(scene: Path, path: Path) -> None:

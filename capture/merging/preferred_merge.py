@@ -13,7 +13,7 @@ from capture.merging.replaced_places import replaced_depth
 from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack
-from mrbokeh.guessed_metres import metres_facts
+from mrbokeh.guessed_metres import is_near_first, metres_facts
 
 PREFERRED = "preferred"
 """Key in a stack's metadata: the side that was asked for, the share of the picture that changed, and whether near is known."""
@@ -51,8 +51,7 @@ def with_preferred(merged: FocalStack, picture: Rgb, slices: Callable[[], Iterab
 
 def nearest_end(merged: FocalStack) -> tuple[bool, bool]:
     """Whether the first slice is focused nearer than the last, and whether that is known and not guessed."""
-    distances_m = [each for each in merged.focus_distances_m if each is not None]
-    return distances_m[0] < distances_m[-1], bool((metres_facts(merged).get("gauge") or {}).get("near_first_sure", True))
+    return is_near_first(merged), bool((metres_facts(merged).get("gauge") or {}).get("near_first_sure", True))
 
 
 def preferred_side(stack: FocalStack) -> Side | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -29,6 +30,8 @@ Mask = Bool[np.ndarray, "height width"]
 STEP_PX = 1.0
 LEAST_CONFIDENCE = 0.1
 _WIDEST_BORDER = 0.1
+_LEAST_JUDGED = 0.1
+_DISC_RADII_PX = (0.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, np.inf)
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,8 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
         if kept is not None:
             disagreements.append(kept)
     depth = evidence.check() if view.is_explained else None
-    moved = None if depth is None else moving(disagreements, depth.off_px)
+    judged = float(np.mean([each.counted.mean() for each in disagreements])) if disagreements else 0.0
+    moved = None if depth is None or judged < _LEAST_JUDGED else moving(disagreements, depth.off_px)
     camera_rgb = view.stack.all_in_focus_camera_rgb()
     look = picture.look(view.stack.to_rec709(camera_rgb), camera_rgb)
     curve = focus_curve(view.focus_index, view.confidence, len(view))
@@ -121,9 +125,13 @@ def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
 
 def _lit_by(clipped: Mask, coc_px: Plane) -> Mask:
     """Pixels that get light of clipped ones, whose predicted discs are too dark; discs grow and shrink between slices as if they moved."""
-    radius = int(np.ceil(0.5 * float(np.abs(coc_px)[clipped].max(initial=0.0)))) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    return cv2.dilate(clipped.astype(np.uint8), disc) > 0
+    lit, radii = np.zeros(clipped.shape, bool), 0.5 * np.abs(coc_px)
+    for least, largest in pairwise(_DISC_RADII_PX):
+        of_these = clipped & (radii >= least) & (radii < largest)
+        if of_these.any():
+            reach_px = float(radii[of_these].max()) + 1.0
+            lit |= cv2.distanceTransform((~of_these).astype(np.uint8), cv2.DIST_L2, 5) <= reach_px
+    return lit
 
 
 def _inside(coc_px: Plane) -> Mask:

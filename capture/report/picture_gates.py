@@ -77,7 +77,9 @@ def _places(findings: StackFindings) -> Gate:
         parts.append(f"pairs of the registration disagree by {residual_px:.1f} px at slices {first} and {first + 1}")
     unknown = [str(each.first) for each in findings.pairs if each not in measured and each.first not in residuals]
     if unknown:
-        parts.append(f"slices {', '.join(unknown)} cannot be placed surely beside the next, as little is sharp in both, and no pair of the registration held")
+        parts.append(
+            f"slices {', '.join(unknown)} cannot be placed surely, as little is sharp in two, and no pair of the registration held"
+        )
     if not measured and worst_residual is None:
         return PLACES.absent(findings.name, f"{'; '.join(parts)}: use smaller focus steps")
     wrong = any(each.exceeds(limit_px) for each in measured)

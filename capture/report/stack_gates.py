@@ -184,7 +184,8 @@ def _depth(findings: StackFindings) -> Gate:
 def _motion(findings: StackFindings) -> Gate:
     share = findings.moving_share
     if share is None:
-        return MOTION.absent(findings.name, NO_PREDICTION)
+        clipped = "clipped highlights light nearly all of the picture: photograph with less exposure"
+        return MOTION.absent(findings.name, NO_PREDICTION if findings.depth_off_share is None else clipped)
     return MOTION.judge(findings.name, share, f"{share:.2%} of the picture", share <= LARGEST_MOVING)
 
 

@@ -146,8 +146,8 @@ SATURATION = Rule(
 
 SOLVED_FOCUS = replace(
     FOCUS,
-    advice="Focus was solved from the slices, as not all of it is stated: it errs where blur is large or texture is missing. Refocus between "
-    "slices that are right, or state focus_distances_m in lens.toml and merge again.",
+    advice="Focus was solved from the slices, as not all of it is stated: it errs where blur is large or texture is missing. "
+    "Refocus between slices that are right, or state focus_distances_m in lens.toml and merge again.",
 )
 SOLVED_BLUR = replace(
     BLUR,

@@ -20,11 +20,12 @@ from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.guessed_metres import KEY, POSITION, POSITION_ERROR, is_lens_guessed, is_view_guessed, metres_facts
+from mrbokeh.guessed_metres import KEY, POSITION, POSITION_ERROR, guesses, is_lens_guessed, is_near_first, is_view_guessed, metres_facts
 from mrbokeh.lens import Lens
+from mrbokeh.stack_pictures import write_merge_sheet
 
 FACTS = "told"
-_SLICE_POSITION = "blur_position_px"
+_SLICE_POSITION, _GROWTH = "blur_position_px", "px_per_dioptre"
 _NEAR_PIXEL_PX = 2
 _FARTHEST_SHARE = 0.01
 """Of the picture's width: from no farther away a surface is taken for what is at a pixel, where nothing tells the depth there."""
@@ -102,7 +103,7 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
     gauge = dict(changed.metadata[KEY]["gauge"]) | {"offset_from": "told"}
     gauge |= {} if gauge["scale_from"] == "lens" else {"scale_from": "told"}
     if found.directed:
-        gauge |= {"near_first_from": "told", "near_first_sure": True}
+        gauge |= {"near_first_from": FACTS, "near_first_sure": True}
     changed = replace(changed, metadata=changed.metadata | {KEY: _told(stack, gauge, facts, found.deep)})
     _write(changed, found.p, found.q)
     return Regauged(changed, tuple((each.fact, each.error(found.p, found.q)) for each in solving.equations))
@@ -114,11 +115,12 @@ def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
     Turned in the middle of its planes of focus, or so that a stated distance and lengths told of one depth stay. Raises InputError where
     stated focus distances, or lengths and distances at several depths, say it already.
     """
-    facts = metres_facts(stack)
-    gauge, stated = facts.get("gauge"), _stated_dioptres(stack)
+    if not stack.merged:
+        raise InputError(f"{stack.folder} is not merged: run `mrbokeh capture merge {stack.folder}` first")
+    gauge, stated = metres_facts(stack).get("gauge"), _stated_dioptres(stack)
     if not gauge or gauge.get("near_first_from") in (FACTS, "stated distances") or len(stated) > 1:
         raise InputError(f"{stack.folder} knows its nearest slice from its distances: --nearest is for stacks that have to guess it")
-    turned = bool(gauge.get("near_first", True)) != first
+    turned = is_near_first(stack) != first
     p, q = _turn(stack, stated) if turned else (0.0, 1.0)
     changed = _regauged(stack, p, q)
     known = dict(changed.metadata[KEY]["gauge"]) | {"near_first_from": "--nearest", "near_first_sure": True}
@@ -146,7 +148,8 @@ def lines_of(done: Regauged) -> list[str]:
     distances_m = [each for each in done.stack.focus_distances_m if each is not None]
     facts = metres_facts(done.stack)
     lines = [f"{done.stack.folder}: focused from {min(distances_m):.4g} m to {max(distances_m):.4g} m, {facts['why']}"]
-    lines += [f"{done.stack.folder}: still guessed: {facts['guessed']}"] if facts.get("guessed") else []
+    guessed = guesses(done.stack)
+    lines += [f"{done.stack.folder}: still guessed: {guessed}"] if guessed else []
     off = [f"{fact} by {100 * error:+.1f} %" for fact, error in done.errors if abs(error) > _CONTRADICTS]
     return [*lines, f"warning: what was told disagrees: {', '.join(off)}: look at the pixels and measure again"] if off else lines
 
@@ -296,7 +299,7 @@ def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
     gauge = dict(metres_facts(stack)["gauge"])
     gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / abs(q), "offset_dioptres": p + q * gauge["offset_dioptres"]}
     gauge |= {"nearest_m": min(distances_m), "farthest_m": max(distances_m)}
-    gauge |= {"near_first": bool(gauge.get("near_first", True)) == (q > 0.0)}
+    gauge |= {"near_first": distances_m[0] < distances_m[-1]}
     facts = dict(metres_facts(stack)) | {"gauge": gauge}
     return replace(stack, slices=slices, lens=_lens_at(stack, distances_m), metadata=stack.metadata | {KEY: facts})
 
@@ -304,8 +307,10 @@ def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
 def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
     dioptres = p + q / float(each.focus_distance_m or np.inf)
     if dioptres <= 0.0:
-        raise InputError(f"{stack.folder}: by what was told {each.path} is focused beyond infinity: look at the pixels and measure again")
-    metadata = each.metadata | {"px_per_dioptre": each.metadata["px_per_dioptre"] / abs(q)}
+        raise InputError(f"{stack.folder}: by what was told {each.path} is focused beyond infinity: check what you told and tell it again")
+    metadata = dict(each.metadata)
+    if _GROWTH in metadata:
+        metadata[_GROWTH] /= abs(q)
     if _SLICE_POSITION in metadata:
         metadata[_SLICE_POSITION] *= np.sign(q)
     return replace(each, focus_distance_m=1.0 / dioptres, metadata=metadata)
@@ -316,7 +321,7 @@ def _lens_at(stack: FocalStack, distances_m: list[float]) -> Lens | None:
     lens = stack.lens
     if lens is None or not is_lens_guessed(stack):
         return None if lens is None else lens.focused_at(distances_m[stack.reference])
-    factor = min(new / float(old) for new, old in zip(distances_m, stack.focus_distances_m, strict=True) if old is not None)
+    factor = min(distances_m) / min(float(old) for old in stack.focus_distances_m if old is not None)
     return replace(
         lens,
         focal_length_mm=lens.focal_length_mm * factor,
@@ -334,3 +339,4 @@ def _write(stack: FocalStack, p: float, q: float) -> None:
     write_exr(stack.depth_path, replace(part, channels=dict(part.channels) | {"Z": (1.0 / dioptres).astype(np.float32)} | turned))
     write_focal_stack(stack)
     write_depth_picture(stack)
+    write_merge_sheet(stack)
