@@ -27,7 +27,7 @@ CONFIDENCE_NOISE_FLOORS = 10.0
 WIDER = (4, 16)
 # Of the detail of the median block: below the first a block is plain, above the second it speaks for itself. (Where most of the
 # picture is plain no block is: a share of its most textured blocks in place of the median lost 5 % of the blocks of a real stack.)
-PLAIN = (0.4, 0.9)
+PLAIN = (0.4, 0.6)
 WIDER_SIGMA = 2.5
 WIDER_NOISE_FLOORS = 10.0
 WIDER_FROM_PX = 0.7e6
@@ -83,7 +83,9 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     costs = _costs(_without_rims(energies, volume.lights, plain), plain)
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
-    offset, _ = peak_parabola(np.negative(costs, out=costs), labels)
+    offset, _ = peak_parabola(np.log1p(energies, out=energies), labels)
+    # In plain places the label is not the peak of the pixel's own energies.
+    offset += plain * (peak_parabola(np.negative(costs, out=costs), labels)[0] - offset)
     index = volume.enlarged(np.where(volume.reduced(by_light) >= 0, labels, labels + offset).astype(np.float32), SURFACE_STEP)
     trust = share_above(strongest, CONFIDENCE_NOISE_FLOORS) * _confidence(volume, labels)
     trust = volume.enlarged(trust) * _share_of_one_surface(index)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Shaped, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -87,6 +87,7 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
     """
     energies: list[Plane] = []
     lights: list[Light] = []
+    levels: list[Light] = []
     details: list[Blocks] = []
     for index, rgb in enumerate(registered):
         encoded = np.sqrt(np.maximum(rgb, 0.0))
@@ -98,10 +99,11 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
         energies.append(cv2.resize(energy, (width, height), interpolation=cv2.INTER_AREA))
         small = cv2.resize(encoded, (width, height), interpolation=cv2.INTER_AREA)
         lights.append(np.minimum(cv2.transform(small, np.full((1, 3), _WHITE / 3.0)), _WHITE).astype(np.uint8))
+        levels.append(np.minimum(cv2.transform(small, np.full((1, 3), _LEVELS / 3.0)), _LEVELS - 1).astype(np.uint8))
     volume = np.stack(energies)
-    floors = noise_floors(volume, lights)
-    for energy, light in zip(volume, lights, strict=True):
-        energy /= floors[_level_of(light)]
+    floors = noise_floors(volume, levels)
+    for energy, level in zip(volume, levels, strict=True):
+        energy /= floors[level]
     return FocusVolume(volume, np.stack(lights), (rgb.shape[0], rgb.shape[1]), tuple(details))
 
 
@@ -125,11 +127,7 @@ def block_detail(encoded: Rgb) -> Blocks:
     return np.sqrt(cv2.resize(squared, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def _level_of(light: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
-    return (light.astype(np.uint16) * _LEVELS // 256).astype(np.uint8)
-
-
-def noise_floors(energies: Volume, lights: list[Light]) -> Float32[np.ndarray, " levels"]:
+def noise_floors(energies: Volume, levels: list[Light]) -> Float32[np.ndarray, " levels"]:
     """Return the energy that noise alone has at each brightness (square root of light, in _LEVELS steps): what the smoothest places show.
 
     Compression and clipping leave less noise in the dark and at white than in between, by a factor of ten in real JPEG: with one
@@ -137,7 +135,7 @@ def noise_floors(energies: Volume, lights: list[Light]) -> Float32[np.ndarray, "
     """
     every = (slice(None, None, _EVERY_PX),) * 2
     energy = np.concatenate([each[every].ravel() for each in energies])
-    level = _level_of(np.concatenate([each[every].ravel() for each in lights]))
+    level = np.concatenate([each[every].ravel() for each in levels])
     level, energy = level[energy > 0], energy[energy > 0]
     lows = {each: float(np.percentile(energy[level == each], _NOISE_PERCENTILE)) for each in _well_filled(level)}
     if not lows:
