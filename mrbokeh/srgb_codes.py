@@ -3,12 +3,12 @@
 from functools import cache
 
 import numpy as np
-from jaxtyping import Float32, Int32, Shaped
+from jaxtyping import Float32, Shaped
 
 from mrbokeh.color import linear_to_srgb, srgb_to_linear
 from mrbokeh.workers import in_bands, workers
 
-_SHIFT = {np.dtype(np.uint8): 16, np.dtype(np.uint16): 11}
+_SHIFT = {np.dtype(np.uint8): 15, np.dtype(np.uint16): 10}
 """Bits of a float that the table leaves out: few codes begin within one of its cells."""
 _BAND_ROWS = 64
 _ONE_BITS = 0x3F800000
@@ -16,16 +16,16 @@ _ONE_BITS = 0x3F800000
 
 def srgb_codes(rgb: Float32[np.ndarray, "height width channels"], dtype: type) -> Shaped[np.ndarray, "height width channels"]:
     """0 to 1 becomes 0 to the largest of dtype (uint8 or uint16); what is beyond is clipped, NaN is 0, inf the largest."""
-    from mrbokeh._srgb_codes_numba import encode
-
-    rgb = np.ascontiguousarray(rgb, np.float32)
     codes: np.ndarray = np.empty(rgb.shape, dtype)
-    flat, bits, row = rgb.reshape(-1), rgb.reshape(-1).view(np.int32), rgb.shape[1] * rgb.shape[2]
-    first, thresholds = _table(np.dtype(dtype))
+    first, thresholds, most = _table(np.dtype(dtype))
 
     def work(top: int, end: int) -> None:
-        some = slice(top * row, end * row)
-        encode(flat[some], bits[some], first, thresholds, _SHIFT[np.dtype(dtype)], codes.reshape(-1)[some])
+        light = np.minimum(rgb[top:end], np.float32(1.0), dtype=np.float32)
+        np.fmax(light, np.float32(0.0), out=light)
+        code = first.take(light.view(np.int32) >> _SHIFT[np.dtype(dtype)])
+        for _ in range(most):
+            code += light >= thresholds.take(code)
+        codes[top:end] = code
 
     with workers(rgb.shape[0] * rgb.shape[1]) as pool:
         in_bands(pool, rgb.shape[0], _BAND_ROWS, work)
@@ -38,8 +38,9 @@ def plain_srgb_codes(linear: Float32[np.ndarray, "*shape"], dtype: type) -> Shap
 
 
 @cache
-def _table(dtype: np.dtype) -> tuple[Int32[np.ndarray, " cells"], Float32[np.ndarray, " codes"]]:
-    """(code of the least value of each cell of floats from 0 to 1, the least value of each code from 1 on)."""
+def _table(dtype: np.dtype) -> tuple[Shaped[np.ndarray, " cells"], Float32[np.ndarray, " codes"], int]:
+    """Return the code of the least value of each cell of floats from 0 to 1, the least value of each code's successor, infinite for the
+    last, and how many codes at most begin within a cell."""
     top = np.iinfo(dtype).max
     guess = srgb_to_linear(((np.arange(top) + 0.5) / top).astype(np.float32)).view(np.int32)
     low, high = guess - 256, guess + 256
@@ -48,6 +49,7 @@ def _table(dtype: np.dtype) -> tuple[Int32[np.ndarray, " cells"], Float32[np.nda
         middle = (low + high) // 2
         reached = plain_srgb_codes(middle.view(np.float32), dtype.type) >= wanted
         low, high = np.where(reached, low, middle), np.where(reached, middle, high)
-    thresholds = high.view(np.float32)
+    thresholds = np.append(high.view(np.float32), np.float32(np.inf))
     cells = (np.arange((_ONE_BITS >> _SHIFT[dtype]) + 1, dtype=np.int64) << _SHIFT[dtype]).astype(np.int32)
-    return np.searchsorted(thresholds, cells.view(np.float32), side="right").astype(np.int32), thresholds
+    first = np.searchsorted(thresholds, cells.view(np.float32), side="right")
+    return first.astype(dtype), thresholds, int(np.diff(first).max())

@@ -51,7 +51,7 @@ ROWS = (
     ("color_management", "blender."),
     ("exr_primaries",),
     ("exr_io", "picture_codec"),
-    ("srgb_codes", "_srgb_codes_numba", "tiff_pixels"),
+    ("srgb_codes", "tiff_pixels"),
     ("exif_orientation",),
     ("tiff_tags",),
     ("layering",),

@@ -3,12 +3,12 @@ import itertools
 import cv2
 import numpy as np
 
-from capture.merging._semi_global_numba import aggregate_costs
 from capture.merging.all_in_focus import all_in_focus, sharp_all_in_focus, slice_weight
 from capture.merging.blur_evidence import disc_kernel
 from capture.merging.depth_from_focus import FocusMap, depth_from_focus, focus_map, peak_parabola
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import find_lights, no_lights
+from capture.merging.semi_global import aggregate_costs
 from mrbokeh.aperture import Aperture
 from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import opaque

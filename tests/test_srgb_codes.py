@@ -10,7 +10,7 @@ both = pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 
 @both
 def test_the_floats_around_every_step_are_coded_as_by_the_formula(dtype: type) -> None:
-    steps = _table(np.dtype(dtype))[1]
+    steps = _table(np.dtype(dtype))[1][:-1]
     assert len(steps) == np.iinfo(dtype).max and (np.diff(steps) > 0).all()
     around = (steps.view(np.int32)[None, :, None] + np.arange(-2, 3, dtype=np.int32)).view(np.float32)
     found = srgb_codes(around, dtype)

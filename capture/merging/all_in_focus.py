@@ -45,7 +45,9 @@ def slice_weight(focus_index: Plane, index: int, crossover: float = NARROW_CROSS
     sharp, so that it lessens the noise there and leaves no seam; 1 is linear interpolation.
     """
     distance = np.abs(focus_index - np.float32(index))
-    return np.clip((0.5 - distance) / np.float32(crossover) + np.float32(0.5), 0.0, 1.0)
+    distance *= np.float32(-1.0 / crossover)
+    distance += np.float32(0.5 / crossover + 0.5)
+    return np.clip(distance, 0.0, 1.0, out=distance)
 
 
 def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float = NARROW_CROSSOVER, bands: int = BANDS) -> Rgb:
@@ -192,7 +194,7 @@ class BandBlend:
     def _box(self, weight: Plane) -> tuple[slice, slice] | None:
         """Return what a picture changes: its weights, as far as the coarsest band carries them, on the grid of that band."""
         step, (height, width) = 1 << self.bands, self.shape[:2]
-        rows, columns = np.flatnonzero(weight.any(axis=1)), np.flatnonzero(weight.any(axis=0))
+        rows, columns = (np.flatnonzero(cv2.reduce(np.abs(weight), along, cv2.REDUCE_MAX)) for along in (1, 0))
         if not rows.size:
             return None
         reach = 4 * step

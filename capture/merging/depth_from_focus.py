@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Int, UInt8
 
 from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, focus_volume, share_above
 from capture.merging.lights import Lights
+from capture.merging.semi_global import aggregate_costs
 
 __all__ = ["FocusMap", "depth_from_focus", "focus_energy", "focus_map", "peak_parabola", "share_above"]
 
@@ -74,8 +75,6 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     Energies within the reach of a light have no say, but the light's own pixels are known to be sharp in its sharpest slice.
     saturated: (H, W) full in some slice: no confidence there and beside it.
     """
-    from capture.merging._semi_global_numba import aggregate_costs
-
     by_light = lights.slice_index()
     energies = volume.calmed()
     strongest = energies.max(axis=0)

@@ -7,6 +7,7 @@ slice against the other. (Field of view says little: most lenses narrow it towar
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -121,18 +122,22 @@ class Contours:
         if len(self.places_px) == 0:
             return np.zeros(0)
         grey = cv2.transform(np.ascontiguousarray(rgb), np.full((1, 3), 1.0 / 3.0, np.float32))
-        across = np.arange(-_ACROSS_PX, _ACROSS_PX + 1, dtype=np.float32) * self.step_px
-        along = np.arange(-_ALONG_PX, _ALONG_PX + 1, dtype=np.float32) * self.step_px
+        sampled = cv2.remap(grey, *self._grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        profile = np.sqrt(np.maximum(sampled.reshape(len(self.places_px), 2 * _ALONG_PX + 1, -1).mean(axis=1), 0.0))
+        return (np.diff(profile, axis=1) ** 2).sum(axis=1).astype(np.float64)
+
+    @cached_property
+    def _grid(self) -> tuple[Float32[np.ndarray, "points samples"], Float32[np.ndarray, "points samples"]]:
+        """x and y of the samples about each point: rows along its contour, columns across it."""
+        across = np.arange(-_ACROSS_PX, _ACROSS_PX + 1, dtype=np.float32) * np.float32(self.step_px)
+        along = np.arange(-_ALONG_PX, _ALONG_PX + 1, dtype=np.float32) * np.float32(self.step_px)
         tangents = np.stack([-self.normals[:, 1], self.normals[:, 0]], axis=1)
         grid = (
             self.places_px[:, None, None, :]
             + along[None, :, None, None] * tangents[:, None, None, :]
             + across[None, None, :, None] * self.normals[:, None, None, :]
-        )
-        flat = grid.reshape(len(self.places_px), -1, 2)
-        sampled = cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        profile = np.sqrt(np.maximum(sampled.reshape(len(self.places_px), len(along), len(across)).mean(axis=1), 0.0))
-        return (np.diff(profile, axis=1) ** 2).sum(axis=1).astype(np.float64)
+        ).reshape(len(self.places_px), -1, 2)
+        return np.ascontiguousarray(grid[..., 0]), np.ascontiguousarray(grid[..., 1])
 
 
 def _slopes(focus_index: Plane, step_px: float) -> Float32[np.ndarray, "height width 2"]:

@@ -90,7 +90,8 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
     levels: list[Light] = []
     details: list[Blocks] = []
     for index, rgb in enumerate(registered):
-        encoded = np.sqrt(np.maximum(rgb, 0.0))
+        encoded = np.maximum(rgb, 0.0)
+        cv2.sqrt(encoded, dst=encoded)
         energy = _energy(encoded)
         details.append(block_detail(encoded))
         if valid is not None:

@@ -119,7 +119,7 @@ def find_lights(slices: Callable[[], Iterable[Rgb]], extremes: Extremes | None =
     members = np.flatnonzero(near)
     spreads = _Spreads(near.ravel()[members], (surroundings + CLEARLY_BRIGHTER).ravel()[members])
     for rgb in slices():
-        spreads.add(rgb.reshape(-1, 3)[members].max(axis=1))
+        spreads.add(_brightness(rgb).take(members))
     return _lights(spreads, near, distance_px, reach_px)
 
 

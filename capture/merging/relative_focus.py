@@ -20,6 +20,7 @@ from capture.merging.blur_evidence import BlurEvidence, blur_evidence
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
+Cells = Int[np.ndarray, " some"]
 Positions = Float[np.ndarray, " slices"]
 
 _BLOCKS = 5
@@ -36,7 +37,8 @@ _SURFACE_STEP = 0.7
 _MODEL_SHARE = 0.01
 """Of a cell's texture: what a disc does not reproduce of real blur, whatever its size."""
 _ROUNDS = 3
-_ENOUGH_CELLS = 10000
+_ENOUGH_CELLS = 5000
+_SPENT = 4.0
 _REACH = 5
 _WIDEST_OFFSET_STEPS = 0.8
 _WINDOW_SAMPLES = 12.0
@@ -129,6 +131,26 @@ class _Places:
     def widest_px(self) -> float:
         return float(np.sqrt(self.squares_px2[-1]))
 
+    def is_told(self, cells: Cells | slice, one: int, diameter_px: Float[np.ndarray, " some"]) -> Bool[np.ndarray, " some"]:
+        """Return which cells have data in a slice, and no wider disc there than the rungs reach."""
+        return (self.errors[cells, one, 0] >= 0.0) & (diameter_px <= self.widest_px)
+
+    def misfits(self, cells: Cells, one: int, squares_px2: Float[np.ndarray, "tries some"]) -> Float32[np.ndarray, "tries some"]:
+        """Return the squared difference of a slice to the picture blurred by discs of squared diameters.
+
+        Pictures go over linearly between the rungs, for which this is exact.
+        """
+        wanted = squares_px2.astype(np.float32)
+        rungs = self.squares_px2.astype(np.float32)
+        rung = np.zeros(wanted.shape, np.uint8)
+        for edge in rungs[1:-1]:
+            rung += wanted > edge
+        share = np.clip((wanted - rungs[rung]) * (1.0 / np.diff(rungs))[rung], 0.0, 1.0)
+        at = (cells * self.count + one) * len(rungs) + rung
+        below, above = self.errors.take(at), self.errors.take(at + 1)
+        gap = self.gaps.take(cells * (len(rungs) - 1) + rung)
+        return np.maximum(below + share * (above - below - (1.0 - share) * gap), 0.0)
+
     @property
     def nearest(self) -> Int[np.ndarray, " cells"]:
         return np.rint(self.index).astype(np.int64)
@@ -193,12 +215,8 @@ def _measured(
     own_blur: Float[np.ndarray, " cells"],
     candidates: Float[np.ndarray, " candidates"],
 ) -> _Diameters:
-    from capture.merging._relative_focus_numba import sum_curves
-
-    curves = np.zeros((places.count, places.count, _BLOCKS**2, len(candidates)))
-    weight = np.where(weight > _LEAST_WEIGHT * weight.max(), weight, 0.0)
-    cells = (weight.astype(np.float32), places.nearest, places.block, base, own_blur)
-    sum_curves(places.errors, places.gaps, places.squares_px2, *cells, candidates, curves)
+    weight = np.where(weight > _LEAST_WEIGHT * weight.max(), weight, 0.0).astype(np.float32)
+    curves = _summed_curves(places, weight, base, own_blur, candidates)
     total = curves.sum(axis=2)
     best = np.clip(total.argmin(axis=2), 1, len(candidates) - 2)
     inside = (total.argmin(axis=2) < len(candidates) - 1) & (total.max(axis=2) > 0)
@@ -218,6 +236,46 @@ def _measured(
     value = candidates[best] + shift
     least_px2 = np.full(len(one), _LEAST_ERROR_PX2 * places.shrink**2)
     return _Diameters(one, other, value[one, other], error[one, other], least_px2)
+
+
+def _summed_curves(
+    places: _Places,
+    weight: Float32[np.ndarray, " cells"],
+    base: Float[np.ndarray, "cells slices"],
+    own_blur: Float[np.ndarray, " cells"],
+    candidates: Float[np.ndarray, " candidates"],
+) -> Float[np.ndarray, "slices slices blocks candidates"]:
+    """Return, for every slice and the cells of every block that are sharp in another, the misfits at base + candidate.
+
+    They are lessened as by Cauchy's cost: what fits badly everywhere still tells the better from the worse.
+    """
+    curves = np.zeros((places.count, places.count * _BLOCKS**2, len(candidates)))
+    group = places.nearest * _BLOCKS**2 + places.block
+    cells = np.argsort(group, kind="stable")
+    cells = cells[weight[cells] > 0.0]
+    for one in range(places.count):
+        told = cells[places.is_told(cells, one, base[cells, one])]
+        if not len(told):
+            continue
+        diameters = np.maximum(base[told, one] + candidates[:, None], 0.0)
+        misfits = np.log1p(places.misfits(told, one, diameters**2 - own_blur[told])) * weight[told]
+        first = np.flatnonzero(np.diff(group[told], prepend=-1))
+        curves[one, group[told[first]]] = np.add.reduceat(misfits, first, axis=1, dtype=np.float64).T
+    return curves.reshape(places.count, places.count, _BLOCKS**2, len(candidates))
+
+
+def _offset_costs(
+    places: _Places, positions: Positions, start: Float[np.ndarray, " cells"], away: Float[np.ndarray, "offsets cells"]
+) -> Float[np.ndarray, "offsets cells"]:
+    """Return how badly the cells fit all slices if they lie at `start + away`; an outlier costs no more than _SPENT."""
+    place, costs = start + away, np.zeros(away.shape)
+    # The shares of the slices that a cell's sharp picture is of sum to 1.
+    own_blur = places.own @ positions**2 - place * (2.0 * (places.own @ positions) - place)
+    for one, position in enumerate(positions):
+        told = np.flatnonzero(places.is_told(slice(None), one, np.abs(position - start)))
+        misfits = places.misfits(told, one, (position - place[:, told]) ** 2 - own_blur[:, told])
+        costs[:, told] += misfits / (1.0 + misfits / np.float32(_SPENT))
+    return costs
 
 
 def _solved(parts: Sequence[_Diameters], before: Positions) -> tuple[Positions, Positions]:
@@ -252,26 +310,17 @@ def _solved(parts: Sequence[_Diameters], before: Positions) -> tuple[Positions, 
 
 def _offsets(places: _Places, positions: Positions) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
     """(what to add to the position that the focus index gives, standard error) of each cell."""
-    from capture.merging._relative_focus_numba import best_offsets
-
     steps = np.maximum(np.gradient(positions), 0.3)
     local = np.interp(places.index, np.arange(places.count), steps)
     start = np.interp(places.index, np.arange(places.count), positions)
-    offsets, bends = np.empty_like(start), np.empty_like(start)
-    prior = 1.0 / (_WINDOW_SAMPLES * (_PRIOR_STEPS * local) ** 2)
-    best_offsets(
-        places.errors,
-        places.gaps,
-        places.squares_px2,
-        positions,
-        start,
-        _WIDEST_OFFSET_STEPS * local / _REACH,
-        places.own.astype(np.float64),
-        prior,
-        _REACH,
-        offsets,
-        bends,
-    )
+    step = _WIDEST_OFFSET_STEPS * local / _REACH
+    away = np.arange(-_REACH, _REACH + 1)[:, None] * step
+    costs = _offset_costs(places, positions, start, away) + away**2 / (_WINDOW_SAMPLES * (_PRIOR_STEPS * local) ** 2)
+    inside = np.clip(costs.argmin(axis=0), 1, 2 * _REACH - 1)
+    before, at, after = (np.take_along_axis(costs, (inside + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    bend = np.maximum(before - 2.0 * at + after, 0.0)
+    shift = np.where(bend > 1e-9, np.clip(0.5 * (before - after) / np.maximum(bend, 1e-9), -1.0, 1.0), 0.0)
+    offsets, bends = (inside - _REACH + shift) * step, bend / step**2
     information = 0.5 * bends * _WINDOW_SAMPLES + 1e-9
     shape = places.shape
     trust = information.reshape(shape).astype(np.float32)

@@ -59,29 +59,35 @@ class SliceStructure:
 
 def structure_of(rgb: Float32[np.ndarray, "height width 3"], valid: Bool[np.ndarray, "height width"] | None = None) -> SliceStructure:
     """valid: where the slice has data that is not saturated; None is everywhere."""
-    logarithm = log_luminance(rgb)
-    usable = np.full(logarithm.shape, 255, np.uint8) if valid is None else np.where(valid, 255, 0).astype(np.uint8)
-    finest = max(0, int(np.ceil(0.5 * np.log2(logarithm.size / _MOST_PIXELS))))
-    coarsest = max(finest, int(np.log2(max(1.0, min(logarithm.shape) / _SMALLEST_SIDE_PX))))
-    pictures = [(level, shrunk(logarithm, level), shrunk_mask(usable, level)) for level in range(coarsest, finest - 1, -1)]
+    luminance = cv2.transform(rgb, np.array([[0.2126, 0.7152, 0.0722]], np.float32))
+    finest = max(0, int(np.ceil(0.5 * np.log2(luminance.size / _MOST_PIXELS))))
+    coarsest = max(finest, int(np.log2(max(1.0, min(luminance.shape) / _SMALLEST_SIDE_PX))))
+    logarithm = _logarithm(shrunk(luminance, finest))
+    usable = np.full(logarithm.shape, 255, np.uint8) if valid is None else shrunk_mask(np.where(valid, np.uint8(255), np.uint8(0)), finest)
+    pictures = [
+        (level, shrunk(logarithm, level - finest), shrunk_mask(usable, level - finest)) for level in range(coarsest, finest - 1, -1)
+    ]
     levels = tuple(_detail_level(*each) for each in pictures)
     return SliceStructure((rgb.shape[1], rgb.shape[0]), levels, pictures[0][1], pictures[0][2])
 
 
-def log_luminance(rgb: Float32[np.ndarray, "height width 3"]) -> Plane:
+def _logarithm(luminance: Plane) -> Plane:
     """In which a change of exposure or of light is an offset and bright lights do not outshout the rest."""
-    luminance = cv2.transform(rgb, np.array([[0.2126, 0.7152, 0.0722]], np.float32))
     return cv2.log(np.maximum(luminance, 0.0) + np.float32(0.02))
 
 
 def shrunk(plane: Plane, level: int) -> Float32[np.ndarray, "small_height small_width"]:
     """Area-averaged by exactly 2^level; rows and columns that do not fill a pixel are left out."""
+    if level == 0:
+        return plane
     height, width = (max(1, side >> level) for side in plane.shape)
     return cv2.resize(plane[: height << level, : width << level], (width, height), interpolation=cv2.INTER_AREA)
 
 
 def shrunk_mask(mask: Grey, level: int) -> UInt8[np.ndarray, "small_height small_width"]:
     """255 where the whole of a larger pixel is."""
+    if level == 0:
+        return mask
     return np.where(shrunk(mask.astype(np.float32), level) > 254.5, np.uint8(255), np.uint8(0))
 
 

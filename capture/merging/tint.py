@@ -62,10 +62,14 @@ def tint_gains(slices: Sequence[SmallSlice], reference_from_slice: Sequence[Simi
 
 def with_gain(rgb: Rgb, gain: Float[np.ndarray, "3"]) -> Rgb:
     """Return a slice with its gain, which fades out towards what fills the sensor: full is full, and white stays white."""
-    red, green, blue = cv2.split(rgb)
-    room = (np.float32(_FULL) - cv2.max(cv2.max(red, green), blue)) / np.float32(_FULL - _NEARLY_FULL)
-    share = np.clip(room, 0.0, 1.0, out=room)
-    return cv2.merge([each + each * share * np.float32(factor - 1.0) for each, factor in zip((red, green, blue), gain, strict=True)])
+    planes = cv2.split(rgb)
+    share = cv2.max(cv2.max(planes[0], planes[1]), planes[2])
+    np.subtract(np.float32(_FULL), share, out=share)
+    share *= 1.0 / (_FULL - _NEARLY_FULL)
+    np.clip(share, 0.0, 1.0, out=share)
+    for each, factor in zip(planes, gain, strict=True):
+        cv2.scaleAdd(cv2.multiply(each, share), float(factor) - 1.0, each, dst=each)
+    return cv2.merge(planes)
 
 
 def _areas(small: SmallSlice, transform: Similarity) -> tuple[Rgb, Bool[np.ndarray, "rows columns"]]:
