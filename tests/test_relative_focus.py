@@ -13,7 +13,7 @@ from capture.merging.blur_evidence import DIAMETERS_PX, DRAWN_PX, disc_kernel
 from capture.merging.focus_direction import Contours
 from capture.merging.focus_order import focus_order
 from capture.merging.merge import merge_scene
-from capture.merging.relative_focus import solve_relative_focus
+from capture.merging.relative_focus import _Places, solve_relative_focus
 from capture.merging.relative_stack import gauge_of
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera_rgb import write_camera_rgb
@@ -83,6 +83,21 @@ def test_positions_and_surfaces_are_those_of_the_lens(noise: float) -> None:
     off_px = np.abs(scale * solved.focus_px + offset + GROWTH * scene.dioptres)[20:-20, 20:-20]
     assert np.median(off_px) < 0.2, "a twentieth of the mean step"
     assert np.median(off_px / solved.error_px[20:-20, 20:-20]) < 1.5, "errors are of the size that is stated"
+
+
+def test_misfits_are_those_of_pictures_that_go_over_linearly_between_rungs() -> None:
+    rng = np.random.default_rng(5)
+    squares_px2 = np.array([0.0, 1.5, 4.0, 9.0])
+    slices, ladder = rng.random((2, 3, 50)), rng.random((3, 4, 50))
+    errors = ((slices.transpose(1, 0, 2)[:, :, None] - ladder[:, None]) ** 2).mean(axis=3).astype(np.float32)
+    gaps = (np.diff(ladder, axis=1) ** 2).mean(axis=2).astype(np.float32)
+    nothing = np.zeros(3, np.float32)
+    places = _Places(errors, gaps, squares_px2, 1.0, (1, 3), nothing, np.zeros((3, 2), np.float32), nothing)
+    for wanted in (-1.0, 0.0, 0.7, 1.5, 3.0, 8.9, 9.0, 12.0):
+        blended = np.stack([[np.interp(wanted, squares_px2, column) for column in rungs.T] for rungs in ladder])
+        for one in range(2):
+            found = places.misfits(np.arange(3), one, np.full((1, 3), wanted))
+            np.testing.assert_allclose(found[0], ((slices[one] - blended) ** 2).mean(axis=1), rtol=1e-4)
 
 
 def test_a_slice_too_many_does_no_harm() -> None:

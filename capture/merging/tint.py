@@ -65,7 +65,7 @@ def with_gain(rgb: Rgb, gain: Float[np.ndarray, "3"]) -> Rgb:
     planes = cv2.split(rgb)
     share = cv2.max(cv2.max(planes[0], planes[1]), planes[2])
     np.subtract(np.float32(_FULL), share, out=share)
-    share *= 1.0 / (_FULL - _NEARLY_FULL)
+    np.multiply(share, np.float32(1.0 / (_FULL - _NEARLY_FULL)), out=share)
     np.clip(share, 0.0, 1.0, out=share)
     for each, factor in zip(planes, gain, strict=True):
         cv2.scaleAdd(cv2.multiply(each, share), float(factor) - 1.0, each, dst=each)
