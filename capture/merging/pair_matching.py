@@ -48,7 +48,7 @@ def match_from(target: SliceStructure, source: SliceStructure, start: Similarity
     """
     best, least_error_px = PairMatch(start, None), np.inf
     for of_target, of_source in zip(target.levels, source.levels, strict=True):
-        found = _tracked(of_target, of_source, best.target_from_source, rough=best.tracks is None)
+        found = _tracked(of_target, of_source, best.target_from_source)
         if found is None:
             break
         transform, tracks, agreeing = found
@@ -59,9 +59,9 @@ def match_from(target: SliceStructure, source: SliceStructure, start: Similarity
     return best
 
 
-def _tracked(target: DetailLevel, source: DetailLevel, start: Similarity, rough: bool) -> tuple[Similarity, CornerTracks, int] | None:
+def _tracked(target: DetailLevel, source: DetailLevel, start: Similarity) -> tuple[Similarity, CornerTracks, int] | None:
     """(target_from_source, tracks, how many agree) in pixels of the slices; None where too few agree."""
-    tracks = track_corners(target, source, at_level(start, target.level), rough=rough)
+    tracks = track_corners(target, source, at_level(start, target.level))
     if len(tracks) < FEWEST_AGREEING:
         return None
     found = similarity_of_tracks(tracks)
