@@ -5,7 +5,7 @@ import numpy as np
 
 from capture.merging.all_in_focus import all_in_focus, sharp_all_in_focus, slice_weight
 from capture.merging.blur_evidence import disc_kernel
-from capture.merging.depth_from_focus import FocusMap, depth_from_focus, focus_map, peak_parabola
+from capture.merging.depth_from_focus import FocusMap, focus_map, peak_parabola
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import find_lights, no_lights
 from capture.merging.semi_global import aggregate_costs
@@ -32,7 +32,7 @@ def stack_of(rgb: np.ndarray, true_index: np.ndarray) -> list[np.ndarray]:
 
 
 def focus_of(slices: list[np.ndarray]) -> FocusMap:
-    return depth_from_focus(slices, find_lights(lambda: slices))
+    return focus_map(focus_volume(slices), find_lights(lambda: slices))
 
 
 def test_a_flat_textured_plane_is_found_between_slices() -> None:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from capture.merging.all_in_focus import all_in_focus
-from capture.merging.depth_from_focus import depth_from_focus
+from capture.merging.depth_from_focus import focus_map
+from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Lights, find_lights, no_lights
 from capture.merging.restored_lights import restored_lights, with_restored_lights
 from capture.photos.clipped_highlights import neutral_where_full
@@ -75,7 +76,7 @@ def test_the_merged_picture_has_no_ghost_ring() -> None:
 
 
 def merged_with_lights(stack: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, Lights]:
-    merged = all_in_focus(stack, depth_from_focus(stack, no_lights(SIZE)).focus_index)
+    merged = all_in_focus(stack, focus_map(focus_volume(stack), no_lights(SIZE)).focus_index)
     lights, restored = restored_lights(lambda: stack, merged)
     return with_restored_lights(merged, restored), merged, lights
 

@@ -1,19 +1,18 @@
 """Depth from focus: in which slice, and between which two, every pixel is sharp, and how sure that is."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
-from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, focus_volume, share_above
+from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, share_above
 from capture.merging.lights import Lights
 from capture.merging.semi_global import aggregate_costs
 
-__all__ = ["FocusMap", "depth_from_focus", "focus_energy", "focus_map", "peak_parabola", "share_above"]
+__all__ = ["FocusMap", "focus_energy", "focus_map", "peak_parabola", "share_above"]
 
-Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Labels = Int[np.ndarray, "height width"]
 
@@ -61,11 +60,6 @@ class FocusMap:
     def dioptres(self, focus_dioptres: Sequence[float]) -> Plane:
         """(H, W) 1 / depth in metres, interpolated between the focus of the slices (1 / metres each)."""
         return np.interp(self.focus_index, np.arange(len(focus_dioptres)), focus_dioptres).astype(np.float32)
-
-
-def depth_from_focus(registered: Iterable[Rgb], lights: Lights) -> FocusMap:
-    """The focus map of registered slices in the order of their focus; slices are read once."""
-    return focus_map(focus_volume(registered), lights)
 
 
 def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "height width"] | None = None) -> FocusMap:

@@ -39,6 +39,7 @@ _MODEL_SHARE = 0.01
 _ROUNDS = 3
 _ENOUGH_CELLS = 5000
 _SPENT = 4.0
+"""What the misfit of an outlier costs at most, in variances."""
 _REACH = 5
 _WIDEST_OFFSET_STEPS = 0.8
 _WINDOW_SAMPLES = 12.0
