@@ -26,7 +26,7 @@ def preferred(slices: list[np.ndarray], from_first: bool) -> tuple[Preferred, np
     volume = focus_volume(slices)
     index = focus_map(volume, no_lights(volume.shape)).focus_index
     plain = all_in_focus(slices, index)
-    found = preferred_places(slices, volume, index, from_first)
+    found = preferred_places(slices, volume, index, from_first, np.zeros(index.shape, bool))
     return found, plain, blended(plain, slices, found)
 
 

@@ -8,8 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from capture.cli import app
+from capture.merging.all_in_focus import painted
 from capture.merging.merge import merge_scene
-from capture.merging.retouch import PAINTED_CONFIDENCE, RETOUCHES, painted, retouch_scene
+from capture.merging.retouch import PAINTED_CONFIDENCE, RETOUCHES, bands_of, retouch_scene
 from capture.merging.retouch_mask import read_mask
 from mrbokeh.errors import InputError
 from mrbokeh.exif_orientation import upright
@@ -72,7 +73,7 @@ def test_no_edge_of_the_mask_is_seen_where_slices_differ_in_brightness() -> None
     """A slice that is 10 % brighter: across the edge of the mask its light comes in over the reach of the bands, not at once."""
     picture = np.full((*SIZE, 3), 0.4, np.float32)
     share = (white(np.uint8) > 0).astype(np.float32)
-    blended = painted(picture, np.float32(1.1) * picture, share)[75, :, 0]
+    blended = painted(picture, [(np.float32(1.1) * picture, share)], share, bands_of(share))[75, :, 0]
     assert blended[95] == pytest.approx(0.44, rel=5e-3)
     # A step of 0.04 at once would be seen; the bands go over in some 2^5 px, here in half of that as the mask is narrow.
     assert np.abs(np.diff(blended)).max() < 0.25 * 0.04

@@ -41,7 +41,8 @@ def depth_command(
         typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
         if stack.folder in retouched and not retouches_text(stack):
             typer.echo(
-                f"  made anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask to `capture merge` again"
+                f"  its retouches ({retouched[stack.folder]}) stay at most where depth is not trusted: look at the picture, and give "
+                "--from-slice and --mask to `capture merge` again where they are gone"
             )
     if result.left_out:
         typer.echo(f"without a pose or with guessed metres, depth from focus only: {', '.join(result.left_out)}")

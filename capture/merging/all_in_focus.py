@@ -73,7 +73,7 @@ def sharp_all_in_focus(
     def blended_as(wanted: Plane) -> Rgb:
         nonlocal taken
         for index, rgb in enumerate(slices()):
-            blend.add(rgb, slice_weight(wanted, index, crossover) - slice_weight(taken, index, crossover))
+            blend.change(rgb, slice_weight(wanted, index, crossover) - slice_weight(taken, index, crossover))
         taken = wanted
         return blend.result()
 
@@ -86,12 +86,24 @@ def sharp_all_in_focus(
         proposed = blended_as(_taken_from(choice, lost, before, around_px))
         # Beside strong edges a block may gain the blurred rim of a slice, and its neighbours lose what they had.
         helped = _helped(lost, _lost_blocks(proposed, volume), _moved_blocks(picture, proposed))
-        if (helped != lost).any():
+        if helped.any() and (helped != lost).any():
             proposed = blended_as(_taken_from(choice, helped, before, around_px))
-            if _lost_blocks(proposed, volume).sum() >= lost.sum():
-                proposed = blended_as(before)
-        picture = proposed
+            helped &= _lost_blocks(proposed, volume).sum() < lost.sum()
+        picture = proposed if helped.any() else blended_as(before)
     return picture
+
+
+def painted(picture: Rgb, slices: Iterable[tuple[Rgb, Plane]], share: Plane, bands: int = BANDS) -> Rgb:
+    """Blend slices into a picture, each by its share (H, W); what lies beyond the reach of the bands stays bit for bit.
+
+    share: the sum of all shares, within 0 to 1.
+    """
+    blend = BandBlend(share.shape, bands)
+    blend.add(picture, np.float32(1.0) - share)
+    for rgb, own in slices:
+        if own.any():
+            blend.add(rgb, own)
+    return np.where(blend.reached(share)[..., None], blend.result(), picture)
 
 
 def _helped(lost: BlockMask, still_lost: BlockMask, moved: BlockMask) -> BlockMask:
@@ -150,6 +162,10 @@ class BandBlend:
     def add(self, rgb: Rgb, weight: Plane) -> None:
         """Add a picture (H, W, 3) with its weight (H, W)."""
         self._widen(rgb)
+        self.change(rgb, weight)
+
+    def change(self, rgb: Rgb, weight: Plane) -> None:
+        """Add to the weight of a picture that was added before."""
         box = self._box(weight)
         if box is None:
             return

@@ -7,11 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
-from capture.merging.focus_volume import FocusVolume, Volume, focus_energy, share_above
+from capture.merging.focus_volume import FocusVolume, Volume, share_above
 from capture.merging.lights import Lights
 from capture.merging.semi_global import aggregate_costs
-
-__all__ = ["FocusMap", "focus_energy", "focus_map", "peak_parabola", "share_above"]
 
 Plane = Float32[np.ndarray, "height width"]
 Labels = Int[np.ndarray, "height width"]
@@ -153,9 +151,16 @@ def vetoed(by_light: Labels, saturated: Bool[np.ndarray, "height width"] | None)
 
 
 def _confidence(volume: FocusVolume, labels: np.ndarray) -> Plane:
-    """From the energies as they are: averaged over slices every peak is flatter."""
+    """Return what is high where the energy has one sharp peak under the label, and 0 where all slices look alike.
+
+    Energies are taken as they are: averaged over slices every peak is flatter.
+    """
     log_energies = np.log1p(volume.energies)
-    return confidence_of(log_energies, labels, peak_parabola(log_energies, labels)[1])
+    at_label = np.take_along_axis(log_energies, labels[None], axis=0)[0]
+    off_peak = log_energies.max(axis=0) - at_label
+    contrast = at_label - np.median(log_energies, axis=0)
+    curvature = np.clip(peak_parabola(log_energies, labels)[1] / SHARP_CURVATURE, 0.0, 1.0)
+    return (np.exp(-2.0 * off_peak) * (1.0 - np.exp(-np.maximum(contrast, 0.0))) * curvature).astype(np.float32)
 
 
 def _share_of_one_surface(index: Plane) -> Plane:
@@ -180,12 +185,3 @@ def peak_parabola(log_energies: Volume, labels: np.ndarray) -> tuple[Plane, Plan
     interior = (labels > 0) & (labels < last)
     offset = np.where(interior, 0.5 * (after - before) / np.maximum(curvature, 1e-3), 0.0)
     return np.clip(offset, -0.5, 0.5).astype(np.float32), np.where(interior, curvature, 0.5 * curvature).astype(np.float32)
-
-
-def confidence_of(log_energies: Volume, labels: np.ndarray, curvature: Plane) -> Plane:
-    """High where the energy has one sharp peak and the label sits on it; 0 where all slices look alike."""
-    at_label = np.take_along_axis(log_energies, labels[None], axis=0)[0]
-    off_peak = log_energies.max(axis=0) - at_label
-    contrast = at_label - np.median(log_energies, axis=0)
-    agreement = np.exp(-2.0 * off_peak)
-    return (agreement * (1.0 - np.exp(-np.maximum(contrast, 0.0))) * np.clip(curvature / SHARP_CURVATURE, 0.0, 1.0)).astype(np.float32)

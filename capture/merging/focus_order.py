@@ -7,7 +7,6 @@ usually right.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -29,36 +28,24 @@ _MOST_CELLS = 3000
 _MOST_STARTS = 8
 
 
-@dataclass(frozen=True)
-class FocusOrder:
-    """order: indices of the given slices along their focus. gain: by how much it is better than as given, see `gain_of`."""
-
-    order: tuple[int, ...]
-    gain: float
-
-    @property
-    def as_given(self) -> bool:
-        return self.order == tuple(range(len(self.order)))
-
-
-def focus_order(read_rgb: Callable[[int], Rgb], count: int) -> FocusOrder:
-    """The order of slices 0 to count - 1, each read once; as given where that is as good as any.
+def focus_order(read_rgb: Callable[[int], Rgb], count: int) -> tuple[int, ...]:
+    """Return slices 0 to count - 1 in the order of their focus, each read once; as given where that is as good as any.
 
     Of the two directions it takes the one that goes more along the given order.
     """
     given = tuple(range(count))
     if count < 3:
-        return FocusOrder(given, 0.0)
+        return given
     violations = violations_of([detail_map(read_rgb(index)) for index in range(count)])
     best = best_order(violations)
     gain = gain_of(violations, given, best)
     if gain < _KEPT or cost_of(violations, best) > _CLEAR * violations.sum() / 6.0:
-        return FocusOrder(given, gain)
-    return FocusOrder(tuple(best if _rises(best) else best[::-1]), gain)
+        return given
+    return tuple(best if _rises(best) else best[::-1])
 
 
 def gain_of(violations: Violations, given: Sequence[int], best: Sequence[int]) -> float:
-    """By how much the best order is better, as a share of what slices in no order would cost."""
+    """Return by how much the best order is better, as a share of what slices in no order would cost."""
     at_random = float(violations.sum()) / 6.0
     return (cost_of(violations, given) - cost_of(violations, best)) / max(at_random, 1e-12)
 
@@ -100,7 +87,7 @@ def violations_of(maps: Sequence[Maps]) -> Violations:
 
 
 def cost_of(violations: Violations, order: Sequence[int]) -> float:
-    """Of all slices that lie between two others."""
+    """Return what an order costs, summed over all slices that lie between two others."""
     index = np.array(order, int)
     ordered = violations[np.ix_(index, index, index)]
     return float(sum(ordered[:b, b, b + 1 :].sum() for b in range(1, len(order) - 1)))

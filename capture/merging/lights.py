@@ -35,7 +35,6 @@ class Lights:
 
     sharpest: for light 1, 2, ... the index of the slice in which it is most concentrated.
     focus_index: the fractional index at which each is in focus, from the growth of its disc.
-    widest: the slice in which each is spread widest and still seen.
     areas_px: how many pixels each covers in each slice.
     """
 
@@ -43,7 +42,6 @@ class Lights:
     core: Bool[np.ndarray, "height width"]
     sharpest: Int[np.ndarray, " lights"]
     focus_index: Float[np.ndarray, " lights"]
-    widest: Int[np.ndarray, " lights"]
     areas_px: Float[np.ndarray, "slices lights"]
 
     def __len__(self) -> int:
@@ -72,7 +70,7 @@ class Lights:
         """Return some of the lights; the others are no lights any more."""
         number = np.concatenate([[0], np.where(kept, np.cumsum(kept), 0)]).astype(self.zone.dtype)
         zone = number[self.zone]
-        return Lights(zone, self.core & (zone > 0), self.sharpest[kept], self.focus_index[kept], self.widest[kept], self.areas_px[:, kept])
+        return Lights(zone, self.core & (zone > 0), self.sharpest[kept], self.focus_index[kept], self.areas_px[:, kept])
 
     def slice_index(self) -> Int[np.ndarray, "height width"]:
         """(H, W): the sharpest slice of the light that reaches a pixel, -1 where none does."""
@@ -136,8 +134,7 @@ def _lights(spreads: "_Spreads", near: Int[np.ndarray, "height width"], distance
     for index in range(len(areas_px)):
         mine = owner == index
         core.ravel()[members[mine]] = spreads.over_range(index)[mine]
-    widest = np.where(seen, areas_px, -1.0).argmax(axis=0)
-    found = Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), widest, areas_px)
+    found = Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), areas_px)
     return found.only(_grows(areas_px, peaks, seen))
 
 
@@ -150,7 +147,7 @@ def _grows(areas_px: np.ndarray, peaks: np.ndarray, seen: np.ndarray) -> Bool[np
 
 def no_lights(shape: tuple[int, ...]) -> Lights:
     nothing = np.zeros(0, np.int64)
-    return Lights(np.zeros(shape, np.int64), np.zeros(shape, bool), nothing, nothing.astype(np.float64), nothing, np.zeros((0, 0)))
+    return Lights(np.zeros(shape, np.int64), np.zeros(shape, bool), nothing, nothing.astype(np.float64), np.zeros((0, 0)))
 
 
 def _between_slices(areas_px: np.ndarray, seen: np.ndarray, sharpest: Int[np.ndarray, " lights"]) -> PerLight:

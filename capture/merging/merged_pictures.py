@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 
-from capture.merging.tiff_writer import BYTE, RATIONAL, SHORT, UNDEFINED, TiffTag, fractions_tag, text_tag, write_tiff
+from capture.merging.tiff_writer import BYTE, LONG, RATIONAL, SHORT, UNDEFINED, TiffTag, fractions_tag, text_tag, write_tiff
 from mrbokeh.camera_rgb import Matrix3x3
 from mrbokeh.color import rec709_from_XYZ
 from mrbokeh.exif_orientation import upright
 from mrbokeh.focal_stack import FocalStack
-from mrbokeh.picture_codec import codes_of, write_stored
+from mrbokeh.picture_codec import codes_of, even_codes, write_stored
 from mrbokeh.stack_pictures import depth_codes, orientation_of, write_upright_png
 
 PNG_NAME, TIFF_NAME, DNG_NAME, DEPTH_NAME = "all_in_focus.png", "all_in_focus.tif", "all_in_focus.dng", "depth.png"
@@ -30,7 +30,7 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Rgb8 = UInt8[np.ndarray, "height width 3"]
 
 
-def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None, depth_rgb8: Rgb8 | None = None) -> list[Path]:
+def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None, depth_rgb8: Rgb8 | None = None) -> None:
     """Write the pictures of a merged stack, beside its EXR.
 
     camera_rgb: its all-in-focus picture as it is stored. depth_rgb8: its `depth_codes`. What is None is read.
@@ -44,11 +44,9 @@ def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None, de
     write_upright_png(folder / PNG_NAME, rgb, stack)
     _write_srgb_tiff(folder / TIFF_NAME, upright(codes_of(rgb, np.uint16, "srgb"), orientation))
     write_depth_picture(stack, depth_rgb8)
-    names = readable_names(stack)
-    if DNG_NAME in names and stack.rec709_from_camera is not None:
+    if stack.rec709_from_camera is not None and stack.metadata.get("white_balance") is not None:
         model = next((model for each in stack.slices if (model := each.metadata.get("camera_model"))), "unknown camera")
         write_linear_dng(folder / DNG_NAME, camera_rgb, stack.rec709_from_camera, stack.metadata["white_balance"], model, orientation)
-    return [folder / name for name in names]
 
 
 def write_depth_picture(stack: FocalStack, depth_rgb8: Rgb8 | None = None) -> None:
@@ -58,7 +56,7 @@ def write_depth_picture(stack: FocalStack, depth_rgb8: Rgb8 | None = None) -> No
 
 
 def readable_names(stack: FocalStack) -> list[str]:
-    """Of the files that a merge of this stack writes for people."""
+    """Return the names of the files that a merge of this stack writes for people."""
     is_raw = stack.rec709_from_camera is not None and stack.metadata.get("white_balance") is not None
     return [PNG_NAME, TIFF_NAME, *([DNG_NAME] if is_raw else []), DEPTH_NAME]
 
@@ -76,7 +74,7 @@ def write_linear_dng(
     scale = float(np.clip(native.max(), 1.0, _BRIGHTEST))
     camera_from_XYZ = neutral[:, None] * (np.linalg.inv(np.asarray(rec709_from_camera)) @ rec709_from_XYZ)
     tags = {
-        254: TiffTag(4, (0,)),
+        254: TiffTag(LONG, (0,)),
         262: TiffTag(SHORT, (_LINEAR_RAW,)),
         271: text_tag(_SOFTWARE),
         272: text_tag(model),
@@ -88,11 +86,11 @@ def write_linear_dng(
         50714: TiffTag(SHORT, (0, 0, 0)),  # BlackLevel
         50717: TiffTag(SHORT, (_TOP, _TOP, _TOP)),  # WhiteLevel
         50721: fractions_tag(camera_from_XYZ.reshape(-1).tolist(), _MATRIX_DENOMINATOR),  # ColorMatrix1
-        50728: _unsigned_fractions(neutral),  # AsShotNeutral
+        50728: fractions_tag(neutral.tolist(), _FINE_DENOMINATOR, RATIONAL),  # AsShotNeutral
         50730: fractions_tag([math.log2(scale)], _FINE_DENOMINATOR),  # BaselineExposure
         50778: TiffTag(SHORT, (_D65,)),  # CalibrationIlluminant1
     }
-    write_tiff(path, _even_codes(native / np.float32(scale)), tags)
+    write_tiff(path, even_codes(native / np.float32(scale), np.uint16), tags)
 
 
 def _write_srgb_tiff(path: Path, codes: UInt16[np.ndarray, "height width 3"]) -> None:
@@ -109,11 +107,3 @@ def _srgb_profile() -> bytes:
     from PIL import ImageCms
 
     return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-
-
-def _even_codes(values: Rgb) -> UInt16[np.ndarray, "height width 3"]:
-    return np.rint(np.clip(values, 0.0, 1.0) * np.float32(_TOP)).astype(np.uint16)
-
-
-def _unsigned_fractions(values: Float[np.ndarray, " n"]) -> TiffTag:
-    return TiffTag(RATIONAL, tuple(each for value in values for each in (round(float(value) * _FINE_DENOMINATOR), _FINE_DENOMINATOR)))

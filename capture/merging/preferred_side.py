@@ -1,4 +1,4 @@
-"""Where two things at different depths are seen in one place, which of them the merged picture shows: a web or the leaves behind it.
+"""Choice of a side where two things at different depths are seen in one place: a web or the leaves behind it.
 
 There the focus energy has two clear peaks along the slices. The focus map takes what fits its surroundings; who merges may prefer the near
 or the far one. The window of the energy sees a thread from several pixels away, where there is nothing but what lies behind it: a pixel
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from capture.merging.all_in_focus import BandBlend
+from capture.merging.all_in_focus import painted
 from capture.merging.depth_from_focus import SURFACE_STEP
 from capture.merging.focus_volume import FocusVolume, focus_energy
 
@@ -45,9 +45,7 @@ class Preferred:
     index: Plane
 
 
-def preferred_places(
-    registered: Iterable[Rgb], volume: FocusVolume, focus_index: Plane, from_first: bool, excluded: Mask | None = None
-) -> Preferred:
+def preferred_places(registered: Iterable[Rgb], volume: FocusVolume, focus_index: Plane, from_first: bool, excluded: Mask) -> Preferred:
     """Return where one of two clear peaks takes the place of what was taken. Registered slices are read once.
 
     from_first: the peak that is nearer to the first slice is preferred, else the one nearer to the last. excluded: (H, W) where peaks are
@@ -63,60 +61,34 @@ def preferred_places(
             has_wanted |= detail & is_wanted
             has_other |= detail & is_other
     label = np.where(has_wanted, wanted, np.where(has_other, other, np.float32(-1.0)))
-    where = (label >= 0) & (np.abs(label - focus_index) > SURFACE_STEP)
-    if excluded is not None:
-        where &= ~excluded
+    where = (label >= 0) & (np.abs(label - focus_index) > SURFACE_STEP) & ~excluded
     return Preferred(where, np.where(where, label, focus_index).astype(np.float32))
 
 
 def blended(picture: Rgb, registered: Iterable[Rgb], preferred: Preferred) -> Rgb:
     """Blend the preferred slices into a picture; where nothing is preferred nearby it stays bit for bit."""
-    if not preferred.where.any():
-        return picture
-    share = preferred.where.astype(np.float32)
-    blend = BandBlend(share.shape)
-    blend.add(picture, np.float32(1.0) - share)
-    for index, rgb in enumerate(registered):
-        chosen = share * (preferred.index == index)
-        if chosen.any():
-            blend.add(rgb, chosen.astype(np.float32))
-    return np.where(blend.reached(share)[..., None], blend.result(), picture)
+    where = preferred.where
+    shared = ((rgb, (where & (preferred.index == index)).astype(np.float32)) for index, rgb in enumerate(registered))
+    return painted(picture, shared, where.astype(np.float32))
 
 
 def first_of_two_peaks(energies: Float32[np.ndarray, "slices height width"], from_first: bool) -> Labels:
     """Return the slice of the first clear peak that a second one follows, -1 where there is one peak or none."""
     order = range(len(energies)) if from_first else range(len(energies) - 1, -1, -1)
-    climb = _Climb.at_foot(energies.shape[1:])
+    shape, clear = energies.shape[1:], np.log1p(_LEAST_NOISE_FLOORS)
+    peak, second, valley = (np.full(shape, start, np.float32) for start in (-1.0, -1.0, np.inf))
+    label, left = np.full(shape, -1), np.zeros(shape, bool)
+    # At every pixel: up to a peak (label), down until it is left, through the valley and up again.
     for index in order:
-        climb.pass_slice(index, np.log1p(cv2.GaussianBlur(energies[index], (0, 0), _SMOOTH_PX)))
-    return np.where(_without_specks(climb.is_double()), climb.label, -1)
-
-
-@dataclass
-class _Climb:
-    """The walk along the slices at every pixel: up to a peak (label), down until it is left, through the valley and up again."""
-
-    label: Labels
-    peak: Plane
-    valley: Plane
-    second: Plane
-    left: Mask
-
-    @classmethod
-    def at_foot(cls, shape: tuple[int, ...]) -> "_Climb":
-        low, high = np.full(shape, -1.0, np.float32), np.full(shape, np.inf, np.float32)
-        return cls(np.full(shape, -1), low, high, low.copy(), np.zeros(shape, bool))
-
-    def pass_slice(self, index: int, height: Plane) -> None:
-        rises = ~self.left & (height > self.peak)
-        self.label[rises], self.peak[rises] = index, height[rises]
-        self.left |= (self.peak > np.log1p(_LEAST_NOISE_FLOORS)) & (height < self.peak - _DROP)
-        self.valley[self.left] = np.minimum(self.valley, height)[self.left]
-        climbs = self.left & (height > np.maximum(self.valley + _DROP, np.log1p(_LEAST_NOISE_FLOORS)))
-        self.second[climbs] = np.maximum(self.second, height)[climbs]
-
-    def is_double(self) -> Mask:
-        return (self.second > 0) & (np.abs(self.second - self.peak) < _WITHIN)
+        height = np.log1p(cv2.GaussianBlur(energies[index], (0, 0), _SMOOTH_PX))
+        rises = ~left & (height > peak)
+        label[rises], peak[rises] = index, height[rises]
+        left |= (peak > clear) & (height < peak - _DROP)
+        valley[left] = np.minimum(valley, height)[left]
+        climbs = left & (height > np.maximum(valley + _DROP, clear))
+        second[climbs] = np.maximum(second, height)[climbs]
+    double = (second > 0) & (np.abs(second - peak) < _WITHIN)
+    return np.where(_without_specks(double), label, -1)
 
 
 def _without_specks(found: Mask) -> Mask:

@@ -94,12 +94,12 @@ def in_focus_order(stack: FocalStack, ingested: IngestedSlices) -> FocalStack:
     if stack.is_metric:
         return stack
     found = focus_order(lambda index: ingested.read(stack.folder / source_path(stack.slices[index]))[0], len(stack))
-    if found.as_given:
+    if found == tuple(range(len(stack))):
         return stack
-    slices = tuple(replace(stack.slices[i], metadata=stack.slices[i].metadata | {GIVEN_INDEX: i}) for i in found.order)
+    slices = tuple(replace(stack.slices[i], metadata=stack.slices[i].metadata | {GIVEN_INDEX: i}) for i in found)
     names = ", ".join(str(each.metadata.get("source", each.path)) for each in slices)
     why = f"the slices were not in the order of their focus and have been put in it, as the pictures tell: {names}"
-    reference = found.order.index(stack.reference)
+    reference = found.index(stack.reference)
     return replace(stack, slices=slices, reference=reference, metadata=stack.metadata | {ORDER: why})
 
 

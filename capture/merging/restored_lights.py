@@ -260,7 +260,7 @@ def _drawn(blank: Rgb, discs: Discs, sharp_area_px: float) -> Rgb:
     use = discs.believable
     certainty = 1.0 / np.maximum(discs.variance_px2[use], 0.5)
     xy_px, flux = (np.average(each[use], axis=0, weights=certainty) for each in (discs.xy_px, discs.flux))
-    clear_px = 1.15 * np.sqrt(sharp_area_px / np.pi) + 2.0
+    clear_px = _radius_px(sharp_area_px)
     y, x = np.mgrid[: blank.shape[0], : blank.shape[1]] + 0.5
     distance = np.hypot(x - xy_px[0], y - xy_px[1])
     around = (distance > clear_px) & (distance <= clear_px + MARGIN_PX)

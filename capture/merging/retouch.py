@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.merging.all_in_focus import BANDS, BandBlend
+from capture.merging.all_in_focus import BANDS, painted
 from capture.merging.merged_pictures import readable_names, write_readable_pictures
 from capture.merging.replaced_places import replaced_depth
 from capture.merging.retouch_mask import read_mask
@@ -22,7 +22,7 @@ from mrbokeh.stack_pictures import SHEET_NAME, orientation_of, write_merge_sheet
 RETOUCHES = "retouches"
 """Key in a stack's metadata: which slice was put where a mask is white, in the order of the calls (slice, source, mask, share)."""
 PAINTED_CONFIDENCE = 0.5
-"""Of a depth that a mask states: it is that of the slice, while the surface under a coarse mask may lean."""
+"""Confidence of a depth that a mask states: it is that of the slice, while the surface under a coarse mask may lean."""
 _HALF = 0.5
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -31,7 +31,9 @@ Plane = Float32[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Retouch:
-    """index: of a slice. mask: the file as the user named it. share: (H, W) how much of the slice each pixel takes, in 0 to 1."""
+    """A slice and where it is painted in.
+
+    mask: the file as the user named it. share: (H, W) how much of the slice each pixel takes, in 0 to 1."""
 
     index: int
     mask: Path
@@ -51,7 +53,7 @@ def retouch_scene(scene: Path, slices: Sequence[int], masks: Sequence[Path]) -> 
     picture, part = stack.all_in_focus_camera_rgb(), read_exr(stack.depth_path)[0]
     channels = dict(part.channels)
     for each in wanted:
-        picture = painted(picture, stack.slice_camera_rgb(each.index), each.share)
+        picture = painted(picture, [(stack.slice_camera_rgb(each.index), each.share)], each.share, bands_of(each.share))
         white = each.share >= _HALF
         index, confidence = (np.full(white.shape, value, np.float32) for value in (each.index, PAINTED_CONFIDENCE))
         channels = replaced_depth(stack, channels, index, confidence, white)
@@ -66,14 +68,6 @@ def retouch_scene(scene: Path, slices: Sequence[int], masks: Sequence[Path]) -> 
 
 def _outputs(stack: FocalStack) -> list[Path]:
     return [stack.all_in_focus_path, stack.depth_path, *(stack.folder / name for name in (*readable_names(stack), SHEET_NAME))]
-
-
-def painted(picture: Rgb, slice_rgb: Rgb, share: Plane) -> Rgb:
-    """Blend a slice into a picture by its share, band by band; what lies beyond the reach of the bands stays bit for bit."""
-    blend = BandBlend(share.shape, _bands_of(share))
-    blend.add(picture, np.float32(1.0) - share)
-    blend.add(slice_rgb, share)
-    return np.where(blend.reached(share)[..., None], blend.result(), picture)
 
 
 def retouches_of(stack: FocalStack) -> list[dict[str, object]]:
@@ -94,7 +88,7 @@ def retouched_stacks(scene: Path) -> dict[Path, str]:
     return {stack.folder: text for stack in stacks if (text := retouches_text(stack))}
 
 
-def _bands_of(share: Plane) -> int:
+def bands_of(share: Plane) -> int:
     """Return how many bands fit into what is white: through a stroke that is narrower than a band, what it covers would shine."""
     inside = np.pad((share >= _HALF).astype(np.uint8), 1)
     radius_px = float(cv2.distanceTransform(inside, cv2.DIST_L2, 3).max())

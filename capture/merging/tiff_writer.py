@@ -34,8 +34,8 @@ def text_tag(text: str) -> TiffTag:
     return TiffTag(ASCII, (*text.encode("ascii", "replace"), 0))
 
 
-def fractions_tag(values: Sequence[float], denominator: int) -> TiffTag:
-    return TiffTag(SRATIONAL, tuple(each for value in values for each in (round(value * denominator), denominator)))
+def fractions_tag(values: Sequence[float], denominator: int, kind: int = SRATIONAL) -> TiffTag:
+    return TiffTag(kind, tuple(each for value in values for each in (round(value * denominator), denominator)))
 
 
 def write_tiff(path: Path, pixels: UInt16[np.ndarray, "height width 3"], tags: Mapping[int, TiffTag]) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from capture.merging.depth_from_focus import focus_energy
+from capture.merging.focus_volume import focus_energy
 from capture.tether.camera_driver import Preview
 from mrbokeh.color import luminance, srgb_to_linear
 from mrbokeh.errors import InputError

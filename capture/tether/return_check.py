@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from capture.merging.depth_from_focus import focus_energy
+from capture.merging.focus_volume import focus_energy
 from capture.photos.developing import develop, is_raw
 from mrbokeh.color import luminance
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture.merging.merged_pictures import write_readable_pictures
+from capture.merging.preferred_merge import PREFERRED
 from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, first_pass_path, second_pass
 from capture.views.dense_finish import DenseDepth
@@ -24,8 +25,8 @@ _SEAM_PX = 1.5
 
 
 def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, object]) -> FocalStack:
-    """Pictures first, stack.json last; retouches are of the first picture. record: what the depth was made from."""
-    kept = {key: value for key, value in stack.metadata.items() if key != RETOUCHES}
+    """Pictures first, stack.json last; retouches and the preferred side are of the first picture. record: what the depth was made from."""
+    kept = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)}
     deepened = replace(stack, metadata=kept | {DEPTH_SOURCE: record})
     write_merged(
         stack.folder,
