@@ -37,18 +37,26 @@ class IngestedSlices:
     stack: FocalStack
     _held: dict[Path, tuple[Stored, Plane | None]] = field(default_factory=dict)
     _small: dict[Path, SmallSlice] = field(default_factory=dict)
+    _buffer: Rgb | None = None
 
     def read(self, path: Path) -> tuple[Rgb, Plane]:
-        """Return (camera RGB, share of each pixel that was full) of a file of the stack."""
+        """Return (camera RGB, share of each pixel that was full) of a file of the stack; the colours hold until the next call."""
         if path not in self._held:
-            stored, saturated = _read_stored(path)
+            stored, saturated = _stored_slice(path)
             if stored.nbytes * len(self.stack) <= LARGEST_HELD_BYTES:
                 self._held[path] = stored, saturated if saturated.any() else None
-            rgb = _single(stored)
+            rgb = self._single(stored)
             self._small[path] = SmallSlice.of(rgb, saturated)
             return rgb, saturated
         rgb, held = self._held[path]
-        return _single(rgb), np.zeros(rgb.shape[:2], np.float32) if held is None else held
+        return self._single(rgb), np.zeros(rgb.shape[:2], np.float32) if held is None else held
+
+    def _single(self, stored: Stored) -> Rgb:
+        if stored.dtype != np.float16:
+            return stored.copy()
+        # Memory that is new costs more than what is written into it.
+        self._buffer = single_of(stored, self._buffer)
+        return self._buffer
 
     def small(self, path: Path) -> SmallSlice:
         """Return what is left of a slice at the size of large areas; it is read if it was not before."""
@@ -84,9 +92,7 @@ class RegisteredSlices:
         for index, each in enumerate(self.stack.slices):
             path, sources = self.path(index), (self.stack.folder / source_path(each), self.stack.folder / REGISTRATION_NAME)
             kept = keep and newer(path, *sources) and self._has_gain(path, index)
-            rgb, saturated = read_slice(path) if kept else self._resampled(index)
-            # Half float keeps 11 bits, far below the noise of a photograph. Rounded at once, a resumed run gives the same.
-            half = half_of(np.minimum(rgb, _LARGEST_HALF))
+            half, saturated = self._kept(path) if kept else self._resampled(index)
             self._remember(half, saturated)
             if not kept:
                 self._write(index, half, saturated)
@@ -105,7 +111,7 @@ class RegisteredSlices:
     def passing(self) -> Iterator[Rgb]:
         """The slices once more, after they were all made."""
         for index in range(len(self.stack)):
-            yield single_of(self._held[index]) if self._held else read_slice(self.path(index))[0]
+            yield single_of(self._held[index] if self._held else self._kept(self.path(index))[0])
 
     def valid(self, index: int) -> Mask:
         """(H, W) where a slice has data, once the first has been made."""
@@ -145,12 +151,18 @@ class RegisteredSlices:
             for index, each in enumerate(self.stack.slices)
         )
 
-    def _resampled(self, index: int) -> tuple[Rgb, Plane]:
+    def _kept(self, path: Path) -> tuple[Half, Plane]:
+        """Return a resampled slice of an earlier run, or of an earlier pass of this one."""
+        stored, saturated = _stored_slice(path)
+        return np.asarray(stored, np.float16), saturated
+
+    def _resampled(self, index: int) -> tuple[Half, Plane]:
         rgb, saturated = self.ingested.taken(self.stack.folder / source_path(self.stack.slices[index]))
         transform, gain = self.registration.reference_from_slice[index], self.tint_gains[index]
         if (gain != 1.0).any():
             rgb = with_gain(rgb, gain)
-        return warp(rgb, transform), _warped_share(saturated, transform)
+        # Half float keeps 11 bits, far below the noise of a photograph. Rounded at once, a resumed run gives the same.
+        return half_of(np.minimum(warp(rgb, transform), _LARGEST_HALF)), _warped_share(saturated, transform)
 
     @cached_property
     def tint_gains(self) -> Gains:
@@ -170,21 +182,11 @@ def source_path(each: Slice) -> str:
     return str(each.metadata.get("ingested", each.path))
 
 
-def read_slice(path: Path) -> tuple[Rgb, Plane]:
-    """(camera RGB, share of each pixel that was full) of one file, read once."""
-    rgb, saturated = _read_stored(path)
-    return _single(rgb), saturated
-
-
-def _read_stored(path: Path) -> tuple[Stored, Plane]:
-    """Return what `read_slice` does with the colours as the file has them, mostly in half floats."""
+def _stored_slice(path: Path) -> tuple[Stored, Plane]:
+    """Return (camera RGB as the file has it, mostly in half floats; share of each pixel that was full) of one file, read once."""
     part = read_exr(path)[0]
     rgb = cv2.merge(part.planes("RGB"))
     return rgb, part.channels[SATURATED].astype(np.float32) if SATURATED in part.channels else np.zeros(rgb.shape[:2], np.float32)
-
-
-def _single(rgb: Stored) -> Rgb:
-    return single_of(rgb) if rgb.dtype == np.float16 else rgb.copy()
 
 
 def _warped_share(saturated: Plane, reference_from_slice: Similarity) -> Plane:
