@@ -25,6 +25,10 @@ from mrbokeh.lens_file import lens_from_json, lens_to_json
 FORMAT = "mrbokeh-focal-stack"
 VERSION = 2
 FILE_NAME = "stack.json"
+METRES = "metres"
+"""Key in a stack's metadata: what is known of its metres, see `mrbokeh.guessed_metres`."""
+GROWTH, GROWTH_WIDTH = "px_per_dioptre", "px_per_dioptre_width_px"
+"""Keys in a slice's metadata: how fast its blur grows before registration enlarges it, in a picture so wide."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ class FocalStack:
     @property
     def metres_known(self) -> bool:
         """False where merging guessed metres because focus distances are unknown; its circles of confusion are measured all the same."""
-        return bool((self.metadata.get("metres") or {}).get("known", True))
+        return bool((self.metadata.get(METRES) or {}).get("known", True))
 
     def slice_camera_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
         return read_camera_rgb(self.folder / self.slices[index].path)
@@ -154,9 +158,9 @@ class FocalStack:
     def lens_of(self, index: int) -> Lens:
         """The lens of one slice; where its blur was calibrated (`mrbokeh capture scale`), with the f-number that gives the blur found."""
         lens, metadata = self.stated_lens_of(index), self.slices[index].metadata
-        if "px_per_dioptre" not in metadata:
+        if GROWTH not in metadata:
             return lens
-        found = metadata["px_per_dioptre"] / lens.coc_px_per_dioptre(metadata["px_per_dioptre_width_px"])
+        found = metadata[GROWTH] / lens.coc_px_per_dioptre(metadata[GROWTH_WIDTH])
         return replace(lens, f_number=lens.f_number / found)
 
     def registered_lens_of(self, index: int) -> Lens:

@@ -1,7 +1,9 @@
 """Focus as a user says it: in metres, by what is in focus at a pixel, or by where between the slices of a stack it lies."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float32
@@ -38,7 +40,7 @@ class Seen:
         return self.lens.focused_on(self.depth_m, x_px + 0.5, y_px + 0.5, _NEAR_PIXEL_PX).focus_distance_m
 
     def at_slice(self, position: float) -> float:
-        """Between slices evenly in dioptres."""
+        """Return the focus distance at a place between slices, evenly in dioptres."""
         if not 0.0 <= position <= len(self.slices_m) - 1:
             last = f"#0 to #{len(self.slices_m) - 1}" if self.slices_m else "a focal stack, for a picture has no slices"
             raise InputError(f"--focus #{position:g}: expected {last}")
@@ -48,15 +50,15 @@ class Seen:
         return _distance(float(np.interp(position, np.arange(len(self.slices_m)), [1.0 / each for each in self.slices_m])))
 
 
-def parse_focus(text: str, seen: Seen | None = None) -> tuple[float, ...]:
-    """Focus distances in metres. seen: None allows metres only."""
+def parse_focus(text: str, seen: Seen) -> tuple[float, ...]:
+    """Return focus distances in metres, all different."""
     if not (places := _places(text, seen)) or not all(each > 0 for each in places) or len(set(places)) < len(places):
         raise InputError(f"--focus: {_EXPECTED}, got {text!r}")
     return places
 
 
-def _places(text: str, seen: Seen | None) -> tuple[float, ...]:
-    """Empty where the text is not as expected."""
+def _places(text: str, seen: Seen) -> tuple[float, ...]:
+    """Return nothing where the text is not as expected."""
     try:
         if parts := re.fullmatch(rf"({_PLACE}):({_PLACE}):(\d+)", text):
             near, far = (_place(each, seen) for each in parts.groups()[:2])
@@ -70,12 +72,10 @@ def _places(text: str, seen: Seen | None) -> tuple[float, ...]:
     return ()
 
 
-def _place(text: str, seen: Seen | None) -> float:
+def _place(text: str, seen: Seen) -> float:
     if text[0] not in "@#":
         return float(text)
     numbers = tuple(float(each) for each in text[1:].split(","))
-    if seen is None:
-        raise InputError(f"--focus {text} is for a focal stack or a picture with depth: give metres here")
     return seen.at_pixel(numbers[0], numbers[1]) if text[0] == "@" else seen.at_slice(numbers[0])
 
 
@@ -84,9 +84,13 @@ def _distance(dioptres: float) -> float:
 
 
 def slice_names(distances_m: tuple[float, ...]) -> list[str]:
-    """Of the files of new slices: with as many digits as tell them apart, four at least."""
-    for digits in range(4, 12):
-        names = [f"slice_{each:.{digits}f}m.exr" for each in distances_m]
-        if len(set(names)) == len(names):
-            return names
-    raise InputError(f"--focus states distances that are too alike, such as {distances_m[0]} and {distances_m[1]}: give fewer")
+    """Name the files of new slices, whose distances differ, with as many digits as tell them apart, four at least."""
+    names = ([f"slice_{each:.{digits}f}m.exr" for each in distances_m] for digits in count(4))
+    return next(each for each in names if len(set(each)) == len(each))
+
+
+def index_between(distances_m: Sequence[float], dioptres: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
+    """Return the fractional index of the slice, among slices focused at these distances, in which a surface is sharp."""
+    focus_dioptres = np.array([1.0 / each for each in distances_m])
+    order = np.argsort(focus_dioptres)
+    return np.interp(dioptres, focus_dioptres[order], order).astype(np.float32)

@@ -1,28 +1,46 @@
 """What is known of the metres of a focal stack, in one line for people.
 
 Where no focus distance is known, merging measures blur from the slices alone and guesses the metres (`metadata["metres"]`: known, why,
-guessed, gauge): circles of confusion are right in pixels, lengths and distances are not, until one known length or distance is told.
+guessed, told, gauge): circles of confusion are right in pixels, lengths and distances are not, until one known length or distance is told.
 """
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.focal_stack import FILE_NAME, FocalStack, read_focal_stack
+from mrbokeh.focal_stack import FILE_NAME, METRES, FocalStack, read_focal_stack
 
-KEY = "metres"
 GUESSED = "guessed metres"
-BEFORE = "stated_before_guessing"
+STATED_BEFORE = "stated_before_guessing"
 """Key in a stack's metadata: the lens and camera that it stated, or None."""
+STATED_DISTANCE = "stated_focus_distance_m"
+"""Key in a slice's metadata: the focus distance that was stated of it, or None, where another one has taken its place."""
+SLICE_POSITION, SLICE_POSITION_ERROR = "blur_position_px", "blur_position_error_px"
+"""Keys in a slice's metadata: where it is focused in pixels of blur, growing towards the camera, and the standard error."""
 POSITION, POSITION_ERROR = "blur_position", "blur_position_error"
 """Channels of depth.exr: where the surface lies in pixels of blur, growing towards the camera, and its standard error."""
-_WHY = "blur in pixels is solved from the slices, and no focus distance is known"
+TOLD = "told"
+"""Key in what is known of a stack's metres: the lengths and distances that the user told."""
+_OF_ITS_DEPTH = ("known", "why", "guessed")
 
 
 def metres_facts(stack: FocalStack) -> Mapping[str, Any]:
     """known: whether metres are; why: in words; guessed: what else is a guess where they are known. Empty for stacks that state theirs."""
-    facts = stack.metadata.get(KEY)
+    facts = stack.metadata.get(METRES)
     return facts if isinstance(facts, Mapping) else {}
+
+
+def inherited_facts(stack: FocalStack, with_lens: bool) -> dict[str, Any]:
+    """Return the metadata on metres that a stack made of another's picture and depth takes over.
+
+    with_lens: it is seen through that stack's own lens; what is known of the blur of this one says nothing of another.
+    """
+    if METRES not in stack.metadata:
+        return {}
+    if with_lens:
+        return {name: stack.metadata[name] for name in (METRES, STATED_BEFORE) if name in stack.metadata}
+    facts = metres_facts(stack)
+    return {METRES: {name: facts[name] for name in _OF_ITS_DEPTH if name in facts}}
 
 
 def is_lens_guessed(stack: FocalStack) -> bool:
@@ -30,13 +48,13 @@ def is_lens_guessed(stack: FocalStack) -> bool:
     gauge = metres_facts(stack).get("gauge")
     if not gauge:
         return False
-    stated = gauge["scale_from"] == "lens" or bool((stack.metadata.get(BEFORE) or {}).get("lens"))
+    stated = gauge["scale_from"] == "lens" or bool((stack.metadata.get(STATED_BEFORE) or {}).get("lens"))
     return not stated
 
 
 def is_view_guessed(stack: FocalStack) -> bool:
     """Whether nobody knows the field of view."""
-    return is_lens_guessed(stack) and not (stack.metadata.get(BEFORE) or {}).get("camera")
+    return is_lens_guessed(stack) and not (stack.metadata.get(STATED_BEFORE) or {}).get("camera")
 
 
 def unit_of(stack: FocalStack) -> str:
@@ -49,12 +67,12 @@ def metres_note(stack: FocalStack) -> str:
     facts, end = metres_facts(stack), _guessed_end(stack)
     if not stack.metres_known:
         turn = f", and if near and far are swapped `--nearest {'last' if end == 'first' else 'first'}`" if end else ""
-        return (
-            f"{stack.folder}: metres are guessed: {facts.get('why') or _WHY}{f', the {end} slice nearest' if end else ''}; "
-            f"give one known length by `mrbokeh capture scale {stack.folder} --ruler X1,Y1,X2,Y2,METRES`{turn}"
-        )
+        way = f"give one known length by `mrbokeh capture scale {stack.folder} --ruler X1,Y1,X2,Y2,METRES`{turn}"
+        if "gauge" not in facts:
+            way = "give one known length to the stack that it was made from by `mrbokeh capture scale`, and make it again"
+        return f"{stack.folder}: metres are guessed: {facts['why']}{f', the {end} slice nearest' if end else ''}; {way}"
     guessed = guesses(stack)
-    return f"{stack.folder}: {facts.get('why')}; still guessed: {guessed}" if guessed else ""
+    return f"{stack.folder}: {facts['why']}; still guessed: {guessed}" if guessed else ""
 
 
 def guesses(stack: FocalStack) -> str:

@@ -24,6 +24,7 @@ from capture.views.lens_calibration import (
 from capture.views.lens_calibration_stacks import calibrate_scene
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera import Camera
+from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.lens import Lens
@@ -211,6 +212,8 @@ def test_stacks_of_a_lens_share_rows_of_the_same_stated_focus(tmp_path: Path) ->
 def test_a_scene_is_calibrated_with_its_depth(tmp_path: Path) -> None:
     """Half way between slices at 1 m (calibrated 1 / 0.96 + 0.02 dioptres) and 2 m (1 / 1.96)."""
     stack = replace(stack_at(tmp_path, (1.0, 2.0)), merged=True)
+    for each in stack.slices:
+        write_camera_rgb(tmp_path / each.path, np.zeros((6, 8, 3), np.float32), None)
     half = np.full((6, 8), 0.5, np.float32)
     write_merged(tmp_path, np.zeros((6, 8, 3), np.float32), half, half, np.full((6, 8), 9.0, np.float32))
     write_focal_stack(stack)
@@ -219,6 +222,7 @@ def test_a_scene_is_calibrated_with_its_depth(tmp_path: Path) -> None:
     expected = (1.0 / 0.96 + 0.02 + 1.0 / 1.96) / 2.0
     np.testing.assert_allclose(1.0 / read.depth_m(), expected, rtol=1e-5)
     assert stated_distances_m(read) == (1.0, 2.0)
+    assert (tmp_path / "depth.png").is_file() and (tmp_path / "merge.png").is_file(), "pictures show the depth as it is now"
 
 
 def test_the_command_applies_a_calibration_without_poses(tmp_path: Path) -> None:

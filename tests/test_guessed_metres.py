@@ -7,15 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture.merging.preferred_merge import PREFERRED
+from capture.views.lens_calibration_stacks import write_calibrated
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.focal_stack_dataset import read_focal_stack_dataset
 from mrbokeh.focus_places import Seen, parse_focus, slice_names
-from mrbokeh.guessed_metres import POSITION, POSITION_ERROR, metres_note, metres_notes
+from mrbokeh.guessed_metres import (
+    POSITION,
+    POSITION_ERROR,
+    SLICE_POSITION,
+    STATED_BEFORE,
+    is_lens_guessed,
+    metres_note,
+    metres_notes,
+)
 from mrbokeh.image_io import read_image, write_layer
 from mrbokeh.layer import Layer
-from mrbokeh.lens_file import write_lens
+from mrbokeh.lens_file import lens_to_json, write_lens
 from mrbokeh.lens_fitting.stack_views import StackSlices
 from mrbokeh.refocusing import leave_one_out
 from mrbokeh.renderers.scatter_reference import ScatterReference
@@ -85,8 +95,9 @@ def test_places_between_slices_and_at_pixels(known: FocalStack) -> None:
 def test_places_that_are_not_there_are_refused(known: FocalStack, text: str, match: str) -> None:
     with pytest.raises(InputError, match=match):
         parse_focus(text, Seen.of(known))
-    with pytest.raises(InputError, match="for a focal stack"):
-        parse_focus("#1")
+    for place, needed in (("#1", "a focal stack, for a picture has no slices"), ("@1,1", "needs the depth of the picture")):
+        with pytest.raises(InputError, match=needed):
+            parse_focus(place, Seen(LENS))
 
 
 def test_names_of_slices_close_together_differ() -> None:
@@ -112,6 +123,27 @@ def test_another_opening_says_how_its_blur_compares(guessed: FocalStack, tmp_pat
     half = guessed.lens_of(guessed.reference).f_number / 2
     told = run("refocus", guessed.folder, "--focus", "#1", "--f-number", half, "--out", tmp_path / "a", "--renderer", "scatter")
     assert "grows 2.00 times as fast as in the slices" in told
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_lens_is_a_guess_of_new_slices_as_of_the_old(guessed: FocalStack, tmp_path: Path, run: Run, stated: bool) -> None:
+    before = {"lens": lens_to_json(LENS) if stated else None, "camera": None}
+    write_focal_stack(replace(guessed, metadata=guessed.metadata | {STATED_BEFORE: before}))
+    run("refocus", guessed.folder, "--focus", "#1", "--out", tmp_path / "a", "--renderer", "scatter")
+    assert is_lens_guessed(read_focal_stack(tmp_path / "a")) is is_lens_guessed(read_focal_stack(guessed.folder)) is not stated
+
+
+@pytest.mark.parametrize("command", ["refocus", "transfer"])
+def test_a_lens_that_the_user_gives_is_no_guess(command: str, guessed: FocalStack, tmp_path: Path, run: Run) -> None:
+    """Its stack is in guessed metres all the same, and nothing can be told of it: its blur does not come from slices."""
+    write_lens(tmp_path / "lens.json", LENS)
+    out = tmp_path / "made"
+    run(command, guessed.folder, "--focus", "#0,#2", "--lens", tmp_path / "lens.json", "--out", out, "--renderer", "scatter")
+    made = read_focal_stack(out)
+    assert is_lens_guessed(guessed) and not is_lens_guessed(made) and not made.metres_known
+    assert "give one known length to the stack that it was made from" in metres_note(made)
+    with pytest.raises(AssertionError, match="was made from another stack" if command == "refocus" else "knows its metres"):
+        run("capture", "scale", out, "--distance-at", f"{ON_WALL},0.7")
 
 
 def test_a_slice_left_out_comes_back_as_well_as_in_true_metres(known: FocalStack, guessed: FocalStack) -> None:
@@ -352,6 +384,41 @@ def test_near_and_far_are_turned_by_one_word(known: FocalStack, tmp_path: Path, 
     assert again.lens.focal_length_mm == pytest.approx(made.lens.focal_length_mm, rel=1e-6)
 
 
+def test_what_was_preferred_turns_with_near_and_far(guessed: FocalStack, run: Run) -> None:
+    """And words of merges of former versions, which stated the guess as part of why metres are guessed, go."""
+    record = {"side": "near", "share": 0.1, "first_is_near": True, "sure": False}
+    why = "no focus distance is stated: the nearest plane of focus is put at 1 m; that the first slice is the nearest is a guess"
+    facts = guessed.metadata["metres"] | {"why": why}
+    positions = tuple(replace(each, metadata=each.metadata | {SLICE_POSITION: 3.0}) for each in guessed.slices)
+    write_focal_stack(replace(guessed, slices=positions, metadata=guessed.metadata | {"metres": facts, PREFERRED: record}))
+    for nearest, side in (("first", "near"), ("last", "far")):
+        run("capture", "scale", guessed.folder, "--nearest", nearest)
+        made = read_focal_stack(guessed.folder)
+        assert made.metadata[PREFERRED] == record | {"side": side, "first_is_near": side == "near", "sure": True}
+        assert made.metadata["metres"]["why"].endswith("put at 1 m")
+    assert made.slices[0].metadata[SLICE_POSITION] == -3.0
+
+
+def test_calibration_against_poses_turns_what_merging_guessed_wrong(known: FocalStack, guessed: FocalStack) -> None:
+    """Its depth is made from the focus index, which is that of the first slice everywhere in this stack."""
+    record = {"side": "near", "share": 0.1, "first_is_near": True, "sure": False}
+    before = replace(guessed, metadata=guessed.metadata | {PREFERRED: record})
+    positions_px = read_exr(before.depth_path)[0].channels[POSITION]
+    distances_m = known.focus_distances_m[::-1]
+    slices = [
+        replace(each, focus_distance_m=distance_m, metadata=each.metadata | {SLICE_POSITION: 2.0})
+        for each, distance_m in zip(before.slices, distances_m, strict=True)
+    ]
+    facts = {"known": True, "why": "metres rest on the camera poses"}
+    write_calibrated(before, replace(before, slices=tuple(slices), metadata=before.metadata | {"metres": facts}))
+    made = read_focal_stack(before.folder)
+    np.testing.assert_allclose(made.depth_m(), 0.7, rtol=1e-6)
+    np.testing.assert_array_equal(read_exr(made.depth_path)[0].channels[POSITION], -positions_px)
+    assert [each.metadata[SLICE_POSITION] for each in made.slices] == [-2.0] * 3
+    assert made.metadata[PREFERRED]["side"] == "far"
+    assert (made.folder / "depth.png").is_file() and (made.folder / "merge.png").is_file()
+
+
 def test_turning_keeps_a_length_that_was_told(known: FocalStack, tmp_path: Path, run: Run) -> None:
     twin = guessed_twin(known, tmp_path / "twin")
     run("capture", "scale", twin.folder, "--distance-at", f"{ON_WALL},0.7")
@@ -389,7 +456,10 @@ def test_what_cannot_be_told_is_refused(known: FocalStack, guessed: FocalStack, 
         (guessed.folder, ("--ruler", "9,9,20,9"), "--ruler: expected"),
         (guessed.folder, ("--distance-at", "9,9,-1"), "--distance-at: expected"),
         (guessed.folder, ("--distance-at", "99,9,1"), "outside the picture of 72x48"),
-        (guessed.folder, ("--distance-at", "9,9,1", "--distance", "a,b,1"), "choose"),
+        (guessed.folder, ("--distance-at", "9,9,1", "--distance", "a,b,1"), "--distance for a scene: choose"),
+        (guessed.folder, ("--distance-at", "9,9,1", "--square-mm", 30, "--marker-mm", 22), "--square-mm, --marker-mm for a scene: choose"),
+        (guessed.folder, ("--nearest", "last", "--no-calibrate"), "--no-calibrate for a scene: choose"),
+        (guessed.folder, ("--nearest", "last", "--overwrite"), "--nearest alone needs none"),
     ):
         with pytest.raises(AssertionError, match=match):
             run("capture", "scale", folder, *arguments)
@@ -427,3 +497,39 @@ def test_a_stated_focus_counts_as_a_fact(known: FocalStack, guessed: FocalStack,
     write_focal_stack(replace(guessed, slices=slices))
     run("capture", "scale", guessed.folder, "--distance-at", f"{ON_WALL},0.7")
     assert true_m(read_focal_stack(guessed.folder), known) < 1e-3
+
+
+@pytest.mark.parametrize("across", [False, True])
+def test_a_slice_stated_at_infinity_stays_there_and_one_fact_gives_the_rest(tmp_path: Path, run: Run, across: bool) -> None:
+    """The fact: how far the wall is, or a length from the card to the wall."""
+    known = make_card_stack(tmp_path / "known", 3, (0.5, 0.7, float("inf")))
+    twin = guessed_twin(known, tmp_path / "twin")
+    write_focal_stack(_with_farthest_at_infinity(twin))
+    points = [np.array([(x - SIZE[1] / 2) / twin_focal_px(twin), 0.0, 1.0]) * z for x, z in ((10, 0.5), (60, 0.7))]
+    ruler = ("--ruler", f"{ON_CARD},{ON_WALL},{np.linalg.norm(points[0] - points[1])}")
+    told = run("capture", "scale", twin.folder, *(ruler if across else ("--distance-at", f"{ON_WALL},0.7")))
+    made = read_focal_stack(twin.folder)
+    assert made.focus_distances_m == pytest.approx((0.5, 0.7, float("inf")), rel=1e-4)
+    assert made.metres_known and "how deep the scene is" not in told
+    for index in range(3):
+        np.testing.assert_allclose(made.coc_px(index, made.depth_m()), known.coc_px(index, known.depth_m()), atol=1e-3)
+    with pytest.raises(AssertionError, match="knows its nearest slice from its distances"):
+        run("capture", "scale", twin.folder, "--nearest", "last")
+
+
+def twin_focal_px(twin: FocalStack) -> float:
+    assert twin.camera is not None
+    return twin.camera.focal_px[0]
+
+
+def _with_farthest_at_infinity(twin: FocalStack) -> FocalStack:
+    """A twin whose last slice, which it takes to be focused at 2 m, states infinity: all is half a dioptre farther."""
+    part = read_exr(twin.depth_path)[0]
+    depth_m = (1.0 / (1.0 / part.channels["Z"] - 0.5)).astype(np.float32)
+    write_exr(twin.depth_path, replace(part, channels=dict(part.channels) | {"Z": depth_m}))
+    slices = tuple(replace(each, focus_distance_m=1.0 / (1.0 / float(each.focus_distance_m or 0.0) - 0.5)) for each in twin.slices[:2])
+    last = twin.slices[2]
+    last = replace(last, focus_distance_m=float("inf"), metadata=last.metadata | {"stated_focus_distance_m": "inf"})
+    gauge = twin.metadata["metres"]["gauge"] | {"offset_dioptres": 0.0, "offset_from": "distances"}
+    facts = twin.metadata["metres"] | {"gauge": gauge}
+    return replace(twin, slices=(*slices, last), metadata=twin.metadata | {"metres": facts})

@@ -13,7 +13,7 @@ from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
 from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from mrbokeh.focus_places import parse_focus
+from mrbokeh.focus_places import Seen, parse_focus
 from mrbokeh.image_metrics import psnr
 from mrbokeh.layer import Layer
 from mrbokeh.lens_file import write_lens
@@ -131,6 +131,8 @@ def test_the_command_writes_a_focal_stack(tmp_path: Path) -> None:
     np.testing.assert_array_equal(made.slice_rgb(1), stack.slice_rgb(1))
     np.testing.assert_array_equal(made.all_in_focus(), stack.all_in_focus())
     np.testing.assert_array_equal(made.depth_m(), stack.depth_m())
+    # The card at 0.5 m lies before the first new slice, the wall at 0.7 m between those at 0.55 m and at infinity.
+    np.testing.assert_allclose(made.focus_index()[24, [10, 60]], [0.0, 1.0 + (1 / 0.55 - 1 / 0.7) * 0.55], atol=1e-6)
     assert psnr(made.slice_rgb(0), stack.slice_rgb(0)) < 60 and (tmp_path / "sheet.png").stat().st_size > 500
     with pytest.raises(InputError, match="--overwrite"):
         run(stack.folder, "--focus", "0.52", "--out", tmp_path / "new")
@@ -180,13 +182,13 @@ def test_an_interrupted_run_goes_on_and_other_settings_start_anew(tmp_path: Path
 @pytest.mark.parametrize("text", ["", "0.8,0.8", "-1", "a", "1:2", "0:2:3"])
 def test_odd_distances_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="--focus"):
-        parse_focus(text)
+        parse_focus(text, Seen(LENS))
 
 
 def test_distances_evenly_in_dioptres() -> None:
     """From 0.5 m to infinity in five: 2, 1.5, 1, 0.5 and 0 dioptres."""
-    assert parse_focus("0.5:inf:5") == pytest.approx((0.5, 2 / 3, 1.0, 2.0, float("inf")))
-    assert parse_focus("0.8,inf") == (0.8, float("inf"))
+    assert parse_focus("0.5:inf:5", Seen(LENS)) == pytest.approx((0.5, 2 / 3, 1.0, 2.0, float("inf")))
+    assert parse_focus("0.8,inf", Seen(LENS)) == (0.8, float("inf"))
 
 
 # ---- one virtual scene in all slices

@@ -7,6 +7,7 @@ import typer
 
 from mrbokeh.errors import InputError
 
+_DICTIONARY = "DICT_4X4_50"
 HELP = "\n\n".join(
     (
         "Find how many metres the unit of the camera poses is: from a ChArUco board in the scene, from a measured distance between two "
@@ -39,7 +40,7 @@ def scale_command(
     ] = None,
     square_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a square as measured on the print")] = None,
     marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
-    dictionary: Annotated[str, typer.Option(help="of cv2.aruco")] = "DICT_4X4_50",
+    dictionary: Annotated[str, typer.Option(help="of cv2.aruco")] = _DICTIONARY,
     distance: Annotated[str | None, typer.Option(metavar="VIEW_A,VIEW_B,METRES", help="between two camera centres")] = None,
     lens_calibration: Annotated[
         Path | None, typer.Option(metavar="FILE", help="only put this calibration to use on the stacks; poses are not needed")
@@ -65,10 +66,19 @@ def scale_command(
     from capture.views.scale_text import scale_lines
 
     if ruler or distance_at or nearest:
-        if board or distance or lens_calibration:
-            raise InputError(
-                "--ruler, --distance-at and --nearest are for one stack, --board, --distance and --lens-calibration for a scene: choose"
-            )
+        of_scenes = {
+            "--board": board,
+            "--square-mm": square_mm,
+            "--marker-mm": marker_mm,
+            "--dictionary": dictionary != _DICTIONARY,
+            "--distance": distance,
+            "--lens-calibration": lens_calibration,
+            "--no-calibrate": not calibrate,
+        }
+        if given := [name for name, value in of_scenes.items() if value is not None and value is not False]:
+            raise InputError(f"--ruler, --distance-at and --nearest are for one stack, {', '.join(given)} for a scene: choose")
+        if overwrite and not (ruler or distance_at):
+            raise InputError("--overwrite drops lengths and distances told before, in favour of new ones: --nearest alone needs none")
         _tell(scene, ruler or [], distance_at or [], nearest, overwrite)
         return
     if lens_calibration is not None:
@@ -81,7 +91,8 @@ def scale_command(
 
 
 def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | None, overwrite: bool) -> None:
-    from capture.views.stack_metres import Fact, lines_of, parse_known_distance, parse_length, tell_metres, tell_nearest
+    from capture.merging.known_metres import Fact, parse_known_distance, parse_length
+    from capture.merging.stack_metres import lines_of, tell_metres, tell_nearest
     from mrbokeh.focal_stack import find_focal_stacks
     from mrbokeh.guessed_metres import metres_note
 

@@ -80,7 +80,9 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
     merged = _with_highlights(merged, restored)
     if stack.is_metric:
-        write_merged(stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus), stack.rec709_from_camera)
+        write_merged(
+            stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus.focus_index), stack.rec709_from_camera
+        )
     else:
         write_camera_rgb(stack.all_in_focus_path, sharp, stack.rec709_from_camera, half=False)
         merged = with_solved_blur(merged, slices, sharp, focus)

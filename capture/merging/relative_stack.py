@@ -7,7 +7,6 @@ plane of focus is twice as far as the nearest, and without any of that they lie 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,24 +21,23 @@ from mrbokeh.camera import Camera
 from mrbokeh.camera_file import camera_from_json, camera_to_json
 from mrbokeh.camera_rgb import half_of
 from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import FocalStack, Slice
+from mrbokeh.focal_stack import GROWTH, GROWTH_WIDTH, METRES, FocalStack, Slice
+from mrbokeh.guessed_metres import POSITION, POSITION_ERROR, SLICE_POSITION, SLICE_POSITION_ERROR, STATED_BEFORE, STATED_DISTANCE
 from mrbokeh.lens import Lens
 from mrbokeh.lens_file import lens_from_json, lens_to_json
 
-METRES = "metres"
-"""Key in a stack's metadata: known (whether its metres are), why (in words), gauge (numbers)."""
-STATED = "stated_before_guessing"
-STATED_DISTANCE = "stated_focus_distance_m"
-POSITION = "blur_position_px"
 ORDER = "order_by_focus"
 """Key in a stack's metadata: said in words that its slices were put in the order of their focus, which their names are not."""
 GIVEN_INDEX = "given_index"
+FROM_DISTANCES = "stated distances"
+"""Source of a direction that these tell."""
 _NEAREST_DIOPTRES, _FARTHEST_DIOPTRES = 1.0, 0.5
 _FAR_OVER_NEAR = 2.0
 _LEAST_DIOPTRES = 1e-3
 _LEAST_RANGE_PX = 0.5
 _NEAREST_SHARE = 0.8
-"""Of the reciprocal of the focal length: nearer a lens is not taken to focus."""
+"""Share of the reciprocal of the focal length: nearer a lens is not taken to focus."""
+_LENS_FACTS = ("focal_length_mm", "f_number", "sensor_width_mm")
 _SENSOR_MM, _FOCAL_LENGTH_MM = 36.0, 35.0
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -69,10 +67,10 @@ class Gauge:
 def as_stated(stack: FocalStack) -> FocalStack:
     """The stack with nothing in it that an earlier merge guessed, and its slices in the order in which they came."""
     stack = _in_given_order(stack)
-    if STATED not in stack.metadata:
+    if STATED_BEFORE not in stack.metadata:
         return stack
-    kept: Mapping[str, Any] = stack.metadata[STATED]
-    metadata = {key: value for key, value in stack.metadata.items() if key not in (STATED, METRES)}
+    kept: Mapping[str, Any] = stack.metadata[STATED_BEFORE]
+    metadata = {key: value for key, value in stack.metadata.items() if key not in (STATED_BEFORE, METRES)}
     return replace(
         stack,
         slices=tuple(_stated_slice(each) for each in stack.slices),
@@ -83,7 +81,7 @@ def as_stated(stack: FocalStack) -> FocalStack:
 
 
 def _stated_slice(each: Slice) -> Slice:
-    ours = (STATED_DISTANCE, POSITION, "blur_position_error_px", "px_per_dioptre", "px_per_dioptre_width_px")
+    ours = (STATED_DISTANCE, SLICE_POSITION, SLICE_POSITION_ERROR, GROWTH, GROWTH_WIDTH)
     stated = each.metadata.get(STATED_DISTANCE)
     metadata = {key: value for key, value in each.metadata.items() if key not in ours}
     return replace(each, focus_distance_m=None if stated is None else float(stated), metadata=metadata)
@@ -123,29 +121,34 @@ def with_solved_blur(merged: FocalStack, slices: RegisteredSlices, all_in_focus:
     relative = solve_relative_focus(passing, all_in_focus, index, confidence, len(merged), slices.valid, slices.saturated)
     scales, as_given = [each.scale for each in merged.slices], ORDER not in merged.metadata
     direction = told_direction(merged, relative) or contours.direction(relative.positions_px, scales, as_given)
-    guessed = with_guessed_metres(merged, relative, direction, (all_in_focus.shape[1], all_in_focus.shape[0]))
-    write_relative_depth(guessed, index, confidence, relative, direction)
+    size_px = all_in_focus.shape[1], all_in_focus.shape[0]
+    gauge = gauge_of(merged, nearness_px(relative.positions_px, direction), size_px)
+    guessed = with_guessed_metres(merged, relative, direction, gauge, size_px)
+    write_relative_depth(guessed, focus, relative, direction, gauge)
     return guessed
 
 
 def told_direction(stack: FocalStack, relative: RelativeFocus) -> Direction | None:
-    """The one that two or more stated distances tell."""
+    """The one that two or more stated distances tell, or one at infinity, beyond which nothing lies."""
     told = [(p, 1.0 / d) for p, d in zip(relative.positions_px, stack.focus_distances_m, strict=True) if d is not None]
-    if len(told) < 2 or np.ptp([d for _, d in told]) == 0.0:
-        return None
-    slope = np.polyfit([p for p, _ in told], [d for _, d in told], 1)[0]
-    return Direction(near_first=bool(slope < 0), source="stated distances", sure=True)
+    if len({d for _, d in told}) > 1:
+        slope = np.polyfit([p for p, _ in told], [d for _, d in told], 1)[0]
+        return Direction(near_first=bool(slope < 0), source=FROM_DISTANCES, sure=True)
+    middle_px = 0.5 * (relative.positions_px[0] + relative.positions_px[-1])
+    far_last = {bool(p > middle_px) for p, d in told if d == 0.0}
+    return Direction(near_first=far_last.pop(), source=FROM_DISTANCES, sure=True) if len(far_last) == 1 else None
 
 
-def with_guessed_metres(stated: FocalStack, relative: RelativeFocus, direction: Direction, size_px: tuple[int, int]) -> FocalStack:
+def with_guessed_metres(
+    stated: FocalStack, relative: RelativeFocus, direction: Direction, gauge: Gauge, size_px: tuple[int, int]
+) -> FocalStack:
     """The merged stack, in which nothing is guessed yet, with a focus distance for every slice, a lens that blurs as solved and a camera.
 
     size_px: (width, height).
     """
     positions_px = nearness_px(relative.positions_px, direction)
-    gauge = gauge_of(stated, positions_px, size_px)
-    dioptres = gauge.dioptres(positions_px)
-    distances_m = [1.0 / float(each) if each_stated is None else each_stated for each, each_stated in _paired(dioptres, stated)]
+    found = zip(gauge.dioptres(positions_px), stated.focus_distances_m, strict=True)
+    distances_m = [1.0 / float(dioptres) if stated_m is None else stated_m for dioptres, stated_m in found]
     growth = gauge.px_per_dioptre
     slices = tuple(
         replace(
@@ -154,11 +157,11 @@ def with_guessed_metres(stated: FocalStack, relative: RelativeFocus, direction: 
             metadata=each.metadata
             | {
                 STATED_DISTANCE: _json_number(each.focus_distance_m),
-                POSITION: float(position),
-                "blur_position_error_px": float(error),
+                SLICE_POSITION: float(position),
+                SLICE_POSITION_ERROR: float(error),
                 # Blur grows alike in all registered slices, so less in those that registration enlarged.
-                "px_per_dioptre": growth / each.scale,
-                "px_per_dioptre_width_px": size_px[0],
+                GROWTH: growth / each.scale,
+                GROWTH_WIDTH: size_px[0],
             },
         )
         for each, distance_m, position, error in zip(stated.slices, distances_m, positions_px, relative.errors_px, strict=True)
@@ -168,8 +171,8 @@ def with_guessed_metres(stated: FocalStack, relative: RelativeFocus, direction: 
         "lens": None if stated.lens is None else lens_to_json(stated.lens),
         "camera": None if stated.camera is None else camera_to_json(stated.camera),
     }
-    facts = {"known": gauge.known, "why": _why(gauge, stated), "gauge": _gauge_json(gauge, direction, distances_m)}
-    metadata = stated.metadata | {METRES: facts, STATED: before}
+    facts = {"known": gauge.known, "why": _why(gauge, stated), "gauge": _gauge_json(gauge, direction)}
+    metadata = stated.metadata | {METRES: facts, STATED_BEFORE: before}
     return replace(stated, slices=slices, lens=lens, camera=stated.camera or _camera(lens, size_px), metadata=metadata)
 
 
@@ -196,29 +199,27 @@ def gauge_of(stated: FocalStack, positions_px: Float[np.ndarray, " slices"], siz
         # The farthest plane is at D, the nearest at twice that; the stated one lies between them as its position does.
         shares = [1.0 + (_FAR_OVER_NEAR - 1.0) * (p - farthest_px) / spread_px for p, _ in told]
         farthest = float(np.mean([d / share for (_, d), share in zip(told, shares, strict=True)]))
-        growth = spread_px / max((_FAR_OVER_NEAR - 1.0) * farthest, _LEAST_DIOPTRES)
+        if farthest < _LEAST_DIOPTRES:
+            # At infinity: twice that is no depth to guess. Where the slices lie is known, how deep they go is as if nothing were.
+            growth = spread_px / (_NEAREST_DIOPTRES - _FARTHEST_DIOPTRES)
+            return Gauge(growth, float(np.mean([d - p / growth for p, d in told])), "guess", "distances")
+        growth = spread_px / ((_FAR_OVER_NEAR - 1.0) * farthest)
         return Gauge(growth, farthest - farthest_px / growth, "guess", "distances")
     growth = spread_px / (_NEAREST_DIOPTRES - _FARTHEST_DIOPTRES)
     return Gauge(growth, _FARTHEST_DIOPTRES - farthest_px / growth, "guess", "guess")
 
 
-def write_relative_depth(stack: FocalStack, focus_index: Plane, confidence: Plane, relative: RelativeFocus, direction: Direction) -> None:
-    """depth.exr of a stack of `with_guessed_metres`: with Z in its metres, and blur_position and blur_position_error in pixels."""
+def write_relative_depth(stack: FocalStack, focus: FocusMap, relative: RelativeFocus, direction: Direction, gauge: Gauge) -> None:
+    """Write depth.exr of a stack of `with_guessed_metres`: with Z in its metres, and where surfaces lie in pixels of blur."""
     position_px = nearness_px(relative.focus_px, direction).astype(np.float32)
-    gauge = stack.metadata[METRES]["gauge"]
-    dioptres = np.maximum(gauge["offset_dioptres"] + position_px / gauge["px_per_dioptre"], _LEAST_DIOPTRES)
     channels = {
-        "focus_index": focus_index,
-        "confidence": half_of(confidence),
-        "Z": (1.0 / dioptres).astype(np.float32),
-        "blur_position": position_px,
-        "blur_position_error": half_of(relative.error_px),
+        "focus_index": focus.focus_index,
+        "confidence": half_of(focus.confidence),
+        "Z": (1.0 / gauge.dioptres(position_px)).astype(np.float32),
+        POSITION: position_px,
+        POSITION_ERROR: half_of(relative.error_px),
     }
-    write_exr(Path(stack.folder) / "depth.exr", ExrPart(channels), compress=False)
-
-
-def _paired(dioptres: Float[np.ndarray, " slices"], stated: FocalStack) -> zip:
-    return zip(dioptres, stated.focus_distances_m, strict=True)
+    write_exr(stack.depth_path, ExrPart(channels), compress=False)
 
 
 def _stated_growth(stated: FocalStack, width_px: int) -> float | None:
@@ -238,10 +239,9 @@ def _focuses(stated: FocalStack, dioptres: float) -> bool:
 def _stated_lens(stated: FocalStack) -> dict[str, float] | None:
     """focal_length_mm, f_number and sensor_width_mm, where all are known."""
     if stated.lens is not None:
-        return {name: getattr(stated.lens, name) for name in ("focal_length_mm", "f_number", "sensor_width_mm")}
+        return {name: getattr(stated.lens, name) for name in _LENS_FACTS}
     facts = stated.metadata.get("optics") or {}
-    names = ("focal_length_mm", "f_number", "sensor_width_mm")
-    return {name: float(facts[name]) for name in names} if all(facts.get(name) for name in names) else None
+    return {name: float(facts[name]) for name in _LENS_FACTS} if all(facts.get(name) for name in _LENS_FACTS) else None
 
 
 def _nominal_lens(stated: FocalStack, size_px: tuple[int, int], growth: float, focus_m: float, nearest_m: float) -> Lens:
@@ -274,14 +274,12 @@ def _why(gauge: Gauge, stated: FocalStack) -> str:
     return f"{blur}; no focus distance is stated: the nearest plane of focus is put at 1 m and the farthest at 2 m"
 
 
-def _gauge_json(gauge: Gauge, direction: Direction, distances_m: list[float]) -> dict[str, Any]:
+def _gauge_json(gauge: Gauge, direction: Direction) -> dict[str, Any]:
     return {
         "px_per_dioptre": gauge.px_per_dioptre,
         "offset_dioptres": gauge.offset_dioptres,
         "scale_from": gauge.scale_from,
         "offset_from": gauge.offset_from,
-        "nearest_m": min(distances_m),
-        "farthest_m": _json_number(max(distances_m)),
         "near_first": direction.near_first,
         "near_first_from": direction.source,
         "near_first_sure": direction.sure,

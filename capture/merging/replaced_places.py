@@ -5,22 +5,23 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from capture.merging.depth_from_focus import FocusMap
 from mrbokeh.focal_stack import FocalStack
-from mrbokeh.guessed_metres import POSITION, POSITION_ERROR
+from mrbokeh.guessed_metres import POSITION, POSITION_ERROR, SLICE_POSITION, SLICE_POSITION_ERROR
 
-_OF_SLICES = {POSITION: "blur_position_px", POSITION_ERROR: "blur_position_error_px"}
+_OF_SLICES = {POSITION: SLICE_POSITION, POSITION_ERROR: SLICE_POSITION_ERROR}
+_LEAST_DIOPTRES = 1e-6
 
 Plane = Float32[np.ndarray, "height width"]
 Channels = dict[str, Float[np.ndarray, "height width"]]
 
 
-def depth_m_of(stack: FocalStack, focus: FocusMap) -> Plane | None:
-    """The focus index in metres, interpolated in dioptres; None where a focus distance is unknown."""
+def depth_m_of(stack: FocalStack, focus_index: Plane) -> Plane | None:
+    """Return the focus index in metres, interpolated in dioptres; None where a focus distance is unknown."""
     if not stack.is_metric:
         return None
     dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
-    return (1.0 / np.maximum(focus.dioptres(dioptres), 1e-6)).astype(np.float32)
+    interpolated = np.interp(focus_index, np.arange(len(stack)), dioptres)
+    return (1.0 / np.maximum(interpolated, _LEAST_DIOPTRES)).astype(np.float32)
 
 
 def replaced_depth(
@@ -31,8 +32,7 @@ def replaced_depth(
     where: Bool[np.ndarray, "height width"],
 ) -> Channels:
     """Return the channels of depth.exr with another focus index and confidence in some places, and all that follows from the index."""
-    depth_m = depth_m_of(stack, FocusMap(index, confidence))
-    new: dict[str, Plane | None] = {"focus_index": index, "confidence": confidence, "Z": depth_m}
+    new: dict[str, Plane | None] = {"focus_index": index, "confidence": confidence, "Z": depth_m_of(stack, index)}
     for channel, key in _OF_SLICES.items():
         values = [each.metadata.get(key) for each in stack.slices]
         known = channel in channels and None not in values

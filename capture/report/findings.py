@@ -12,8 +12,8 @@ from capture.report.picture_evidence import PictureFindings
 from capture.report.registration_drift import RegistrationDrift, registration_drift
 from capture.report.slice_fit import SliceFit
 from capture.stacks.sentinel_focus import stated_by_sentinel
-from capture.views.lens_calibration import STATED_KEY
 from mrbokeh.focal_stack import FocalStack
+from mrbokeh.guessed_metres import STATED_DISTANCE
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class StackFindings:
         """None where focus distances are not known."""
         if not self.stack.is_metric:
             return None
-        calibrated = np.array([STATED_KEY in each.metadata for each in self.stack.slices], bool)
+        calibrated = np.array([STATED_DISTANCE in each.metadata for each in self.stack.slices], bool)
         known = calibrated | ~stated_by_sentinel(self.stack)
         return focus_spacing([each for each in self.stack.focus_distances_m if each is not None], known)
 

@@ -23,8 +23,7 @@ from capture.views.sparse_model import SparseModel, SparseView
 from mrbokeh.aperture import Aperture
 from mrbokeh.color import luminance
 from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.guessed_metres import KEY
+from mrbokeh.focal_stack import METRES, FocalStack
 from mrbokeh.progress import track
 
 _WIDEST_PX = 1600
@@ -69,8 +68,8 @@ def reduced(plane: Plane, factor: int) -> Float32[np.ndarray, "reduced_height re
 
 
 def focus_start(stack: FocalStack, sample: FocusSample, metres_per_unit: float, offset_m: float, width_px: int) -> FocusStart:
-    """As stated, less the offset of the lens, and hardly trusted where a sentinel stated it; where distances are unknown, the points that
-    are sharpest in each slice.
+    """Start as stated, less the offset of the lens, and hardly trusting a sentinel; where distances are unknown, from the points that are
+    sharpest in each slice.
     """
     count = len(stack)
     growth = np.ones(count)
@@ -104,10 +103,10 @@ def calibrated_stack(found: StackFocus, view: SparseView) -> FocalStack:
 
 
 def _with_known_metres(stack: FocalStack) -> FocalStack:
-    """Where metres were guessed before, they rest on the camera poses now."""
-    if KEY not in stack.metadata:
+    """Say of a stack whose metres were guessed before that they rest on the camera poses now."""
+    if METRES not in stack.metadata:
         return stack
-    return replace(stack, metadata=stack.metadata | {KEY: {"known": True, "why": "metres rest on the camera poses"}})
+    return replace(stack, metadata=stack.metadata | {METRES: {"known": True, "why": "metres rest on the camera poses"}})
 
 
 def with_view(stack: FocalStack, view: SparseView) -> FocalStack:

@@ -13,12 +13,12 @@ import numpy as np
 
 from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice
+from mrbokeh.focal_stack import GROWTH, GROWTH_WIDTH, FocalStack, Slice
+from mrbokeh.guessed_metres import STATED_DISTANCE
 
 FORMAT = "mrbokeh-lens-calibration"
 VERSION = 1
 FILE_NAME = "lens_calibration.json"
-STATED_KEY = "stated_focus_distance_m"
 
 _LENS_DIFFERS = 0.01
 
@@ -95,10 +95,10 @@ def apply_lens_calibration(stack: FocalStack, calibration: LensCalibration) -> F
 
 def with_calibrated_focus(each: Slice, stated_m: float | None, dioptre: float, px_per_dioptre: float, width_px: int) -> Slice:
     """px_per_dioptre: of the photograph at width_px; what is registered has it times the slice's scale."""
-    told = {"px_per_dioptre": px_per_dioptre, "px_per_dioptre_width_px": width_px}
+    told = {GROWTH: px_per_dioptre, GROWTH_WIDTH: width_px}
     stated = "inf" if stated_m == float("inf") else stated_m
     distance_m = 1.0 / dioptre if dioptre > 0 else float("inf")
-    return replace(each, focus_distance_m=distance_m, metadata=each.metadata | told | {STATED_KEY: stated})
+    return replace(each, focus_distance_m=distance_m, metadata=each.metadata | told | {STATED_DISTANCE: stated})
 
 
 def focused_stack(stack: FocalStack, slices: Sequence[Slice]) -> FocalStack:
@@ -109,7 +109,7 @@ def focused_stack(stack: FocalStack, slices: Sequence[Slice]) -> FocalStack:
 
 def stated_distances_m(stack: FocalStack) -> tuple[float | None, ...]:
     """What the camera or the user stated, also after a calibration has put its own distances in their place."""
-    stated = (each.metadata.get(STATED_KEY, each.focus_distance_m) for each in stack.slices)
+    stated = (each.metadata.get(STATED_DISTANCE, each.focus_distance_m) for each in stack.slices)
     return tuple(None if each is None else float(each) for each in stated)
 
 

@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
-
+from capture.merging.changed_metres import with_known_nearest, write_changed_metres
+from capture.merging.replaced_places import depth_m_of
 from capture.views.lens_calibration import LensCalibration, apply_lens_calibration, check_lens
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack
-
-_FARTHEST_DIOPTRE = 1e-6
+from mrbokeh.guessed_metres import is_near_first
 
 
 def calibrate_scene(scene: Path, calibration: LensCalibration) -> list[FocalStack]:
@@ -17,20 +15,16 @@ def calibrate_scene(scene: Path, calibration: LensCalibration) -> list[FocalStac
     for stack in stacks:
         check_lens(stack, calibration)
     changed = [apply_lens_calibration(stack, calibration) for stack in stacks]
-    for stack in changed:
-        if stack.merged:
-            write_depth(stack)
-        write_focal_stack(stack)
+    for before, after in zip(stacks, changed, strict=True):
+        if after.merged:
+            write_calibrated(before, after)
+        else:
+            write_focal_stack(after)
     return changed
 
 
-def write_depth(stack: FocalStack) -> None:
-    """Depth in metres anew from the focus index, interpolated in dioptres."""
-    parts = read_exr(stack.depth_path)
-    channels = dict(parts[0].channels)
-    if "focus_index" not in channels:
-        return
-    dioptres = np.array([1.0 / distance for distance in stack.focus_distances_m if distance is not None])
-    interpolated = np.interp(channels["focus_index"], np.arange(len(stack)), dioptres)
-    channels["Z"] = (1.0 / np.maximum(interpolated, _FARTHEST_DIOPTRE)).astype(np.float32)
-    write_exr(stack.depth_path, ExrPart(channels))
+def write_calibrated(before: FocalStack, after: FocalStack) -> None:
+    """Write a merged stack with other focus distances, and its depth in metres anew from the focus index."""
+    depth_m, turned = depth_m_of(after, after.focus_index()), is_near_first(before) != is_near_first(after)
+    assert depth_m is not None, f"{after.folder}: calibrated stacks are metric"
+    write_changed_metres(with_known_nearest(after, turned), depth_m, turned)

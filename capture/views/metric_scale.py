@@ -12,7 +12,7 @@ from capture.views.colmap_job import job_from_json
 from capture.views.focus_calibration_stacks import StackFocus, calibrated_stack, focus_start, lens_calibrations, stack_focus, with_view
 from capture.views.lens_calibration import FILE_NAME as CALIBRATION_NAME
 from capture.views.lens_calibration import LensCalibration, write_lens_calibration
-from capture.views.lens_calibration_stacks import write_depth
+from capture.views.lens_calibration_stacks import write_calibrated
 from capture.views.scale_answer import ScaleAnswer
 from capture.views.scale_board import board_scale
 from capture.views.scale_distance import distance_scale
@@ -25,6 +25,7 @@ from mrbokeh.charuco.board import CharucoBoard
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME as STACK_NAME
 from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack
+from mrbokeh.guessed_metres import metres_facts
 
 RECONSTRUCTION_FOLDER = "reconstruction"
 JOB_NAME = "colmap_job.json"
@@ -151,9 +152,10 @@ def _calibrated(
     for name, stack in stacks.items():
         view = metric.view(name)
         changed = calibrated_stack(calibrated[name], view) if name in calibrated else with_view(stack, view)
-        if changed.metres_known and not stack.metres_known:
-            write_depth(changed)
-        write_focal_stack(changed)
+        if name in calibrated and metres_facts(changed):
+            write_calibrated(stack, changed)
+        else:
+            write_focal_stack(changed)
     return ScaledScene(result, calibrated, uncalibrated, calibrations)
 
 

@@ -60,21 +60,20 @@ def is_transferred(folder: Path) -> bool:
 def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tuple[float, ...], blurred: Blurred) -> None:
     from mrbokeh.atomic_files import atomic_folder
     from mrbokeh.focal_stack import write_focal_stack, write_merged
-    from mrbokeh.focus_places import slice_names
-    from mrbokeh.guessed_metres import KEY, metres_facts
+    from mrbokeh.focus_places import index_between, slice_names
+    from mrbokeh.guessed_metres import inherited_facts
     from mrbokeh.image_io import write_image
 
     slices = tuple(map(Slice, slice_names(distances_m), distances_m))
     depth = sharp.depth
-    order = np.argsort([1.0 / each for each in distances_m])
-    index = np.interp(depth.dioptres, np.sort([1.0 / each for each in distances_m]), order).astype(np.float32)
+    index = index_between(distances_m, depth.dioptres)
     if out.is_dir() and is_transferred(out):
         shutil.rmtree(out)
     with atomic_folder(out) as folder:
         for each, distance_m in zip(slices, track(distances_m, "blurring"), strict=True):
             write_image(folder / each.path, blurred(distance_m), half=False)
         write_merged(folder, sharp.photograph.rgb, index, depth.valid.astype(np.float32), depth.depth_m)
-        metadata = {_MADE: depth.note} | ({KEY: dict(metres_facts(sharp.stack))} if sharp.stack and metres_facts(sharp.stack) else {})
+        metadata = {_MADE: depth.note} | ({} if sharp.stack is None else inherited_facts(sharp.stack, with_lens=False))
         made = FocalStack(folder, slices, lens.focused_at(distances_m[0]), registered=True, merged=True, metadata=metadata)
         write_focal_stack(made)
 

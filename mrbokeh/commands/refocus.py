@@ -1,6 +1,5 @@
 """`mrbokeh refocus`: new slices of a focal stack at any focus, with its own lens or another."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -52,9 +51,9 @@ def refocus(
     Example: mrbokeh refocus STACK --focus @300,200,#2.5 --out refocused
     """
     from mrbokeh.atomic_files import require_safe_outputs
-    from mrbokeh.focal_stack import read_focal_stack, write_focal_stack, write_merged
+    from mrbokeh.focal_stack import read_focal_stack, write_focal_stack
     from mrbokeh.focus_places import Seen, parse_focus
-    from mrbokeh.guessed_metres import metres_note, unit_of
+    from mrbokeh.guessed_metres import inherited_facts, metres_note, unit_of
     from mrbokeh.image_io import require_suffix
     from mrbokeh.interrupts import kept_when_interrupted
 
@@ -74,22 +73,25 @@ def refocus(
     settings = {"stack": str(stack.resolve()), "f_number": f_number, "lens": str(lens), "renderer": renderer, "residuals": residuals}
     with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
         slices = _write_slices(way, distances_m, out, settings, overwrite)
-    write_merged(out, source.all_in_focus(), source.focus_index(), source.depth_confidence(), source.depth_m())
-    shutil.copyfile(source.depth_path, out / source.depth_path.name)  # with all that the source knows
-    made = FocalStack(
-        out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata=_metadata(source, settings)
-    )
+    metadata = {"refocused": settings} | inherited_facts(source, with_lens=way.lens is None)
+    made = FocalStack(out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata=metadata)
+    _write_sharp(source, made, distances_m)
     write_focal_stack(made)
     if sheet is not None:
         _write_sheet(sheet, made)
     typer.echo(f"wrote {out} ({len(slices)} slices, in focus at {', '.join(f'{each:.3g}' for each in distances_m)} {unit_of(source)})")
 
 
-def _metadata(source: FocalStack, settings: dict) -> dict:
-    """What of the source's holds for its new slices too: what its metres rest on."""
-    from mrbokeh.guessed_metres import KEY
+def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float, ...]) -> None:
+    """Write all_in_focus.exr and depth.exr with all that the source knows, its focus index counted in the new slices."""
+    from mrbokeh.camera_rgb import write_camera_rgb
+    from mrbokeh.exr_io import read_exr, write_exr
+    from mrbokeh.focus_places import index_between
 
-    return {"refocused": settings} | {name: source.metadata[name] for name in (KEY,) if name in source.metadata}
+    write_camera_rgb(made.all_in_focus_path, source.all_in_focus(), None, half=False)
+    part = read_exr(source.depth_path)[0]
+    index = index_between(distances_m, 1.0 / source.depth_m())
+    write_exr(made.depth_path, replace(part, channels=dict(part.channels) | {"focus_index": index}), compress=False)
 
 
 def _make_room(out: Path, overwrite: bool) -> None:
@@ -143,10 +145,12 @@ def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, se
 
 def _growth(way: Refocusing, distance_m: float) -> dict:
     """How fast blur grows in a new slice, where that was measured of the captured ones."""
-    width_px = way.stack.slices[0].metadata.get("px_per_dioptre_width_px")
+    from mrbokeh.focal_stack import GROWTH, GROWTH_WIDTH
+
+    width_px = way.stack.slices[0].metadata.get(GROWTH_WIDTH)
     if way.lens is not None or width_px is None:
         return {}
-    return {"px_per_dioptre": way.lens_at(distance_m).coc_px_per_dioptre(width_px), "px_per_dioptre_width_px": width_px}
+    return {GROWTH: way.lens_at(distance_m).coc_px_per_dioptre(width_px), GROWTH_WIDTH: width_px}
 
 
 def _times_as_fast(way: Refocusing) -> float:

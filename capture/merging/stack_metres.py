@@ -3,6 +3,7 @@
 Its dioptres are known up to D' = p + q D, for blur in pixels is the same with px_per_dioptre / q. The rule: what the photographs state
 stays (a stated lens fixes q = 1, a stated focus distance counts as one more fact); the facts told fix the rest by least squares of their
 relative errors; and where facts lie at one depth only, the world is scaled as a whole (p = 0), which keeps proportions that are guessed.
+So it is where a slice is stated at infinity, which stays there: then one fact gives all.
 Blur looks alike on both sides of the focus: where merging had to guess which end of the sweep is near, facts at two depths tell (q < 0).
 """
 
@@ -14,21 +15,28 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import least_squares
 
-from capture.merging.merged_pictures import write_depth_picture
-from capture.views.lens_calibration import STATED_KEY
+from capture.merging.changed_metres import with_known_nearest, write_changed_metres
+from capture.merging.known_metres import NEAREST_OPTION, Fact, told_facts
+from capture.merging.relative_stack import FROM_DISTANCES
 from mrbokeh.camera import Camera
 from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr, write_exr
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.guessed_metres import KEY, POSITION, POSITION_ERROR, guesses, is_lens_guessed, is_near_first, is_view_guessed, metres_facts
+from mrbokeh.exr_io import read_exr
+from mrbokeh.focal_stack import GROWTH, METRES, FocalStack, Slice
+from mrbokeh.guessed_metres import (
+    POSITION_ERROR,
+    STATED_DISTANCE,
+    TOLD,
+    guesses,
+    is_lens_guessed,
+    is_near_first,
+    is_view_guessed,
+    metres_facts,
+)
 from mrbokeh.lens import Lens
-from mrbokeh.stack_pictures import write_merge_sheet
 
-FACTS = "told"
-_SLICE_POSITION, _GROWTH = "blur_position_px", "px_per_dioptre"
 _NEAR_PIXEL_PX = 2
 _FARTHEST_SHARE = 0.01
-"""Of the picture's width: from no farther away a surface is taken for what is at a pixel, where nothing tells the depth there."""
+"""Share of the picture's width: from no farther away a surface is taken for what is at a pixel, where nothing tells the depth there."""
 _LEAST_CONFIDENCE = 0.1
 _SURE_PX, _SURE_SHARE = 1.0, 0.05
 """A place is known whose position is known to so many pixels of blur, or that share of the range of the slices."""
@@ -36,43 +44,10 @@ _LEAST_SPREAD_PX = 3.0
 """Facts whose surfaces differ in blur by less lie at one depth: they cannot tell how deep the scene is."""
 _CONTRADICTS = 0.1
 _LEAST_DIOPTRES = 1e-6
+_GUESSED_END = "; that the "
+"""Begins what merges of former versions add to why their metres are guessed: that one end was taken for near."""
 
-
-@dataclass(frozen=True)
-class KnownLength:
-    """metres between what is seen at two pixels."""
-
-    x1: float
-    y1: float
-    x2: float
-    y2: float
-    metres: float
-
-    @property
-    def pixels(self) -> tuple[tuple[float, float], ...]:
-        return (self.x1, self.y1), (self.x2, self.y2)
-
-    def __str__(self) -> str:
-        return f"the length of {self.metres:g} m from pixel {self.x1:g},{self.y1:g} to {self.x2:g},{self.y2:g}"
-
-
-@dataclass(frozen=True)
-class KnownDistance:
-    """metres from the lens, along its axis, to what is seen at a pixel."""
-
-    x: float
-    y: float
-    metres: float
-
-    @property
-    def pixels(self) -> tuple[tuple[float, float], ...]:
-        return ((self.x, self.y),)
-
-    def __str__(self) -> str:
-        return f"the distance of {self.metres:g} m at pixel {self.x:g},{self.y:g}"
-
-
-Fact = KnownLength | KnownDistance
+_Unknowns = Callable[[Float[np.ndarray, " numbers"]], tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -90,23 +65,27 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
     """
     depth_m = _told_depth_m(stack)
     facts = _with_earlier(stack, told, overwrite)
-    camera = stack.camera
-    if not metres_facts(stack) or camera is None or (metres_facts(stack).get("known") and FACTS not in metres_facts(stack)):
-        sizes = "; ".join(f"{each} is {_now(each, depth_m, camera):.4g} m by them" for each in told if camera is not None)
+    camera, known = stack.camera, metres_facts(stack)
+    if not known or camera is None or (known.get("known") and TOLD not in known):
+        now = (f"{each} is {_Equation.of(each, depth_m, camera).metres(0.0, 1.0):.4g} m by them" for each in told if camera is not None)
+        sizes = "; ".join(now)
         raise InputError(
             f"{stack.folder} knows its metres from its focus distances{' (' + sizes + ')' if sizes else ''}: to correct them state focus "
             f"distances in lens.toml and merge again, or find the scale of camera poses with --board or --distance"
         )
-    solving = _Solving(tuple(_Equation.of(each, depth_m, camera) for each in facts), _stated_dioptres(stack), metres_facts(stack)["gauge"])
-    found = solving.solution()
+    if "gauge" not in known:
+        raise InputError(f"{stack.folder} was made from another stack, with another lens: tell that stack, and make this one again")
+    equations = [_Equation.of(each, depth_m, camera) for each in facts]
+    found = _solution(equations, _stated_dioptres(stack), known["gauge"])
     changed = _regauged(stack, found.p, found.q)
-    gauge = dict(changed.metadata[KEY]["gauge"]) | {"offset_from": "told"}
-    gauge |= {} if gauge["scale_from"] == "lens" else {"scale_from": "told"}
+    gauge = dict(changed.metadata[METRES]["gauge"]) | {"offset_from": TOLD}
+    gauge |= {} if gauge["scale_from"] == "lens" else {"scale_from": TOLD}
     if found.directed:
-        gauge |= {"near_first_from": FACTS, "near_first_sure": True}
-    changed = replace(changed, metadata=changed.metadata | {KEY: _told(stack, gauge, facts, found.deep)})
+        gauge |= {"near_first_from": TOLD, "near_first_sure": True}
+        changed = with_known_nearest(changed, found.q < 0.0)
+    changed = replace(changed, metadata=changed.metadata | {METRES: _known_facts(stack, gauge, facts, found.deep)})
     _write(changed, found.p, found.q)
-    return Regauged(changed, tuple((each.fact, each.error(found.p, found.q)) for each in solving.equations))
+    return Regauged(changed, tuple((each.fact, each.error(found.p, found.q)) for each in equations))
 
 
 def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
@@ -118,22 +97,25 @@ def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
     if not stack.merged:
         raise InputError(f"{stack.folder} is not merged: run `mrbokeh capture merge {stack.folder}` first")
     gauge, stated = metres_facts(stack).get("gauge"), _stated_dioptres(stack)
-    if not gauge or gauge.get("near_first_from") in (FACTS, "stated distances") or len(stated) > 1:
+    by_distances = len(stated) > 1 or 0.0 in stated
+    if not gauge or gauge.get("near_first_from") in (TOLD, FROM_DISTANCES) or by_distances:
         raise InputError(f"{stack.folder} knows its nearest slice from its distances: --nearest is for stacks that have to guess it")
     turned = is_near_first(stack) != first
     p, q = _turn(stack, stated) if turned else (0.0, 1.0)
-    changed = _regauged(stack, p, q)
-    known = dict(changed.metadata[KEY]["gauge"]) | {"near_first_from": "--nearest", "near_first_sure": True}
-    changed = replace(changed, metadata=changed.metadata | {KEY: dict(changed.metadata[KEY]) | {"gauge": known}})
+    changed = with_known_nearest(_regauged(stack, p, q), turned)
+    facts = changed.metadata[METRES]
+    known = {"near_first_from": NEAREST_OPTION, "near_first_sure": True}
+    facts = facts | {"why": facts["why"].partition(_GUESSED_END)[0], "gauge": facts["gauge"] | known}
+    changed = replace(changed, metadata=changed.metadata | {METRES: facts})
     _write(changed, p, q)
     return changed
 
 
 def _turn(stack: FocalStack, stated: Float[np.ndarray, " slices"]) -> tuple[float, float]:
-    """p and q below 0 of the stack turned; what is stated or told stays at its dioptres."""
+    """Return p and q below 0 that turn the stack; what is stated or told stays at its dioptres."""
     facts, dioptres = metres_facts(stack), [1.0 / each for each in stack.focus_distances_m if each]
     depth_m = _told_depth_m(stack)
-    told = [1.0 / _depth_at(depth_m, *pixel) for each in facts.get(FACTS, ()) for pixel in _fact(each).pixels]
+    told = [1.0 / _depth_at(depth_m, *pixel) for each in told_facts(stack) for pixel in each.pixels]
     kept, ends = [*stated, *told], min(dioptres) + max(dioptres)
     if not kept:
         return ends, -1.0
@@ -154,32 +136,10 @@ def lines_of(done: Regauged) -> list[str]:
     return [*lines, f"warning: what was told disagrees: {', '.join(off)}: look at the pixels and measure again"] if off else lines
 
 
-def parse_length(text: str) -> KnownLength:
-    return KnownLength(*_numbers(text, 5, "--ruler", "X1,Y1,X2,Y2,METRES such as 310,220,480,224,0.05"))
-
-
-def parse_known_distance(text: str) -> KnownDistance:
-    return KnownDistance(*_numbers(text, 3, "--distance-at", "X,Y,METRES such as 310,220,0.35"))
-
-
-def _numbers(text: str, count: int, option: str, expected: str) -> list[float]:
-    try:
-        numbers = [float(each) for each in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not np.isfinite(numbers).all() or numbers[-1] <= 0.0 or (count == 5 and numbers[:2] == numbers[2:4]):
-        raise InputError(f"{option}: expected {expected}, got {text!r}")
-    return numbers
-
-
 def _with_earlier(stack: FocalStack, told: Sequence[Fact], overwrite: bool) -> tuple[Fact, ...]:
     """Facts of earlier calls, and the new ones in place of those at the same pixels."""
-    earlier = [] if overwrite else [_fact(each) for each in metres_facts(stack).get(FACTS, ())]
+    earlier = [] if overwrite else told_facts(stack)
     return tuple({each.pixels: each for each in (*earlier, *told)}.values())
-
-
-def _fact(document: Mapping[str, float]) -> Fact:
-    return KnownLength(**document) if "x1" in document else KnownDistance(**document)
 
 
 @dataclass(frozen=True)
@@ -213,40 +173,42 @@ class _Solution(NamedTuple):
     directed: bool
 
 
-@dataclass(frozen=True)
-class _Solving:
-    """stated: dioptres of slices whose focus the photographs state. gauge: of the stack, as merging or an earlier call left it."""
+def _solution(equations: Sequence[_Equation], stated: Float[np.ndarray, " slices"], gauge: Mapping[str, Any]) -> _Solution:
+    """Solve by least squares; q is below 0 where the facts tell that what was taken for near is far.
 
-    equations: tuple[_Equation, ...]
-    stated: Float[np.ndarray, " slices"]
-    gauge: Mapping[str, Any]
+    stated: dioptres of slices whose focus the photographs state. gauge: of the stack, as merging or an earlier call left it.
+    """
+    finite = stated[stated > 0.0]
+    seen = np.array([*(each.dioptres.mean() for each in equations), *finite])
+    # What each fact would make of its own dioptres alone.
+    alone = np.array([*(each.dioptres.mean() * each.metres(0.0, 1.0) / each.fact.metres for each in equations), *finite])
+    deep = float(np.ptp(np.concatenate([seen, *(each.dioptres for each in equations)]))) * gauge["px_per_dioptre"]
+    at_infinity, by_lens = len(finite) < len(stated), gauge["scale_from"] == "lens"
+    if not by_lens and (at_infinity or deep < _LEAST_SPREAD_PX):
+        return _Solution(0.0, float(np.exp(np.mean(np.log(alone / seen)))), deep=at_infinity, directed=False)
+    apart = float(np.ptp(seen)) * gauge["px_per_dioptre"] >= _LEAST_SPREAD_PX
+    slope = float(np.polyfit(seen, alone, 1)[0]) if apart else 1.0
+    sign = -1.0 if slope < 0.0 and not gauge.get("near_first_sure", True) else 1.0
+    if by_lens:
+        p, q = _least_squares(equations, finite, lambda x: (float(x[0]), sign), [float(np.mean(alone - sign * seen))])
+        return _Solution(p, q, deep=True, directed=apart)
+    size = abs(slope) if slope * sign > 0.0 else float(np.mean(alone) / np.mean(seen))
+    start = [float(np.mean(alone) - sign * size * np.mean(seen)), np.log(size)]
+    p, q = _least_squares(equations, finite, lambda x: (float(x[0]), sign * float(np.exp(x[1]))), start)
+    return _Solution(p, q, deep=True, directed=apart and slope * sign > 0.0)
 
-    def solution(self) -> _Solution:
-        """Of least squares; q is below 0 where the facts tell that what was taken for near is far."""
-        seen = np.array([*(each.dioptres.mean() for each in self.equations), *self.stated])
-        # What each fact would make of its own dioptres alone.
-        alone = np.array([*(each.dioptres.mean() * each.metres(0.0, 1.0) / each.fact.metres for each in self.equations), *self.stated])
-        deep = float(np.ptp(np.concatenate([seen, *(each.dioptres for each in self.equations)]))) * self.gauge["px_per_dioptre"]
-        if self.gauge["scale_from"] != "lens" and deep < _LEAST_SPREAD_PX:
-            return _Solution(0.0, float(np.exp(np.mean(np.log(alone / seen)))), deep=False, directed=False)
-        apart = float(np.ptp(seen)) * self.gauge["px_per_dioptre"] >= _LEAST_SPREAD_PX
-        slope = float(np.polyfit(seen, alone, 1)[0]) if apart else 1.0
-        sign = -1.0 if slope < 0.0 and not self.gauge.get("near_first_sure", True) else 1.0
-        if self.gauge["scale_from"] == "lens":
-            p, q = self._least(lambda x: (float(x[0]), sign), [float(np.mean(alone - sign * seen))])
-            return _Solution(p, q, deep=True, directed=apart)
-        size = abs(slope) if slope * sign > 0.0 else float(np.mean(alone) / np.mean(seen))
-        start = [float(np.mean(alone) - sign * size * np.mean(seen)), np.log(size)]
-        p, q = self._least(lambda x: (float(x[0]), sign * float(np.exp(x[1]))), start)
-        return _Solution(p, q, deep=True, directed=apart and slope * sign > 0.0)
 
-    def _least(self, of: Callable[[Float[np.ndarray, " numbers"]], tuple[float, float]], start: list[float]) -> tuple[float, float]:
-        def off(numbers: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, " facts"]:
-            p, q = of(numbers)
-            told = [np.log1p(each.error(p, q)) for each in self.equations]
-            return np.array([*told, *np.log(np.maximum(p + q * self.stated, _LEAST_DIOPTRES) / self.stated)])
+def _least_squares(
+    equations: Sequence[_Equation], stated: Float[np.ndarray, " slices"], of: _Unknowns, start: list[float]
+) -> tuple[float, float]:
+    """Return p and q of the least relative errors. of: p and q of the unknown numbers. stated: dioptres above 0."""
 
-        return of(least_squares(off, start, x_scale="jac").x)
+    def off(numbers: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, " facts"]:
+        p, q = of(numbers)
+        told = [np.log1p(each.error(p, q)) for each in equations]
+        return np.array([*told, *np.log(np.maximum(p + q * stated, _LEAST_DIOPTRES) / stated)])
+
+    return of(least_squares(off, start, x_scale="jac").x)
 
 
 def _told_depth_m(stack: FocalStack) -> Float32[np.ndarray, "height width"]:
@@ -270,18 +232,14 @@ def _depth_at(depth_m: Float32[np.ndarray, "height width"], x: float, y: float) 
     raise InputError(f"nothing at pixel {x:g},{y:g} tells how far away it is: choose a place with texture")
 
 
-def _now(fact: Fact, depth_m: Float32[np.ndarray, "height width"], camera: Camera) -> float:
-    return _Equation.of(fact, depth_m, camera).metres(0.0, 1.0)
-
-
 def _stated_dioptres(stack: FocalStack) -> Float[np.ndarray, " slices"]:
-    """Of the slices that state their focus; as they lie in the stack's present dioptres, which agree with them."""
-    told = [each.focus_distance_m for each in stack.slices if each.metadata.get(STATED_KEY) is not None]
+    """Return dioptres of the slices that state their focus, as they lie in the stack's present ones, which agree with them."""
+    told = [each.focus_distance_m for each in stack.slices if each.metadata.get(STATED_DISTANCE) is not None]
     return np.array([1.0 / each for each in told if each], np.float64)
 
 
-def _told(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fact], deep: bool) -> dict[str, Any]:
-    """The stack's facts about metres, as they are now."""
+def _known_facts(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fact], deep: bool) -> dict[str, Any]:
+    """Return what is known of the stack's metres when all facts are told."""
     guessed = []
     if not deep:
         guessed.append("how deep the scene is for its distance, as all that was told lies at one depth")
@@ -289,7 +247,7 @@ def _told(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fact], de
         guessed.append("the field of view, so that distances stand beside lengths in a guessed proportion")
     count = f"{len(facts)} known lengths and distances" if len(facts) > 1 else str(facts[0])
     told = [asdict(each) for each in facts]
-    return {"known": True, "why": f"metres rest on {count}", "guessed": "; ".join(guessed) or None, FACTS: told, "gauge": dict(gauge)}
+    return {"known": True, "why": f"metres rest on {count}", "guessed": "; ".join(guessed) or None, TOLD: told, "gauge": dict(gauge)}
 
 
 def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
@@ -298,22 +256,21 @@ def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
     distances_m = [float(each.focus_distance_m or 0.0) for each in slices]
     gauge = dict(metres_facts(stack)["gauge"])
     gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / abs(q), "offset_dioptres": p + q * gauge["offset_dioptres"]}
-    gauge |= {"nearest_m": min(distances_m), "farthest_m": max(distances_m)}
     gauge |= {"near_first": distances_m[0] < distances_m[-1]}
     facts = dict(metres_facts(stack)) | {"gauge": gauge}
-    return replace(stack, slices=slices, lens=_lens_at(stack, distances_m), metadata=stack.metadata | {KEY: facts})
+    return replace(stack, slices=slices, lens=_lens_at(stack, distances_m), metadata=stack.metadata | {METRES: facts})
 
 
 def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
     dioptres = p + q / float(each.focus_distance_m or np.inf)
-    if dioptres <= 0.0:
+    if dioptres < 0.0:
         raise InputError(f"{stack.folder}: by what was told {each.path} is focused beyond infinity: check what you told and tell it again")
-    metadata = dict(each.metadata)
-    if _GROWTH in metadata:
-        metadata[_GROWTH] /= abs(q)
-    if _SLICE_POSITION in metadata:
-        metadata[_SLICE_POSITION] *= np.sign(q)
-    return replace(each, focus_distance_m=1.0 / dioptres, metadata=metadata)
+    growth = {GROWTH: each.metadata[GROWTH] / abs(q)} if GROWTH in each.metadata else {}
+    return replace(each, focus_distance_m=_distance(dioptres), metadata=each.metadata | growth)
+
+
+def _distance(dioptres: float) -> float:
+    return 1.0 / dioptres if dioptres else float("inf")
 
 
 def _lens_at(stack: FocalStack, distances_m: list[float]) -> Lens | None:
@@ -332,11 +289,6 @@ def _lens_at(stack: FocalStack, distances_m: list[float]) -> Lens | None:
 
 
 def _write(stack: FocalStack, p: float, q: float) -> None:
-    """Depth with dioptres p + q D, its picture, and stack.json."""
-    part = read_exr(stack.depth_path)[0]
-    dioptres = np.maximum(p + q / part.channels["Z"].astype(np.float64), _LEAST_DIOPTRES)
-    turned = {POSITION: -part.channels[POSITION]} if q < 0.0 and POSITION in part.channels else {}
-    write_exr(stack.depth_path, replace(part, channels=dict(part.channels) | {"Z": (1.0 / dioptres).astype(np.float32)} | turned))
-    write_focal_stack(stack)
-    write_depth_picture(stack)
-    write_merge_sheet(stack)
+    """Write the stack, and its depth with dioptres p + q D."""
+    dioptres = np.maximum(p + q / stack.depth_m().astype(np.float64), _LEAST_DIOPTRES)
+    write_changed_metres(stack, (1.0 / dioptres).astype(np.float32), turned=q < 0.0)
