@@ -10,11 +10,11 @@ import pytest
 
 from capture.merging.all_in_focus import all_in_focus
 from capture.merging.blur_evidence import DIAMETERS_PX, DRAWN_PX, disc_kernel
-from capture.merging.focus_direction import Contours
+from capture.merging.focus_direction import Contours, Direction
 from capture.merging.focus_order import focus_order
 from capture.merging.merge import merge_scene
-from capture.merging.relative_focus import _Places, solve_relative_focus
-from capture.merging.relative_stack import gauge_of
+from capture.merging.relative_focus import RelativeFocus, _Places, solve_relative_focus
+from capture.merging.relative_stack import FROM_DISTANCES, gauge_of, told_direction
 from mrbokeh.aperture import Aperture
 from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.drawn_diameters import drawn_diameters_px
@@ -23,6 +23,7 @@ from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.layer import opaque
 from mrbokeh.lens import Lens
 from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from tests.test_user_mistakes import said
 
 SIZE = (200, 280)
 # Uneven steps of focus, in dioptres, nearest first; 30 px of blur to each: 2.4 to 6 px from one slice to the next.
@@ -233,6 +234,54 @@ def test_what_is_known_fixes_the_gauge() -> None:
     # No lens of 800 mm focuses at 0.6 m: what it states cannot be meant.
     far_off = optics | {"focal_length_mm": 800.0, "f_number": 640.0 * 2.5}
     assert gauged(None, None, None, optics=far_off) == nothing
+
+
+def test_a_slice_at_infinity_tells_where_the_others_lie_but_not_how_deep() -> None:
+    """Six slices 4 px apart, the farthest at infinity: 20 px are half a dioptre, as where nothing is stated."""
+    positions_px = np.array([13.0, 9.0, 5.0, 1.0, -3.0, -7.0])
+    stack = FocalStack(Path(), tuple(Slice("", each) for each in (None, None, None, None, None, float("inf"))))
+    gauge = gauge_of(stack, positions_px, (3600, 2400))
+    np.testing.assert_allclose(gauge.dioptres(positions_px)[:5], [0.5, 0.4, 0.3, 0.2, 0.1])
+    assert gauge.px_per_dioptre == pytest.approx(40.0) and not gauge.known
+
+
+@pytest.mark.parametrize(("places", "near_first"), [([0], False), ([3], True), ([3, 2], True), ([0, 3], None), ([], None)])
+def test_nothing_lies_beyond_infinity(places: list[int], near_first: bool | None) -> None:
+    plane = np.zeros((2, 2), np.float32)
+    relative = RelativeFocus(np.array([-6.0, -2.0, 2.0, 6.0]), np.ones(4), plane, plane)
+    stack = FocalStack(Path(), tuple(Slice("", float("inf") if index in places else None) for index in range(4)))
+    expected = None if near_first is None else Direction(near_first, FROM_DISTANCES, sure=True)
+    assert told_direction(stack, relative) == expected
+
+
+def test_blur_is_right_in_pixels_beside_a_slice_at_infinity(tmp_path: Path) -> None:
+    """What one slice shows of a surface on which another is focused, against the solved positions."""
+    unmerged(tmp_path, (0, 1, 2, 3, 4, 5), {5: float("inf")})
+    stack = merge_scene(tmp_path)[0]
+    positions_px = np.array([each.metadata["blur_position_px"] for each in stack.slices])
+    assert stack.focus_distances_m[5] == float("inf") and np.ptp(positions_px) > 20.0
+    for index in range(6):
+        for other, distance_m in enumerate(stack.focus_distances_m):
+            on_other_px = stack.coc_px(index, np.full((1, SIZE[1]), distance_m, np.float32))
+            np.testing.assert_allclose(on_other_px, positions_px[index] - positions_px[other], atol=0.05)
+
+
+def test_merging_anew_says_what_was_told_before(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unmerged(tmp_path, (0, 1, 2, 3, 4, 5))
+
+    def run(*arguments: object) -> str:
+        code, told = said(capsys, monkeypatch, "capture", *arguments)
+        assert code == 0, told
+        return told
+
+    assert "without what was told" not in run("merge", tmp_path)
+    run("scale", tmp_path, "--nearest", "last", "--distance-at", "100.5,90,0.35")
+    run("scale", tmp_path, "--ruler", "70,60,130,140,0.125")
+    told = run("merge", tmp_path, "--overwrite")
+    assert f"capture scale {tmp_path} --distance-at 100.5,90,0.35 --ruler 70,60,130,140,0.125 --nearest last`" in told
+    assert "without what was told" not in run("merge", tmp_path, "--overwrite")
 
 
 def test_discs_of_the_evidence_are_those_that_renderers_draw() -> None:

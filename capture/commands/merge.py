@@ -44,12 +44,16 @@ def merge_command(
         list[int] | None, typer.Option(metavar="K", help="slice to put where the --mask after it is white; may be repeated")
     ] = None,
     mask: Annotated[list[Path] | None, typer.Option(metavar="FILE", help="white where the --from-slice before it is to be taken")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="merge again what is merged already; retouches are dropped")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="merge again what is merged already; retouches and what was told to `scale` are dropped")
+    ] = False,
 ) -> None:
+    from capture.merging.known_metres import told_options
     from capture.merging.merge import merge_scene
     from capture.merging.preferred_merge import preferred_lines, preferred_side
     from capture.merging.relative_stack import ORDER
     from capture.merging.retouch import retouched_stacks
+    from mrbokeh.focal_stack import find_focal_stacks
     from mrbokeh.guessed_metres import metres_facts, metres_note
     from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.malloc_settings import keep_freed_pictures
@@ -63,6 +67,7 @@ def merge_command(
         return
     keep_freed_pictures()
     retouched = retouched_stacks(scene) if overwrite else {}
+    scaled = {each.folder: told_options(each) for each in find_focal_stacks(scene) if overwrite or not each.merged}
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         stacks = merge_scene(scene, overwrite, registration, prefer)
     for stack in stacks:
@@ -76,6 +81,8 @@ def merge_command(
             typer.echo(f"  merged before, without --prefer {prefer}: --overwrite merges it again")
         if stack.folder in retouched:
             typer.echo(f"  merged anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask again")
+        if told := scaled.get(stack.folder):
+            typer.echo(f"  merged anew without what was told of it: tell it again by `mrbokeh capture scale {stack.folder} {told}`")
 
 
 def _tell(stack: "FocalStack") -> None:
