@@ -1,14 +1,19 @@
 """Focus energies in noise, confidence beside edges and saturation, and the blend's fast and plain twins."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from capture.merging.all_in_focus import BANDS, BandBlend, all_in_focus, crossover_of, slice_weight
-from capture.merging.depth_from_focus import FocusMap, focus_map
+from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import FocusVolume, focus_energy, focus_volume
 from capture.merging.lights import no_lights
+from capture.merging.replaced_places import depth_m_of
 from mrbokeh.aperture import Aperture
+from mrbokeh.focal_stack import FocalStack, Slice
 from mrbokeh.layer import opaque
 from mrbokeh.renderers.scatter_reference import blur_layer
 
@@ -103,10 +108,13 @@ def test_confidence_is_low_where_the_window_sees_two_surfaces() -> None:
     assert beside.mean() < 0.5 * away.mean()
 
 
-def test_the_index_in_dioptres() -> None:
+def test_depth_lies_between_slices_evenly_in_dioptres() -> None:
     index = np.array([[0.0, 0.5, 1.75]], np.float32)
-    focus = FocusMap(index, index)
-    np.testing.assert_allclose(focus.dioptres((2.0, 1.0, 0.6)), [[2.0, 1.5, 0.7]], rtol=1e-6)
+    stack = FocalStack(Path(), tuple(Slice("", 1.0 / each) for each in (2.0, 1.0, 0.6)))
+    depth_m = depth_m_of(stack, index)
+    assert depth_m is not None
+    np.testing.assert_allclose(1.0 / depth_m, [[2.0, 1.5, 0.7]], rtol=1e-6)
+    assert depth_m_of(replace(stack, slices=(*stack.slices, Slice("", None))), index) is None
 
 
 @pytest.mark.parametrize("crossover", [0.5, 0.8, 1.0])

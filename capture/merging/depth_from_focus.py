@@ -1,6 +1,5 @@
 """Depth from focus: in which slice, and between which two, every pixel is sharp, and how sure that is."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -54,10 +53,6 @@ class FocusMap:
 
     focus_index: Plane
     confidence: Plane
-
-    def dioptres(self, focus_dioptres: Sequence[float]) -> Plane:
-        """(H, W) 1 / depth in metres, interpolated between the focus of the slices (1 / metres each)."""
-        return np.interp(self.focus_index, np.arange(len(focus_dioptres)), focus_dioptres).astype(np.float32)
 
 
 def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "height width"] | None = None) -> FocusMap:
