@@ -169,12 +169,12 @@ def test_the_rate_of_steps_is_told_without_the_first_one() -> None:
 def test_what_to_change_is_said() -> None:
     """Enough minutes for 200 steps of 2 s are 7, with a quarter of reserve 8.4."""
     published = train.TrainSettings(epochs=None, minutes=1.0)
-    words = too_few_words([2.0, 4.0, 6.0], published, 10)
+    words = too_few_words([2.0, 4.0, 6.0], published, 10, LEAST_STEPS)
     assert "about 30 steps of 2 s" in words and "--preset demo" in words and "--max-width" in words
     assert float(re.search(r"--minutes ([\d.]+)", words)[1]) == 9.0  # type: ignore[index]
     crops = dataclasses.replace(DEMO_LIKE, epochs=None, minutes=1.0, crop_px=256, batch=2)
-    assert "--set crop_px=128 or --set batch=1" in too_few_words([2.0, 4.0], crops, 20)
-    assert "crop_px" not in too_few_words([2.0, 4.0], crops, 40), "half a crop would have less inside than its rim"
+    assert "--set crop_px=128 or --set batch=1" in too_few_words([2.0, 4.0], crops, 20, LEAST_STEPS)
+    assert "crop_px" not in too_few_words([2.0, 4.0], crops, 40, LEAST_STEPS), "half a crop would have less inside than its rim"
 
 
 def test_a_budget_without_time_for_200_steps_is_refused_and_nothing_changes(

@@ -145,6 +145,25 @@ def test_sigterm_of_a_batch_system_leaves_a_checkpoint_of_that_very_step(scene: 
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["progress"]["step"] > 0
 
 
+@pytest.mark.parametrize("name", ["old", "new"])
+def test_ctrl_c_in_the_first_steps_changes_nothing(name: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the first steps tell how many there is time for, a finished run is still there, even with --overwrite. 130 is 128 + SIGINT."""
+    run, step = tmp_path / name, Run._step
+    (tmp_path / "old").mkdir()
+    for file in ("settings.json", "network.pt"):
+        (tmp_path / "old" / file).write_bytes(b"{}")
+
+    def stopped(run: Run, rate_factor: float) -> None:
+        step(run, rate_factor)
+        run._stopped_by = signal.SIGINT
+
+    monkeypatch.setattr(Run, "_step", stopped)
+    arguments = ["fit", str(scene), "--preset", "demo", "--minutes", "10", "--threads", "1", "--overwrite", "--out", str(run)]
+    told = CliRunner().invoke(app, arguments)
+    assert told.exit_code == 130 and f"nothing was changed in {run}" in " ".join(told.output.split())
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["network.pt", "old", "settings.json"]
+
+
 def test_a_second_ctrl_c_does_not_wait_but_one_that_torchrun_repeats_does() -> None:
     before = signal.getsignal(signal.SIGINT)
     with Interruption() as alone:

@@ -8,10 +8,10 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StoppedError(KeyboardInterrupt):
-    """The run was asked to stop and its checkpoint is written; number: of the signal."""
+    """A run that was asked to stop did so; number: of the signal. left: what there is now, in words."""
 
-    def __init__(self, number: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(number).name}")
+    def __init__(self, number: int, left: str) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}; {left}")
         self.number = number
 
     @property

@@ -47,7 +47,10 @@ class Run:
         self._saved_s = self._looked_s = self.progress.elapsed_s
 
     def require_steps(self, least: int) -> None:
-        """Take the first steps of a budget in minutes; raises InputError where it has no time for `least` of them. Nothing is written."""
+        """Take the first steps of a budget in minutes; nothing is written.
+
+        Raises InputError where it has no time for `least` of them, StoppedError where any process is asked to stop.
+        """
         if self.settings.minutes is None or self.progress.step:
             return
         budget_s, ends_s = 60.0 * self.settings.minutes, list[float]()
@@ -57,7 +60,9 @@ class Run:
                 self._step(learning_rate_factor(self._done(), self.settings.warm_up))
                 ends_s.append(self.progress.elapsed_s)
                 bars.advance(bar)
-        if self._stopped_by is None and steps_within(ends_s, budget_s) < least:
+        if self._stopped_by is not None:
+            raise StoppedError(self._stopped_by, f"training had not begun, and nothing was changed in {self.task.folder}")
+        if steps_within(ends_s, budget_s) < least:
             raise InputError(too_few_words(ends_s, self.settings, self._halo_px, least))
 
     def train(self) -> Progress:
@@ -68,7 +73,8 @@ class Run:
             self._loop()
             if self._stopped_by is not None:
                 self._save()
-                raise StoppedError(self._stopped_by)
+                kept = f"the checkpoint in {self.task.folder} is kept, run the same command again (without --overwrite) to go on"
+                raise StoppedError(self._stopped_by, kept)
             self.ranks.from_first(self._record.finish)
         return self.progress
 

@@ -30,7 +30,7 @@ def steps_within(ends_s: Sequence[float], budget_s: float) -> int:
     return len(ends_s) + max(0, int((budget_s - ends_s[-1]) / max(seconds_of_a_step(ends_s), 1e-9)))
 
 
-def too_few_words(ends_s: Sequence[float], settings: TrainSettings, halo_px: int, least: int = LEAST_STEPS) -> str:
+def too_few_words(ends_s: Sequence[float], settings: TrainSettings, halo_px: int, least: int) -> str:
     """What to say to somebody whose budget has time for fewer steps than `least`. halo_px: see `training.crops.Drawing`."""
     minutes, step_s = settings.minutes or 0.0, seconds_of_a_step(ends_s)
     steps, enough = steps_within(ends_s, 60.0 * minutes), 1.25 * (ends_s[0] + least * step_s) / 60.0

@@ -34,7 +34,8 @@ def fit(
 
     overwrite: start again where there is a run. least_steps: raises InputError, and writes or removes nothing, where the first steps say
     that a budget in minutes has no time for so many.
-    Ctrl-C and SIGTERM end it after the step (StoppedError, a KeyboardInterrupt) with a checkpoint, from which the same call goes on.
+    Ctrl-C and SIGTERM end it after the step (StoppedError, a KeyboardInterrupt) with a checkpoint, from which the same call goes on; while
+    the first steps tell the time, with nothing changed.
     Processes that torchrun started train together; all need the data, only the first needs the folder.
     """
     with joined(settings.device) as ranks:

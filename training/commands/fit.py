@@ -105,7 +105,7 @@ def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: lis
                 typer.echo(note, err=True)
         said = f"{out}: {_summary(fit(data, out, settings, held_out, overwrite))}"
     except StoppedError as stop:
-        code, said = stop.exit_code, f"stopped; the checkpoint in {out} is kept, run the same command again to go on"
+        code, said = stop.exit_code, str(stop)
     except KeyboardInterrupt:
         code, said = 130, "stopped at once; the same command goes on from the last checkpoint, if there is one"
     if _number("RANK") == 0:
