@@ -15,7 +15,15 @@ import cv2
 import numpy as np
 
 from capture.merging.alignment import register_stack, warp
-from capture.merging.similarity import Similarity, about_centre, as_similarity, chained, from_opencv_centres, inverse, to_opencv_centres
+from capture.merging.plane_transforms import (
+    Transform,
+    about_centre,
+    as_similarity,
+    chained,
+    from_opencv_centres,
+    inverse,
+    to_opencv_centres,
+)
 from mrbokeh.image_io import read_image
 from tests.jittered_stack import JITTER_PX, JITTER_RAD, JitteredStack, jittered_stack
 from tests.machine import machine_line, memory_line
@@ -25,7 +33,7 @@ NOISE = 0.01
 PHOTOGRAPHS = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "stacks" / "button_macro"
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-6)
 
-Pair = Callable[[np.ndarray, np.ndarray, Similarity], Similarity]
+Pair = Callable[[np.ndarray, np.ndarray, Transform], Transform]
 
 
 def main() -> None:
@@ -53,11 +61,11 @@ def _noisy(stack: JitteredStack) -> JitteredStack:
     return JitteredStack(noisy, stack.first_from_slice, stack.image_distances)
 
 
-def _ours(stack: JitteredStack, image_distances: tuple[float, ...] | None) -> tuple[Similarity, ...]:
+def _ours(stack: JitteredStack, image_distances: tuple[float, ...] | None) -> tuple[Transform, ...]:
     return register_stack(stack.slices.__getitem__, len(stack.slices), image_distances).reference_from_slice
 
 
-def _line(what: str, stack: JitteredStack, register: Callable[[], tuple[Similarity, ...]]) -> tuple[float, float]:
+def _line(what: str, stack: JitteredStack, register: Callable[[], tuple[Transform, ...]]) -> tuple[float, float]:
     """(worst error in px, CPU seconds)."""
     started_s = time.process_time()
     found = register()
@@ -68,7 +76,7 @@ def _line(what: str, stack: JitteredStack, register: Callable[[], tuple[Similari
     return error_px, took_s
 
 
-def _chain(pictures: tuple[np.ndarray, ...], pair: Pair, prior: list[Similarity]) -> tuple[Similarity, ...]:
+def _chain(pictures: tuple[np.ndarray, ...], pair: Pair, prior: list[Transform]) -> tuple[Transform, ...]:
     chain = [np.eye(2, 3)]
     for i in range(1, len(pictures)):
         start = chained(inverse(prior[i - 1]), prior[i])
@@ -76,19 +84,19 @@ def _chain(pictures: tuple[np.ndarray, ...], pair: Pair, prior: list[Similarity]
     return tuple(chain)
 
 
-def _ecc(target: np.ndarray, source: np.ndarray, start: Similarity) -> Similarity:
+def _ecc(target: np.ndarray, source: np.ndarray, start: Transform) -> Transform:
     guess = to_opencv_centres(inverse(start)).astype(np.float32)
     _, found = cv2.findTransformECC(_luminance(target), _luminance(source), guess, cv2.MOTION_AFFINE, _STOP)
     return _similarity_from_opencv(found, target)
 
 
-def _ecc_multi_scale(target: np.ndarray, source: np.ndarray, start: Similarity) -> Similarity:
+def _ecc_multi_scale(target: np.ndarray, source: np.ndarray, start: Transform) -> Transform:
     guess = to_opencv_centres(inverse(start)).astype(np.float32)
     _, found = cv2.findTransformECCMultiScale(_luminance(target), _luminance(source), guess)
     return _similarity_from_opencv(found, target)
 
 
-def _sift(target: np.ndarray, source: np.ndarray, _: Similarity) -> Similarity:
+def _sift(target: np.ndarray, source: np.ndarray, _: Transform) -> Transform:
     sift = cv2.SIFT.create(3000)
     (to_points, to_features), (from_points, from_features) = (sift.detectAndCompute(_display(each), None) for each in (target, source))
     found = cv2.BFMatcher().knnMatch(from_features, to_features, k=2)
@@ -110,7 +118,7 @@ def _display(rgb: np.ndarray) -> np.ndarray:
     return np.clip(255.0 * np.sqrt(np.maximum(_luminance(rgb), 0.0)), 0, 255).astype(np.uint8)
 
 
-def _similarity_from_opencv(source_from_target: np.ndarray, picture: np.ndarray) -> Similarity:
+def _similarity_from_opencv(source_from_target: np.ndarray, picture: np.ndarray) -> Transform:
     affine = inverse(from_opencv_centres(np.asarray(source_from_target, np.float64)))
     return as_similarity(affine, picture.shape[1], picture.shape[0])
 

@@ -22,7 +22,17 @@ REGISTRATION = Registration(
 )
 
 
-@pytest.mark.parametrize("registration", [REGISTRATION, replace(REGISTRATION, breathing=None, size_px=None, camera_moved=False)])
+TURNED = np.array([[1.0, 0.0, 2.0], [0.0, 1.0, 1.0], [1e-6, -2e-6, 1.0]])
+
+
+@pytest.mark.parametrize(
+    "registration",
+    [
+        REGISTRATION,
+        replace(REGISTRATION, reference_from_slice=(TURNED, np.eye(2, 3), TURNED)),
+        replace(REGISTRATION, breathing=None, size_px=None, camera_moved=False),
+    ],
+)
 def test_what_is_written_is_read_to_the_last_bit(tmp_path: Path, registration: Registration) -> None:
     write_registration(tmp_path / "registration.json", registration)
     found = read_registration(tmp_path / "registration.json", slices=3, size_px=(640, 428))

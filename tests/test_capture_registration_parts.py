@@ -6,10 +6,10 @@ import pytest
 
 from capture.merging.breathing import breathing_of
 from capture.merging.corner_tracks import CornerTracks, track_corners
-from capture.merging.joint_similarities import joint_similarities
+from capture.merging.joint_transforms import joint_transforms
 from capture.merging.masked_ecc import match_coarsely
 from capture.merging.pair_matching import match_neighbours
-from capture.merging.similarity import Similarity, about_centre, chained, farthest_corner_px, inverse, moved, scale_of
+from capture.merging.plane_transforms import Transform, about_centre, chained, farthest_corner_px, inverse, moved, scale_of
 from capture.merging.slice_structure import structure_of
 from capture.merging.track_fit import similarity_of_tracks
 from capture.merging.warping import warp
@@ -25,13 +25,13 @@ def scene(seed: int = 0) -> np.ndarray:
     return np.clip(0.35 + 1.2 * (summed - np.mean(summed)), 0.01, None).astype(np.float32)
 
 
-def similarity(scale: float, angle_rad: float, shift_px: tuple[float, float]) -> Similarity:
+def similarity(scale: float, angle_rad: float, shift_px: tuple[float, float]) -> Transform:
     turn = scale * np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
     centre = np.array([WIDTH_PX / 2, HEIGHT_PX / 2])
     return np.column_stack([turn, centre - turn @ centre + shift_px])
 
 
-def corner_error_px(a: Similarity, b: Similarity) -> float:
+def corner_error_px(a: Transform, b: Transform) -> float:
     return farthest_corner_px(a, b, WIDTH_PX, HEIGHT_PX)
 
 
@@ -44,7 +44,7 @@ MOVEMENTS = [
 
 
 @pytest.mark.parametrize("truth", MOVEMENTS)
-def test_a_known_movement_is_found_through_different_blur(truth: Similarity) -> None:
+def test_a_known_movement_is_found_through_different_blur(truth: Transform) -> None:
     """The slice is blurred by another disc than the target, as two slices of a focal stack are."""
     target, source = structure_of(scene()), structure_of(cv2.GaussianBlur(warp(scene(), inverse(truth)), (0, 0), 2.0))
     coarse = match_coarsely(target, source, np.eye(2, 3))
@@ -103,7 +103,7 @@ def test_a_fit_to_exact_tracks_is_exact_and_outliers_do_not_bend_it() -> None:
     assert corner_error_px(similarity_of_tracks(CornerTracks(target, source)), truth) < 0.02
 
 
-def joint_pairs(truth: list[Similarity], noise_px: float) -> dict[tuple[int, int], CornerTracks]:
+def joint_pairs(truth: list[Transform], noise_px: float) -> dict[tuple[int, int], CornerTracks]:
     """Tracks between neighbours and slices two apart: (target, source), as a scene in slice 0 would give them."""
     pairs = {}
     for i, j in [(i, i + stride) for stride in (1, 2) for i in range(len(truth) - stride)]:
@@ -114,10 +114,17 @@ def joint_pairs(truth: list[Similarity], noise_px: float) -> dict[tuple[int, int
     return pairs
 
 
-def test_joint_similarities_of_exact_tracks_are_exact() -> None:
+def test_joint_transforms_of_exact_tracks_are_exact() -> None:
     truth = [similarity(1.0 + 0.01 * i, 0.001 * i, (0.3 * i, -0.5 * i)) for i in range(6)]
     truth = [chained(inverse(truth[0]), each) for each in truth]
-    found = joint_similarities(6, joint_pairs(truth, 0.0), (WIDTH_PX, HEIGHT_PX))
+    found = joint_transforms(6, joint_pairs(truth, 0.0), (WIDTH_PX, HEIGHT_PX))
+    assert max(corner_error_px(a, b) for a, b in zip(found, truth, strict=True)) < 1e-6
+
+
+def test_joint_homographies_of_exact_tracks_are_exact() -> None:
+    truth = [np.vstack([similarity(1.0 + 0.01 * i, 0.001 * i, (0.3 * i, -0.5 * i)), [3e-5 * i, -2e-5 * i, 1.0]]) for i in range(6)]
+    truth = [chained(inverse(truth[0]), each) for each in truth]
+    found = joint_transforms(6, joint_pairs(truth, 0.0), (WIDTH_PX, HEIGHT_PX), perspective=True)
     assert max(corner_error_px(a, b) for a, b in zip(found, truth, strict=True)) < 1e-6
 
 
@@ -127,7 +134,7 @@ def test_all_pairs_together_drift_less_than_a_chain_and_outvote_a_wrong_one() ->
     chain = {pair: tracks for pair, tracks in pairs.items() if pair[1] == pair[0] + 1}
 
     def worst_px(used: dict[tuple[int, int], CornerTracks]) -> float:
-        found = joint_similarities(10, used, (WIDTH_PX, HEIGHT_PX))
+        found = joint_transforms(10, used, (WIDTH_PX, HEIGHT_PX))
         return max(corner_error_px(a, b) for a, b in zip(found, truth, strict=True))
 
     assert worst_px(pairs) < worst_px(chain)

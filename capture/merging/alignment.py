@@ -1,7 +1,8 @@
-"""Registration of a focal stack: undoes focus breathing and small movements by one similarity per slice.
+"""Registration of a focal stack: undoes focus breathing and small movements by one transform per slice.
 
 Neighbours are matched coarsely by masked ECC and then by tracked corners; slices three apart by corners alone. All tracks
-together give the similarities. The breathing of the lens is the prior: it says which matches to believe, stands in where none
+together give the transforms: similarities, or homographies where a camera in the hand has turned so far that a similarity leaves corners
+clearly apart. The breathing of the lens is the prior: it says which matches to believe, stands in where none
 holds, and is kept as it is where the camera did not move.
 """
 
@@ -13,11 +14,20 @@ from jaxtyping import Bool, Float32
 
 from capture.merging.breathing import Breathing, Pair, breathing_of
 from capture.merging.corner_tracks import CornerTracks
-from capture.merging.joint_similarities import joint_similarities
+from capture.merging.joint_transforms import joint_transforms
 from capture.merging.pair_links import with_links
-from capture.merging.pair_matching import PairMatch, match_from, match_neighbours
+from capture.merging.pair_matching import NOTICEABLE_PX, PairMatch, match_from, match_neighbours
+from capture.merging.plane_transforms import (
+    Transform,
+    about_centre,
+    chained,
+    farthest_corner_px,
+    inverse,
+    middle_of,
+    scale_of,
+    scaled_about,
+)
 from capture.merging.registration import Registration
-from capture.merging.similarity import Similarity, about_centre, chained, farthest_corner_px, inverse, scale_of, scaled_about
 from capture.merging.slice_structure import SliceStructure, structure_of
 from capture.merging.track_fit import distances_px
 from capture.merging.warping import warp, warped_validity
@@ -53,13 +63,16 @@ def register_stack(
     unknown_scales: slices whose prior is a guess (infinity by a sentinel), which pictures override.
     """
     matches, size_px = _matched(read_rgb, count, prior_scales, read_valid)
-    scales = {pair: scale_of(match.target_from_source) for pair, match in matches.items() if match.tracks is not None}
+    scales = {pair: scale_of(match.target_from_source, middle_of(size_px)) for pair, match in matches.items() if match.tracks is not None}
     breathing = breathing_of(count, scales, prior_scales, unknown_scales)
     held = {pair: tracks for pair, match in matches.items() if (tracks := match.tracks) and breathing.allows(pair, scales[pair])}
     linked = with_links(count, held, matches, breathing, size_px)
-    first_from_slice = joint_similarities(count, linked, size_px)
+    first_from_slice = joint_transforms(count, linked, size_px)
     settled, camera_moved = _settled(first_from_slice, breathing, held, size_px)
-    reference, transforms = _to_narrowest(settled)
+    if camera_moved and held:
+        turned = joint_transforms(count, linked, size_px, perspective=True)
+        settled = turned if _is_clearly_nearer(turned, settled, held) else settled
+    reference, transforms = _to_narrowest(settled, size_px)
     correlations = tuple(matches[i, i + 1].correlation for i in range(count - 1))
     residuals_px = _residuals_px(transforms, {pair: matches[pair] for pair in held}, size_px)
     return Registration(reference, transforms, correlations, residuals_px, size_px, breathing, camera_moved)
@@ -94,8 +107,8 @@ def _require_same_size(one: SliceStructure, other: SliceStructure, index: int) -
 
 
 def _settled(
-    measured: Sequence[Similarity], breathing: Breathing, held: Mapping[Pair, CornerTracks], size_px: tuple[int, int]
-) -> tuple[Sequence[Similarity], bool]:
+    measured: Sequence[Transform], breathing: Breathing, held: Mapping[Pair, CornerTracks], size_px: tuple[int, int]
+) -> tuple[Sequence[Transform], bool]:
     """Return (first_from_slice, whether the camera moved): what pictures cannot tell from the lens's own breathing is the lens's.
 
     First for all of the transforms, then for their scales alone, which drift most: depth edges pull all tracks the same way. Where no lens
@@ -115,7 +128,7 @@ def _settled(
     return [scaled_about(pivot, measured[i], breathing.scale(0, i)) for i in range(count)], True
 
 
-def _fit_as_they_are(measured: Sequence[Similarity], held: Mapping[Pair, CornerTracks], size_px: tuple[int, int]) -> bool:
+def _fit_as_they_are(measured: Sequence[Transform], held: Mapping[Pair, CornerTracks], size_px: tuple[int, int]) -> bool:
     """Return whether corners lie about as well on one another in unmoved slices as in moved ones.
 
     Depth edges and uneven blur pull corners by half a pixel and more, all of them together, and so a fit always finds a little to move.
@@ -127,18 +140,30 @@ def _fit_as_they_are(measured: Sequence[Similarity], held: Mapping[Pair, CornerT
     return bool(np.all(np.array(unmoved_px) <= CLEARLY_BETTER * np.array(moved_px)))
 
 
-def _to_narrowest(first_from_slice: Sequence[Similarity]) -> tuple[int, tuple[Similarity, ...]]:
+def _is_clearly_nearer(turned: Sequence[Transform], settled: Sequence[Transform], held: Mapping[Pair, CornerTracks]) -> bool:
+    """Return whether homographies leave corners so much nearer that the camera has turned, and noise and depth edges do not explain it."""
+    turned_px, settled_px = (_apart_px(each, held) for each in (turned, settled))
+    return settled_px > max(NOTICEABLE_PX, CLEARLY_BETTER * turned_px)
+
+
+def _apart_px(transforms: Sequence[Transform], held: Mapping[Pair, CornerTracks]) -> float:
+    """Return how far the corners of the median pair lie apart in the median."""
+    apart_px = [np.median(distances_px(tracks, chained(inverse(transforms[i]), transforms[j]))) for (i, j), tracks in held.items()]
+    return float(np.median(apart_px))
+
+
+def _to_narrowest(first_from_slice: Sequence[Transform], size_px: tuple[int, int]) -> tuple[int, tuple[Transform, ...]]:
     """(reference, reference_from_slice): what needs the least enlargement sees the narrowest field."""
-    reference = int(np.argmin([scale_of(transform) for transform in first_from_slice]))
+    reference = int(np.argmin([scale_of(transform, middle_of(size_px)) for transform in first_from_slice]))
     back = inverse(first_from_slice[reference])
     return reference, tuple(np.eye(2, 3) if i == reference else chained(back, each) for i, each in enumerate(first_from_slice))
 
 
-def _departure_px(one: Sequence[Similarity], other: Sequence[Similarity], size_px: tuple[int, int]) -> float:
+def _departure_px(one: Sequence[Transform], other: Sequence[Transform], size_px: tuple[int, int]) -> float:
     return max(farthest_corner_px(a, b, *size_px) for a, b in zip(one, other, strict=True))
 
 
-def _residuals_px(transforms: Sequence[Similarity], held: Mapping[Pair, PairMatch], size_px: tuple[int, int]) -> tuple[float | None, ...]:
+def _residuals_px(transforms: Sequence[Transform], held: Mapping[Pair, PairMatch], size_px: tuple[int, int]) -> tuple[float | None, ...]:
     """How far each slice's pairs, taken alone, disagree with where all together put it."""
     worst: list[float | None] = [None] * len(transforms)
     for (i, j), match in held.items():

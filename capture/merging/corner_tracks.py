@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from capture.merging.similarity import Similarity, inverse, moved
+from capture.merging.plane_transforms import Transform, inverse, moved
 from capture.merging.slice_structure import DetailLevel
 
 _WINDOW_PX = 19
@@ -37,7 +37,7 @@ class CornerTracks:
         return CornerTracks(self.target_px * factor, self.source_px * factor, self.scatter_px * factor)
 
 
-def track_corners(target: DetailLevel, source: DetailLevel, target_from_source: Similarity) -> CornerTracks:
+def track_corners(target: DetailLevel, source: DetailLevel, target_from_source: Transform) -> CornerTracks:
     """Corners of both slices followed into the other (Lucas and Kanade 1981, Bouguet 2000) and back; what does not return is dropped.
 
     All in pixels of the level. Blur that is the same on all sides of a corner does not move it, so that a track is unbiased
@@ -48,7 +48,7 @@ def track_corners(target: DetailLevel, source: DetailLevel, target_from_source: 
     return CornerTracks(np.vstack([there[0], back[1]]), np.vstack([there[1], back[0]]))
 
 
-def _followed(origin: DetailLevel, goal: DetailLevel, goal_from_origin: Similarity) -> tuple[Points, Points]:
+def _followed(origin: DetailLevel, goal: DetailLevel, goal_from_origin: Transform) -> tuple[Points, Points]:
     corners = origin.corners_px
     if not len(corners):
         return np.zeros((0, 2)), np.zeros((0, 2))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from capture.merging.similarity import Similarity, as_similarity, at_level, from_opencv_centres, inverse, scale_of, to_opencv_centres
+from capture.merging.plane_transforms import Transform, as_similarity, at_level, from_opencv_centres, inverse, scale_of, to_opencv_centres
 from capture.merging.slice_structure import SliceStructure, shrunk, shrunk_mask
 
 LEAST_CORRELATION = 0.6
@@ -25,7 +25,7 @@ Mask = UInt8[np.ndarray, "height width"]
 class CoarseMatch:
     """correlation: of the smoothed log luminance, 1 is perfect, 0 where ECC found nothing."""
 
-    target_from_source: Similarity
+    target_from_source: Transform
     correlation: float
 
     @property
@@ -33,7 +33,7 @@ class CoarseMatch:
         return self.correlation >= LEAST_CORRELATION
 
 
-def match_coarsely(target: SliceStructure, source: SliceStructure, start: Similarity) -> CoarseMatch:
+def match_coarsely(target: SliceStructure, source: SliceStructure, start: Transform) -> CoarseMatch:
     """Coarse-to-fine ECC (Evangelidis and Psarakis 2008) over what is usable in both, projected to a similarity.
 
     A level that does not correlate, or whose scale leaves start by more than LARGEST_STEP, moves nothing; the correlation
@@ -49,7 +49,7 @@ def match_coarsely(target: SliceStructure, source: SliceStructure, start: Simila
     return CoarseMatch(transform, correlation)
 
 
-def _match_at(level: int, target: SliceStructure, source: SliceStructure, guess: Similarity) -> tuple[Similarity, float]:
+def _match_at(level: int, target: SliceStructure, source: SliceStructure, guess: Transform) -> tuple[Transform, float]:
     in_all = target.levels[0].level + level
     # Smoothed so that two slices differ less by their focus.
     one, other = (cv2.GaussianBlur(shrunk(each.coarse, level), (0, 0), _SIGMA_PX) for each in (target, source))

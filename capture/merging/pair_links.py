@@ -7,7 +7,7 @@ import numpy as np
 from capture.merging.breathing import Breathing, Pair
 from capture.merging.corner_tracks import CornerTracks
 from capture.merging.pair_matching import PairMatch
-from capture.merging.similarity import Similarity, about_centre, moved, scale_of
+from capture.merging.plane_transforms import Transform, about_centre, middle_of, moved, scale_of
 
 _LAID_SCATTER_PX = 0.01
 
@@ -22,7 +22,9 @@ def with_links(
     pairs = dict(held)
     for pair in _missing_links(count, held):
         match = matches[pair]
-        guessed = match.tracks is None and match.guess_holds and breathing.allows(pair, scale_of(match.target_from_source))
+        guessed = (
+            match.tracks is None and match.guess_holds and breathing.allows(pair, scale_of(match.target_from_source, middle_of(size_px)))
+        )
         link = match.target_from_source if guessed else about_centre(breathing.scale(*pair), *size_px)
         pairs[pair] = _laid_tracks(link, size_px)
     return pairs
@@ -41,7 +43,7 @@ def _missing_links(count: int, pairs: Iterable[Pair]) -> list[Pair]:
     return [pair for pair in missing if pair not in set(pairs)]
 
 
-def _laid_tracks(target_from_source: Similarity, size_px: tuple[int, int]) -> CornerTracks:
+def _laid_tracks(target_from_source: Transform, size_px: tuple[int, int]) -> CornerTracks:
     """The corners of the picture, as a transform moves them.
 
     They alone hold two groups of slices together: trusted like tracks, they would give way, and a group shrink to a point, where its own

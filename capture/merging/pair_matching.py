@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from capture.merging.corner_tracks import CornerTracks, track_corners
+from capture.merging.joint_transforms import joint_transforms
 from capture.merging.masked_ecc import match_coarsely
-from capture.merging.similarity import Similarity, about_centre, at_level
+from capture.merging.plane_transforms import Transform, about_centre, at_level
 from capture.merging.slice_structure import DetailLevel, SliceStructure
 from capture.merging.track_fit import AGREEING_PX, distances_px, similarity_of_tracks, typical_px
 
@@ -15,6 +16,10 @@ LEAST_SHARE_AGREEING = 0.5
 # Finer detail is believed even at so many times the standard error: it lies in the depths that both slices show sharp, while
 # the outlines of large discs move with more than the camera (depth edges, pupils off the axis).
 _FINER_IS_WORTH = 2.0
+# Where a similarity leaves half of the corners farther apart than this, and a homography brings them nearer by this factor, the camera
+# has turned.
+NOTICEABLE_PX = 0.1
+_CLEARLY_BETTER = 1.4
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ class PairMatch:
     guess_holds: where there are no tracks, target_from_source is what ECC found, else only what was expected.
     """
 
-    target_from_source: Similarity
+    target_from_source: Transform
     tracks: CornerTracks | None
     correlation: float = 0.0
     guess_holds: bool = False
@@ -40,7 +45,7 @@ def match_neighbours(target: SliceStructure, source: SliceStructure, expected_sc
     return replace(match, correlation=coarse.correlation, guess_holds=coarse.holds)
 
 
-def match_from(target: SliceStructure, source: SliceStructure, start: Similarity) -> PairMatch:
+def match_from(target: SliceStructure, source: SliceStructure, start: Transform) -> PairMatch:
     """Two slices that lie within a few pixels of `start`.
 
     The larger the pictures, the finer the detail, until defocus and noise leave too little that both show: the largest size
@@ -59,13 +64,18 @@ def match_from(target: SliceStructure, source: SliceStructure, start: Similarity
     return best
 
 
-def _tracked(target: DetailLevel, source: DetailLevel, start: Similarity) -> tuple[Similarity, CornerTracks, int] | None:
+def _tracked(target: DetailLevel, source: DetailLevel, start: Transform) -> tuple[Transform, CornerTracks, int] | None:
     """(target_from_source, tracks, how many agree) in pixels of the slices; None where too few agree."""
     tracks = track_corners(target, source, at_level(start, target.level))
     if len(tracks) < FEWEST_AGREEING:
         return None
     found = similarity_of_tracks(tracks)
     off_px = distances_px(tracks, found)
+    if np.median(off_px) > NOTICEABLE_PX:
+        turned = joint_transforms(2, {(0, 1): tracks}, target.detail.shape[::-1], perspective=True)[1]
+        turned_px = distances_px(tracks, turned)
+        if np.median(off_px) > _CLEARLY_BETTER * np.median(turned_px):
+            found, off_px = turned, turned_px
     agreeing = int(np.count_nonzero(off_px < AGREEING_PX))
     if agreeing < max(FEWEST_AGREEING, LEAST_SHARE_AGREEING * len(tracks)):
         return None

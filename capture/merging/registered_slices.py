@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32
 
 from capture.merging.alignment import Registration, warp, warped_validity
+from capture.merging.plane_transforms import Transform
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
-from capture.merging.similarity import Similarity, to_opencv_centres
 from capture.merging.tint import Gains, SmallSlice, tint_gains, with_gain
+from capture.merging.warping import sampled
 from mrbokeh.camera_rgb import SATURATED, half_of, single_of, write_camera_rgb
 from mrbokeh.errors import InputError
 from mrbokeh.exr_io import read_exr
@@ -189,11 +190,11 @@ def _stored_slice(path: Path) -> tuple[Stored, Plane]:
     return rgb, part.channels[SATURATED].astype(np.float32) if SATURATED in part.channels else np.zeros(rgb.shape[:2], np.float32)
 
 
-def _warped_share(saturated: Plane, reference_from_slice: Similarity) -> Plane:
+def _warped_share(saturated: Plane, reference_from_slice: Transform) -> Plane:
     if not saturated.any():
         return saturated
     size = (saturated.shape[1], saturated.shape[0])
-    return cv2.warpAffine(saturated, to_opencv_centres(reference_from_slice), size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled(saturated, reference_from_slice, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def newer(path: Path, *sources: Path) -> bool:

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from capture.merging.breathing import Breathing
+from capture.merging.plane_transforms import Transform
 from capture.merging.registration import Registration
-from capture.merging.similarity import Similarity
 from mrbokeh.atomic_files import read_json, write_json
 from mrbokeh.errors import InputError
 
@@ -15,7 +15,10 @@ FILE_NAME = "registration.json"
 FORMAT = "mrbokeh-registration"
 VERSION = 1
 
-_CONVENTION = "reference_from_slice takes (x, y, 1) of a slice to pixels of the reference slice; the first pixel's centre is (0.5, 0.5)"
+_CONVENTION = (
+    "reference_from_slice takes (x, y, 1) of a slice to pixels of the reference slice; the first pixel's centre is (0.5, 0.5); "
+    "a third row, where the camera has turned, is what both are divided by"
+)
 
 
 def write_registration(path: Path | str, registration: Registration) -> None:
@@ -49,7 +52,7 @@ def read_registration(path: Path | str, slices: int | None = None, size_px: tupl
 
 
 def _registration(document: dict[str, Any]) -> Registration:
-    transforms = tuple(_similarity(each) for each in document["reference_from_slice"])
+    transforms = tuple(_transform(each) for each in document["reference_from_slice"])
     if not 0 <= document["reference"] < len(transforms):
         raise ValueError(f"reference {document['reference']} of {len(transforms)} slices")
     breathing, size_px = document["breathing"], document["size_px"]
@@ -64,10 +67,10 @@ def _registration(document: dict[str, Any]) -> Registration:
     )
 
 
-def _similarity(rows: Any) -> Similarity:
+def _transform(rows: Any) -> Transform:
     matrix = np.array(rows, np.float64)
-    if matrix.shape != (2, 3) or not np.isfinite(matrix).all() or not abs(np.linalg.det(matrix[:, :2])) > 0:
-        raise ValueError(f"{rows} is no transform of 2 rows and 3 columns")
+    if matrix.shape not in ((2, 3), (3, 3)) or not np.isfinite(matrix).all() or not abs(np.linalg.det(matrix[:2, :2])) > 0:
+        raise ValueError(f"{rows} is no transform of 2 or 3 rows and 3 columns")
     return matrix
 
 

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from capture.merging.similarity import Similarity, at_scale, to_opencv_centres
+from capture.merging.plane_transforms import Transform, at_scale
 from capture.merging.track_fit import robust_weights
+from capture.merging.warping import sampled
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -51,7 +52,7 @@ class SmallSlice:
         return cls(light, full, shrink)
 
 
-def tint_gains(slices: Sequence[SmallSlice], reference_from_slice: Sequence[Similarity], reference: int) -> Gains:
+def tint_gains(slices: Sequence[SmallSlice], reference_from_slice: Sequence[Transform], reference: int) -> Gains:
     """Return what each slice is to be multiplied with, 1 for all where none leaves the dead zone."""
     areas = [_areas(small, transform) for small, transform in zip(slices, reference_from_slice, strict=True)]
     steps = np.array([_step(one, other) for one, other in pairwise(areas)]).reshape(-1, 3)
@@ -72,12 +73,12 @@ def with_gain(rgb: Rgb, gain: Float[np.ndarray, "3"]) -> Rgb:
     return cv2.merge(planes)
 
 
-def _areas(small: SmallSlice, transform: Similarity) -> tuple[Rgb, Bool[np.ndarray, "rows columns"]]:
+def _areas(small: SmallSlice, transform: Transform) -> tuple[Rgb, Bool[np.ndarray, "rows columns"]]:
     """Return logarithms of light over large areas in the geometry of the reference, and which are known and not full."""
     size = small.full.shape[::-1]
-    matrix = to_opencv_centres(at_scale(transform, 1.0 / small.shrink))
-    light = cv2.warpAffine(small.light, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    full = cv2.warpAffine(small.full, matrix, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
+    smaller = at_scale(transform, 1.0 / small.shrink)
+    light = sampled(small.light, smaller, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    full = sampled(small.full, smaller, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
     light = cv2.GaussianBlur(light, (0, 0), _SIGMA_PX)
     usable = (light > _DARKEST).all(axis=2) & (cv2.dilate(full, np.ones((3, 3), np.uint8)) < _LARGEST_SATURATED_SHARE)
     return np.log(np.maximum(light, np.float32(_DARKEST))), usable

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.merging.corner_tracks import CornerTracks
-from capture.merging.similarity import Similarity, moved
+from capture.merging.plane_transforms import Transform, moved
 
 AGREEING_PX = 1.0
 _SMALLEST_SCATTER_PX = 0.05
@@ -13,7 +13,7 @@ _ROUNDS = 12
 Distances = Float[np.ndarray, " tracks"]
 
 
-def similarity_of_tracks(tracks: CornerTracks) -> Similarity:
+def similarity_of_tracks(tracks: CornerTracks) -> Transform:
     """target_from_source by least squares, reweighted until the odd ones do not count. Wants at least 2 tracks."""
     weights = np.ones(len(tracks))
     for _ in range(_ROUNDS):
@@ -23,7 +23,7 @@ def similarity_of_tracks(tracks: CornerTracks) -> Similarity:
     return similarity
 
 
-def distances_px(tracks: CornerTracks, target_from_source: Similarity) -> Distances:
+def distances_px(tracks: CornerTracks, target_from_source: Transform) -> Distances:
     """How far each track's source lands from its target."""
     return np.hypot(*(tracks.target_px - moved(target_from_source, tracks.source_px)).T)
 
@@ -38,7 +38,7 @@ def robust_weights(distances: Distances, scatter_px: float) -> Distances:
     return 1.0 / (1.0 + (distances / scatter_px) ** 2) ** 2
 
 
-def _weighted_similarity(tracks: CornerTracks, weights: Distances) -> Similarity:
+def _weighted_similarity(tracks: CornerTracks, weights: Distances) -> Transform:
     """Umeyama 1991 in the plane, weighted."""
     share = (weights / weights.sum())[:, None]
     middle_target, middle_source = (share * tracks.target_px).sum(0), (share * tracks.source_px).sum(0)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from capture.merging.plane_transforms import Transform, middle_of, moved, scale_of
 from mrbokeh.focal_stack import FocalStack
 
 FILE_NAME = "registration.json"
@@ -52,17 +53,17 @@ def registration_drift(stack: FocalStack, width_px: int, height_px: int) -> Regi
 
 
 def drift_of(
-    reference_from_slice: Sequence[Float[np.ndarray, "2 3"]],
+    reference_from_slice: Sequence[Transform],
     width_px: int,
     height_px: int,
     correlations: Sequence[float | None] = (),
     residuals_px: Sequence[float | None] = (),
 ) -> RegistrationDrift:
-    transforms = np.stack(list(reference_from_slice))
-    middle = np.array([0.5 * width_px, 0.5 * height_px])
-    shift_px = transforms[:, :, :2] @ middle + transforms[:, :, 2] - middle
-    magnification = np.sqrt(np.abs(np.linalg.det(transforms[:, :, :2])))
-    rotation_rad = np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0])
+    middle = np.array([[0.5 * width_px, 0.5 * height_px], [0.5 * width_px + 1.0, 0.5 * height_px]])
+    ends = np.stack([moved(each, middle) for each in reference_from_slice])
+    shift_px, along = ends[:, 0] - middle[0], ends[:, 1] - ends[:, 0]
+    magnification = np.array([scale_of(each, middle_of((width_px, height_px))) for each in reference_from_slice])
+    rotation_rad = np.arctan2(along[:, 1], along[:, 0])
     known = [float(each) for each in correlations if each is not None]
     all_known = tuple(known) if len(known) == len(correlations) else ()
     return RegistrationDrift(shift_px, rotation_rad, magnification, all_known, width_px, tuple(residuals_px))

@@ -1,0 +1,102 @@
+"""Transforms of the picture plane in pixels, with (0.5, 0.5) at the centre of the first pixel.
+
+Two rows are a similarity (scale, rotation, shift). A camera in the hand also turns between slices, and pictures of a wide lens then differ
+by a perspective: three rows are a homography whose last element is 1.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+Transform = Float[np.ndarray, "_ 3"]
+
+
+def is_perspective(transform: Transform) -> bool:
+    return len(transform) == 3
+
+
+def middle_of(size_px: tuple[int, int]) -> tuple[float, float]:
+    return 0.5 * size_px[0], 0.5 * size_px[1]
+
+
+def scale_of(transform: Transform, at_px: tuple[float, float] = (0.0, 0.0)) -> float:
+    """Return by how much lengths grow at a point; a similarity enlarges all points alike."""
+    if not is_perspective(transform):
+        return float(np.hypot(transform[0, 0], transform[1, 0]))
+    # Of a homography the determinant of the derivative is that of the matrix over the cube of the denominator.
+    return float(np.sqrt(np.linalg.det(transform) / (transform[2] @ [*at_px, 1.0]) ** 3))
+
+
+def about_centre(scale: float, width_px: int, height_px: int) -> Transform:
+    """Scaling about the centre of the picture."""
+    return np.array([[scale, 0.0, (1 - scale) * width_px / 2], [0.0, scale, (1 - scale) * height_px / 2]])
+
+
+def scaled_about(pivot_px: Float[np.ndarray, "2"], similarity: Transform, scale: float) -> Transform:
+    """The similarity with another scale that takes the pivot where it went before."""
+    turn = similarity[:, :2] * (scale / scale_of(similarity))
+    return np.column_stack([turn, moved(similarity, pivot_px[None])[0] - turn @ pivot_px])
+
+
+def chained(outer: Transform, inner: Transform) -> Transform:
+    """First `inner`, then `outer`."""
+    return _reduced(_square(outer) @ _square(inner))
+
+
+def inverse(transform: Transform) -> Transform:
+    return _reduced(np.linalg.inv(_square(transform)))
+
+
+def moved(transform: Transform, xy_px: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+    """Where points go."""
+    ends = xy_px @ transform[:2, :2].T + transform[:2, 2]
+    return ends / (xy_px @ transform[2, :2] + transform[2, 2])[:, None] if is_perspective(transform) else ends
+
+
+def _square(transform: Transform) -> Float[np.ndarray, "3 3"]:
+    return np.array(transform, np.float64) if is_perspective(transform) else np.vstack([transform, [0.0, 0.0, 1.0]])
+
+
+def _reduced(matrix: Float[np.ndarray, "3 3"]) -> Transform:
+    """Return a homography with a last element of 1, or its two rows if it has no perspective."""
+    return matrix / matrix[2, 2] if (matrix[2, :2] != 0.0).any() else matrix[:2] / matrix[2, 2]
+
+
+def as_similarity(affine: Transform, width_px: int, height_px: int) -> Transform:
+    """The similarity nearest to an affine transform over a picture: both take its centre to the same place."""
+    a, b = 0.5 * (affine[0, 0] + affine[1, 1]), 0.5 * (affine[1, 0] - affine[0, 1])
+    turn, centre = np.array([[a, -b], [b, a]]), np.array([width_px / 2, height_px / 2])
+    return np.column_stack([turn, affine[:, :2] @ centre + affine[:, 2] - turn @ centre])
+
+
+def farthest_corner_px(a: Transform, b: Transform, width_px: int, height_px: int) -> float:
+    """How far apart two transforms take a corner of the picture."""
+    corners = np.array([[x, y] for x in (0.0, width_px) for y in (0.0, height_px)])
+    return float(np.hypot(*(moved(a, corners) - moved(b, corners)).T).max())
+
+
+def at_level(transform: Transform, level: int) -> Transform:
+    """The same transform in pixels of a picture 2^level times smaller (negative: larger)."""
+    return at_scale(transform, 2.0**-level)
+
+
+def at_scale(transform: Transform, scale: float) -> Transform:
+    """Return the same transform in pixels of a picture of another size."""
+    result = np.array(transform, np.float64)
+    result[:2, 2] *= scale
+    result[2:, :2] /= scale
+    return result
+
+
+def to_opencv_centres(transform: Transform) -> Transform:
+    """From centres at half pixels to OpenCV's, where pixel (0, 0) has its centre at (0, 0)."""
+    return _about(transform, 0.5)
+
+
+def from_opencv_centres(transform: Transform) -> Transform:
+    return _about(transform, -0.5)
+
+
+def _about(transform: Transform, origin_px: float) -> Transform:
+    """The same transform with the origin at (origin_px, origin_px)."""
+    shift = np.array([[1.0, 0.0, origin_px], [0.0, 1.0, origin_px]])
+    return chained(inverse(shift), chained(transform, shift))
