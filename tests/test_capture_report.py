@@ -16,6 +16,7 @@ from capture.report.exposure_drift import low_frequency_gain
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.focus_curve import focus_curve
 from capture.report.focus_spacing import focus_spacing
+from capture.report.picture_evidence import PictureFindings
 from capture.report.poses_view import poses_view, scene_of
 from capture.report.reblur import Reblur
 from capture.report.registration_drift import drift_of, registration_drift
@@ -209,7 +210,9 @@ def test_a_jump_or_a_pair_that_does_not_match_fails_registration(scene: Path, tm
 
     def verdict(shifts_px: list[float], correlations: tuple[float, ...] = ()) -> str:
         found = tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(len(shifts_px)))
-        gates = stack_gates(StackFindings(placed(shifts_px, correlations), (160, 107), (160, 107), found, curve, None, None))
+        picture = PictureFindings(None, None, 1.0, 1.0, (160, 107))
+        of_stack = placed(shifts_px, correlations)
+        gates = stack_gates(StackFindings(of_stack, (160, 107), (160, 107), found, curve, None, None, picture, ()))
         return str(next(each for each in gates if each.name == "registration held").verdict)
 
     assert verdict([0.0, 2.0, 4.0, 6.0]) == "passed"

@@ -170,9 +170,10 @@ def test_findings_are_read_back_exactly(scene: Path) -> None:
     stack: FocalStack = read_focal_stack(scene / "view_0")
     fit = SliceFit(*(Change(0.1 * k, float("inf") if k == 3 else 1.0 / (3.0 + k)) for k in range(7)))
     slices = (SliceFindings(0, 1.0 / 3.0, 0.0, 0.5, 7.25, float("inf"), 20.1, fit), SliceFindings(1, 1.5, 0.0, 1.0))
-    findings = StackFindings(stack, (160, 107), (320, 214), slices, FocusCurve(np.array([1 / 3, 2 / 3]), 0.7, 0.1, 0.2), 0.01, None)
+    curve = FocusCurve(np.array([1 / 3, 2 / 3]), 0.7, 0.1, 0.2)
     pairs = (NeighbourPlace(0, 0.1 / 3.0, 0.02, (3, 4)), NeighbourPlace(1, None, float("inf"), (160, 107)))
-    findings = replace(findings, picture=PictureFindings(1.0 / 300.0, None, float("inf"), 1.0 / 3.0, (320, 214)), pairs=pairs)
+    picture = PictureFindings(1.0 / 300.0, None, float("inf"), 1.0 / 3.0, (320, 214))
+    findings = StackFindings(stack, (160, 107), (320, 214), slices, curve, 0.01, None, picture, pairs)
     write_json(scene / "there.json", findings_document(findings))
     text = (scene / "there.json").read_text(encoding="utf-8")
     assert "Infinity" not in text and "NaN" not in text

@@ -15,14 +15,13 @@ from typer.testing import CliRunner
 
 from capture.commands.process import process_command
 from capture.commands.report import report_command
-from capture.merging import merge
-from capture.report import stack_rules
 from capture.report.detail import BLOCK_PX
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.focus_curve import FocusCurve
 from capture.report.gates import Gate
 from capture.report.kept_examination import KeptPlace
 from capture.report.neighbour_places import NeighbourPlace, PlaceEvidence
+from capture.report.picture_evidence import PictureFindings
 from capture.report.picture_gates import picture_gates
 from capture.report.scene_page import SceneReport
 from capture.report.scene_report import report_scene
@@ -243,6 +242,9 @@ def test_what_has_no_data_is_not_compared() -> None:
     assert evidence.places()[0].off_px == pytest.approx(0.0, abs=0.1)
 
 
+SHARP_PICTURE = PictureFindings(0.0, 1.0, 0.5, 0.5, (1000, 800))
+
+
 def findings_with(tmp_path: Path, residuals_px: list[float | None], pairs: tuple[NeighbourPlace, ...]) -> StackFindings:
     """Of pictures 1000 px wide."""
     write_json(tmp_path / "registration.json", {"correlations": [1.0] * len(pairs), "residuals_px": residuals_px})
@@ -251,7 +253,7 @@ def findings_with(tmp_path: Path, residuals_px: list[float | None], pairs: tuple
     stack = FocalStack(tmp_path, slices, registered=True, merged=True)
     found = tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(len(slices)))
     curve = FocusCurve(np.ones(len(slices)), 1.0, 0.0, 0.0)
-    return StackFindings(stack, (500, 400), (1000, 800), found, curve, None, None, pairs=pairs)
+    return StackFindings(stack, (500, 400), (1000, 800), found, curve, None, None, SHARP_PICTURE, pairs)
 
 
 UNKNOWN = float("inf")
@@ -301,7 +303,8 @@ def test_a_picture_too_small_to_be_judged_never_passes(tmp_path: Path) -> None:
     assert gate(report, SEAMS.name).verdict == "absent"
     assert not report.failures and not report.passed
     assert json.loads((tmp_path / "report.json").read_text())["passed"] is False
-    assert "nobody looked at the all-in-focus picture" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Not passed: not all gates of the all-in-focus pictures could be judged." in page and "nobody looked" not in page
 
 
 def app(command: Callable[..., None]) -> typer.Typer:
@@ -345,5 +348,4 @@ def test_a_gate_that_nobody_knows_is_refused_before_the_work(command: Callable[.
 
 def test_names_of_gates_are_told_apart() -> None:
     assert len(set(GATE_NAMES)) == len(GATE_NAMES) == 20
-    assert stack_rules.HIGHLIGHTS == merge.HIGHLIGHTS, "what merging leaves is what the report looks for"
     assert replace(NeighbourPlace(0, 1.4, 0.3, (0, 0)), error_px=0.6).exceeds(1.0) is False

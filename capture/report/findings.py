@@ -39,7 +39,7 @@ class StackFindings:
 
     size_px, full_size_px: width and height of the pictures as examined and as stored. depth_off_share: of the pixels that tell, how many
     contradict depth by more than `stack_rules.DEPTH_OFF_PX`. moving_share: of the picture. Both are None where nothing can be predicted.
-    picture: the all-in-focus picture beside its slices, at full size; None where nobody looked. pairs: how neighbouring slices lie.
+    picture: the all-in-focus picture beside its slices, at full size. pairs: how neighbouring slices lie.
     """
 
     stack: FocalStack
@@ -49,8 +49,8 @@ class StackFindings:
     curve: FocusCurve
     depth_off_share: float | None
     moving_share: float | None
-    picture: PictureFindings | None = None
-    pairs: tuple[NeighbourPlace, ...] = ()
+    picture: PictureFindings
+    pairs: tuple[NeighbourPlace, ...]
 
     @property
     def name(self) -> str:

@@ -7,22 +7,13 @@ import numpy as np
 
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.focus_curve import FocusCurve
+from capture.report.json_numbers import exact
 from capture.report.neighbour_places import NeighbourPlace
 from capture.report.picture_evidence import PictureFindings
 from capture.report.slice_fit import NAMES, Change, SliceFit
 from mrbokeh.focal_stack import FocalStack
 
 Number = Callable[[float | None], float | str | None]
-
-
-def exact(value: float | None) -> float | str | None:
-    """JSON has neither nan nor infinity: they are written as words, which `float` reads."""
-    return value if value is None or abs(value) < float("inf") else str(float(value))
-
-
-def finite(value: float | None) -> float | None:
-    """null for what is not finite."""
-    return value if value is not None and abs(value) < float("inf") else None
 
 
 def slice_document(found: SliceFindings, number: Number) -> dict[str, Any]:
@@ -49,7 +40,7 @@ def findings_document(findings: StackFindings) -> dict[str, Any]:
         "curve": vars(curve) | {"shares": curve.shares.tolist()},
         "depth_off_share": findings.depth_off_share,
         "moving_share": findings.moving_share,
-        "picture": None if findings.picture is None else picture_document(findings.picture, exact),
+        "picture": picture_document(findings.picture, exact),
         "pairs": [pair_document(each, exact) for each in findings.pairs],
     }
 
@@ -65,7 +56,7 @@ def findings_from(document: dict[str, Any], stack: FocalStack) -> StackFindings:
         FocusCurve(**curve | {"shares": np.asarray(curve["shares"], np.float64)}),
         document["depth_off_share"],
         document["moving_share"],
-        None if document["picture"] is None else _picture_from(document["picture"]),
+        _picture_from(document["picture"]),
         tuple(_pair_from(each) for each in document["pairs"]),
     )
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from capture.report.json_numbers import finite
+
 
 class Verdict(StrEnum):
     """absent: what the gate looks at is not there (yet), which neither passes nor fails."""
@@ -37,8 +39,7 @@ class Gate:
         return self.verdict is Verdict.FAILED
 
     def as_json(self) -> dict[str, Any]:
-        value = self.value if self.value is not None and abs(self.value) < float("inf") else None
-        return vars(self) | {"verdict": str(self.verdict), "value": value}
+        return vars(self) | {"verdict": str(self.verdict), "value": finite(self.value)}
 
 
 @dataclass(frozen=True)

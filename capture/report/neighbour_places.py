@@ -30,6 +30,8 @@ _SHARP_IN_BOTH = 0.5
 FEWEST_PATCHES = 8
 _ROUNDS = 20
 _LEAST_SCATTER_PX = 0.05
+_SURELY = 3.0
+"""Standard errors by which nothing lies apart by chance."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,9 @@ class NeighbourPlace:
     error_px: float
     place_px: tuple[int, int]
 
-    def exceeds(self, limit_px: float, sigmas: float = 3.0) -> bool:
+    def exceeds(self, limit_px: float) -> bool:
         """Whether they lie farther apart than the limit, and not by chance."""
-        return self.off_px is not None and self.off_px > max(limit_px, sigmas * self.error_px)
+        return self.off_px is not None and self.off_px > max(limit_px, _SURELY * self.error_px)
 
     def rank(self) -> tuple[bool, float]:
         """Larger for a pair that is farther apart, above all where that is no chance."""

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
+from capture.merging.merge import HIGHLIGHTS
 from capture.report.findings import StackFindings
 from capture.report.gates import Gate
 from capture.report.neighbour_places import NeighbourPlace
 from capture.report.stack_rules import (
-    HIGHLIGHTS,
     LARGEST_APART,
     LARGEST_APART_PX,
     LARGEST_FLAT,
@@ -26,24 +26,21 @@ def picture_gates(findings: StackFindings) -> list[Gate]:
 
 
 def _sharp(findings: StackFindings) -> Gate:
-    lost = None if findings.picture is None else findings.picture.lost
+    lost = findings.picture.lost
     if lost is None:
         return SHARP.absent(findings.name, NO_BLOCKS)
     return SHARP.judge(findings.name, lost, f"{lost:.2%} of the textured blocks are lost", lost <= LARGEST_LOST)
 
 
 def _seams(findings: StackFindings) -> Gate:
-    flat = None if findings.picture is None else findings.picture.flat
+    flat = findings.picture.flat
     if flat is None:
         return SEAMS.absent(findings.name, NO_BLOCKS)
     return SEAMS.judge(findings.name, flat, f"{flat:.3f} times the detail of the sharpest slice in flat zones", flat <= LARGEST_FLAT)
 
 
 def _light(findings: StackFindings) -> Gate:
-    picture = findings.picture
-    if picture is None:
-        return LIGHT.absent(findings.name, NO_BLOCKS)
-    supported = largest_supported(findings)
+    picture, supported = findings.picture, largest_supported(findings)
     measured = f"largest value {picture.top:.3g}, {picture.top_ratio:.2f} times that of the slices"
     if supported > 0.0:
         measured += f"; measured flux supports {supported:.3g}"

@@ -60,7 +60,7 @@ def write_html(report: SceneReport) -> None:
     """One file in the folder of the scene, with all pictures inside."""
     failures = report.failures
     kind = "missed" if failures else "met" if report.passed else "muted"
-    unseen = "" if failures or report.passed else " Not passed: nobody looked at the all-in-focus picture of every stack."
+    unseen = "" if failures or report.passed else " Not passed: not all gates of the all-in-focus pictures could be judged."
     blocks = [
         f"<h1>Capture report: {report.scene.resolve().name}</h1>",
         f'<p class="{kind}">{counts(report.gates)}.{unseen}</p>',

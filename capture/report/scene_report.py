@@ -6,7 +6,8 @@ from typing import Any
 from capture.report.examination import Examination, examine
 from capture.report.exclusion_masks import exclusion_masks, has_fresh_exclusions, write_exclusions
 from capture.report.findings import StackFindings
-from capture.report.findings_json import finite, pair_document, picture_document, slice_document
+from capture.report.findings_json import pair_document, picture_document, slice_document
+from capture.report.json_numbers import finite
 from capture.report.kept_examination import keep, kept, signature_of
 from capture.report.pictures import Shown, slice_triple, stack_maps
 from capture.report.reblur import Reblur
@@ -105,7 +106,7 @@ def _stack_document(examined: ExaminedStack) -> dict[str, Any]:
         "registration_shift_px": None if drift is None else drift.shift_px.tolist(),
         "registration_magnification": None if drift is None else drift.magnification.tolist(),
         "registration_residuals_px": None if drift is None else list(drift.residuals_px),
-        "picture": None if findings.picture is None else picture_document(findings.picture, finite),
+        "picture": picture_document(findings.picture, finite),
         "neighbours": [pair_document(each, finite) for each in findings.pairs],
         "worst_places": [{"gate": each.gate, "at_px": list(each.at_px), "what": each.caption} for each in examined.places],
         "slices": [slice_document(each, finite) for each in findings.slices],

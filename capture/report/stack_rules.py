@@ -39,9 +39,6 @@ LARGEST_JUMP = 0.01
 LEAST_TRUSTED = 0.2
 
 NO_BLOCKS = "the pictures are too small or too even to have blocks that tell: merge larger ones"
-HIGHLIGHTS = "highlights"
-"""Of the metadata of a merged stack: which highlights were drawn anew, as `drawn`, and the `largest_supported` value by measured flux."""
-
 NO_PREDICTION = "needs a merged stack with lens and focus distances: add them to lens.toml, ingest and merge again"
 
 SHARP = Rule(
@@ -174,4 +171,4 @@ STACK_RULES = (
     MOTION,
 )
 PICTURE_RULES = (SHARP, SEAMS, LIGHT)
-"""Those that look at the all-in-focus picture: without their verdict nobody has."""
+"""Rules of the all-in-focus picture: a report that lacks a verdict on one of them is not passed."""
