@@ -96,9 +96,7 @@ def half_of(values: Float32[np.ndarray, "*shape"]) -> Float16[np.ndarray, "*shap
     return np.asarray(cv2.multiply(values, 1.0, dtype=cv2.CV_16F))  # type: ignore[call-overload]
 
 
-def single_of(
-    values: Float16[np.ndarray, "*shape"], out: Float32[np.ndarray, "*shape"] | None = None
-) -> Float32[np.ndarray, "*shape"]:
+def single_of(values: Float16[np.ndarray, "*shape"], out: Float32[np.ndarray, "*shape"] | None = None) -> Float32[np.ndarray, "*shape"]:
     """Return half floats as single ones, in a quarter of NumPy's time; out: memory to take for them if it is of their shape."""
     import cv2
 

@@ -9,7 +9,7 @@ import pytest
 from jaxtyping import UInt8
 from PIL import Image, ImageCms
 
-from capture.merging.merged_pictures import DEPTH_NAME, DNG_NAME, PNG_NAME, TIFF_NAME, write_readable_pictures
+from capture.merging.merged_pictures import DEPTH_NAME, DNG_NAME, PNG_NAME, TIFF_NAME, readable_names, write_readable_pictures
 from capture.photos.developing import develop
 from capture.stacks.ingest import ingest
 from mrbokeh.color import convert, linear_to_srgb
@@ -55,8 +55,8 @@ def write_stored_in(path: Path, codes: UInt8[np.ndarray, "height width 3"]) -> N
 def test_png_repeats_an_eight_bit_photograph_bit_for_bit(tmp_path: Path) -> None:
     """Through the half floats of its slice: their steps are a ninth of those of 8 bits at most."""
     stack = merged_like_its_first_slice(jpeg_free_stack(tmp_path))
-    written = write_readable_pictures(stack)
-    assert [path.name for path in written] == [PNG_NAME, TIFF_NAME, DEPTH_NAME]
+    write_readable_pictures(stack)
+    assert readable_names(stack) == [PNG_NAME, TIFF_NAME, DEPTH_NAME] and not (stack.folder / DNG_NAME).exists()
     np.testing.assert_array_equal(stored_rgb(stack.folder / PNG_NAME), all_codes())
 
 
@@ -100,7 +100,8 @@ def test_dng_develops_to_the_colours_of_the_stack(tmp_path: Path) -> None:
 
     stack = only_stack(ingest([make_shoot(tmp_path / "shoot")], tmp_path / "scene"))
     merged = merged_like_its_first_slice(stack)
-    assert DNG_NAME in [path.name for path in write_readable_pictures(merged)]
+    write_readable_pictures(merged)
+    assert DNG_NAME in readable_names(merged)
     path, wanted = stack.folder / DNG_NAME, merged.all_in_focus()
     developed = develop(path, None)
     assert developed.white_balance == pytest.approx(stack.metadata["white_balance"], abs=1e-4)

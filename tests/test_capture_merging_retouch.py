@@ -94,10 +94,12 @@ def test_grey_blends_and_later_calls_add_up(stack: FocalStack, tmp_path: Path) -
 
 def test_a_merge_anew_drops_retouches_and_says_so(stack: FocalStack, tmp_path: Path) -> None:
     before = stack.all_in_focus()
+    (stack.folder.parent / "report.html").write_text("of the picture before")
     retouch_scene(stack.folder, [0], [painted_upright(tmp_path / "mask.png", white(np.uint8))])
     given = ["merge", str(stack.folder), "--overwrite", "--registration", str(unmoved(tmp_path))]
     told = CliRunner().invoke(app, given, env={"COLUMNS": "400"}, catch_exceptions=False).output
     assert "without its retouches (slice 0 by mask.png)" in told
+    assert "report.html is of pictures from before: run `mrbokeh capture report" in told
     again = read_focal_stack(stack.folder)
     assert RETOUCHES not in again.metadata
     np.testing.assert_array_equal(again.all_in_focus(), before)

@@ -63,7 +63,7 @@ def merge_command(
             raise InputError(
                 "--from-slice and --mask retouch what is merged: leave out --overwrite, --registration and --prefer, or merge first"
             )
-        _retouch(scene, from_slice or [], mask or [])
+        _tell_of_report([_retouch(scene, from_slice or [], mask or [])])
         return
     keep_freed_pictures()
     retouched = retouched_stacks(scene) if overwrite else {}
@@ -83,6 +83,7 @@ def merge_command(
             typer.echo(f"  merged anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask again")
         if told := scaled.get(stack.folder):
             typer.echo(f"  merged anew without what was told of it: tell it again by `mrbokeh capture scale {stack.folder} {told}`")
+    _tell_of_report(stacks)
 
 
 def _tell(stack: "FocalStack") -> None:
@@ -94,9 +95,19 @@ def _tell(stack: "FocalStack") -> None:
     typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {files}")
 
 
-def _retouch(scene: Path, slices: list[int], masks: list[Path]) -> None:
+def _tell_of_report(stacks: "list[FocalStack]") -> None:
+    """Say that a report is older than the pictures; a report lies in the folder of the scene, and a stack may be given alone."""
+    from capture.report import HTML_NAME
+
+    for report in {folder / HTML_NAME for stack in stacks for folder in (stack.folder, stack.folder.parent)}:
+        if report.is_file() and any(report.stat().st_mtime < stack.all_in_focus_path.stat().st_mtime for stack in stacks):
+            typer.echo(f"{report} is of pictures from before: run `mrbokeh capture report {report.parent}` again")
+
+
+def _retouch(scene: Path, slices: list[int], masks: list[Path]) -> "FocalStack":
     from capture.merging.retouch import retouch_scene, retouches_text
 
     stack = retouch_scene(scene, slices, masks)
     _tell(stack)
     typer.echo(f"  retouched: {retouches_text(stack)}")
+    return stack

@@ -34,9 +34,9 @@ def report_command(
     width: Annotated[int, typer.Option(min=64, help="wider pictures are re-blurred at this width, in pixels")] = 960,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
+    from capture.report import HTML_NAME
     from capture.report.gates import tally, verdict_lines
     from capture.report.reblur import reblur_by
-    from capture.report.scene_page import HTML_NAME
     from capture.report.scene_report import report_scene
     from capture.report.strictness import require_gates, unmet
     from mrbokeh.interrupts import kept_when_interrupted

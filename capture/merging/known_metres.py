@@ -74,8 +74,10 @@ def _numbers(text: str, count: int, option: str, expected: str) -> list[float]:
         numbers = [float(each) for each in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != count or not np.isfinite(numbers).all() or numbers[-1] <= 0.0 or (count == 5 and numbers[:2] == numbers[2:4]):
+    if len(numbers) != count or not np.isfinite(numbers).all() or numbers[-1] <= 0.0:
         raise InputError(f"{option}: expected {expected}, got {text!r}")
+    if count == 5 and numbers[:2] == numbers[2:4]:
+        raise InputError(f"{option}: expected two different pixels, got the same one twice in {text!r}")
     return numbers
 
 

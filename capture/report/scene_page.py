@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from capture.report import HTML_NAME
 from capture.report.gates import Gate, Verdict, absent, absent_names, counts, failed
 from capture.report.poses_view import poses_view
 from capture.report.scene_gates import WHERE, Reconstruction
@@ -13,7 +14,6 @@ from capture.report.stack_section import ExaminedStack, gate_table, stack_sectio
 from mrbokeh import __version__
 from mrbokeh.html_page import cell, section, table, write_page
 
-HTML_NAME = "report.html"
 MOST_WITH_PICTURES = 12
 _STYLE = """
 details { margin: 1rem 0; border-top: 1px solid #ddd; padding-top: .6rem; } summary { cursor: pointer; padding: .3rem 0; }
