@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.report.detail import BLOCK_PX, Blocks, SharpestSlices, Sharpness, border_blocks
+from capture.report.detail import Blocks, SharpestSlices, Sharpness, border_blocks
+from capture.stacks.block_detail import BLOCK_PX
 from mrbokeh.color import display_rgb8
 from tests.real_bench_stack import Rgb
 

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 
 from capture.commands.process import process_command
 from capture.commands.report import report_command
-from capture.report.detail import BLOCK_PX
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.focus_curve import FocusCurve
 from capture.report.gates import Gate
@@ -27,6 +26,7 @@ from capture.report.scene_page import SceneReport
 from capture.report.scene_report import report_scene
 from capture.report.stack_rules import LIGHT, PLACES, SEAMS, SHARP
 from capture.report.strictness import GATE_NAMES
+from capture.stacks.block_detail import BLOCK_PX
 from mrbokeh.atomic_files import write_json
 from mrbokeh.camera_rgb import write_camera_rgb
 from mrbokeh.errors import InputError

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.report.detail import BLOCK_PX, SharpestSlices, block_detail
+from capture.report.detail import SharpestSlices, block_detail
+from capture.stacks.block_detail import BLOCK_PX
 from mrbokeh.color import linear_to_srgb, srgb_to_linear
 from tests.fusion_measures import FusionScores
 from tests.process_cost import attempted

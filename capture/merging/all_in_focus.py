@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.merging.focus_volume import BLOCK_PX, Blocks, FocusVolume, block_detail
+from capture.merging.focus_volume import Blocks, FocusVolume, block_detail
+from capture.stacks.block_detail import BLOCK_PX
 from mrbokeh.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]

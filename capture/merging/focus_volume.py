@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from capture.stacks.block_detail import detail_of_blocks
+
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
@@ -19,9 +21,6 @@ LEAST_SHRINK = 2
 LARGEST_VOLUME_BYTES = 300e6
 # Where the strongest energy of a pixel is this many times that of noise, its slices need no averaging.
 CALM_NOISE_FLOORS = 1000.0
-# Blocks in which a merged picture is held against its slices (capture.report.detail).
-BLOCK_PX = 24
-DETAIL_SIGMA_PX = 1.5
 # Noise is measured at so many brightnesses, each on at least so many pixels, as a low percentile of their energies.
 _LEVELS = 24
 _WHITE = 255.0
@@ -120,12 +119,8 @@ def _energy(encoded: Rgb, window_px: float = 2.5) -> Plane:
 
 
 def block_detail(encoded: Rgb) -> Blocks:
-    """Return the root mean square of fine detail in blocks of BLOCK_PX of a picture in square roots of light; the rest is cut off."""
-    grey = cv2.transform(encoded, np.array([[0.2126, 0.7152, 0.0722]]))
-    fine = cv2.subtract(grey, cv2.GaussianBlur(grey, (0, 0), DETAIL_SIGMA_PX))
-    rows, columns = (max(side // BLOCK_PX, 1) for side in grey.shape)
-    squared = cv2.multiply(fine, fine)[: rows * BLOCK_PX, : columns * BLOCK_PX]
-    return np.sqrt(cv2.resize(squared, (columns, rows), interpolation=cv2.INTER_AREA))
+    """Return the fine detail of a picture in square roots of light by blocks, those at its border included."""
+    return detail_of_blocks(cv2.transform(encoded, np.array([[0.2126, 0.7152, 0.0722]])))
 
 
 def noise_floors(energies: Volume, levels: list[Light]) -> Float32[np.ndarray, " levels"]:

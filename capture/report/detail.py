@@ -1,21 +1,19 @@
 """Sharpness of an all-in-focus picture beside its slices, measured without truth, lens or focus distances.
 
-The detail of a block is the root mean square of what a Gaussian of DETAIL_SIGMA_PX takes from the display-encoded luminance. The measures
-hold for any tool's result, once it lies on the registered slices.
+The detail of a block is that of the display-encoded luminance (`capture.stacks.block_detail`). The measures hold for any tool's result,
+once it lies on the registered slices.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped
 
+from capture.stacks.block_detail import BLOCK_PX, detail_of_blocks
 from mrbokeh.color import linear_to_srgb
 
-BLOCK_PX = 24
-DETAIL_SIGMA_PX = 1.5
 BORDER_BLOCKS = 2
 """Blocks at the border of the picture that are left out: slices have no data there, or mirrored data."""
 KEPT_DETAIL = 0.6
@@ -33,17 +31,21 @@ def display_luminance(rgb: Rgb) -> Float32[np.ndarray, "height width"]:
 
 def block_detail(rgb: Rgb) -> Blocks:
     """Return the detail of every block of linear Rec.709 (1.0 is display white); border blocks and a rest below BLOCK_PX are cut off."""
-    luminance = display_luminance(rgb)
-    fine = luminance - cv2.GaussianBlur(luminance, (0, 0), DETAIL_SIGMA_PX)
-    return np.sqrt(inner_blocks(fine * fine).mean(axis=(1, 3))).astype(np.float32)
+    return detail_of_blocks(display_luminance(rgb))[_inside(rgb.shape)]
 
 
 def inner_blocks(plane: Shaped[np.ndarray, "height width"]) -> Shaped[np.ndarray, "rows block columns block"]:
     """Return a plane cut into its blocks, those at the border and a rest below BLOCK_PX left out."""
     rows, columns = (side // BLOCK_PX for side in plane.shape)
-    border = border_blocks(plane.shape)
-    blocks = plane[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX)
-    return blocks[border : rows - border, :, border : columns - border]
+    down, across = _inside(plane.shape)
+    return plane[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX)[down, :, across]
+
+
+def _inside(shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of the blocks that are not at the border."""
+    border = border_blocks(shape)
+    down, across = (slice(border, side // BLOCK_PX - border) for side in shape[:2])
+    return down, across
 
 
 def border_blocks(shape: tuple[int, ...]) -> int:

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from capture.report.detail import BLOCK_PX, SharpestSlices, Sharpness, block_detail, border_blocks, inner_blocks
+from capture.report.detail import SharpestSlices, Sharpness, block_detail, border_blocks, inner_blocks
+from capture.stacks.block_detail import BLOCK_PX
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]

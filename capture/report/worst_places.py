@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from capture.report.detail import BLOCK_PX
 from capture.report.neighbour_places import NeighbourPlace
 from capture.report.picture_evidence import PictureLook
 from capture.report.pictures import Shown, crops_shown
 from capture.report.stack_rules import LARGEST_FLAT, LARGEST_LOST, LARGEST_TOP, LIGHT, PLACES, SEAMS, SHARP
+from capture.stacks.block_detail import BLOCK_PX
 from mrbokeh.focal_stack import FocalStack
 
 Rgb = Float32[np.ndarray, "height width 3"]

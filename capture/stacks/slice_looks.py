@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from capture.photos.decoded_photo import DecodedPhoto
+from capture.stacks.block_detail import block_means, detail_of_blocks
 from capture.stacks.gain_fit import LowFrequency, correlation, fit_gain, low_frequency
 from mrbokeh.camera_rgb import Matrix3x3
 from mrbokeh.color import convert, luminance
 
 _LONG_SIDE_PX = 1000
 _FEATURE_SIDE_PX = 480
-_BLOCK_PX = 24
 _NOISE_CODES = 0.3
 _SAME_LIGHT_CODES = 1.5
 _SAME_BLOCK_CODES = 2.5
@@ -88,7 +88,7 @@ def look_at(
 
 
 def same_photograph(first: SliceLook, second: SliceLook) -> bool:
-    """Identical, or all but (a copy that was compressed again): the detail of 24-px blocks differs by 3 % at most, as do hardly any codes.
+    """Identical, or all but (a copy that was compressed again): the detail of blocks differs by 3 % at most, as do hardly any codes.
 
     Neighbours of a finely stepped sweep differ more: where one sharpens by less, it adds nothing to the other.
     """
@@ -100,10 +100,10 @@ def same_photograph(first: SliceLook, second: SliceLook) -> bool:
     difference = first.codes.astype(np.float32) - second.codes
     if not difference.any():
         return True
-    details = [_detail(each.codes) for each in (first, second)]
+    details = [detail_of_blocks(each.codes.astype(np.float32)) for each in (first, second)]
     textured = np.maximum(*details) >= np.median(np.maximum(*details))
     ratio = np.abs(np.log((details[0] + _NOISE_CODES) / (details[1] + _NOISE_CODES)))[textured]
-    blocks = np.sqrt(_block_means(difference**2))
+    blocks = np.sqrt(block_means(difference**2))
     return float(np.percentile(ratio, 95)) <= _SAME_DETAIL and float(np.percentile(blocks, 95)) <= _SAME_BLOCK_CODES
 
 
@@ -153,18 +153,3 @@ def _features_agree(first: SliceLook, second: SliceLook) -> bool | None:
         return False
     scale, count = float(np.hypot(similarity[0, 0], similarity[1, 0])), int(agreeing.sum())
     return count >= max(_FEWEST_MATCHES, _LEAST_AGREEING * len(good)) and 1.0 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE
-
-
-def _detail(codes: UInt8[np.ndarray, "height width"]) -> Float32[np.ndarray, "rows columns"]:
-    import cv2
-
-    values = codes.astype(np.float32)
-    return np.sqrt(_block_means((values - cv2.GaussianBlur(values, (0, 0), 1.5)) ** 2))
-
-
-def _block_means(values: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "rows columns"]:
-    import cv2
-
-    rows, columns = (max(1, each // _BLOCK_PX) for each in values.shape)
-    cut = values[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
-    return cv2.resize(np.ascontiguousarray(cut), (columns, rows), interpolation=cv2.INTER_AREA)
