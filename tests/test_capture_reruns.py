@@ -10,12 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 import capture.stacks.stack_ingest
+import mrbokeh.camera_rgb
 from capture.cli import app
 from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.slice_files import find_slices
 from capture.stacks.stack_ingest import Development
 from mrbokeh.errors import InputError
+from mrbokeh.image_io import write_image
 from tests.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
 
 
@@ -92,6 +94,37 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(shoot: Path, tmp_path: Pat
     assert (stack.slices, stack.metadata) == (whole.slices, whole.metadata)
     assert all(np.array_equal(stack.slice_rgb(index), whole.slice_rgb(index)) for index in range(5))
     assert not [path for path in stack.folder.rglob("*") if path.name.startswith((".", "made_", "moving_"))]
+
+
+def opened_slices(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Every slice whose pixels are read from now on, once for each time."""
+    opened: list[str] = []
+    read = mrbokeh.camera_rgb.read_exr
+    monkeypatch.setattr(mrbokeh.camera_rgb, "read_exr", lambda path: (opened.append(path.name), read(path))[1])
+    return opened
+
+
+@pytest.mark.parametrize(("grouping", "times"), [(Grouping.folder, 1), (Grouping.none, 0)])
+def test_kept_slices_are_read_once_or_not_at_all(
+    grouping: Grouping, times: int, shoot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sixth photograph joins five that are there: whether it belongs is seen in their pixels, but their sizes are on record."""
+    settings = IngestSettings(grouping)
+    ingest([shoot], tmp_path / "scene", settings)
+    make_raw_photo(shoot / "IMG_7.dng", scene_rgb(72, 96), 0.7)
+    opened = opened_slices(monkeypatch)
+    assert ingest([shoot], tmp_path / "scene", settings).stacks[0].kept == 5
+    assert sorted(opened) == sorted(times * [f"{index:02d}.exr" for index in range(5)])
+
+
+def test_the_stack_that_set_the_exposure_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without stated exposure the second stack is brought to the first by what both show."""
+    for name, light in (("a", 1.0), ("b", 0.5)):
+        write_image(tmp_path / name / "0.png", np.minimum(scene_rgb(96, 128), 0.6) * np.float32(light))
+    ingest([tmp_path / "a"], tmp_path / "scene")
+    opened = opened_slices(monkeypatch)
+    slice_ = only_stack(ingest([tmp_path / "b"], tmp_path / "scene")).slices[0]
+    assert slice_.metadata["exposure_gain_session"] == pytest.approx(2.0, rel=0.02) and opened == ["00.exr"]
 
 
 def test_copies_of_one_photograph_stay_apart(tmp_path: Path) -> None:

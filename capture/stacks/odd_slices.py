@@ -24,32 +24,34 @@ Odd = dict[int, str]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A developed photograph that might become a slice. size_px: width, height."""
+    """A developed photograph that might become a slice."""
 
     photo: Photo
-    size_px: tuple[int, int]
     look: SliceLook
 
 
-def odd_sizes(candidates: Sequence[Candidate]) -> Odd:
-    """All but those of the size that most have. Raises InputError where no size is the usual one."""
-    sizes = Counter(each.size_px for each in candidates)
+def odd_sizes(named: Sequence[tuple[str, tuple[int, int]]]) -> Odd:
+    """Find those of another size than most. Raises InputError where no size is the usual one.
+
+    named: file name, and width and height.
+    """
+    sizes = Counter(size for _, size in named)
     if len(sizes) < 2:
         return {}
     (usual, count), (_, next_count) = sizes.most_common(2)
     if count == next_count:
-        listed = ", ".join(f"{each.photo.path.name} {_size(each.size_px)}" for each in candidates[:6])
-        more = " ..." if len(candidates) > 6 else ""
+        listed = ", ".join(f"{name} {_size(size)}" for name, size in named[:6])
+        more = " ..." if len(named) > 6 else ""
         raise InputError(
-            f"the slices of a stack have one size, but of these {len(candidates)} photographs no size is the usual one ({listed}{more}): "
+            f"the slices of a stack have one size, but of these {len(named)} photographs no size is the usual one ({listed}{more}): "
             f"put each stack into a folder of its own, or take away what does not belong"
         )
-    odd = ((index, each.size_px) for index, each in enumerate(candidates) if each.size_px != usual)
+    odd = ((index, size) for index, (_, size) in enumerate(named) if size != usual)
     return {index: f"{_size(size)} px, but most of its stack have {_size(usual)} px" for index, size in odd}
 
 
 def blown(candidates: Sequence[Candidate]) -> Odd:
-    """Those that are almost all saturated or black while the others are not."""
+    """Find those that are almost all saturated or black while the others are not."""
     odd = {}
     for index, each in enumerate(candidates):
         others = [other.look for at, other in enumerate(candidates) if at != index]
@@ -63,7 +65,7 @@ def blown(candidates: Sequence[Candidate]) -> Odd:
 
 
 def duplicates(candidates: Sequence[Candidate]) -> Odd:
-    """Those that are all but identical with an earlier one, unless their files state another focus."""
+    """Find those that are all but identical with an earlier one, unless their files state another focus."""
     odd: Odd = {}
     for index, each in enumerate(candidates):
         kept = (other for at, other in enumerate(candidates[:index]) if at not in odd)
@@ -74,7 +76,7 @@ def duplicates(candidates: Sequence[Candidate]) -> Odd:
 
 
 def strangers(candidates: Sequence[Candidate]) -> Odd:
-    """Those of another scene than most. Raises InputError where no scene has more than half of them."""
+    """Find those of another scene than most. Raises InputError where no scene has more than half of them."""
     scenes = sorted(_scenes([each.look for each in candidates]), key=len, reverse=True)
     if len(scenes) < 2:
         return {}
@@ -114,7 +116,7 @@ def _hang_together(looks: Sequence[SliceLook], scene: Sequence[int], other: Sequ
 
 
 def _same_focus(first: Photo, second: Photo) -> bool:
-    """As far as is stated; in dioptres, because of infinity."""
+    """Tell whether two are focused alike as far as is stated; in dioptres, because of infinity."""
     distances_m = first.focus_distance_m, second.focus_distance_m
     if distances_m[0] is None or distances_m[1] is None:
         return distances_m[0] is distances_m[1]

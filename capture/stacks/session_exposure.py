@@ -6,7 +6,7 @@ from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.photo_metadata import PhotoMetadata, StatedExposure
 from capture.stacks.exposure import ExposureGain, overlap_gain
 from capture.stacks.gain_fit import LowFrequency, low_frequency
-from mrbokeh.camera_rgb import read_camera_rgb, read_slice_masks
+from mrbokeh.camera_rgb import read_slice
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import read_focal_stack
 
@@ -34,6 +34,7 @@ def _light_of_stack(folder: Path) -> LowFrequency | None:
     try:
         stack = read_focal_stack(folder)
         path = stack.folder / stack.slices[0].metadata.get("ingested", stack.slices[0].path)
-        return low_frequency(read_camera_rgb(path), read_slice_masks(path).saturated, stack.rec709_from_camera)
+        rgb, masks = read_slice(path)
+        return low_frequency(rgb, masks.saturated, stack.rec709_from_camera)
     except InputError:
         return None

@@ -18,13 +18,13 @@ from capture.stacks.disk_space import DiskFullError
 from capture.stacks.exposure import ExposureGain, evened_out
 from capture.stacks.gain_fit import LowFrequency
 from capture.stacks.grouping import Photo
-from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, strangers
+from capture.stacks.odd_slices import Candidate, Odd, blown, duplicates, odd_sizes, strangers
 from capture.stacks.session import CameraChoice
 from capture.stacks.session_exposure import gain_to_session, stated_gain
 from capture.stacks.slice_files import FOLDER, find_slices, source_record, write_slice
 from capture.stacks.slice_looks import SliceLook, look_at, look_of
 from capture.stacks.slice_metadata import slice_metadata
-from mrbokeh.camera_rgb import Matrix3x3, matrix3x3, read_camera_rgb, read_slice_masks
+from mrbokeh.camera_rgb import Matrix3x3, matrix3x3, read_slice
 from mrbokeh.color import convert
 from mrbokeh.errors import InputError
 
@@ -92,11 +92,14 @@ class StackWork:
         Raises InputError where no more than half of the slices belong together.
         """
         first = self.finished[0]
-        for odd in (odd_sizes,) if sizes_only else (odd_sizes, blown, duplicates, strangers):
-            reasons = odd([Candidate(each.photo, tuple(each.record["size_px"]), self._look(each)) for each in self.finished])
-            self.skipped += [SkippedFile(self.finished[index].photo.path, reason) for index, reason in reasons.items()]
-            self.finished = [each for index, each in enumerate(self.finished) if index not in reasons]
+        self._leave_out(odd_sizes([(each.photo.path.name, tuple(each.record["size_px"])) for each in self.finished]))
+        for odd in () if sizes_only else (blown, duplicates, strangers):
+            self._leave_out(odd([Candidate(each.photo, self._look(each)) for each in self.finished]))
         return self.finished[0] is not first
+
+    def _leave_out(self, odd: Odd) -> None:
+        self.skipped += [SkippedFile(self.finished[index].photo.path, reason) for index, reason in odd.items()]
+        self.finished = [each for index, each in enumerate(self.finished) if index not in odd]
 
     def with_another_reference(self) -> "StackWork":
         """The slice that gave the exposure was left out: the others evened out again, relative to the first of them."""
@@ -116,13 +119,13 @@ class StackWork:
                 folder.rmdir()
 
     def _look(self, finished: FinishedSlice) -> SliceLook:
-        """As it was before its exposure was evened out; read from the slice where an earlier run made it."""
+        """Return how a slice looked before its exposure was evened out; it is read where an earlier run made it."""
         if finished.path not in self._looks:
             metadata, matrix = finished.record["metadata"], finished.record["rec709_from_camera"]
             gain = np.float32(metadata["exposure_gain"])
-            rgb, saturated = read_camera_rgb(finished.path) / gain, read_slice_masks(finished.path).saturated
+            rgb, masks = read_slice(finished.path)
             primaries = None if matrix is None else matrix3x3(matrix)
-            self._looks[finished.path] = look_at(rgb, saturated, primaries, metadata["saturated_fraction"] or 0.0)
+            self._looks[finished.path] = look_at(rgb / gain, masks.saturated, primaries, metadata["saturated_fraction"] or 0.0)
         return self._looks[finished.path]
 
     def _request(self, photo: Photo) -> dict[str, Any]:
