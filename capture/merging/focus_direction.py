@@ -109,11 +109,14 @@ class Contours:
         points = np.arange(len(self.places_px))
         low, high = (strength[np.rint(side).astype(int), points] for side in (self.low, self.high))
         usable = (blur > _LEAST_BLUR_PX) & (np.rint(self.low) < np.rint(self.high))
-        counts, lows, highs = (np.bincount(self.block[usable], each[usable], _BLOCKS**2) for each in (np.ones(len(low)), low, high))
-        if (counts > 0).sum() < _FEWEST_BLOCKS:
+        # Weak contours tell little: each vote counts as much as the step is high.
+        both = low + high
+        vote, height = (low - high) / np.maximum(both, 1e-12), np.sqrt(both)
+        heights, summed = (np.bincount(self.block[usable], each[usable], _BLOCKS**2) for each in (height, height * vote))
+        if (heights > 0).sum() < _FEWEST_BLOCKS:
             return 0.0
-        votes = (lows - highs) / np.maximum(lows + highs, 1e-12)
-        share = np.sqrt(counts) / np.sqrt(counts).sum()
+        votes = summed / np.maximum(heights, 1e-12)
+        share = np.sqrt(heights) / np.sqrt(heights).sum()
         mean = float((share * votes).sum())
         return mean / (float(np.sqrt((share**2 * (votes - mean) ** 2).sum())) + 1e-6)
 
