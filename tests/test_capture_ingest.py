@@ -174,6 +174,21 @@ def test_the_command_prints_a_table(shoot: Path, tmp_path: Path) -> None:
     assert "--white-balance 2,1,1.6" in result.output
 
 
+def test_what_is_no_photograph_is_told_in_one_line(shoot: Path, tmp_path: Path) -> None:
+    """Sidecars are read and hidden files are nobody's; where photographs are named one by one, nobody asked for the rest."""
+    for name in ("notes.txt", "clip.mov", ".hidden", "lens.toml", *(f"IMG_{index}.xmp" for index in range(8, 13))):
+        (shoot / name).write_text("")
+    named = sorted(shoot.glob("*.dng"))
+    for given, told in (([shoot], "clip.mov, IMG_8.xmp, IMG_9.xmp, IMG_10.xmp, IMG_11.xmp ... (7 files)"), (named, None)):
+        result = CliRunner().invoke(app, ["ingest", *map(str, given), "--out", str(tmp_path / "scene")])
+        lines = [each for each in result.output.splitlines() if each.startswith("not photographs")]
+        assert result.exit_code == 0 and lines == ([] if told is None else [f"not photographs, left out: {told}"])
+    (shoot / "my.toml").write_text("")
+    (tmp_path / "shoot" / "aside").mkdir()
+    report = ingest([shoot], tmp_path / "scene", IngestSettings(sidecar=shoot / "my.toml"))
+    assert {each.name for each in report.no_photographs} == {"notes.txt", "clip.mov", *(f"IMG_{index}.xmp" for index in range(8, 13))}
+
+
 @pytest.mark.parametrize("command", ["ingest", "merge"])
 def test_help_shows_an_example(command: str) -> None:
     result = CliRunner().invoke(app, [command, "--help"])

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from capture.photos.focus_csv import FILE_NAME as FOCUS_FILE
 from capture.photos.raw import RAW_SUFFIXES
+from capture.photos.sidecar import FILE_NAME as LENS_FILE
 from mrbokeh.errors import InputError
 from mrbokeh.focal_stack import FILE_NAME as STACK_FILE_NAME
 from mrbokeh.image_io import ENCODED_SUFFIXES, HEIF_ADVICE, HEIF_SUFFIXES, LINEAR_SUFFIXES
@@ -68,6 +70,16 @@ def find_photos(given: Sequence[Path], scene: Path) -> tuple[list[PhotoFolder], 
         skipped += doubles
         result.append(PhotoFolder(folder, found[folders[folder][0]], tuple(kept)))
     return result, skipped
+
+
+def no_photographs(given: Sequence[Path], folders: Sequence[PhotoFolder], sidecar: Path | None = None) -> list[Path]:
+    """Find files that lie beside photographs in folders that were searched and are none, without hidden files and sidecars."""
+    searched = [Path(each).resolve() for each in given if Path(each).is_dir()]
+    looked_in = [each.folder for each in folders if any(each.folder.is_relative_to(top) for top in searched)]
+    read = {folder / name for folder in looked_in for name in (LENS_FILE, FOCUS_FILE)} | ({sidecar.resolve()} if sidecar else set())
+    beside = sorted((path for folder in looked_in for path in folder.iterdir() if path not in read), key=natural_key)
+    known = (*PHOTO_SUFFIXES, *HEIF_SUFFIXES)
+    return [path for path in beside if path.is_file() and not path.name.startswith(".") and path.suffix.lower() not in known]
 
 
 def _photos_under(top: Path, scene: Path) -> tuple[list[Path], list[SkippedFile]]:

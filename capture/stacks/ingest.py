@@ -11,7 +11,7 @@ from pathlib import Path
 
 from capture.photos.developing import is_raw
 from capture.photos.metadata import read_metadata_of
-from capture.photos.photo_files import PhotoFolder, SkippedFile, find_photos
+from capture.photos.photo_files import PhotoFolder, SkippedFile, find_photos, no_photographs
 from capture.photos.raw import read_raw_metadata
 from capture.photos.sidecar import sidecar_of
 from capture.stacks.disk_space import told_when_full
@@ -36,10 +36,11 @@ class IngestSettings:
 
 @dataclass(frozen=True)
 class IngestReport:
-    """All stacks of a call, and the files that belong to none."""
+    """All stacks of a call, and the files that belong to none. no_photographs: what else lies beside the photographs."""
 
     stacks: tuple[StackReport, ...]
     skipped: tuple[SkippedFile, ...]
+    no_photographs: tuple[Path, ...]
 
 
 def ingest(given: Sequence[Path], scene: Path, settings: IngestSettings | None = None) -> IngestReport:
@@ -61,7 +62,7 @@ def ingest(given: Sequence[Path], scene: Path, settings: IngestSettings | None =
         raise InputError(
             "; ".join(problems) or _nothing_usable(given, [*skipped, *(each for report in reports for each in report.skipped)])
         )
-    return IngestReport(tuple(reports), tuple(skipped))
+    return IngestReport(tuple(reports), tuple(skipped), tuple(no_photographs(given, folders, settings.sidecar)))
 
 
 def photos_of_folder(folder: PhotoFolder, sidecar_path: Path | None = None, advance: Callable[[], None] = lambda: None) -> list[Photo]:

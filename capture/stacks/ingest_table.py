@@ -1,6 +1,8 @@
 """What ingest did, for people: a table of stacks, remarks below it, and the files that were left out."""
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -9,6 +11,8 @@ from capture.stacks.ingest import IngestReport
 from capture.stacks.stack_description import StackReport
 from capture.stacks.stack_lens import lens_text
 from mrbokeh.focal_stack import FocalStack
+
+_MOST_NAMED = 5
 
 
 def print_report(report: IngestReport, console: Console) -> None:
@@ -24,6 +28,14 @@ def print_report(report: IngestReport, console: Console) -> None:
             console.print(f"no stack {each.name}: {each.problem}", style="yellow", highlight=False, markup=False, soft_wrap=True)
     for skipped in (*report.skipped, *(one for each in report.stacks for one in each.skipped)):
         console.print(f"skipped {skipped.path.name}: {skipped.reason}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+    if report.no_photographs:
+        console.print(f"not photographs, left out: {_some_names(report.no_photographs)}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _some_names(paths: Sequence[Path]) -> str:
+    """Name the first few, and say how many there are."""
+    more = f" ... ({len(paths)} files)" if len(paths) > _MOST_NAMED else ""
+    return ", ".join(each.name for each in paths[:_MOST_NAMED]) + more
 
 
 def focus_text(stack: FocalStack) -> str:
