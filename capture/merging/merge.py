@@ -98,7 +98,7 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
 
 
 def _with_highlights(stack: FocalStack, restored: Sequence[RestoredLight]) -> FocalStack:
-    found = {"drawn": len(restored), "largest_supported": max((each.largest for each in restored), default=0.0)}
+    found = {"drawn": len(restored), "largest_supported": max((each.supported for each in restored), default=0.0)}
     return replace(stack, metadata=stack.metadata | {HIGHLIGHTS: found})
 
 

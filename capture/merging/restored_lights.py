@@ -55,15 +55,15 @@ MARGIN_PX = 3
 
 @dataclass(frozen=True)
 class RestoredLight:
-    """What replaces a part of the all-in-focus picture: picture (h, w, 3) where mask (h, w), at box (rows, columns)."""
+    """What replaces a part of the all-in-focus picture: picture (h, w, 3) where mask (h, w), at box (rows, columns).
+
+    supported: the largest value that the light can have, all of the flux that its discs show in one pixel above what is around it.
+    """
 
     box: tuple[slice, slice]
     mask: Mask
     picture: Rgb
-
-    @property
-    def largest(self) -> float:
-        return float(self.picture[self.mask].max(initial=0.0))
+    supported: float
 
 
 def restored_lights(
@@ -187,7 +187,8 @@ def _restored(patches: Patches, ordinary: Rgb, place: _Place, areas_px: Float[np
             ways.append((error * handicap * (CLEARLY if lost and picture is not drawn else 1.0), error, picture))
     _, error, picture = min(ways, key=lambda way: way[0])
     limit = min(LARGEST_ERROR_SHARE * compare.error(ordinary), (1.0 - LEAST_EXPLAINED) * compare.light)
-    return RestoredLight(place.box, (picture != ordinary).any(axis=2), picture) if error < limit else None
+    supported = float(np.median(discs.flux[discs.believable], axis=0).max()) + float(ordinary[zone & ~core].max(initial=0.0))
+    return RestoredLight(place.box, (picture != ordinary).any(axis=2), picture, supported) if error < limit else None
 
 
 def _stands_alone(sharp: Rgb, place: _Place) -> bool:
