@@ -1,14 +1,19 @@
 """`mrbokeh capture process`: everything from photographs to a report in one go."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+if TYPE_CHECKING:
+    from mrbokeh.focal_stack import FocalStack
 
 HELP = "\n\n".join(
     (
         "Run ingest, merge, poses, scale, depth and report one after the other. What is finished in SCENE is kept, an interrupted "
         "stage goes on, and only the pages of the report are written anew each time; --overwrite makes everything again. "
+        "A new scene is taken away again where no stack of it can be merged. "
         "With one viewpoint, or where camera poses cannot be found, depth comes from focus alone, and the report says so.",
         "Example:  mrbokeh capture process shoot/ --out scene/",
         "Example:  mrbokeh capture process shoot/ --out scene/ --board 8x6 --square-mm 30 --marker-mm 22 --strict",
@@ -41,6 +46,7 @@ def process_command(
     from capture.commands.report import report_command
     from capture.commands.scale import scale_command
     from capture.report.strictness import require_gates
+    from capture.stacks.begun_scene import taken_away_when_refused
     from capture.stacks.session import FILE_NAME as SESSION_NAME
     from capture.views.board_options import board_from_options
     from capture.views.scale_distance import parse_distance
@@ -54,8 +60,9 @@ def process_command(
         board_from_options(board, square_mm, marker_mm, "DICT_4X4_50")
     if (out / SESSION_NAME).exists() and not overwrite:
         typer.echo(f"{out} is there already: what is finished is kept, the rest goes on (--overwrite makes all of it again)")
-    ingest_command(photographs, out, sidecar=sidecar, max_width=max_width, overwrite=overwrite)
-    merge_command(out, prefer=prefer, overwrite=overwrite)
+    with taken_away_when_refused(out, _is_of_use):
+        ingest_command(photographs, out, sidecar=sidecar, max_width=max_width, overwrite=overwrite)
+        merge_command(out, prefer=prefer, overwrite=overwrite)
     if len(find_focal_stacks(out)) < 2:
         typer.echo("one viewpoint: depth comes from focus alone (photograph five or more for depth from several views)")
     else:
@@ -68,3 +75,10 @@ def process_command(
             scale_command(out, board=board, square_mm=square_mm, marker_mm=marker_mm, distance=distance, overwrite=overwrite)
             depth_command(out, overwrite=overwrite)
     report_command(out, strict=strict, allow_absent=allow_absent, overwrite=overwrite)
+
+
+def _is_of_use(stacks: "Sequence[FocalStack]") -> bool:
+    """Whether one is merged, or may be once the first, at which merging stopped, is mended."""
+    from capture.stacks.stack_remarks import FEWEST_TO_MERGE
+
+    return any(each.merged for each in stacks) or any(len(each) >= FEWEST_TO_MERGE for each in stacks[1:])

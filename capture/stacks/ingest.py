@@ -14,6 +14,7 @@ from capture.photos.metadata import read_metadata_of
 from capture.photos.photo_files import PhotoFolder, SkippedFile, find_photos, no_photographs
 from capture.photos.raw import read_raw_metadata
 from capture.photos.sidecar import sidecar_of
+from capture.stacks.begun_scene import taken_away_when_refused
 from capture.stacks.disk_space import told_when_full
 from capture.stacks.grouping import Grouping, Photo, PhotoGroup, group_photos, in_focus_order, why_aside
 from capture.stacks.session import CameraChoice, Session, open_session
@@ -45,7 +46,11 @@ class IngestReport:
 
 def ingest(given: Sequence[Path], scene: Path, settings: IngestSettings | None = None) -> IngestReport:
     """Make or complete the stacks of a scene. Unusable files are reported and left out; InputError where nothing is usable."""
-    settings, scene = settings or IngestSettings(), Path(scene)
+    with taken_away_when_refused(Path(scene), bool):
+        return _ingested(given, Path(scene), settings or IngestSettings())
+
+
+def _ingested(given: Sequence[Path], scene: Path, settings: IngestSettings) -> IngestReport:
     folders, skipped = find_photos(given, scene)
     with progress_bars() as progress:
         reading = progress.add_task("metadata", total=sum(len(each.paths) for each in folders))
