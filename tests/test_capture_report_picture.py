@@ -318,6 +318,7 @@ def test_strict_asks_for_every_gate(tmp_path: Path) -> None:
     write_made(tmp_path / "view_0", right())
     plain = CliRunner().invoke(app(report_command), [str(tmp_path)])
     assert plain.exit_code == 0 and "9 of 20 gates judged, 0 failed, 11 absent: all viewpoints placed" in plain.output
+    assert "--strict" not in plain.output
     assert "absent: all viewpoints placed, points lie where they are seen, scales agree: no reconstruction" in plain.output
     absences = [each.name for each in report_scene(tmp_path).absences]
     allowed = [option for name in absences for option in ("--allow-absent", name.upper())]
@@ -331,6 +332,9 @@ def test_strict_fails_on_a_fault_whatever_is_allowed(tmp_path: Path) -> None:
     allowed = [option for name in GATE_NAMES for option in ("--allow-absent", name)]
     failed = CliRunner().invoke(app(report_command), [str(tmp_path), "--strict", *allowed])
     assert failed.exit_code == 1
+    *lines, last = CliRunner().invoke(app(report_command), [str(tmp_path)]).output.splitlines()
+    count = sum(each.startswith("failed: ") for each in lines)
+    assert count and last.startswith(f"{count} gate{'s' if count > 1 else ''} failed: --strict would make this an error")
     line = next(each for each in failed.output.splitlines() if each.startswith("failed: "))
     assert f"view_0: {SHARP.name}: " in line and "Look at the crops." in line, "what failed, and what to do"
 

@@ -51,6 +51,9 @@ def report_command(
     reused = sum(each.reused for each in report.stacks)
     before = f" ({reused} of {len(report.stacks)} stacks were examined before; --overwrite examines them again)" if reused else ""
     typer.echo(f"{scene / HTML_NAME}: {tally(report.gates)}{before}")
+    if report.failures and not strict:
+        count = "1 gate failed" if len(report.failures) == 1 else f"{len(report.failures)} gates failed"
+        typer.echo(f"{count}: --strict would make this an error (exit code 1)")
     short_of = unmet(report, allowed) if strict else []
     if any(not each.failed for each in short_of):
         typer.echo('--strict: gates that may stay unjudged are named one by one, as in --allow-absent "scales agree"')
