@@ -118,7 +118,7 @@ class Measuring:
         return replace(result, figures=figures, shown=shown, refocus=_left_out(made) if self.leave_one_out else None)
 
     def _beside_peers(self, stack: RealStack, captured: Captured, made: FocalStack, picture: Rgb) -> tuple[dict[str, Figures], list[Shown]]:
-        sharpest = SharpestSlices.of(made.iter_rgb())
+        sharpest = SharpestSlices.of(made.iter_rgb(), (made.slice_masks(index).valid for index in range(len(made))))
         own = sharpest.measure(picture)
         figures, pictures = {OURS: Figures(own.lost, own.flat, own.top, *captured.making)}, {OURS: picture}
         slices = features_of_slices(made.iter_rgb(), len(made)) if self.peers else []

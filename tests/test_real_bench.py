@@ -116,6 +116,8 @@ def test_crops_show_the_worst_places(tmp_path: Path) -> None:
     picture[hole] = 0.2
     picture[198:203, 58:63] = 8.0
     picture[200, 60] = 9.0
+    nothing = SharpestSlices.of([np.full_like(sharp, 0.2), sharp], [None, np.zeros(sharp.shape[:2], bool)])
+    assert (nothing.index == 0).all(), "what stands where a slice has no data is not sharp"
     sharpest = SharpestSlices.of([np.full_like(sharp, 0.2), sharp])
     measured = sharpest.measure(picture)
     places = worst_places(sharpest, measured, picture, top_bar=1.5)

@@ -7,6 +7,7 @@ once it lies on the registered slices.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped
@@ -22,6 +23,7 @@ FLAT_PERCENTILE = 30.0
 Rgb = Float32[np.ndarray, "height width 3"]
 Blocks = Float32[np.ndarray, "rows columns"]
 BlockMask = Bool[np.ndarray, "rows columns"]
+Mask = Bool[np.ndarray, "height width"]
 
 
 def display_luminance(rgb: Rgb) -> Float32[np.ndarray, "height width"]:
@@ -29,9 +31,13 @@ def display_luminance(rgb: Rgb) -> Float32[np.ndarray, "height width"]:
     return linear_to_srgb(np.clip(rgb, 0.0, 1.0)) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
-def block_detail(rgb: Rgb) -> Blocks:
-    """Return the detail of every block of linear Rec.709 (1.0 is display white); border blocks and a rest below BLOCK_PX are cut off."""
-    return detail_of_blocks(display_luminance(rgb))[_inside(rgb.shape)]
+def block_detail(rgb: Rgb, valid: Mask | None = None) -> Blocks:
+    """Return the detail of every block of linear Rec.709 (1.0 is display white); border blocks and a rest below BLOCK_PX are cut off.
+
+    valid: where the picture has data; blocks in which it lacks some have no detail, however sharp what stands for it may be.
+    """
+    detail = detail_of_blocks(display_luminance(rgb))[_inside(rgb.shape)]
+    return detail if valid is None or valid.all() else np.where(inner_blocks(valid).all(axis=(1, 3)), detail, np.float32(0.0))
 
 
 def inner_blocks(plane: Shaped[np.ndarray, "height width"]) -> Shaped[np.ndarray, "rows block columns block"]:
@@ -66,11 +72,11 @@ class SharpestSlices:
     largest: float
 
     @classmethod
-    def of(cls, slices: Iterable[Rgb]) -> "SharpestSlices":
-        """Read the slices (linear Rec.709, one size) once."""
+    def of(cls, slices: Iterable[Rgb], valid: Iterable[Mask | None] = repeat(None)) -> "SharpestSlices":
+        """Read the slices (linear Rec.709, one size) once. valid: where each has data, None for everywhere."""
         details, largest = [], 0.0
-        for rgb in slices:
-            details.append(block_detail(rgb))
+        for rgb, known in zip(slices, valid, strict=False):
+            details.append(block_detail(rgb, known))
             largest = max(largest, float(rgb.max()))
         return cls.of_details(details, largest)
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from capture.report.detail import SharpestSlices, Sharpness, block_detail, border_blocks, inner_blocks
+from capture.report.detail import SharpestSlices, Sharpness, block_detail, border_blocks
 from capture.stacks.block_detail import BLOCK_PX
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -46,8 +46,7 @@ class PictureEvidence:
 
     def add(self, rgb: Rgb, camera_rgb: Rgb, valid: Mask) -> None:
         """A slice at the size of its file, in Rec.709 and as it is stored; blocks in which it lacks data do not count as sharp."""
-        detail = block_detail(rgb)
-        self._details.append(detail if valid.all() else np.where(inner_blocks(valid).all(axis=(1, 3)), detail, np.float32(0.0)))
+        self._details.append(block_detail(rgb, valid))
         self._brightest.append(_largest_of_blocks(camera_rgb))
 
     def look(self, picture: Rgb, camera_rgb: Rgb) -> "PictureLook":
