@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from capture.report import kept_examination
+from capture.report import kept_examination, stack_view
+from capture.report.examination import examine
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.findings_json import findings_document, findings_from
 from capture.report.focus_curve import FocusCurve
@@ -72,6 +73,16 @@ def scene(tmp_path: Path) -> Path:
 def reported(scene: Path) -> Path:
     assert report(scene) == 2 * OF_STACK
     return scene
+
+
+def test_an_examination_reads_each_slice_once(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is clipped in any slice is known when all have been seen, and is not read for."""
+    opened: list[str] = []
+    read = stack_view.read_slice
+    monkeypatch.setattr(stack_view, "read_slice", lambda path: (opened.append(path.name), read(path))[1])
+    stack = read_focal_stack(scene / "view_0")
+    examine(stack_view.StackView(stack, 160), Reblur(Counting(), "none"))
+    assert opened == [Path(each.path).name for each in stack.slices]
 
 
 def test_an_interrupted_report_goes_on(reported: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """One pass over a merged stack: looks at every slice, predicts it, compares, and keeps what gates, pictures and masks need."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
@@ -54,17 +54,19 @@ Watch = Callable[[int, Rgb, Rgb], None]
 def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Examination:
     """Raises InputError where the stack is not merged."""
     height, width = view.all_in_focus.shape[:2]
-    found, disagreements, evidence = [], [], DepthEvidence()
+    found, disagreements, saturated, evidence = [], [], [], DepthEvidence()
     picture, places = PictureEvidence(), PlaceEvidence()
-    clipped = view.clipped() if view.is_explained else None
     for index in track(range(len(view)), f"{view.stack.folder.name}: examine"):
         stored = view.stored(index)
         picture.add(stored.rgb, stored.camera_rgb, stored.masks.valid)
         places.add(view.slice_rgb(index), view.usable(index))
-        of_slice, kept = _examine_slice(view, index, reblur, evidence, clipped, watch)
+        saturated.append(view.saturated(index))
+        of_slice, kept = _examine_slice(view, index, float(saturated[-1].mean()), reblur, evidence, watch)
         found.append(of_slice)
         if kept is not None:
             disagreements.append(kept)
+    clipped = np.logical_or.reduce(saturated)
+    disagreements = [_unlit(each, clipped, view.coc_px(index)) for index, each in enumerate(disagreements)]
     depth = evidence.check() if view.is_explained else None
     judged = float(np.mean([each.counted.mean() for each in disagreements])) if disagreements else 0.0
     moved = None if depth is None or judged < _LEAST_JUDGED else moving(disagreements, depth.off_px)
@@ -86,12 +88,11 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
 
 
 def _examine_slice(
-    view: StackView, index: int, reblur: Reblur, evidence: DepthEvidence, clipped: Mask | None, watch: Watch | None
+    view: StackView, index: int, saturated: float, reblur: Reblur, evidence: DepthEvidence, watch: Watch | None
 ) -> tuple[SliceFindings, Disagreement | None]:
     rgb, usable = view.slice_rgb(index), view.usable(index)
     gain = low_frequency_gain(rgb, view.all_in_focus, usable)
-    saturated = float(view.saturated(index).mean())
-    if clipped is None:
+    if not view.is_explained:
         return SliceFindings(index, gain, saturated, float(usable.mean())), None
     prediction = predict(view, index, reblur)
     if watch is not None:
@@ -110,8 +111,7 @@ def _examine_slice(
         psnr(view.all_in_focus, rgb, mask=counted) if counted.any() else None,
         fit,
     )
-    judged = usable & _inside(prediction.coc_px) & ~_lit_by(clipped, prediction.coc_px)
-    return findings, Disagreement(residual, level, per_px, judged)
+    return findings, Disagreement(residual, level, per_px, usable & _inside(prediction.coc_px))
 
 
 def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
@@ -121,6 +121,11 @@ def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
     coc_px = view.coc_px(index)
     rgb, less, more = (reblur(view.all_in_focus, coc_px + np.float32(step_px), view.aperture) for step_px in (0.0, -STEP_PX, STEP_PX))
     return Prediction(rgb, less, more, coc_px, STEP_PX)
+
+
+def _unlit(disagreement: Disagreement, clipped: Mask, coc_px: Plane) -> Disagreement:
+    """Leave pixels out of what is judged that get light of clipped ones. clipped: in any slice."""
+    return replace(disagreement, counted=disagreement.counted & ~_lit_by(clipped, coc_px))
 
 
 def _lit_by(clipped: Mask, coc_px: Plane) -> Mask:

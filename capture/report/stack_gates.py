@@ -130,21 +130,15 @@ def _residual(findings: StackFindings) -> Gate:
 
 
 def _focus(findings: StackFindings) -> Gate:
-    return _worst(
-        SOLVED_FOCUS if metres_facts(findings.stack) else FOCUS,
-        findings,
-        lambda fit: fit.focus_px,
-        LARGEST_FOCUS_PX,
-        lambda value: f"{value:+.2f} px",
-    )
+    rule = _solved_or_stated(findings, SOLVED_FOCUS, FOCUS)
+    return _worst(rule, findings, lambda fit: fit.focus_px, LARGEST_FOCUS_PX, lambda value: f"{value:+.2f} px")
 
 
 def _blur(findings: StackFindings) -> Gate:
-    rule = SOLVED_BLUR if metres_facts(findings.stack) else BLUR
-    gains = [each.fit.blur_gain for each in findings.slices if each.fit is not None and np.isfinite(each.fit.blur_gain.error)]
+    rule, gains = _solved_or_stated(findings, SOLVED_BLUR, BLUR), _known(findings, lambda fit: fit.blur_gain)
     if not gains:
         return rule.absent(findings.name, NO_PREDICTION)
-    gain = mean_change(gains)
+    gain = mean_change([change for _, change in gains])
     measured = f"{gain.value:+.1%} (standard error {gain.error:.1%})"
     return rule.judge(findings.name, gain.value, measured, not gain.exceeds(LARGEST_BLUR_GAIN))
 
@@ -191,9 +185,19 @@ def _motion(findings: StackFindings) -> Gate:
 
 def _worst(rule: Rule, findings: StackFindings, change_of: Callable[..., Change], limit: float, text: Callable[[float], str]) -> Gate:
     """The slice that exceeds a limit farthest; else the one with the largest number that is known."""
-    known = [(each.index, change_of(each.fit)) for each in findings.slices if each.fit is not None]
-    known = [pair for pair in known if np.isfinite(pair[1].error)]
+    known = _known(findings, change_of)
     if not known:
         return rule.absent(findings.name, NO_PREDICTION)
     index, change = max(known, key=lambda pair: (pair[1].exceeds(limit), abs(pair[1].value)))
     return rule.judge(findings.name, change.value, f"{text(change.value)} in slice {index}", not change.exceeds(limit))
+
+
+def _solved_or_stated(findings: StackFindings, solved: Rule, stated: Rule) -> Rule:
+    """The rule for what merging solved from the slices, or for what files state."""
+    return solved if metres_facts(findings.stack) else stated
+
+
+def _known(findings: StackFindings, change_of: Callable[..., Change]) -> list[tuple[int, Change]]:
+    """Changes that the slices tell, each with the number of its slice."""
+    changes = [(each.index, change_of(each.fit)) for each in findings.slices if each.fit is not None]
+    return [pair for pair in changes if np.isfinite(pair[1].error)]

@@ -63,10 +63,6 @@ class StackView:
     def saturated(self, index: int) -> Mask:
         return ~self._shrunk_mask(~self.stored(index).masks.saturated)
 
-    def clipped(self) -> Mask:
-        """Where any slice is saturated; reads all of them."""
-        return np.logical_or.reduce([self.saturated(index) for index in range(len(self))])
-
     @cached_property
     def _read(self) -> Callable[[int], "StoredSlice"]:
         # Not self: a view that refers to itself would outlive its use.
