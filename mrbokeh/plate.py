@@ -51,7 +51,7 @@ class Plate:
                 )
 
     def point_under_pixel_m(self, x_px: float, y_px: float) -> tuple[float, float, float]:
-        """Where in the scene (camera axes, metres) the photograph shows at a pixel."""
+        """Return the place in the scene (camera axes, metres) that the photograph shows at a pixel."""
         if self.depth_m is None:
             raise InputError(
                 "to stand an object on a pixel the photograph needs depth: give --depth, a focal stack, or --at X,Y,Z in metres"
@@ -64,7 +64,7 @@ class Plate:
         return float(x_m), float(y_m), float(z_m)
 
     def length_m(self, pixels: float, depth_m: float) -> float:
-        """Of what covers so many pixels upright at a depth, facing the camera."""
+        """Return the length of what covers so many pixels upright at a depth, facing the camera."""
         return pixels / self.camera.focal_px[1] * depth_m
 
 

@@ -24,9 +24,9 @@ CAPTURED_DIOPTRES = 1e-6
 RESIDUAL_REACH_PX = 24.0
 """A residual counts fully where the blur is that of its slice, and 1/e where the circle of confusion differs by this."""
 RESIDUAL_LIGHT, RESIDUAL_LIGHT_REACH_PX = 0.95, 4.0
-"""Of white: what is brighter, in the slice or as rendered, belongs to lights, whose discs change with the focus: it reaches less far."""
+"""Share of white: what is brighter, in the slice or as rendered, is of lights, whose discs change with the focus: it reaches less far."""
 RESIDUAL_WHITE = 0.98
-"""Of white: what a slice shows brighter was not measured, so that it can only tell that rendering is too dark."""
+"""Share of white: what a slice shows brighter was not measured, so that it can only tell that rendering is too dark."""
 RESIDUAL_BLUR, RESIDUAL_LARGEST_BLUR_PX = 0.85, 2.0
 """Detail of a residual finer than this share of the difference in blur, 2 px at most, is not carried over: it is noise or another's."""
 

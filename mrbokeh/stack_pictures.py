@@ -20,7 +20,7 @@ _LEAST_TRUSTED = 0.05
 _LEAST_COLOUR = np.float32(0.25)
 _GREY = np.float32(127.5)
 _COLOURS = (18, 240)
-"""Of the 256 of the colour map, whose ends are nearly black."""
+"""First and last of the 256 colours of the map that are taken, as its ends are nearly black."""
 
 Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]

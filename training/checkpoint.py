@@ -19,7 +19,7 @@ FILE_NAME = "checkpoint.pt"
 
 @dataclass
 class Progress:
-    """Where a run stands; the one thing that changes while it trains.
+    """State of a run; the one thing that changes while it trains.
 
     pictures: drawn so far, by all processes together.
     best_psnr_db, best_step: of the best look at held-out slices; looks_since_best: how many came after it.

@@ -111,7 +111,7 @@ class PairSet:
         return read_pair(stack, index, self._counting, rows, self._stack_rows(stack, rows) if self.all_fit else None)
 
     def _stack_rows(self, stack: FocalStack, rows: slice) -> StackRows:
-        """Of the whole picture, read by whoever comes first."""
+        """Return what belongs to the whole picture, read by whoever comes first."""
         with self._sharing:
             if stack.folder not in self._shared:
                 self._shared[stack.folder] = read_stack_rows(stack, rows)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 LEAST_SIZE = 9
-"""From this width of kernels on the transforms are faster (half the time at 9, a twentieth at 21, less than a hundredth at 35)."""
+"""Width of kernels from which on the transforms are faster (half the time at 9, a twentieth at 21, less than a hundredth at 35)."""
 _CHANNELS_AT_ONCE = 64  # bounds the memory of the transforms
 
 

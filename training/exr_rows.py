@@ -1,9 +1,10 @@
 """Some rows of an EXR file, without reading the rest of it.
 
-Training on crops of large pictures would otherwise decode 24 megapixels for each crop. The files that this project writes are
-scan lines in ZIP blocks (https://openexr.com/en/latest/OpenEXRFileLayout.html); their blocks are found and decoded here, because OpenEXR's
-own Python module keeps all other threads waiting while it decodes, and what is used here does not. Scan lines in other blocks (PIZ, which
-registered slices have) are decoded by that module, these rows only; tiles and cropped pictures are read whole and cut.
+Training on crops of large pictures would otherwise decode 24 megapixels for each crop. Scan lines that are not compressed (depth, the
+all-in-focus picture and small slices of this project) and those in ZIP blocks (https://openexr.com/en/latest/OpenEXRFileLayout.html) are
+found and decoded here, because OpenEXR's own Python module keeps all other threads waiting while it decodes, and what is used here does
+not. Scan lines in other blocks (PIZ, which large slices have) are decoded by that module, these rows only; tiles and cropped pictures are
+read whole and cut.
 """
 
 import functools

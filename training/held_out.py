@@ -17,7 +17,7 @@ from training.weights import WHERE_TRUTH_IS_KNOWN
 
 SLICES = 4
 SIDE_PX = 384
-"""Of the middle of a picture that a look is at: with blur of 66 px a network took 20 s for each whole picture of 0.8 megapixels."""
+"""Side of the middle of a picture that a look is at: with blur of 66 px a network took 20 s for a whole picture of 0.8 megapixels."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class HeldOutSlices:
 
     @torch.no_grad()
     def look(self, network: torch.nn.Module, device: torch.device) -> Look:
-        """In full precision, whatever the training's."""
+        """Score and show the slices in full precision, whatever the training's."""
         scored = [self._scored(index, network, device) for index in self._chosen]
         return Look(float(np.mean([value for value, _ in scored])) if scored else math.nan, tuple(row for _, row in scored))
 

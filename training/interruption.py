@@ -16,7 +16,7 @@ class StoppedError(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """As shells give it: 130 after Ctrl-C, 143 after SIGTERM."""
+        """The code that shells give: 130 after Ctrl-C, 143 after SIGTERM."""
         return 128 + self.number
 
 

@@ -29,7 +29,7 @@ class Learner:
 
     @property
     def learning_rate(self) -> float:
-        """Of the last step."""
+        """The learning rate of the last step."""
         return float(self._optimizer.param_groups[0]["lr"])
 
     def begin(self, rate_factor: float) -> None:

@@ -148,6 +148,6 @@ def gaussian_kernel(sigma_px: float, radius_px: int) -> Tensor:
 
 
 def _variance(kernel: Tensor) -> Tensor:
-    """Of what the kernel does on pixels, which for a narrow one differs from sigma^2."""
+    """Return the variance of what the kernel does on pixels, which for a narrow one differs from sigma^2."""
     radius = kernel.shape[-1] // 2
     return (kernel[0, 0, 0] * torch.arange(-radius, radius + 1, dtype=torch.float32).square()).sum()

@@ -84,7 +84,7 @@ def _tiles(batch: Batch, grid: TileGrid) -> list[Batch]:
 
 
 def learning_rate_factor(done: float, warm_up: float) -> float:
-    """Of the peak, after this fraction of the budget: a linear rise, then half a cosine to zero."""
+    """Return the share of the peak after this fraction of the budget: a linear rise, then half a cosine to zero."""
     if done < warm_up:
         return max(done / warm_up, 0.02)
     return 0.5 * (1.0 + math.cos(math.pi * min(1.0, (done - warm_up) / (1.0 - warm_up))))

@@ -37,7 +37,7 @@ class ReadAhead:
         return len(self._kept)
 
     def get(self, window: Window) -> Pair:
-        """From memory, from the thread that is reading it, or read here and now."""
+        """Take a window from memory or from the thread that is reading it, or read it here and now."""
         self._expected.discard(window)
         future = self._kept.get(window)
         if future is None:

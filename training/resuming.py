@@ -13,7 +13,7 @@ _MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
 
 
 def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
-    """Where and how fast it computes, and how often it writes, may differ."""
+    """Raise InputError for other settings than those of the run, except where and how fast it computes and how often it writes."""
     if _begun(run_folder, SETTINGS_NAME):
         _require_same(run_folder, "settings", read_settings(run_folder), settings, _MAY_DIFFER)
 

@@ -13,7 +13,7 @@ MOST_KEPT = 16
 
 
 def small_picture(picture: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "small_height small_width 3"]:
-    """As wide as a sheet shows it, so that whole pictures need not be kept until it is written."""
+    """Shrink a picture to the width at which a sheet shows it, so that whole pictures need not be kept until it is written."""
     import cv2
 
     height, width = picture.shape[:2]

@@ -19,7 +19,7 @@ def smooth_noise(size_px: tuple[int, int], cell_px: float, rng: np.random.Genera
 
 
 def octaves(size_px: tuple[int, int], cell_px: float, count: int, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
-    """As Perlin's noise: each octave with half the cell and half the amplitude of the last; mean 0, variance 1."""
+    """Add up octaves as Perlin's noise does: each with half the cell and half the amplitude of the last; mean 0, variance 1."""
     amplitudes = 0.5 ** np.arange(count)
     fields = [amplitude * smooth_noise(size_px, cell_px * amplitude, rng) for amplitude in amplitudes.tolist()]
     return np.asarray(sum(fields) / np.float32(np.linalg.norm(amplitudes)), np.float32)

@@ -40,7 +40,7 @@ class TrainingData:
         return slices_to_hold_out(self.stacks[0]) if test_fraction > 0.0 else ()
 
     def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
-        """Of the manifest, or from a look at every pair to train on. several_lenses: f-number and focal length may differ."""
+        """Read facts from the manifest, or by a look at every pair to train on. several_lenses: f-number and focal length may differ."""
         if self.dataset is None:
             return gather_facts(pairs, several_lenses)
         return manifest_facts(self.dataset, pairs.stacks, several_lenses)

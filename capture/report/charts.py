@@ -50,7 +50,7 @@ class _Frame:
         return cls((min(x) - side, max(x) + side), (low if from_zero and low == 0 else low - room, high + room))
 
     def at(self, x: float, y: float) -> tuple[float, float]:
-        """In units of the SVG."""
+        """Return where a point is drawn, in units of the SVG."""
         right = _LEFT + (x - self.x[0]) / (self.x[1] - self.x[0]) * (WIDTH - _LEFT - _RIGHT)
         down = HEIGHT - _BOTTOM - (y - self.y[0]) / (self.y[1] - self.y[0]) * (HEIGHT - _TOP - _BOTTOM)
         return right, down

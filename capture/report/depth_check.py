@@ -29,7 +29,7 @@ class DepthCheck:
     told: Mask
 
     def share_beyond(self, limit_px: float) -> float:
-        """Of the pixels that tell."""
+        """Return the share of the pixels that tell whose circles of confusion are off by more."""
         return float((np.abs(self.off_px) > limit_px)[self.told].mean()) if self.told.any() else 0.0
 
 

@@ -60,6 +60,6 @@ def _around(sizes: np.ndarray, index: int, usual: float) -> float:
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:
-    """Of those that are known; 0 where none is."""
+    """Return the median of those that are known; 0 where none is."""
     known = np.asarray(values, np.float64)[np.isfinite(values)]
     return float(np.median(known)) if len(known) else 0.0

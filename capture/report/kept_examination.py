@@ -30,7 +30,7 @@ Signature = dict[str, Any]
 
 FOLDER, JSON_NAME, MOVING_NAME = "report", "found.json", "moving.png"
 VERSION = 3
-"""To be raised whenever other numbers or pictures would be found in the same stack."""
+"""A number that rises whenever other numbers or pictures would be found in the same stack."""
 
 
 @dataclass(frozen=True)

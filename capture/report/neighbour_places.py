@@ -24,7 +24,7 @@ HALF_PX, SEARCH_PX = 24, 8
 _BAND_PX = (0.8, 3.0)
 _CELLS = (10, 15)
 _LEAST_ENERGY = 0.004
-"""Of the fine detail, display white being 1: about the noise of a photograph of 8 bits."""
+"""Fine detail of a patch, display white being 1: about the noise of a photograph of 8 bits."""
 _LEAST_CORRELATION = 0.6
 _SHARP_IN_BOTH = 0.5
 FEWEST_PATCHES = 8
@@ -36,7 +36,7 @@ _SURELY = 3.0
 
 @dataclass(frozen=True)
 class NeighbourPlace:
-    """Where slice first + 1 lies against slice first.
+    """The place of slice first + 1 against slice first.
 
     off_px: root mean square of the fitted displacements, in pixels of the stored pictures; None where too few patches are sharp in both.
     error_px: its standard error. place_px: x, y of the middle of the patch to look at, in pixels of the stored pictures.
@@ -103,7 +103,7 @@ def _whole_patches(usable: Mask) -> Mask:
 
 
 def _matched(before: Plane, after: Plane, energy: Plane) -> _Patches:
-    """In each cell of the picture the patch with the most energy."""
+    """Find the patch with the most energy of each cell of the picture again."""
     at, moved, energies = [], [], []
     rows, columns = (np.linspace(0, size, cells + 1).astype(int) for size, cells in zip(energy.shape, _CELLS, strict=True))
     for top, bottom in pairwise(rows):
@@ -126,7 +126,7 @@ def _pairs_of(values: Sequence[tuple[float, float]]) -> Displacements:
 
 
 def _displacement(before: Plane, after: Plane, x: int, y: int) -> tuple[float, float] | None:
-    """By how much the patch around a pixel went right and down; None where it is not found within SEARCH_PX."""
+    """Return by how much the patch around a pixel went right and down; None where it is not found within SEARCH_PX."""
     patch = before[y - HALF_PX : y + HALF_PX, x - HALF_PX : x + HALF_PX]
     reach = HALF_PX + SEARCH_PX
     likeness = cv2.matchTemplate(after[y - reach : y + reach, x - reach : x + reach], patch, cv2.TM_CCOEFF_NORMED)
@@ -139,7 +139,7 @@ def _displacement(before: Plane, after: Plane, x: int, y: int) -> tuple[float, f
 
 
 def _peak(three: Float32[np.ndarray, "3"]) -> float:
-    """Where a parabola through three values has its peak, counted from the middle one."""
+    """Return where a parabola through three values has its peak, counted from the middle one."""
     left, middle, right = (float(each) for each in three)
     bend = left - 2.0 * middle + right
     return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
@@ -158,7 +158,7 @@ def _place(first: int, patches: _Patches, sharpest: Plane, stored_per_px: float)
 
 
 def _best_place(patches: _Patches, stored_per_px: float) -> tuple[int, int]:
-    """Of the patch that can be seen best; the middle of the picture where there is none."""
+    """Return the middle of the patch that can be seen best, or of the picture where there is none."""
     at = patches.at[int(patches.energy.argmax())] if len(patches.at) else 0.5 * np.array(patches.size_px)
     return _stored(at, stored_per_px)
 

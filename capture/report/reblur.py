@@ -42,7 +42,7 @@ class Reblur:
 
 
 def reblur_by(name: str) -> Reblur:
-    """By a renderer's name, or by a trained network (.onnx), which is another one when it was trained further. Raises InputError."""
+    """Choose a renderer by its name, or a trained network (.onnx), which is another one when it was trained further. Raises InputError."""
     from mrbokeh.renderers.choose import make_renderer
 
     path = Path(name)

@@ -86,6 +86,6 @@ def _scene_sections(report: SceneReport) -> list[str]:
 
 
 def _stack_sections(stacks: Sequence[ExaminedStack]) -> list[str]:
-    """Those with most failures first; pictures for the first dozen, so that the page stays one that can be opened."""
+    """Return sections, most failures first; pictures for the first dozen, so that the page stays one that can be opened."""
     ranked = sorted(stacks, key=lambda each: (-each.failures, each.findings.name))
     return [stack_section(each, with_pictures=rank < MOST_WITH_PICTURES) for rank, each in enumerate(ranked)]

@@ -61,7 +61,7 @@ def _places(view: StackView, examination: Examination) -> list[ShownPlace]:
 
 
 def _examine(view: StackView, reblur: Reblur) -> tuple[Examination, list[Shown]]:
-    """And the pictures of the whole stack, then three each of some slices."""
+    """Examine a stack, and keep pictures of it as a whole, then three each of some slices."""
     triples: dict[int, list[Shown]] = {}
 
     def watch(index: int, rgb: Any, prediction: Any) -> None:

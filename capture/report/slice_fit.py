@@ -93,7 +93,7 @@ def fit_slice(rgb: Rgb, prediction: Prediction, counted: Mask) -> tuple[SliceFit
 
 
 def _derivatives(prediction: Prediction) -> list[Rgb]:
-    """In the order of NAMES."""
+    """Return what each of NAMES changes, in their order."""
     rgb, per_px = prediction.rgb, prediction.per_px
     height, width = rgb.shape[:2]
     down, right = np.gradient(rgb, axis=(0, 1))

@@ -42,7 +42,7 @@ from mrbokeh.guessed_metres import metres_facts
 
 
 def stack_gates(findings: StackFindings) -> list[Gate]:
-    """In the order in which to read them."""
+    """Judge a stack; its gates come in the order in which to read them."""
     return [
         *picture_gates(findings),
         _spacing(findings),

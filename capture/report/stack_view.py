@@ -56,7 +56,7 @@ class StackView:
         return self._shrunk(self.stored(index).rgb)
 
     def usable(self, index: int) -> Mask:
-        """Where a slice has data and none of it is saturated."""
+        """Return where a slice has data and none of it is saturated."""
         masks = self.stored(index).masks
         return self._shrunk_mask(masks.valid & ~masks.saturated)
 
@@ -96,7 +96,7 @@ class StackView:
 
     @cached_property
     def optics(self) -> SliceOptics:
-        """In pixels of these pictures. Raises InputError where the lens or a focus distance is unknown."""
+        """Blur in pixels of these pictures. Raises InputError where the lens or a focus distance is unknown."""
         return SliceOptics.of_stack(self.stack, self.width_px)
 
     @property

@@ -1,4 +1,4 @@
-"""Where a merged picture is worst: crops at 100 % of it and of the slices that it was made from."""
+"""The worst places of a merged picture: crops at 100 % of it and of the slices that it was made from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def shown_places(stack: FocalStack, picture: Rgb, places: Sequence[Place]) -> li
 
 
 def _lost(look: PictureLook) -> list[Place]:
-    """By the detail that is missing, lost blocks first."""
+    """Find blocks by the detail that is missing, lost ones first."""
     sharpness, sharpest = look.sharpness, look.sharpest
     if sharpness is None or not sharpest.textured.any():
         return []
@@ -79,7 +79,7 @@ def _lost(look: PictureLook) -> list[Place]:
 
 
 def _seams(look: PictureLook, focus_index: Plane) -> list[Place]:
-    """By the detail that is too much."""
+    """Find blocks by the detail that is too much."""
     sharpness, sharpest = look.sharpness, look.sharpest
     if sharpness is None or look.findings.flat is None:
         return []

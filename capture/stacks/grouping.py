@@ -147,7 +147,7 @@ def by_camera(group: PhotoGroup) -> list[PhotoGroup]:
 
 
 def why_aside(group: PhotoGroup) -> list[SkippedFile]:
-    """In words, for the photographs that lie aside."""
+    """Say of each photograph that lies aside why it does."""
     usual = next((each.metadata.camera_model for each in group.photos if each.metadata.camera_model), None)
     skipped = []
     for photo in group.aside:

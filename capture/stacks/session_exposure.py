@@ -12,13 +12,13 @@ from mrbokeh.focal_stack import read_focal_stack
 
 
 def stated_gain(wanted: StatedExposure | None, metadata: PhotoMetadata) -> float | None:
-    """From a photograph's exposure to another according to metadata, None where they do not tell."""
+    """Return the gain from a photograph's exposure to another according to metadata, None where they do not tell."""
     own = metadata.exposure
     return own.gain_to(wanted) if wanted and own else None
 
 
 def gain_to_session(decoded: DecodedPhoto, light: LowFrequency, stated: float | None, scale_stack: Path | None) -> ExposureGain:
-    """For the reference of a stack. scale_stack: the stack that set the scale, None where it is this one.
+    """Return the gain for the reference of a stack. scale_stack: the stack that set the scale, None where it is this one.
 
     EXR and HDR that state nothing are left alone: their numbers are light already.
     """

@@ -49,7 +49,7 @@ class SliceLook:
 
     @cached_property
     def features(self) -> tuple[Float32[np.ndarray, "points 2"], Float32[np.ndarray, "points 128"]]:
-        """Where SIFT finds something, in pixels of a picture 480 px long, and what it looks like."""
+        """Points that SIFT finds, in pixels of a picture 480 px long, and what they look like."""
         import cv2
 
         shrink = min(1.0, _FEATURE_SIDE_PX / max(self.codes.shape))

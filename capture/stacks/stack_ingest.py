@@ -144,7 +144,7 @@ class StackWork:
 
     @property
     def rec709_from_camera(self) -> Matrix3x3 | None:
-        """From the RGB of the finished slices; None where that is Rec.709."""
+        """The matrix from the RGB of the finished slices; None where that is Rec.709."""
         matrix = self.finished[0].record["rec709_from_camera"]
         return None if matrix is None else matrix3x3(matrix)
 

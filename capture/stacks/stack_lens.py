@@ -70,7 +70,7 @@ def lens_remarks(photos: Sequence[Photo]) -> list[str]:
 
 
 def sentinel_remarks(photos: Sequence[Photo]) -> list[str]:
-    """That a camera's word for infinity is no distance, and how to give one."""
+    """Say that a camera's word for infinity is no distance, and how to give one."""
     told = [(photo.path.name, focus.source) for photo in photos if (focus := photo.metadata.focus) is not None and focus.is_sentinel]
     if not told:
         return []

@@ -14,7 +14,7 @@ FEWEST_TO_MERGE = 2
 
 
 def stack_remarks(work: StackWork, reference: Photo, lens: Lens | None, missing: str | None) -> list[str]:
-    """In sentences. missing: why there is no lens."""
+    """Say in sentences what a reader should know. missing: why there is no lens."""
     photos = [each.photo for each in work.finished]
     counted = Counter(remark for each in work.finished for remark in each.record["remarks"])
     remarks = [remark if count == 1 or count == len(photos) else f"{remark} ({count} slices)" for remark, count in counted.items()]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _COVERED = 0.5
 _HIGH_SHARE = 0.25
-"""Of the picture's height, which an object takes whose size is neither told nor known."""
+"""Share of the picture's height that an object takes whose size is neither told nor known."""
 
 LayersFor = Callable[[Plate], list[Layer]]
 """The same scene for every plate of one view: sharp layers, front first."""
@@ -66,7 +66,7 @@ def standing_on_pixel(layers: Sequence[Layer], plate: Plate, x_px: float, y_px: 
 
 @dataclass(frozen=True)
 class _FileLayers:
-    """Of EXR files. flat: front first; deep: which find their places by depth."""
+    """Layers of EXR files. flat: front first; deep: which find their places by depth."""
 
     flat: Sequence[Layer]
     deep: "Sequence[DeepSamples]"
@@ -102,7 +102,7 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
 
 
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
-    """In metres, or of so many pixels at that depth. None keeps the size of the file, unless that is of no use: metres are guessed."""
+    """Return metres as told, or of so many pixels at that depth; None keeps the size of the file, unless metres are guessed."""
     if text is None:
         return plate.length_m(_HIGH_SHARE * plate.rgb.shape[0], depth_m) if plate.metres_guessed else None
     try:

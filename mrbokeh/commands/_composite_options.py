@@ -65,7 +65,7 @@ class PlateOptions(shared.NearOptions):
 
 @dataclass(frozen=True)
 class ObjectOptions:
-    """Where the --object stands: at or at_pixel, and its height, as typed; angles in degrees."""
+    """Options of how the --object stands: at or at_pixel, and its height, as typed; angles in degrees."""
 
     object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.", rich_help_panel=VIRTUAL)] = None
     at: Annotated[

@@ -23,7 +23,7 @@ def is_finished(planned: PlannedRun) -> bool:
 
 
 def estimated_minutes(planned: Sequence[PlannedRun]) -> list[float]:
-    """Of training, for each run; 0 for those that are finished. Measuring comes on top."""
+    """Estimate the minutes of training of each run; 0 for those that are finished. Measuring comes on top."""
     seconds_of_step: dict[tuple[str, str], float] = {}
     minutes = []
     for each in planned:

@@ -48,7 +48,7 @@ class Report:
         return {table: lines for table, lines in found.items() if lines}
 
     def _results(self) -> list[RunResult]:
-        """Of all planned runs that are finished."""
+        """Read the results of all planned runs that are finished."""
         return [result for each in self._planned if (result := read_result(each.folder)) is not None]
 
     def _is_trained(self, row: Row) -> bool:

@@ -66,7 +66,7 @@ class Summary:
 
 
 def summary(row: Row, results: Sequence[RunResult], sets: Sequence[str]) -> Summary | None:
-    """Of the seeds that are finished on all of the sets; None where there are none."""
+    """Sum up the seeds that are finished on all of the sets; None where there are none."""
     mine = [each for each in results if each.row == row.name and each.data_set in sets]
     seeds = [seed for seed in sorted({each.seed for each in mine}) if {each.data_set for each in mine if each.seed == seed} == set(sets)]
     counted = [each for each in mine if each.seed in seeds]

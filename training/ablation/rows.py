@@ -112,7 +112,7 @@ PAPER_TABLE_3: dict[str, dict[str, PaperNumbers]] = {
         ("28mm", (31.2, 0.944, 0.133), (28.7, 0.920, 0.142), (29.7, 0.932, 0.155)),
     )
 }
-"""By bokeh and row. The paper calls its two lenses Nikkor 35mm (Nikon Z6) and Nikkor 28mm (Nikon D3300)."""
+"""The paper's numbers by bokeh and row. It calls its two lenses Nikkor 35mm (Nikon Z6) and Nikkor 28mm (Nikon D3300)."""
 
 _OUR_NAMES = {"ring": "circle"}
 """Shapes of datasets_scripts.bokeh_stacks that are called otherwise in the paper."""

@@ -120,7 +120,7 @@ def provenance(lines: Sequence[Line]) -> list[str]:
 
 
 def _pivot(lines: Sequence[Line]) -> list[str]:
-    """As the paper prints Table 3: a block of measures per data set, a column per network, the paper's number in brackets."""
+    """Lay lines out as the paper's Table 3: a block of measures per data set, a column per network, the paper's number in brackets."""
     names = list(dict.fromkeys(line.summary.row.name for line in lines))
     titles = {line.summary.row.name: line.summary.row.title for line in lines}
     rows = []

@@ -126,7 +126,7 @@ def _summary(progress: "Progress") -> str:
 
 
 def _number(name: str) -> int:
-    """Of this process, as torchrun tells it: RANK among all, LOCAL_RANK on its machine."""
+    """Return a number of this process, as torchrun tells it: RANK among all, LOCAL_RANK on its machine."""
     return int(os.environ.get(name, "0"))
 
 

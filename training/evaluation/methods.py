@@ -21,7 +21,7 @@ from training.stacks import Seen
 NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE = "network", "no blur", "Gaussian, scattered", "Gaussian, gathered", "scatter reference"
 NEAREST = "nearest slice"
 RENDERERS = ("polygon", "low-rank", "laplacian", "scatter")
-"""Those that a table has unless it is told otherwise; `lrdm` takes minutes a picture."""
+"""Renderers that a table has unless it is told otherwise; `lrdm` takes minutes a picture."""
 
 Image = Float32[np.ndarray, "height width 3"]
 
@@ -63,7 +63,7 @@ def plain_methods() -> list[Method]:
 
 
 def nearest_method() -> Method:
-    """For slices held out of one stack: the photograph of the nearest focus that was trained on, as it is."""
+    """Return, for slices held out of one stack, the photograph of the nearest focus that was trained on, as it is."""
 
     def nearest(seen: UnseenSlice) -> Image:
         assert seen.nearest is not None, "only slices held out of a stack have a nearest one"
@@ -85,7 +85,7 @@ def renderer_method(name: str) -> Method:
 
 
 def bank_methods(names: Sequence[str], bank: Path) -> list[Method]:
-    """Those of the renderers that can take a bank of kernels, with it; "polygon, measured" and so on."""
+    """Return those of the renderers that can take a bank of kernels, with it; "polygon, measured" and so on."""
     return [_renderer_method(f"{name}, measured", chosen_renderer(name, bank)) for name in names if name in WITH_BANKS]
 
 

@@ -50,7 +50,7 @@ def gain_lines(result: Evaluation) -> list[str]:
     ]
 
 
-def write_table(path: Path, result: Evaluation, against: str = "", what: str = "slices of stacks not trained on") -> None:
+def write_table(path: Path, result: Evaluation, against: str, what: str) -> None:
     """against: what the focus pull was compared with, "" where there was none. what: the slices are."""
     lines = [
         f"Mean over {result.slices} {what}. {_LEGEND}",

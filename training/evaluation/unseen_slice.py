@@ -43,7 +43,7 @@ class UnseenSlice:
 
 
 def unseen_slice(pairs: PairSet, index: int) -> UnseenSlice:
-    """Of the pair at that index of the set."""
+    """Read what belongs to the pair at that index of the set."""
     stack, slice_index = pairs.keys[index]
     saturated = stack.slice_masks(slice_index).saturated
     nearest = _nearest(stack, slice_index, pairs.left_out(stack))

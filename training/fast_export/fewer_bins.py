@@ -18,7 +18,7 @@ _NEGLIGIBLE = 1e-5  # part of a knot, a matter of rounding
 
 
 def thinned(weights: GatedWeights, spacing: float) -> GatedWeights:
-    """With knots at least `spacing` times their diameter apart; 0 leaves them all."""
+    """Thin a network out to knots at least `spacing` times their diameter apart; 0 leaves them all."""
     knots_px = fewer_knots(weights.knots_px, spacing, weights.bins_at_once)
     return weights if len(knots_px) == len(weights.knots_px) else with_knots(weights, knots_px)
 

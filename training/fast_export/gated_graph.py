@@ -21,7 +21,10 @@ from training.network import BlurNetwork
 
 
 def gated_model(network: BlurNetwork, weights: GatedWeights, factors: Sequence[int]) -> ModelProto:
-    """Of one network without tiles and its weights, or fewer of them. factors: for n = 1, 2, ... by how much the resolution is lowered."""
+    """Build the graph of a network without tiles from its weights, or fewer of them.
+
+    factors: for n = 1, 2, ... by how much the resolution is lowered.
+    """
     groups, graph = groups_of(weights, factors), GraphBuilder()
     coarsest = max(group.factor for group in groups)
     inputs = prepared(graph, network, weights, coarsest)

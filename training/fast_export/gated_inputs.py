@@ -86,7 +86,7 @@ class _Grow:
 
 
 def _features(graph: GraphBuilder, network: BlurNetwork, grow: _Grow, size: list[str]) -> str:
-    """Of place and lens, which choose between the kernels of a bin (training/field_mixing.py)."""
+    """Add features of place and lens, which choose between the kernels of a bin (training/field_mixing.py)."""
     assert isinstance(network.tiles, GatedTiles)
     if network.tiles.mixing is None:
         return ""

@@ -50,7 +50,7 @@ def total_light(
 def _weights(
     graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, members: Sequence[tuple[Group, Window, str]], hidden: str
 ) -> list[str]:
-    """For some groups, each (B, bins, H, W); several at once, for a matrix of few rows is slow to multiply with."""
+    """Add the weights of some groups, each (B, bins, H, W); several at once, for a matrix of few rows is slow to multiply with."""
     bins = slice(members[0][0].first, members[-1][0].end)
     weight = np.concatenate([weights.logits[bins], weights.logits_bias[bins, None]], axis=1)
     counts = [group.count for group, _, _ in members]

@@ -41,7 +41,7 @@ class GatedWeights:
 
     @property
     def maps(self) -> int:
-        """Of a bin with one base: the light, and the coverage of each kernel."""
+        """Maps of a bin with one base: the light, and the coverage of each kernel."""
         return 3 + self.colours
 
     @property
@@ -55,7 +55,7 @@ class GatedWeights:
 
 
 def weights_of(tiles: GatedTiles) -> GatedWeights:
-    """Of a network without tiles."""
+    """Read the weights of a network without tiles."""
     order = np.argsort(tiles.knots)
     kernels = [kernel for n in range(1, len(tiles.kernels) + 1) for kernel in _kernels(tiles, n)]
     hidden, hidden_bias = pointwise(tiles.hide_in)
@@ -88,6 +88,6 @@ def _kernels(tiles: GatedTiles, n: int) -> np.ndarray:
 
 
 def widened(kernels: Float[np.ndarray, "... k k"], size: int) -> Float[np.ndarray, "... size size"]:
-    """With zeros around them."""
+    """Put zeros around kernels."""
     margin = (size - kernels.shape[-1]) // 2
     return np.pad(kernels, [(0, 0)] * (kernels.ndim - 2) + [(margin, margin)] * 2)

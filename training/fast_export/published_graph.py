@@ -175,7 +175,7 @@ def kernels_of(convolution: nn.Conv2d, channels: int, factor: int = 1) -> tuple[
 
 
 def blocks_of(tiles: PublishedTiles) -> list[ResidualBlock]:
-    """In order."""
+    """Return the residual blocks in their order."""
     return [block for block in tiles.blocks if isinstance(block, ResidualBlock)]
 
 

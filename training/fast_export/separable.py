@@ -63,7 +63,7 @@ def _pieces(graph: GraphBuilder, length: str, piece: int) -> str:
 
 
 def _across(graph: GraphBuilder, padded: str, kernels: SeparableKernels, columns: str, piece: int) -> list[str]:
-    """For every term, (B, maps, H + 2n, pieces * T)."""
+    """Spread light across for every term: (B, maps, H + 2n, pieces * T)."""
     height, maps, margin = graph.size(padded, 2), kernels.rows.shape[0], 2 * kernels.radius_px
     wide = graph.op("Mul", graph.op("Add", columns, graph.ints([1])), graph.ints([piece]))
     missing = graph.op("Sub", wide, graph.size(padded, 3))
