@@ -27,13 +27,13 @@ def depth_command(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
 ) -> None:
-    from capture.merging.retouch import retouched_stacks, retouches_text
+    from capture.merging.retouch import retouched_stacks, retouches_text, stacks_before
     from capture.views.dense_depth import DenseSettings
     from capture.views.scene_depth import SceneDepthSettings, deepen_scene
     from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.stack_pictures import SHEET_NAME
 
-    retouched = retouched_stacks(scene)
+    retouched = retouched_stacks(stacks_before(scene))
     settings = SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device))
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         result = deepen_scene(scene, settings)

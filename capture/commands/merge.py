@@ -52,8 +52,7 @@ def merge_command(
     from capture.merging.merge import merge_scene
     from capture.merging.preferred_merge import preferred_lines, preferred_side
     from capture.merging.relative_stack import ORDER
-    from capture.merging.retouch import retouched_stacks
-    from mrbokeh.focal_stack import find_focal_stacks
+    from capture.merging.retouch import retouched_stacks, stacks_before
     from mrbokeh.guessed_metres import metres_facts, metres_note
     from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.malloc_settings import keep_freed_pictures
@@ -66,8 +65,8 @@ def merge_command(
         _tell_of_report([_retouch(scene, from_slice or [], mask or [])])
         return
     keep_freed_pictures()
-    retouched = retouched_stacks(scene) if overwrite else {}
-    scaled = {each.folder: told_options(each) for each in find_focal_stacks(scene) if overwrite or not each.merged}
+    before = [each for each in stacks_before(scene) if overwrite or not each.merged]
+    retouched, scaled = retouched_stacks(before), {each.folder: told_options(each) for each in before}
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         stacks = merge_scene(scene, overwrite, registration, prefer)
     for stack in stacks:

@@ -79,12 +79,16 @@ def retouches_text(stack: FocalStack) -> str:
     return ", ".join(f"slice {each['slice']} by {each['mask']}" for each in retouches_of(stack))
 
 
-def retouched_stacks(scene: Path) -> dict[Path, str]:
-    """Return what was painted into the stacks of a scene, by their folders; nothing where it has no stacks, which the merge says itself."""
+def stacks_before(scene: Path) -> list[FocalStack]:
+    """Return the stacks of a scene as they are before a command works on them; nothing where it has none, which the command says itself."""
     try:
-        stacks = find_focal_stacks(scene)
+        return find_focal_stacks(scene)
     except InputError:
-        return {}
+        return []
+
+
+def retouched_stacks(stacks: Sequence[FocalStack]) -> dict[Path, str]:
+    """Return what was painted into stacks, by their folders."""
     return {stack.folder: text for stack in stacks if (text := retouches_text(stack))}
 
 
