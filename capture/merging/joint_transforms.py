@@ -11,7 +11,8 @@ from capture.merging.track_fit import robust_weights
 
 PairTracks = Mapping[tuple[int, int], CornerTracks]
 
-_ROUNDS = 12
+_MOST_ROUNDS = 12
+_STANDING_STILL_PX = 1e-3
 # Of a similarity x -> a x - b y + t_x, b x + a y + t_y there are 4; a homography has its matrix, row by row, without the last element.
 _SIMILARITY, _HOMOGRAPHY = 4, 8
 # Tracks count up to so many times their scatter: a camera that turned in the hand has moved as well, and where homographies follow the
@@ -33,8 +34,11 @@ def joint_transforms(count: int, pairs: PairTracks, size_px: tuple[int, int], pe
     places = {pair: tuple(_in_widths(ends, size_px) for ends in (tracks.target_px, tracks.source_px)) for pair, tracks in pairs.items()}
     trust = {pair: np.full(len(tracks), tracks.scatter_px**-2) for pair, tracks in pairs.items()}
     weights, lenient = dict(trust), _LENIENT if perspective else 1.0
-    for _ in range(_ROUNDS):
-        unknowns[1:] -= _step(unknowns, places, weights)
+    for steps_made in range(_MOST_ROUNDS):
+        step = _step(unknowns, places, weights)
+        unknowns[1:] -= step
+        if steps_made and np.abs(step).max(initial=0.0) * size_px[0] < _STANDING_STILL_PX:
+            break
         for pair, ends in places.items():
             apart = np.subtract(*(moved(_transform(unknowns[k]), xy) for k, xy in zip(pair, ends, strict=True)))
             weights[pair] = trust[pair] * robust_weights(size_px[0] * np.hypot(*apart.T), lenient * pairs[pair].scatter_px)

@@ -53,7 +53,7 @@ def match_from(target: SliceStructure, source: SliceStructure, start: Transform)
     """
     best, least_error_px = PairMatch(start, None), np.inf
     for of_target, of_source in zip(target.levels, source.levels, strict=True):
-        found = _tracked(of_target, of_source, best.target_from_source)
+        found = _tracked(of_target, of_source, best.target_from_source, is_first_guess=best.tracks is None)
         if found is None:
             break
         transform, tracks, agreeing = found
@@ -64,9 +64,11 @@ def match_from(target: SliceStructure, source: SliceStructure, start: Transform)
     return best
 
 
-def _tracked(target: DetailLevel, source: DetailLevel, start: Transform) -> tuple[Transform, CornerTracks, int] | None:
+def _tracked(
+    target: DetailLevel, source: DetailLevel, start: Transform, is_first_guess: bool
+) -> tuple[Transform, CornerTracks, int] | None:
     """(target_from_source, tracks, how many agree) in pixels of the slices; None where too few agree."""
-    tracks = track_corners(target, source, at_level(start, target.level))
+    tracks = track_corners(target, source, at_level(start, target.level), is_first_guess)
     if len(tracks) < FEWEST_AGREEING:
         return None
     found = similarity_of_tracks(tracks)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import cv2
@@ -87,9 +87,10 @@ class RegisteredSlices:
     saturated: Mask | None = None
     _valid: tuple[int, Mask] | None = None
     _held: list[Half] = field(default_factory=list)
+    _buffer: Rgb | None = None
 
     def made(self, keep: bool) -> Iterator[Rgb]:
-        """Resample and write every slice, and give it. keep: a file that is newer than slice and registration is read instead."""
+        """Resample and write every slice, and give it; its colours hold until the next. keep: a newer file than slice and registration is read."""
         for index, each in enumerate(self.stack.slices):
             path, sources = self.path(index), (self.stack.folder / source_path(each), self.stack.folder / REGISTRATION_NAME)
             kept = keep and newer(path, *sources) and self._has_gain(path, index)
@@ -97,7 +98,7 @@ class RegisteredSlices:
             self._remember(half, saturated)
             if not kept:
                 self._write(index, half, saturated)
-            yield single_of(half)
+            yield self._single(half)
 
     def _write(self, index: int, half: Half, saturated: Plane) -> None:
         gain = {_GAIN_ATTRIBUTE: str(self.tint_gains[index].tolist())}
@@ -110,9 +111,13 @@ class RegisteredSlices:
         return read_exr(path)[0].attributes.get(_GAIN_ATTRIBUTE) == str(self.tint_gains[index].tolist())
 
     def passing(self) -> Iterator[Rgb]:
-        """The slices once more, after they were all made."""
+        """The slices once more, after they were all made; the colours of one hold until the next."""
         for index in range(len(self.stack)):
-            yield single_of(self._held[index] if self._held else self._kept(self.path(index))[0])
+            yield self._single(self._held[index] if self._held else self._kept(self.path(index))[0])
+
+    def _single(self, half: Half) -> Rgb:
+        self._buffer = single_of(half, self._buffer)
+        return self._buffer
 
     def valid(self, index: int) -> Mask:
         """(H, W) where a slice has data, once the first has been made."""
@@ -160,10 +165,10 @@ class RegisteredSlices:
     def _resampled(self, index: int) -> tuple[Half, Plane]:
         rgb, saturated = self.ingested.taken(self.stack.folder / source_path(self.stack.slices[index]))
         transform, gain = self.registration.reference_from_slice[index], self.tint_gains[index]
-        if (gain != 1.0).any():
-            rgb = with_gain(rgb, gain)
+        lit = partial(with_gain, gain=gain) if (gain != 1.0).any() else None
+        moved = warp(rgb, transform, lit)
         # Half float keeps 11 bits, far below the noise of a photograph. Rounded at once, a resumed run gives the same.
-        return half_of(np.minimum(warp(rgb, transform), _LARGEST_HALF)), _warped_share(saturated, transform)
+        return half_of(np.minimum(moved, _LARGEST_HALF, out=moved)), _warped_share(saturated, transform)
 
     @cached_property
     def tint_gains(self) -> Gains:

@@ -1,5 +1,7 @@
 """Slices resampled to the geometry of the reference, and where they have data there."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -15,16 +17,17 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Sampled = Float32[np.ndarray, "_ _ ..."]
 
 
-def warp(rgb: Rgb, reference_from_slice: Transform) -> Rgb:
+def warp(rgb: Rgb, reference_from_slice: Transform, prepared: Callable[[Rgb], Rgb] | None = None) -> Rgb:
     """Resample with a cubic kernel that cannot overshoot: beside a bright light the lobes would leave dark holes.
 
     Where the slice has no data the border pixel goes on. In strips of rows, so that little memory is held beside the result.
+    prepared: what is done to the pixels before, rows by rows.
     """
     if not is_perspective(reference_from_slice) and np.allclose(reference_from_slice, np.eye(2, 3), atol=1e-9):
-        return rgb
+        return rgb if prepared is None else prepared(rgb)
     out = np.empty_like(rgb)
     for top in range(0, len(rgb), _STRIP_ROWS):
-        _warp_rows(rgb, reference_from_slice, top, out[top : top + _STRIP_ROWS])
+        _warp_rows(rgb, reference_from_slice, top, out[top : top + _STRIP_ROWS], prepared)
     return out
 
 
@@ -49,7 +52,9 @@ def warped_validity(shape: tuple[int, int], reference_from_slice: Transform) -> 
     return (columns >= first[:, None]) & (columns <= last[:, None])
 
 
-def _warp_rows(rgb: Rgb, reference_from_slice: Transform, top: int, out: Float32[np.ndarray, "rows width 3"]) -> None:
+def _warp_rows(
+    rgb: Rgb, reference_from_slice: Transform, top: int, out: Float32[np.ndarray, "rows width 3"], prepared: Callable[[Rgb], Rgb] | None
+) -> None:
     """The rows of the result from `top` on, out of those rows of the slice that they need."""
     rows, width = out.shape[:2]
     corners = np.array([[x, y] for x in (0, width) for y in (top, top + rows)], np.float64)
@@ -57,7 +62,7 @@ def _warp_rows(rgb: Rgb, reference_from_slice: Transform, top: int, out: Float32
     first = int(np.clip(np.floor(needed.min()) - _MARGIN_PX, 0, len(rgb) - 1))
     last = int(np.clip(np.ceil(needed.max()) + _MARGIN_PX, first + 1, len(rgb)))
     matrix = chained(_down(-top), chained(reference_from_slice, _down(first)))
-    source = np.ascontiguousarray(rgb[first:last])
+    source = np.ascontiguousarray(rgb[first:last]) if prepared is None else prepared(rgb[first:last])
     lowest = _sampled(cv2.erode(source, _BOX), matrix, out.shape[:2], cv2.INTER_NEAREST)
     highest = _sampled(cv2.dilate(source, _BOX), matrix, out.shape[:2], cv2.INTER_NEAREST)
     np.clip(_sampled(source, matrix, out.shape[:2], cv2.INTER_CUBIC), lowest, highest, out=out)
