@@ -211,10 +211,10 @@ class BandBlend:
     def _box(self, weight: Plane) -> tuple[slice, slice] | None:
         """Return what a picture changes: its weights, as far as the coarsest band carries them, on the grid of that band."""
         step, (height, width) = 1 << self.bands, self.shape[:2]
-        rows, columns = (np.flatnonzero(cv2.reduce(np.abs(weight), along, cv2.REDUCE_MAX)) for along in (1, 0))
-        if not rows.size:
+        x, y, across, down = cv2.boundingRect((weight != 0.0).view(np.uint8))
+        if not across:
             return None
         reach = 4 * step
-        top, left = (max(int(each[0]) - reach, 0) // step * step for each in (rows, columns))
-        bottom, right = (-(-(int(each[-1]) + 1 + reach) // step) * step for each in (rows, columns))
+        top, left = (max(first - reach, 0) // step * step for first in (y, x))
+        bottom, right = (-(-(end + reach) // step) * step for end in (y + down, x + across))
         return slice(top, min(bottom, height)), slice(left, min(right, width))

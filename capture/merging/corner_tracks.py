@@ -40,8 +40,9 @@ class CornerTracks:
 def track_corners(target: DetailLevel, source: DetailLevel, target_from_source: Transform, is_first_guess: bool = True) -> CornerTracks:
     """Corners of both slices followed into the other (Lucas and Kanade 1981, Bouguet 2000) and back; what does not return is dropped.
 
-    All in pixels of the level. is_first_guess: the transform may be pixels off. Blur that is the same on all sides of a corner does not move it, so that a track is unbiased
-    where depth is even; depth edges shift single tracks, which a robust fit leaves out and a correlation of whole pictures cannot.
+    All in pixels of the level. is_first_guess: the transform may be pixels off. Blur that is the same on all sides of a corner
+    does not move it, so that a track is unbiased where depth is even; depth edges shift single tracks, which a robust fit leaves
+    out and a correlation of whole pictures cannot.
     """
     levels = _FIRST_PYRAMID_LEVELS if is_first_guess else 0
     there = _followed(target, source, inverse(target_from_source), levels)

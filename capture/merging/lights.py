@@ -6,7 +6,7 @@ chosen by the light itself: the one in which its energy is most concentrated thr
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -83,13 +83,14 @@ class Extremes:
 
     darkest: Plane | None = None
     brightest: Plane | None = None
+    _channels: list[Plane] = field(default_factory=list)
 
     def watching(self, slices: Iterable[Rgb]) -> Iterator[Rgb]:
         """The slices as they come; each is looked at."""
         for rgb in slices:
-            plane = _brightness(rgb)
+            plane = _brightness(rgb, self._channels)
             if self.darkest is None or self.brightest is None:
-                self.darkest, self.brightest = plane, plane.copy()
+                self.darkest, self.brightest = plane.copy(), plane.copy()
             else:
                 cv2.min(self.darkest, plane, dst=self.darkest)
                 cv2.max(self.brightest, plane, dst=self.brightest)
@@ -116,8 +117,9 @@ def find_lights(slices: Callable[[], Iterable[Rgb]], extremes: Extremes | None =
     near = np.where(distance_px <= reach_px, nearest, 0)
     members = np.flatnonzero(near)
     spreads = _Spreads(near.ravel()[members], (surroundings + CLEARLY_BRIGHTER).ravel()[members])
+    channels: list[Plane] = []
     for rgb in slices():
-        spreads.add(_brightness(rgb).take(members))
+        spreads.add(_brightness(rgb, channels).take(members))
     return _lights(spreads, near, distance_px, reach_px)
 
 
@@ -165,9 +167,10 @@ def _between_slices(areas_px: np.ndarray, seen: np.ndarray, sharpest: Int[np.nda
     return result
 
 
-def _brightness(rgb: Rgb) -> Plane:
-    """The brightest channel: coloured lights count too."""
-    red, green, blue = cv2.split(rgb)
+def _brightness(rgb: Rgb, channels: list[Plane]) -> Plane:
+    """The brightest channel: coloured lights count too. channels: the planes of the picture before, which are written over."""
+    channels[:] = cv2.split(rgb, channels or None)
+    red, green, blue = channels
     return cv2.max(cv2.max(red, green, dst=red), blue, dst=red)
 
 

@@ -90,7 +90,10 @@ class RegisteredSlices:
     _buffer: Rgb | None = None
 
     def made(self, keep: bool) -> Iterator[Rgb]:
-        """Resample and write every slice, and give it; its colours hold until the next. keep: a newer file than slice and registration is read."""
+        """Resample and write every slice, and give it; its colours hold until the next.
+
+        keep: a file that is newer than slice and registration is read instead.
+        """
         for index, each in enumerate(self.stack.slices):
             path, sources = self.path(index), (self.stack.folder / source_path(each), self.stack.folder / REGISTRATION_NAME)
             kept = keep and newer(path, *sources) and self._has_gain(path, index)
