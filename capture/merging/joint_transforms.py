@@ -12,7 +12,7 @@ from capture.merging.track_fit import robust_weights
 PairTracks = Mapping[tuple[int, int], CornerTracks]
 
 _MOST_ROUNDS = 12
-_STANDING_STILL_PX = 1e-3
+_STANDING_STILL_PX = 5e-3  # A tenth of what the best tracks scatter.
 # Of a similarity x -> a x - b y + t_x, b x + a y + t_y there are 4; a homography has its matrix, row by row, without the last element.
 _SIMILARITY, _HOMOGRAPHY = 4, 8
 # Tracks count up to so many times their scatter: a camera that turned in the hand has moved as well, and where homographies follow the
@@ -70,14 +70,17 @@ def _step(
 
 def _linearised(unknowns: Unknowns, xy: Points) -> tuple[Points, Float[np.ndarray, "rows unknowns"]]:
     """Return where points go, and how their x and y in turn change with the unknowns."""
-    (x, y), one, none = xy.T, np.ones(len(xy)), np.zeros(len(xy))
-    ends = moved(_transform(unknowns), xy)
+    (x, y), ends = xy.T, moved(_transform(unknowns), xy)
+    by = np.zeros((len(xy), 2, len(unknowns)))
+    along_x, along_y = by[:, 0].T, by[:, 1].T
     if len(unknowns) == _SIMILARITY:
-        return ends, np.stack([np.column_stack([x, -y, one, none]), np.column_stack([y, x, none, one])], axis=1).reshape(-1, _SIMILARITY)
-    along_x = np.column_stack([x, y, one, none, none, none, -ends[:, 0] * x, -ends[:, 0] * y])
-    along_y = np.column_stack([none, none, none, x, y, one, -ends[:, 1] * x, -ends[:, 1] * y])
-    denominator = one + xy @ unknowns[6:]
-    return ends, (np.stack([along_x, along_y], axis=1) / denominator[:, None, None]).reshape(-1, _HOMOGRAPHY)
+        along_x[0], along_x[1], along_x[2] = x, -y, 1.0
+        along_y[0], along_y[1], along_y[3] = y, x, 1.0
+        return ends, by.reshape(-1, _SIMILARITY)
+    along_x[0], along_x[1], along_x[2] = along_y[3], along_y[4], along_y[5] = x, y, 1.0
+    by[:, :, 6:] = -ends[:, :, None] * xy[:, None]
+    by /= (1.0 + xy @ unknowns[6:])[:, None, None]
+    return ends, by.reshape(-1, _HOMOGRAPHY)
 
 
 def _transform(unknowns: Unknowns) -> Transform:

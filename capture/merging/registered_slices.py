@@ -195,7 +195,7 @@ def _stored_slice(path: Path) -> tuple[Stored, Plane]:
     """Return (camera RGB as the file has it, mostly in half floats; share of each pixel that was full) of one file, read once."""
     part = read_exr(path)[0]
     rgb = cv2.merge(part.planes("RGB"))
-    return rgb, part.channels[SATURATED].astype(np.float32) if SATURATED in part.channels else np.zeros(rgb.shape[:2], np.float32)
+    return rgb, single_of(part.channels[SATURATED]) if SATURATED in part.channels else np.zeros(rgb.shape[:2], np.float32)
 
 
 def _warped_share(saturated: Plane, reference_from_slice: Transform) -> Plane:
