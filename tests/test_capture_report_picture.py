@@ -319,6 +319,7 @@ def test_strict_asks_for_every_gate(tmp_path: Path) -> None:
     plain = CliRunner().invoke(app(report_command), [str(tmp_path)])
     assert plain.exit_code == 0 and "9 of 20 gates judged, 0 failed, 11 absent: all viewpoints placed" in plain.output
     assert "--strict" not in plain.output
+    assert "all-in-focus pictures: passed: as sharp as its slices, no seams, no invented light" in plain.output
     assert "absent: all viewpoints placed, points lie where they are seen, scales agree: no reconstruction" in plain.output
     absences = [each.name for each in report_scene(tmp_path).absences]
     allowed = [option for name in absences for option in ("--allow-absent", name.upper())]

@@ -38,6 +38,7 @@ def report_command(
     from capture.report.gates import tally, verdict_lines
     from capture.report.reblur import reblur_by
     from capture.report.scene_report import report_scene
+    from capture.report.stack_rules import picture_verdict
     from capture.report.strictness import require_gates, unmet
     from mrbokeh.interrupts import kept_when_interrupted
 
@@ -48,6 +49,7 @@ def report_command(
         report = report_scene(scene, reblur_by(renderer), width, overwrite=overwrite)
     for line in verdict_lines(report.gates):
         typer.echo(line)
+    typer.echo(picture_verdict(report.gates))
     reused = sum(each.reused for each in report.stacks)
     before = f" ({reused} of {len(report.stacks)} stacks were examined before; --overwrite examines them again)" if reused else ""
     typer.echo(f"{scene / HTML_NAME}: {tally(report.gates)}{before}")

@@ -9,7 +9,7 @@ from capture.report import HTML_NAME
 from capture.report.gates import Gate, Verdict, absent, absent_names, counts, failed
 from capture.report.poses_view import poses_view
 from capture.report.scene_gates import WHERE, Reconstruction
-from capture.report.stack_rules import PICTURE_RULES
+from capture.report.stack_rules import PICTURE_RULES, picture_verdict
 from capture.report.stack_section import ExaminedStack, gate_table, stack_section
 from mrbokeh import __version__
 from mrbokeh.html_page import cell, section, table, write_page
@@ -63,7 +63,7 @@ def write_html(report: SceneReport) -> None:
     unseen = "" if failures or report.passed else " Not passed: not all gates of the all-in-focus pictures could be judged."
     blocks = [
         f"<h1>Capture report: {report.scene.resolve().name}</h1>",
-        f'<p class="{kind}">{counts(report.gates)}.{unseen}</p>',
+        f'<p class="{kind}">{html.escape(picture_verdict(report.gates))}. Of all: {counts(report.gates)}.{unseen}</p>',
         f'<p class="muted">Absent: {html.escape(absent_names(report.gates))}.</p>' if report.absences else "",
         f'<p class="muted">Merged stacks: {len(report.stacks)}. mrbokeh {__version__}.</p>',
         section("What failed", "The sections below have all gates.", [gate_table(failures, with_place=True)]) if failures else "",

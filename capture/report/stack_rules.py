@@ -12,10 +12,11 @@ Where too little is sharp in both, what is left is how far pairs of the registra
 stacks from a light field camera, whose slices cannot move, and 0.25% on others, but 0.4% on one of these whose slices were put 1% apart.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from capture.report.detail import KEPT_DETAIL
-from capture.report.gates import Rule
+from capture.report.gates import Gate, Rule, Verdict
 
 LARGEST_LOST = 0.002
 LARGEST_FLAT = 1.1
@@ -172,3 +173,12 @@ STACK_RULES = (
 )
 PICTURE_RULES = (SHARP, SEAMS, LIGHT)
 """Rules of the all-in-focus picture: a report that lacks a verdict on one of them is not passed."""
+
+
+def picture_verdict(gates: Sequence[Gate]) -> str:
+    """Return one line on the all-in-focus pictures alone: a picture can be flawless though its depth is no good for training."""
+    names = [rule.name for rule in (*PICTURE_RULES, PLACES)]
+    found = {
+        verdict: [name for name in names if any(each.name == name and each.verdict is verdict for each in gates)] for verdict in Verdict
+    }
+    return "all-in-focus pictures: " + "; ".join(f"{verdict}: {', '.join(which)}" for verdict, which in found.items() if which)
