@@ -46,9 +46,11 @@ def ingest_command(
     from capture.stacks.ingest_table import print_report
     from capture.stacks.stack_ingest import Development
     from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.malloc_settings import keep_freed_pictures
 
     if group not in list(Grouping):
         raise InputError(f"--group must be one of {', '.join(Grouping)}, got {group!r}")
+    keep_freed_pictures()
     development = Development(parse_white_balance(white_balance), half_size, max_width)
     with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
         report = ingest(photographs, out, IngestSettings(Grouping(group), development, sidecar, overwrite))
