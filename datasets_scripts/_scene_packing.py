@@ -8,8 +8,8 @@ from jaxtyping import Float
 from datasets_scripts._thin_lens_tracer_numba import PackedView
 from datasets_scripts._traced_bodies_numba import PackedScene
 from datasets_scripts.traced_scene import Scene, Texture
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
 
 _NEAREST_M = 1e-3
 _UNIT_BOX = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])

@@ -12,8 +12,8 @@ from datasets_scripts._baked_lighting_numba import open_share
 from datasets_scripts._scene_packing import pack_scene, pack_view
 from datasets_scripts._traced_bodies_numba import PackedScene
 from datasets_scripts.traced_scene import Quad, Scene
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
 
 _SHADOW_M = 1e6  # any hit within a scene leaves next to nothing of a ray
 _WORLD_AXES = Camera(1, 1, (1.0, 1.0), (0.5, 0.5))

@@ -18,22 +18,22 @@ import typer
 from datasets_scripts.bank_pairs_scenes import FARTHEST_M, NEAREST_M, random_layers
 from datasets_scripts.bokeh_stacks_manifest import LICENCE, stack_record
 from datasets_scripts.bokeh_stacks_view import slice_name
-from mrbokeh.aperture import Aperture
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.focal_stack_dataset import FILE_NAME as MANIFEST
-from mrbokeh.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
-from mrbokeh.layer import flatten
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens, write_lens
-from mrbokeh.progress import track
-from mrbokeh.psf_bank import PsfBank
-from mrbokeh.psf_bank_file import read_bank
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.layer import flatten
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens, write_lens
+from mrbokeh.optics.psf_bank import PsfBank
+from mrbokeh.optics.psf_bank_file import read_bank
+from mrbokeh.renderers.kernels.spreadlets_file import fingerprint
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.spreadlets_file import fingerprint
+from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack_dataset import FILE_NAME as MANIFEST
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 PLAN_NAME = "plan.json"
 _TEST_SHARE = 0.2

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32
 
 from datasets_scripts.procedural_textures import checks, mottled, wood
 from datasets_scripts.traced_scene import Texture
-from mrbokeh.layer import Layer, opaque
+from mrbokeh.images.layer import Layer, opaque
 
 NEAREST_M, FARTHEST_M = 0.9, 6.5
 _TEXTURES: tuple[Callable[..., Texture], ...] = (mottled, wood, checks)

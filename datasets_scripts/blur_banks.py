@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from mrbokeh.lens import Lens
-from mrbokeh.psf_bank import PsfBank
-from mrbokeh.psf_bank_file import HEAD, missing_cells, read_bank, read_head
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf_bank import PsfBank
+from mrbokeh.optics.psf_bank_file import HEAD, missing_cells, read_bank, read_head
 from mrbokeh.psf_models.base import PsfModel
 from mrbokeh.psf_models.biconvex_lens import biconvex_lens
 from mrbokeh.psf_models.build import bank_head, build_bank
@@ -21,7 +21,7 @@ from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.psf_models.stylized import Stylized
 from mrbokeh.psf_models.volume import Volume
-from mrbokeh.spreadlets import Sparsification
+from mrbokeh.renderers.kernels.spreadlets import Sparsification
 
 COC_SHARE, MOTION_SHARE = 0.125, 0.14
 NEAREST_M, FARTHEST_M = 1.2, 6.6

@@ -10,13 +10,13 @@ from scipy.ndimage import distance_transform_edt
 
 from datasets_scripts.gathering_filter import gathered
 from datasets_scripts.global_layers import GlobalLayer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.psf_bank import PsfBank
-from mrbokeh.renderers._laplacian_bank import BankTables, Place
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.spreadlets import UNRELAXED, Sparsification
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf_bank import PsfBank
+from mrbokeh.renderers.bank.tables import BankTables, Place
+from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, Sparsification
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 
 Light = Float32[np.ndarray, "height width _"]
 
@@ -78,7 +78,7 @@ class BlurMethods:
         return {"ours": self.ours, "filter": self.filter, "splat": self.splat}
 
     def renderings(self, layers: Sequence[Layer], lens: Lens) -> Mapping[str, Callable[[], np.ndarray]]:
-        """Pictures with the slices and the hidden background of mrbokeh.layering, by points and by taps."""
+        """Pictures with the slices and the hidden background of mrbokeh.layering.layering, by points and by taps."""
         return {
             "ours": lambda: self._sparse.render(layers, lens).rgb,
             "splat": lambda: self._dense.render(layers, lens).rgb,

@@ -17,9 +17,9 @@ from datasets_scripts.blur_methods import BlurMethods
 from datasets_scripts.blur_scenes import BlurScene
 from datasets_scripts.global_layers import composited, read_global_layers, read_moving_layers
 from datasets_scripts.samples_plan import SamplesPlan
-from mrbokeh.image_io import write_image
-from mrbokeh.image_metrics import psnr, ssim
-from mrbokeh.spreadlets import UNRELAXED
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.image_metrics import psnr, ssim
+from mrbokeh.renderers.kernels.spreadlets import UNRELAXED
 
 _RIM_PX = 2
 _TRACED = ("simple", "combined")

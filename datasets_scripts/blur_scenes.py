@@ -11,10 +11,10 @@ from jaxtyping import Float32
 from datasets_scripts.render_samples import render_samples
 from datasets_scripts.samples_plan import SamplesPlan, SamplesSet
 from datasets_scripts.samples_scene import MovingScene
-from mrbokeh.image_io import read_image, write_image
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.light_field_samples_file import read_samples
+from mrbokeh.images.image_io import read_image, write_image
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.light_field_samples_file import read_samples
 
 _TIMED_SHARE = 16
 

@@ -3,7 +3,7 @@
     python -m datasets_scripts.bokeh_stacks OUT --shape heart [--size small|full --pull 48]
     mrbokeh train fit OUT --out RUN
 
-OUT is a data set with a manifest (`mrbokeh.focal_stack_dataset`): OUT/SCENE/view_NN/ are focal stacks with all-in-focus picture and
+OUT is a data set with a manifest (`mrbokeh.stacks.focal_stack_dataset`): OUT/SCENE/view_NN/ are focal stacks with all-in-focus picture and
 depth, OUT/lens.json is the lens. Finished files are kept, so an interrupted run goes on where it stopped; `--scenes` gives machines a
 share of the work each. With --pull OUT.pull/ becomes one test view at many focus distances, to see whether blur changes smoothly.
 It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and is fast where LLVM's library is installed (Debian: libllvm19).
@@ -22,10 +22,10 @@ from datasets_scripts.bokeh_stacks_shapes import SHAPES
 from datasets_scripts.bokeh_stacks_view import StackView
 from datasets_scripts.file_job import claim_folder
 from datasets_scripts.truth_mitsuba import SCALAR, best_variant, load
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import FILE_NAME, FocalStackDataset, write_focal_stack_dataset
-from mrbokeh.lens_file import write_lens
-from mrbokeh.progress import track
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, write_focal_stack_dataset
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 PLAN_NAME = "plan.json"
 

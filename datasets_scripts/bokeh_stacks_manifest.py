@@ -9,10 +9,10 @@ import numpy as np
 
 from datasets_scripts.bokeh_stacks_plan import StacksPlan
 from datasets_scripts.bokeh_stacks_view import NOISE_FLOOR
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FILE_NAME as STACK_FILE
-from mrbokeh.focal_stack import FocalStack, read_focal_stack
-from mrbokeh.focal_stack_dataset import FileRecord, FocalStackDataset, Part, RadianceRange, StackRecord
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import FileRecord, FocalStackDataset, Part, RadianceRange, StackRecord
 
 LICENCE = (
     "These pictures are computed from scenes that a program of this project makes up; no photograph, model or texture of anybody is in "

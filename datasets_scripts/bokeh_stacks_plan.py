@@ -7,10 +7,10 @@ import numpy as np
 from datasets_scripts.bokeh_stacks_scenes import KINDS
 from datasets_scripts.bokeh_stacks_shapes import BokehShape, bokeh_shape
 from datasets_scripts.truth_tracer import Opening
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import Part
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack_dataset import Part
+from mrbokeh.system.errors import InputError
 
 FOCAL_LENGTH_MM, SENSOR_WIDTH_MM = 50.0, 36.0
 NEAREST_FOCUS_M, FARTHEST_FOCUS_M = 0.9, 6.5

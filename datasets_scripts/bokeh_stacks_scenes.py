@@ -22,7 +22,7 @@ from datasets_scripts.truth_scenes import (
     triple,
     twig,
 )
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 NEAREST_M, FARTHEST_LIGHT_M = 0.85, FAR_M - 0.4
 # Radii over depth: discs about two pixels wide where the picture is 240 px wide, as bulbs are.

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from datasets_scripts.truth_field_stop import FieldStop
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.system.errors import InputError
 
 _RING = FieldStop()
 _ROUND_WITH_RIM = replace(Aperture.disc(), cat_eye=0.35)

@@ -13,10 +13,10 @@ from datasets_scripts.truth_scene import pack
 from datasets_scripts.truth_sharp import sharp_layer
 from datasets_scripts.truth_tracer import Opening, Picture, TruthTracer
 from datasets_scripts.truth_tracer_choice import make_tracer
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.image_metrics import psnr
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 
 NOISE_FLOOR = "noiseFloorDb"
 # Two halves differ by twice the variance of one, their mean has half of it: a quarter, 6.02 dB.

@@ -18,10 +18,10 @@ from jaxtyping import Float32, Float64
 from datasets_scripts.card_content import Card, Lamp, cards_of, lamps_of
 from datasets_scripts.card_shapes import TexelGrid
 from datasets_scripts.card_tracer import PINHOLE, PackedCards, card_coverage, trace
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 FOCUS_DISTANCE_M = 2.0
 FARTHEST_DIOPTRES_OFF = 0.4

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, Int, Int8, Int16
 
 from datasets_scripts.card_content import Card, Lamp
 from datasets_scripts.card_shapes import TexelGrid
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 
 # An opening of no size: with planes of no blur the lens point does not matter, the aperture still spreads the samples.
 PINHOLE = Aperture.blades(4)

@@ -9,9 +9,9 @@ from datasets_scripts.baked_lighting import bake_lighting
 from datasets_scripts.fairy_lights import fairy_lights
 from datasets_scripts.procedural_textures import bricks, checks, mottled, page_of_text, spots, wood
 from datasets_scripts.traced_scene import Quad, Scene, Sphere, Texture, Vector
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 TABLE_Y_M = 0.24
 WALL_Z_M = 1.95

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from datasets_scripts.sensor_model import CFA_PATTERNS, SensorModel
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.errors import InputError
-from mrbokeh.lens import MM_PER_M, Lens
+from mrbokeh.optics.lens import MM_PER_M, Lens
+from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.errors import InputError
 
 _MATRIX_DENOMINATOR = 10000
 _FINE_DENOMINATOR = 1000000

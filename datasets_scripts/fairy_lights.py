@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from datasets_scripts.thin_lens_tracer import trace_pinhole
 from datasets_scripts.traced_scene import DiscLight, Scene
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 LIGHTS_PER_VIEW = 12
 

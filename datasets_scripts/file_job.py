@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ import typer
 
 from datasets_scripts.gallery_entries import Entry, read_entries
 from datasets_scripts.gallery_pictures import page_jpeg, result_jpeg
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.errors import InputError
-from mrbokeh.html_page import inline_figure, write_page
-from mrbokeh.progress import track
+from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.html_page import inline_figure, write_page
+from mrbokeh.system.progress import track
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"

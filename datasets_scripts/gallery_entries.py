@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _ENTRY = re.compile(
     r"^### (?P<title>[^\n]+)\n(?:(?!^##).)*?```sh\n(?P<commands>.*?)```\n+!\[(?P<caption>[^\]]*)\]\((?P<picture>[^)]+)\)\n"

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from datasets_scripts.headless_chromium import CHROMIUM, chromium_page
-from mrbokeh.color import display_rgb8
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import LINEAR_SUFFIXES, read_image
+from mrbokeh.images.color import display_rgb8
+from mrbokeh.images.image_io import LINEAR_SUFFIXES, read_image
+from mrbokeh.system.errors import InputError
 
 WIDEST_PX = 960
 _QUALITY = 82
@@ -84,7 +84,7 @@ async def _screenshot(address: str, profile: Path) -> UInt8[np.ndarray, "height 
 
 
 def _frames(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    from mrbokeh.video_io import read_frames
+    from mrbokeh.video.clip import read_frames
 
     frames = [display_rgb8(_smaller(frame.rgb, WIDEST_PX // _FRAMES)) for frame in read_frames(path)]
     return np.concatenate([frames[round(share * (len(frames) - 1))] for share in np.linspace(0.1, 0.9, _FRAMES)], axis=1)

@@ -9,9 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from mrbokeh.errors import InputError
-from mrbokeh.renderers._laplacian_tables import Points
-from mrbokeh.workers import cores
+from mrbokeh.renderers.kernels.laplacian_tables import Points
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.workers import cores
 
 _STRIP_ROWS = 16
 

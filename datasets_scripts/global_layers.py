@@ -2,7 +2,7 @@
 
 The layers are those of the sampler: what is far in front of the focus, and everything else as if that were not there. Coverage
 goes through the same PSFs as colour; where several PSFs do not add up to 1, colour is weighted anew by it (Lee et al. 2008).
-It is plainer than mrbokeh.layering, which cuts every layer into slices: comparisons made with it compare the ways to add up
+It is plainer than mrbokeh.layering.layering, which cuts every layer into slices: comparisons made with it compare the ways to add up
 light, and nothing else.
 """
 
@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.image_io import read_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.motion import MOTION
-from mrbokeh.motion_file import taken_from_channels
-from mrbokeh.renderers._laplacian_bank import Place
+from mrbokeh.images.image_io import read_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.motion import MOTION
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.bank.tables import Place
+from mrbokeh.stacks.motion_file import taken_from_channels
 
 _LEAST = np.float32(1e-6)
 _OPAQUE = 0.999

@@ -13,9 +13,9 @@ from datasets_scripts.baked_lighting import bake_lighting
 from datasets_scripts.desk_scene import VIEWPOINTS, Viewpoint, camera_at, desk_furniture
 from datasets_scripts.procedural_textures import mottled
 from datasets_scripts.traced_scene import DiscLight, Quad, Scene, Texture, Vector, plain_texture
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 LAB_NEAR_M = 0.62
 LAB_FAR_M = 2.05

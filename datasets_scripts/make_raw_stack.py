@@ -24,10 +24,10 @@ from datasets_scripts.sensor_model import SensorModel
 from datasets_scripts.stack_scenes import STACK_SCENES
 from datasets_scripts.thin_lens_tracer import trace, trace_pinhole
 from datasets_scripts.traced_scene import Scene
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import write_image
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import write_image
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 _BETWEEN_SLICES = timedelta(seconds=2)
 _BETWEEN_VIEWS = timedelta(minutes=5)

@@ -16,7 +16,7 @@ from datasets_scripts.mixed_reality_objects import OBJECT_DISTANCES_M
 from datasets_scripts.mixed_reality_views import MixedView
 from datasets_scripts.truth_plan import TruthPlan
 from datasets_scripts.truth_set import make_missing, truth_command
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 DEFAULT_SHAPES = ("disc", "blades7", "cat_eye")
 

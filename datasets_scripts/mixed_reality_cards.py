@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from datasets_scripts.card_scene import CardScene, all_in_focus, card_scene, depth_m, layers, scene_of, truth
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.plate import Plate, plate_of
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
 
 FOCUS_CARD = 3
 """The poster with holes: two near things before it, three far ones behind it."""

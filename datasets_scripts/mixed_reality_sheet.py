@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.atomic_files import read_json
-from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
-from mrbokeh.image_io import read_image, read_layer
+from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+from mrbokeh.images.image_io import read_image, read_layer
+from mrbokeh.system.atomic_files import read_json
 
 
 def write_sheet(folder: Path) -> None:

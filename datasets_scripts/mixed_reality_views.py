@@ -14,8 +14,8 @@ from datasets_scripts.truth_set import ViewFiles
 from datasets_scripts.truth_sharp import sharp_layer
 from datasets_scripts.truth_tracer import TruthTracer
 from datasets_scripts.truth_tracer_choice import make_tracer
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import write_image, write_layer
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import write_image, write_layer
 
 What = Literal["scene", "both"]
 

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from datasets_scripts.psf_quad_tree import QuadTree
-from mrbokeh.image_metrics import ssim
-from mrbokeh.laplacian_integration import integrate
-from mrbokeh.nested_grid import NestedGrid
-from mrbokeh.psf_bank import physical_boxes
+from mrbokeh.images.image_metrics import ssim
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.psf_bank import physical_boxes
 from mrbokeh.psf_models.combined import Combined
-from mrbokeh.spreadlets import Spreadlet
+from mrbokeh.renderers.kernels.laplacian_integration import integrate
+from mrbokeh.renderers.kernels.spreadlets import Spreadlet
 
 COUNTS = (75, 75)
 """Steps of the nested grid with 392 cells; the paper has 400."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 
-from mrbokeh.laplacian_integration import laplacian
-from mrbokeh.spreadlet_values import fitted_values, potential_of, table_for
-from mrbokeh.spreadlets import Spreadlet, whole_laplacian
+from mrbokeh.renderers.kernels.laplacian_integration import laplacian
+from mrbokeh.renderers.kernels.spreadlet_values import fitted_values, potential_of, table_for
+from mrbokeh.renderers.kernels.spreadlets import Spreadlet, whole_laplacian
 
 _LEAST_LINES = 3
 
@@ -56,7 +56,7 @@ def quad_tree(kernel: Float[np.ndarray, "size size"], leaves: int) -> QuadTree:
 def quad_tree_points(kernel: Float[np.ndarray, "size size"], points: int, fit: bool) -> Spreadlet:
     """The Laplacian gathered in squares: one point in each that is not empty, at the centroid of its charges.
 
-    fit: values by least squares, as mrbokeh.spreadlets has them, else the sums; points in three rows or columns or fewer cannot
+    fit: values by least squares, as kernels.spreadlets has them, else the sums; points in three rows or columns or fewer cannot
     hold the moments that a fit keeps, and take the sums, too.
     """
     dense = laplacian(kernel[..., None])

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from datasets_scripts.public_stack import PublicLens, PublicSlice, PublicStack, unlike
-from mrbokeh.atomic_files import read_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
 
 # Stated for all scenes alike, since one network learns one lens; the blur of each level is in px_per_dioptre.
 BLB_LENS = PublicLens(50.0, 1.8, 36.0)

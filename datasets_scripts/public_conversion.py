@@ -10,15 +10,15 @@ from jaxtyping import Bool, Float32
 from datasets_scripts.bokeh_stacks_manifest import stack_record
 from datasets_scripts.public_depth import DepthMaps, sharpest_depth_m
 from datasets_scripts.public_stack import PublicLens, PublicSlice, PublicStack
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera_rgb import write_camera_rgb, write_masks
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME as STACK_FILE
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
-from mrbokeh.image_io import read_image
-from mrbokeh.lens import Lens
-from mrbokeh.progress import track
+from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
+from mrbokeh.images.image_io import read_image
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 # JPEG rounds and rings: what was full may be stored a little lower.
 _CLIPPED_CODE = 250.0 / 255.0

@@ -20,8 +20,8 @@ from datasets_scripts.public_depth import DepthMaps
 from datasets_scripts.public_photo_pairs import APERTURE_LENS, DPDD_LENS, EBB_LENS, aperture_stacks, dpdd_stacks, ebb_stacks
 from datasets_scripts.public_realbokeh import REALBOKEH_LENS, realbokeh_stacks
 from datasets_scripts.public_stack import PublicLens, PublicStack
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import FILE_NAME
+from mrbokeh.stacks.focal_stack_dataset import FILE_NAME
+from mrbokeh.system.errors import InputError
 
 _ASK = "No licence text is known to this project: ask the authors before any use beyond research, and do not pass the pictures on."
 

@@ -8,9 +8,9 @@ from jaxtyping import Float32
 from scipy import ndimage
 
 from datasets_scripts.public_stack import PublicStack
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import read_depth, read_image
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_depth, read_image
+from mrbokeh.system.errors import InputError
 
 _MAPS = (".exr", ".png", ".tif", ".tiff")
 _BINS = 24

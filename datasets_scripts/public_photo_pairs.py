@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from datasets_scripts.public_stack import PublicLens, PublicSlice, PublicStack, f_number_of, pictures_in, unlike
-from mrbokeh.focal_stack_dataset import Part
+from mrbokeh.stacks.focal_stack_dataset import Part
 
 EBB_LENS = PublicLens(50.0, 1.8, 22.3)
 DPDD_LENS = PublicLens(None, 4.0, 36.0)

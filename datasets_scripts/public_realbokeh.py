@@ -7,9 +7,9 @@ distance that the camera reported, which its author calls fairly inaccurate (iss
 from pathlib import Path
 
 from datasets_scripts.public_stack import PublicLens, PublicSlice, PublicStack, unlike
-from mrbokeh.atomic_files import read_json
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import Part
+from mrbokeh.stacks.focal_stack_dataset import Part
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
 
 REALBOKEH_LENS = PublicLens(50.0, 2.0, 36.0)
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import Part
-from mrbokeh.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES
+from mrbokeh.images.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES
+from mrbokeh.stacks.focal_stack_dataset import Part
+from mrbokeh.system.errors import InputError
 
 _PICTURES = (*INTEGER_SUFFIXES, *LINEAR_SUFFIXES)
 _F_NUMBER = re.compile(r"(?:^|[^a-z0-9])f[_/-]?(\d+(?:\.\d+)?)$", re.IGNORECASE)

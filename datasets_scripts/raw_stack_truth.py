@@ -9,11 +9,11 @@ from jaxtyping import Float
 from datasets_scripts.dng_writer import film_plane_distance_m
 from datasets_scripts.sensor_model import SensorModel
 from datasets_scripts.stack_scenes import STACK_SCENES, StackScene
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import lens_to_json
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import lens_to_json
+from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-raw-stack-truth"
 VERSION = 1

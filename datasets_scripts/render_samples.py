@@ -2,7 +2,7 @@
 
     python -m datasets_scripts.render_samples OUT [--scene fence,whirl,coins,rain,gear --seed 1 --width 512 --height 320 --spp 4]
 
-OUT/SCENE_SEED/ holds meta.json (settings, conventions), lens.json, samples.npz (LightFieldSamples: mrbokeh/light_field_samples.py),
+OUT/SCENE_SEED/ holds meta.json (settings, conventions), lens.json, samples.npz (LightFieldSamples: layering/light_field_samples.py),
 reference.exr, all_in_focus.exr with Z and motion, layers/NN.exr where a foreground hides what is behind it, and, if asked for,
 noise.json. Finished files are kept, so an interrupted run goes on where it stopped.
 """
@@ -15,8 +15,8 @@ import typer
 
 from datasets_scripts.samples_plan import SamplesPlan, SamplesSet
 from datasets_scripts.samples_scenes import SCENES
-from mrbokeh.errors import InputError
-from mrbokeh.progress import progress_bars
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import progress_bars
 
 
 def render_samples(out: Path, plan: SamplesPlan, *, measure: bool = False, overwrite: bool = False, threads: int = 0) -> int:

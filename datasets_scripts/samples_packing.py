@@ -8,7 +8,7 @@ from datasets_scripts._samples_bodies_numba import PackedBodies
 from datasets_scripts._samples_numba import Pinhole
 from datasets_scripts.samples_scene import Mover, MovingScene
 from datasets_scripts.traced_scene import Quad, Sphere, plain_texture
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 
 _NEAREST_M = 1e-3
 _LEAST_GATHERED_PX = 6.0

@@ -12,14 +12,14 @@ from datasets_scripts.file_job import claim_folder
 from datasets_scripts.samples_scene import MovingScene
 from datasets_scripts.samples_scenes import LENS, SCENES, make_scene
 from datasets_scripts.samples_tracer import WIDEST_PX, Advance, SampleArrays, SampleTracer
-from mrbokeh.atomic_files import write_json
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, write_image, write_layer
-from mrbokeh.image_metrics import psnr
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import lens_to_json, write_lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.light_field_samples_file import read_samples, write_samples
+from mrbokeh.images.image_io import read_image, write_image, write_layer
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import lens_to_json, write_lens
+from mrbokeh.stacks.light_field_samples_file import read_samples, write_samples
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
 
 CONVENTIONS = {
     "lens_uv": "where the ray passes the unit pupil, x right, y down; a point behind the focus is displaced by +coc/2 * uv",

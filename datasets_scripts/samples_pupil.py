@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datasets_scripts._samples_random_numba import LensTable
-from mrbokeh.aperture import Aperture
-from mrbokeh.aperture_shapes import net_area
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.aperture_shapes import net_area
+from mrbokeh.system.errors import InputError
 
 _SCANLINES = 1 << 13
 _BANDS = 1 << 12

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from datasets_scripts.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 
 _STILL: Vector = (0.0, 0.0, 0.0)
 _SUN_DIRECTION: Vector = (-0.36, -0.64, -0.68)

@@ -13,8 +13,8 @@ from datasets_scripts.procedural_textures import mottled, page_of_text, spots, w
 from datasets_scripts.samples_scene import Mover, MovingScene, Stage
 from datasets_scripts.samples_scenes_metal import coins, gear
 from datasets_scripts.traced_scene import Texture, Vector, plain_texture
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(135.0, 1.8, 2.0, 36.0)
 _FRONT_COC = -0.03

@@ -22,9 +22,9 @@ from datasets_scripts.samples_packing import gathered_lamps, pack, pinhole_of
 from datasets_scripts.samples_pupil import lens_table, light_through
 from datasets_scripts.samples_scene import MovingScene
 from datasets_scripts.truth_sampling import reversed_bits
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 WIDEST_PX = 1 << 11
 _STREAMS_PER_SEED = 64

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt16
 
-from mrbokeh.color import XYZ_from_rec709
-from mrbokeh.errors import InputError
+from mrbokeh.images.color import XYZ_from_rec709
+from mrbokeh.system.errors import InputError
 
 CFA_PATTERNS = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 

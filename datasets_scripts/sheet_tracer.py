@@ -11,8 +11,8 @@ from jaxtyping import Float, Float32, Float64
 
 from datasets_scripts._sheet_tracer_numba import PackedLens, PackedTable, shade
 from datasets_scripts.procedural_textures import mottled
-from mrbokeh.camera import Camera
-from mrbokeh.lens import MM_PER_M, Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import MM_PER_M, Lens
 
 _TABLE_TEXELS = 256
 

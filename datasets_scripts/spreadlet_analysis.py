@@ -14,8 +14,8 @@ import typer
 from datasets_scripts.psf_corpus import Corpus
 from datasets_scripts.spreadlet_drawing import draw_parts
 from datasets_scripts.spreadlet_parts import PARTS
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 _SLOW = {"ablation": 3, "sample_counts": 2}
 """Parts that take a share of the kernels: annealing tries 400 sets of points for each."""

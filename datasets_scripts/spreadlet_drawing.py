@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mrbokeh.atomic_files import atomic_path
+from mrbokeh.system.atomic_files import atomic_path
 
 _OURS, _TREE, _GREY = "#c0392b", "#2c6fbb", "#777777"
 _AS_SPARSE = "0.5"

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from datasets_scripts.blur_rows import Row
-from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
-from mrbokeh.image_io import read_image
+from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+from mrbokeh.images.image_io import read_image
 
 DETAIL_SHARE = (0.22, 0.22)
 """Height and width of a detail over those of the picture."""

@@ -16,9 +16,9 @@ import typer
 from datasets_scripts.blur_rows import ROWS, Measurement, Methods, Row
 from datasets_scripts.samples_plan import SamplesPlan
 from datasets_scripts.spreadlet_sheet import write_details
-from mrbokeh.atomic_files import atomic_path, read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.progress import progress_bars
+from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import progress_bars
 
 _SPP = 4
 _NOT_THERE = "-"

@@ -7,9 +7,9 @@ from typing import Any
 from datasets_scripts.desk_scene import FAR_FOCUS_M, NEAR_FOCUS_M, VIEWPOINTS, desk_camera, desk_scene
 from datasets_scripts.lab_scene import LAB_FAR_M, LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera, lab_facts, lab_scene
 from datasets_scripts.traced_scene import Scene
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.lens import Lens
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 
 
 @dataclass(frozen=True)

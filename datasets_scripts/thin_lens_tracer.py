@@ -14,10 +14,10 @@ from jaxtyping import Float, Float32
 from datasets_scripts._scene_packing import pack_scene, pack_view, pupil_areas
 from datasets_scripts._thin_lens_tracer_numba import PackedView, shade_picture, trace_depth
 from datasets_scripts.traced_scene import Scene
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 _LENS_DIFFERS = 1e-3
 _LEAST_DRAWN = 32  # so that no pixel of a thin ring is left without a ray

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 Texture = Float32[np.ndarray, "_ _ 3"]
 Vector = tuple[float, float, float]

@@ -14,13 +14,13 @@ import numpy as np
 import typer
 from jaxtyping import Float64, UInt8
 
-from mrbokeh.atomic_files import atomic_path, refuse_existing
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.formats import read_track
-from mrbokeh.camera_track.track import CameraTrack
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.errors import InputError
-from mrbokeh.video_io import read_frames
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.atomic_files import atomic_path, refuse_existing
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.formats import read_track
+from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.video.clip import read_frames
 
 _SHARES = (0.1, 0.5, 0.9)
 _YELLOW, _RED, _GREEN, _BLUE = (255, 210, 0), (255, 40, 40), (40, 220, 40), (60, 110, 255)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.aperture_modifiers import joined
-from mrbokeh.aperture_shapes import net_area, outlines_of, unit_disc
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.aperture_modifiers import joined
+from mrbokeh.optics.aperture_shapes import net_area, outlines_of, unit_disc
+from mrbokeh.system.errors import InputError
 
 _LINES = 512
 _TABLE_COLUMNS, _TABLE_ROWS = 65, 49

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int
 
-from mrbokeh.errors import InputError, MissingExtraError
 from mrbokeh.scene.mitsuba_variant import find_llvm
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
 VARIANTS = (LLVM, SCALAR)

@@ -8,9 +8,9 @@ from datasets_scripts.truth_scene import TruthScene
 from datasets_scripts.truth_scenes import SCENES
 from datasets_scripts.truth_shapes import SHAPE_NAMES, lens_shape
 from datasets_scripts.truth_tracer import Opening
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 FOCAL_LENGTH_MM, F_NUMBER, SENSOR_WIDTH_MM = 50.0, 1.2, 36.0
 CONVENTIONS = {

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.system.errors import InputError
 
 _SCANLINES = 1 << 16
 _BANDS = 1 << 14

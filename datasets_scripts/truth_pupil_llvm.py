@@ -7,7 +7,7 @@ import numpy as np
 
 from datasets_scripts.truth_pupil import pupil_table
 from datasets_scripts.truth_tracer import Opening, field_scale
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 
 class LlvmPupil:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32, Int
 
 from datasets_scripts.traced_scene import Texture, Vector
 from datasets_scripts.truth_bodies import Body
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 FACET_COLUMNS = 13
 _LAMP_SIDES = 48

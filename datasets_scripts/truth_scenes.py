@@ -8,7 +8,7 @@ from datasets_scripts.procedural_textures import bricks, checks, fractal_noise, 
 from datasets_scripts.traced_scene import Texture, Vector
 from datasets_scripts.truth_bodies import Body, ball, box, leaf, quad, wire
 from datasets_scripts.truth_scene import Lamp, TruthScene
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 GROUND_M = 0.62
 FAR_M = 9.0

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.system.errors import InputError
 
 _MAKERS: dict[str, Callable[[], Aperture]] = {
     "disc": Aperture.disc,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from datasets_scripts.truth_tracer import Plane, TruthTracer, lamps_of
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
 
 _PLACES_ACROSS = 6
 _LAMP_REACH_PX = 0.8

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from datasets_scripts.truth_tracer import Picture
-from mrbokeh.atomic_files import read_json
-from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
-from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import read_image, read_layer
+from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image, read_layer
+from mrbokeh.system.atomic_files import read_json
 
 
 def write_sheet(folder: Path) -> None:

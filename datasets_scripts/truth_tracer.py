@@ -18,9 +18,9 @@ from jaxtyping import Float32, Float64
 
 from datasets_scripts.truth_field_stop import FieldStop, OpenShares
 from datasets_scripts.truth_scene import PackedScene
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 
 Part = Literal["all", "thin", "rest"]
 Picture = Float32[np.ndarray, "height width 3"]

@@ -3,7 +3,7 @@
 from datasets_scripts.truth_mitsuba import LLVM, best_variant, load
 from datasets_scripts.truth_scene import PackedScene
 from datasets_scripts.truth_tracer import Part, TruthTracer
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 
 def make_tracer(scene: PackedScene, camera: Camera, part: Part = "all", seed: int = 0, variant: str | None = None) -> TruthTracer:

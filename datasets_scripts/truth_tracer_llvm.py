@@ -11,7 +11,7 @@ from datasets_scripts.truth_sampling import owen_scrambled, scramble_seed, sobol
 from datasets_scripts.truth_scene import PackedScene
 from datasets_scripts.truth_shading_llvm import LlvmShading
 from datasets_scripts.truth_tracer import LAMP_STREAM, OWN_LAMP, Opening, Part, Picture, Plane, Traced, lamp_flux, lamps_of, triangles_of
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 _LAMP_RAYS_AT_ONCE = 1 << 22
 

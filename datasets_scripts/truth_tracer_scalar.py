@@ -20,7 +20,7 @@ from datasets_scripts.truth_tracer import (
     lamps_of,
     triangles_of,
 )
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 
 class ScalarTracer:

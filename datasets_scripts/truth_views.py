@@ -15,8 +15,8 @@ from datasets_scripts.truth_sharp import sharp_layer
 from datasets_scripts.truth_sheet import write_sheet
 from datasets_scripts.truth_tracer import Part, Picture, TruthTracer
 from datasets_scripts.truth_tracer_choice import make_tracer
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import write_image, write_layer
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import write_image, write_layer
 
 
 class View(ViewFiles):

@@ -8,21 +8,21 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 _PUBLIC = {
-    "Aperture": "mrbokeh.aperture",
-    "Camera": "mrbokeh.camera",
-    "FocalStack": "mrbokeh.focal_stack",
-    "InputError": "mrbokeh.errors",
-    "Layer": "mrbokeh.layer",
-    "Lens": "mrbokeh.lens",
-    "Psf": "mrbokeh.psf",
+    "Aperture": "mrbokeh.optics.aperture",
+    "Camera": "mrbokeh.optics.camera",
+    "FocalStack": "mrbokeh.stacks.focal_stack",
+    "InputError": "mrbokeh.system.errors",
+    "Layer": "mrbokeh.images.layer",
+    "Lens": "mrbokeh.optics.lens",
+    "Psf": "mrbokeh.optics.psf",
     "Renderer": "mrbokeh.renderers.base",
-    "read_focal_stack": "mrbokeh.focal_stack",
-    "read_image": "mrbokeh.image_io",
-    "read_layer": "mrbokeh.image_io",
-    "read_lens": "mrbokeh.lens_file",
-    "write_image": "mrbokeh.image_io",
-    "write_layer": "mrbokeh.image_io",
-    "write_lens": "mrbokeh.lens_file",
+    "read_focal_stack": "mrbokeh.stacks.focal_stack",
+    "read_image": "mrbokeh.images.image_io",
+    "read_layer": "mrbokeh.images.image_io",
+    "read_lens": "mrbokeh.optics.lens_file",
+    "write_image": "mrbokeh.images.image_io",
+    "write_layer": "mrbokeh.images.image_io",
+    "write_lens": "mrbokeh.optics.lens_file",
 }
 __all__ = sorted(_PUBLIC)
 

@@ -13,8 +13,8 @@ from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from mrbokeh.errors import InputError, MissingExtraError
-from mrbokeh.interrupts import INTERRUPTED
+from mrbokeh.system.errors import InputError, MissingExtraError
+from mrbokeh.system.interrupts import INTERRUPTED
 
 # OpenCV's threads otherwise spin while they wait for work: a tenth of the CPU time of a merge. It is read when OpenCV is imported.
 os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")

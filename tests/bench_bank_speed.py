@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.image_io import write_image
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
-from mrbokeh.lens_fitting.lens_fit import FitSettings, fit_lens
-from mrbokeh.lens_fitting.measured_bank import bank_of
-from mrbokeh.psf_bank import PsfBank
-from mrbokeh.psf_bank_file import read_bank, write_bank
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
+from mrbokeh.lens_measuring.fitting.measured_bank import bank_of
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf_bank import PsfBank
+from mrbokeh.optics.psf_bank_file import read_bank, write_bank
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from tests.machine import machine_line, memory_line
 
 HEIGHT_PX, WIDTH_PX, LARGEST_PX, BLOCKS = 360, 640, 49.0, 25
@@ -79,7 +79,7 @@ def measured(kept: Path | None) -> PsfBank:
 
 def network(folder: Path) -> Callable[[np.ndarray, np.ndarray], object]:
     """The published form, one tile, untrained: its weights do not change its time."""
-    from mrbokeh.renderers.onnx_network import OnnxNetwork
+    from mrbokeh.renderers.network.onnx_network import OnnxNetwork
     from training.export_onnx import export_network
     from training.network_settings import NetworkSettings
     from training.run_folder import RunFacts, build_network

@@ -21,7 +21,7 @@ from datasets_scripts.lab_scene import BOARD_MARKER_M, BOARD_SQUARE_M, BOARD_SQU
 from datasets_scripts.make_raw_stack import make_raw_stack
 from datasets_scripts.raw_stack_truth import StackPlan
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.focal_stack import read_focal_stack
+from mrbokeh.stacks.focal_stack import read_focal_stack
 from tests.capture_truth import Score, ViewTruth, score, view_truth
 from tests.machine import machine_line
 from tests.process_cost import mrbokeh

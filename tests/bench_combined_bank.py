@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.psf_bank import physical_boxes
+from mrbokeh.optics.psf_bank import physical_boxes
 from mrbokeh.psf_models.base import centred
 from mrbokeh.psf_models.build import bank_head
 from mrbokeh.psf_models.combined import PAPER_COUNTS, Combined

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from mrbokeh.compositing.choose import MODES, insertion_of
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.plate import Plate, plate_of
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from tests.machine import machine_line, memory_line
 from tests.mixed_reality_cases import BASELINES, MixedCase, card_cases, traced_cases
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.choose import BY_NAME, make_renderer
 from tests.fidelity_baselines import BASELINES, gegl_lens_blur, has_gegl
 from tests.fidelity_cases import CARD_RADII_PX, Case, card_cases, truth_cases

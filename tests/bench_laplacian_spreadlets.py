@@ -16,13 +16,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.image_metrics import psnr, ssim
-from mrbokeh.laplacian_integration import integrate, integrate_by_pyramid, laplacian
-from mrbokeh.renderers._laplacian_tables import DENSE, WHOLE, kind_of
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.images.image_metrics import psnr, ssim
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.kernels.laplacian_integration import integrate, integrate_by_pyramid, laplacian
+from mrbokeh.renderers.kernels.laplacian_tables import DENSE, WHOLE, kind_of
+from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.spreadlets import UNRELAXED, Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from tests.machine import machine_line, memory_line
 
 REPEATS = 9

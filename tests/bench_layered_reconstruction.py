@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from skimage.restoration import denoise_nl_means
 
-from mrbokeh.color import linear_to_srgb, srgb_to_linear
-from mrbokeh.image_io import read_image
-from mrbokeh.image_metrics import psnr, ssim
-from mrbokeh.lens_file import read_lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.light_field_samples_file import read_samples
+from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
+from mrbokeh.images.image_io import read_image
+from mrbokeh.images.image_metrics import psnr, ssim
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
+from mrbokeh.stacks.light_field_samples_file import read_samples
 from tests.machine import machine_line, memory_line
 from tests.sampled_planes import LENS, Plane, checker, fence_scene, sample_planes, truth, waves
 

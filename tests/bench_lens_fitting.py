@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks
-from mrbokeh.layer import opaque
-from mrbokeh.lens_fitting.lens_fit import FitSettings, fit_lens
-from mrbokeh.lens_fitting.measured_bank import bank_of
-from mrbokeh.lens_fitting.stack_equations import SliceView, usable_pixels
-from mrbokeh.lens_fitting.stack_views import StackSlices
-from mrbokeh.psf_bank import Axis, PsfBank
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.images.layer import opaque
+from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
+from mrbokeh.lens_measuring.fitting.measured_bank import bank_of
+from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, usable_pixels
+from mrbokeh.lens_measuring.fitting.stack_views import StackSlices
+from mrbokeh.optics.psf_bank import Axis, PsfBank
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
 from tests.machine import machine_line, memory_line
 
 FITTED_VIEWS = 5

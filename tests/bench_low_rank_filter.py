@@ -15,11 +15,11 @@ from statistics import median
 import cv2
 import numpy as np
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.low_rank import aperture_errors
-from mrbokeh.renderers._low_rank_exact import scatter_exactly
-from mrbokeh.renderers.low_rank_filter import LowRankFilter
-from mrbokeh.tilt_shift import tilt_shift
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.kernels.low_rank_kernel import aperture_errors
+from mrbokeh.renderers.low_rank.exact import scatter_exactly
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+from mrbokeh.renderers.low_rank.tilt_shift import tilt_shift
 from tests.machine import machine_line, memory_line
 
 HEIGHT_PX, WIDTH_PX = 1080, 1920

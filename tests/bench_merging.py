@@ -21,8 +21,8 @@ from capture.merging.slice_optics import SliceOptics
 from datasets_scripts.make_raw_stack import make_raw_stack
 from datasets_scripts.raw_stack_truth import StackPlan
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.focal_stack import FocalStack, read_focal_stack
-from mrbokeh.image_io import read_image, write_image
+from mrbokeh.images.image_io import read_image, write_image
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
 from tests.capture_truth import ViewTruth, picture_db, view_truth
 from tests.machine import machine_line
 from tests.process_cost import measured, mrbokeh

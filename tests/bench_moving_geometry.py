@@ -13,16 +13,16 @@ from statistics import median
 import cv2
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.layer import Layer
-from mrbokeh.lens_distortion import LensDistortion, distorted, overscan_camera
-from mrbokeh.lens_distortion.warping import _reached_box, sampled_positions_px
-from mrbokeh.motion import with_motion
-from mrbokeh.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer
-from mrbokeh.pixel_box import lit_box
+from mrbokeh.distortion import LensDistortion, distorted, overscan_camera
+from mrbokeh.distortion.warping import _reached_box, sampled_positions_px
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.motion import with_motion
+from mrbokeh.layering.pixel_box import lit_box
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, sun, world_from_scene_placing
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf_loader import load_glb
+from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer
 from tests.machine import machine_line, memory_line
 
 PLATE = Camera(1920, 1080, (1600.0, 1590.0), (950.3, 545.1))

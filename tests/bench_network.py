@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 import torch
 
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.onnx_network import OnnxNetwork
-from mrbokeh.renderers.onnx_sessions import PROVIDERS, open_session
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.renderers.network.onnx_sessions import PROVIDERS, open_session
 from tests.machine import machine_line, memory_line
 from training.export_onnx import export_network
 from training.fast_export.export import FastExported, export_fast_network, export_fast_run

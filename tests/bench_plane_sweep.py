@@ -18,7 +18,7 @@ from capture.views.plane_sweep_planes import dioptre_planes
 from capture.views.plane_sweep_view import SweepView, neighbour_from_reference, packed_view, rays_of, structure_of
 from datasets_scripts.lab_scene import LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera, lab_scene
 from datasets_scripts.thin_lens_tracer import trace_pinhole
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 from tests.machine import machine_line, memory_line
 
 WIDTH_PX, HEIGHT_PX, SAMPLES = 960, 640, 32

@@ -12,14 +12,14 @@ import numpy as np
 
 from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.over import behind
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.plate import plate_of
-from mrbokeh.plate_look.colour_match import ColourMatch
-from mrbokeh.plate_look.finishing import Finishing, finished
-from mrbokeh.plate_look.grain import measured_grain, measured_grain_of_pair
-from mrbokeh.plate_look.light_wrap import LightWrap
-from mrbokeh.plate_look.vignetting import RadialFalloff
+from mrbokeh.compositing.plate import plate_of
+from mrbokeh.compositing.plate_look.colour_match import ColourMatch
+from mrbokeh.compositing.plate_look.finishing import Finishing, finished
+from mrbokeh.compositing.plate_look.grain import measured_grain, measured_grain_of_pair
+from mrbokeh.compositing.plate_look.light_wrap import LightWrap
+from mrbokeh.compositing.plate_look.vignetting import RadialFalloff
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
 from tests.machine import machine_line, memory_line
 
 HEIGHT_PX, WIDTH_PX, OBJECT_PX = 1080, 1920, 600

@@ -19,12 +19,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.image_io import write_image
-from mrbokeh.layer import opaque
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.layer import opaque
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from tests.machine import machine_line
 
 OCTAGON = Aperture.blades(8, np.pi / 8)
@@ -106,7 +106,7 @@ def render_row() -> None:
         spreads_ms.append(1e3 * (time.perf_counter() - started_s))
         return result
 
-    from mrbokeh.layering import render_layers
+    from mrbokeh.layering.layering import render_layers
 
     render_layers([layer], lens, timed, renderer.layering)
     print(f"{'':<68} {sum(spreads_ms):8.1f} ms of these in its {len(spreads_ms)} spreads")

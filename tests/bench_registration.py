@@ -24,7 +24,7 @@ from capture.merging.plane_transforms import (
     inverse,
     to_opencv_centres,
 )
-from mrbokeh.image_io import read_image
+from mrbokeh.images.image_io import read_image
 from tests.jittered_stack import JITTER_PX, JITTER_RAD, JitteredStack, jittered_stack
 from tests.machine import machine_line, memory_line
 

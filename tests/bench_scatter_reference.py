@@ -9,8 +9,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.layer import opaque
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
 from tests.machine import machine_line, memory_line
 

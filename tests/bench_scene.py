@@ -13,13 +13,13 @@ from functools import partial
 import numpy as np
 import trimesh
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Material, Scene, Texture, matte, rectangle, shadow_catcher, sphere, sun
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions
 from mrbokeh.scene.wgpu_device import gpu
 from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
+from mrbokeh.system.errors import InputError
 from tests.machine import machine_line, memory_line
 
 CAMERA = Camera(640, 360, (520.0, 515.0), (320.0, 180.0))

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Scene, shadow_catcher, sun, world_from_scene_placing
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf_loader import load_glb

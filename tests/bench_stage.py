@@ -15,17 +15,17 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.lens import Lens
-from mrbokeh.overlay import code_tables
+from mrbokeh.compositing.overlay import code_tables
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.scene import Environment, Scene
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment_filter import lighting_maps
 from mrbokeh.scene.gltf_loader import GltfAsset
-from mrbokeh.staging.assets import Assets
-from mrbokeh.staging.scene_description import PlacedObject, SceneDescription, ShadowPlane
-from mrbokeh.staging.staged_scene import StagedObject, StagedScene
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.scene.staging.assets import Assets
+from mrbokeh.scene.staging.scene_description import PlacedObject, SceneDescription, ShadowPlane
+from mrbokeh.scene.staging.staged_scene import StagedObject, StagedScene
+from mrbokeh.tracking.upright import upright_camera
 from tests.machine import machine_line, memory_line
 from tests.stage_scenes import looking
 from viewfinder.stage.drawn_layer import Brushes, Drawing, DrawRequest, draw
@@ -165,7 +165,7 @@ def print_warp(drawing: Drawing) -> None:
     print(f"yardstick cv2.remap, whose map is known: {remap_ms:.2f} ms; warp / yardstick {warp_ms / remap_ms:.1f}")
     plate, tables = np.full((HEIGHT, WIDTH, 3), 90, np.uint8), code_tables("bt709")
     overlay.over_codes(plate, tables)
-    print(f"overlay on the frame (mrbokeh.overlay): {best_ms(lambda: overlay.over_codes(plate, tables), 40)[0]:.2f} ms")
+    print(f"overlay on the frame (mrbokeh.compositing.overlay): {best_ms(lambda: overlay.over_codes(plate, tables), 40)[0]:.2f} ms")
 
 
 def print_quality(drawn: Callable[[float], Drawing], step_s: float) -> None:

@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mrbokeh.image_metrics import psnr
-from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
-from mrbokeh.renderers.torch_reconstruction import DeviceSamples, TorchReconstruction
-from mrbokeh.torch_device import has_triton
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction
+from mrbokeh.system.torch_device import has_triton
 from tests.device_timing import milliseconds
 from tests.machine import machine_line, memory_line
 from tests.sampled_planes import LENS, fence_scene, sample_planes

@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 import torch
 
-from mrbokeh.image_metrics import psnr
-from mrbokeh.laplacian_integration import laplacian
-from mrbokeh.psf_bank import PsfBank
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.psf_models.build import build_bank
 from mrbokeh.psf_models.combined import Combined
-from mrbokeh.renderers._laplacian_bank import Place
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.renderers.torch_spreadlets import DeviceLayer, TorchSpreadlets
-from mrbokeh.renderers.torch_spreadlets._integration import integrate
-from mrbokeh.torch_device import has_triton
+from mrbokeh.renderers.bank.tables import Place
+from mrbokeh.renderers.kernels.laplacian_integration import laplacian
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.renderers.spreadlets.torch_spreadlets import DeviceLayer, TorchSpreadlets
+from mrbokeh.renderers.spreadlets.torch_spreadlets._integration import integrate
+from mrbokeh.system.torch_device import has_triton
 from tests.device_timing import milliseconds
 from tests.machine import machine_line, memory_line
 

@@ -15,14 +15,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.board_alignment import AlignedDetector, aligned_corners
-from mrbokeh.charuco.corner_flow import flow
-from mrbokeh.charuco.detector import CharucoDetector, Grey
-from mrbokeh.charuco.pose_from_points import poses_from_plane
-from mrbokeh.lens import Lens
-from mrbokeh.video_io import read_display_frames
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
+from mrbokeh.tracking.charuco.corner_flow import flow
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Grey
+from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
+from mrbokeh.video.clip import read_display_frames
 from tests.machine import machine_line, memory_line
 from tests.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
 from viewfinder.frames import CameraFrame

@@ -19,9 +19,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.picture_sources.choose import open_source
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.crew import Crew, OneProcess
 from mrbokeh.shots.frame_maker import MakerRecipe
@@ -31,7 +30,8 @@ from mrbokeh.shots.process_crew import ProcessCrew
 from mrbokeh.shots.segment import SEGMENT_S
 from mrbokeh.shots.shot import Shot
 from mrbokeh.shots.video_target import VideoTarget
-from mrbokeh.video_io import VideoWriter, probe
+from mrbokeh.video.clip import VideoWriter, probe
+from mrbokeh.video.picture_sources.choose import open_source
 from tests.machine import machine_line
 from tests.shot_makers import Brighter, MovingDisc
 

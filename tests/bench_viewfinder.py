@@ -22,7 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 from tests.live_clip import SCENE, LiveClip, write_live_clip
 from tests.live_viewfinder import live
 from tests.machine import machine_line, memory_line

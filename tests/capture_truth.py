@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from mrbokeh.atomic_files import read_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_from_json
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import read_image
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.atomic_files import read_json
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.image_io import write_image
-from mrbokeh.layer import opaque
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 
 SIZE = (48, 72)
 LENS = Lens(35.0, 2.8, 1.0, 3.5, Aperture.blades(6, 0.2))

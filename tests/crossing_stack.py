@@ -8,8 +8,8 @@ import numpy as np
 from capture.merging.registration import Registration
 from capture.merging.registration_file import write_registration
 from capture.stacks.ingest import ingest
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import write_image
+from mrbokeh.images.image_io import write_image
+from mrbokeh.stacks.focal_stack import FocalStack
 from tests.made_photographs import only_stack
 
 SIZE = (144, 192)

@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import read_image, write_image
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.psf import kernel_radius_px
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import read_image, write_image
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf import kernel_radius_px
 from mrbokeh.renderers.scatter_reference import scatter
+from mrbokeh.system.errors import InputError
 
 _GATHER_STEP_PX = 0.5
 _GEGL_GROWTH_PX = 0.5  # a point through lens-blur of radius r fills a disc of radius r + 1/2

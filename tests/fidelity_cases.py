@@ -9,14 +9,14 @@ import numpy as np
 from scipy.ndimage import binary_dilation, grey_dilation
 
 from datasets_scripts import card_scene as cards
-from mrbokeh.aperture import Aperture
-from mrbokeh.atomic_files import read_json
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import read_image, read_layer, write_image
-from mrbokeh.image_metrics import depth_edge_mask, energy_ratio, psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image, read_layer, write_image
+from mrbokeh.images.image_metrics import depth_edge_mask, energy_ratio, psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.atomic_files import read_json
 
 CARD_RADII_PX = (12, 32)
 _EDGE_REACH_PX = 4

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.exr_io import read_exr, write_exr
-from mrbokeh.focal_stack import FocalStack, write_focal_stack
-from mrbokeh.guessed_metres import POSITION, POSITION_ERROR
+from mrbokeh.images.exr_io import read_exr, write_exr
+from mrbokeh.optics.camera import Camera
+from mrbokeh.stacks.focal_stack import FocalStack, write_focal_stack
+from mrbokeh.stacks.guessed_metres import POSITION, POSITION_ERROR
 
 NEAREST_M, FARTHEST_M = 1.0, 2.0
 

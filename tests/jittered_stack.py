@@ -8,8 +8,8 @@ import numpy as np
 from capture.merging.plane_transforms import Transform, about_centre, chained, farthest_corner_px, inverse, moved
 from datasets_scripts.desk_scene import desk_camera
 from datasets_scripts.thin_lens_tracer import trace
-from mrbokeh.camera import Camera
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from tests.traced_focal_stack import still_life
 
 WIDTH_PX, HEIGHT_PX = 320, 214

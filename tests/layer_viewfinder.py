@@ -15,11 +15,11 @@ import aiohttp
 import cv2
 import numpy as np
 
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.video_color import linear_from_code
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.color import linear_from_code
 from viewfinder.lens_book import LensBook
 from viewfinder.running import Parts, Viewfinder
 from viewfinder.running import running as parts_running

@@ -10,9 +10,9 @@ from threading import Event
 import cv2
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.video_io import VideoWriter, read_display_frames
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter, read_display_frames
 from tests.stage_scenes import card
 from tests.traced_board_clip import BOARD, clip_of
 from viewfinder.frames import CameraFrame

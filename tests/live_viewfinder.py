@@ -15,9 +15,9 @@ import aiohttp
 import numpy as np
 from aiortc.mediastreams import MediaStreamError
 
-from mrbokeh.lens import Lens
-from mrbokeh.video_color import color_of
-from mrbokeh.video_frames import display_bgr
+from mrbokeh.optics.lens import Lens
+from mrbokeh.video.color import color_of
+from mrbokeh.video.frames import display_bgr
 from tests.live_clip import LiveClip, board_tracker
 from tests.streaming_viewers import Viewer, watching
 from tests.traced_board_clip import LENS

@@ -13,8 +13,8 @@ from scipy.ndimage import gaussian_filter
 from capture.stacks.ingest import IngestReport
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack
 
 Picture = Float32[np.ndarray, "height width 3"]
 LENS = Lens(35.0, 2.8, 1.0, 23.5)

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.frame_header import finite
 from viewfinder.frames import FrameStatus, OutputFrame
 from viewfinder.server.access import Access

@@ -11,17 +11,17 @@ import numpy as np
 from datasets_scripts.card_scene import lens_of_radius, truth
 from datasets_scripts.mixed_reality_cards import mixed_cards
 from datasets_scripts.truth_shapes import lens_shape
-from mrbokeh.aperture import Aperture
 from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.near_and_far import continued
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import read_image, read_layer
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.plate import Plate, plate_of
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image, read_layer
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 
 BASELINES = ("sharp mask", "plain over")

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 
 from datasets_scripts.sheet_tracer import pack_table, trace_sheet
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.camera_track.world_axes import inverted, rigid
-from mrbokeh.charuco.board_file import write_board
-from mrbokeh.color import display_rgb8
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.color import display_rgb8
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
+from mrbokeh.tracking.charuco.board_file import write_board
 from tests.traced_board_clip import BOARD, clip_of
 from viewfinder.frames import Pose
 from viewfinder.tracking.rigid_motion import rigid_of

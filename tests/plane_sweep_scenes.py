@@ -8,7 +8,7 @@ from capture.views.plane_sweep_view import SweepView, structure_of
 from datasets_scripts.procedural_textures import mottled
 from datasets_scripts.thin_lens_tracer import trace_pinhole
 from datasets_scripts.traced_scene import Quad, Scene, emissive_quad, plain_texture
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 160, 112, 170.0
 PLACES_M = ((0.0, 0.0, 0.0), (0.06, 0.0, 0.0), (-0.06, 0.0, 0.005), (0.0, 0.05, 0.0), (0.0, -0.05, -0.005))

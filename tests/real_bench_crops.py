@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from capture.report.detail import Blocks, SharpestSlices, Sharpness, border_blocks
 from capture.stacks.block_detail import BLOCK_PX
-from mrbokeh.color import display_rgb8
+from mrbokeh.images.color import display_rgb8
 from tests.real_bench_stack import Rgb
 
 CROP_PX = 7 * BLOCK_PX

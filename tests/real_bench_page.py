@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 
-from mrbokeh.html_page import cell, section, table, write_page
+from mrbokeh.system.html_page import cell, section, table, write_page
 from tests.fusion_measures import MEASURES
 from tests.real_bench_pairs import Agreement, Ranking
 from tests.real_bench_result import OURS, TOP_BAR, StackResult

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from scipy.io import loadmat
 from scipy.stats import rankdata
 
-from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.system.atomic_files import read_json, write_json
 from tests import fusion_measures
 from tests.fusion_measures import FusionScores, Picture, fusion_scores
 from tests.real_bench_sets import FUSED_BY_OTHERS, PAIR_SET, PUBLISHED_VALUES, photographs_in

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.color import display_rgb8, srgb_to_linear
+from mrbokeh.images.color import display_rgb8, srgb_to_linear
+from mrbokeh.system.atomic_files import read_json, write_json
 from tests.process_cost import Cost, attempted
 from tests.real_bench_sets import RealStack
 from tests.real_bench_stack import Rgb, linked

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from capture.report.detail import SharpestSlices
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import write_image
+from mrbokeh.images.image_io import write_image
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 from tests.real_bench_crops import Crop, Place, worst_places, write_crops
 from tests.real_bench_peers import features_of_slices, on_slices, peer_result
 from tests.real_bench_sets import RealStack
@@ -162,7 +162,7 @@ def _focus(stack: RealStack, made: FocalStack) -> Focus | None:
 
 
 def _left_out(made: FocalStack) -> LeaveOneOut:
-    from mrbokeh.refocusing import leave_one_out
+    from mrbokeh.refocus.refocusing import leave_one_out
     from mrbokeh.renderers.choose import lens_and_renderer
 
     started = time.process_time()

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from capture.report.detail import SharpestSlices, Sharpness, inner_blocks
-from mrbokeh.atomic_files import read_json
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.system.atomic_files import read_json
 from tests.process_cost import Cost, attempted, mrbokeh_command
 from tests.real_bench_sets import RealStack
 

@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.bank_apertures import BankApertures, fit_apertures
-from mrbokeh.bank_lattice import BankLattice
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.nested_grid import NestedGrid
-from mrbokeh.psf_bank import Axis, PsfBank, physical_boxes
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.renderers.low_rank_filter import LowRankFilter
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.renderers.bank.apertures import BankApertures, fit_apertures
+from mrbokeh.renderers.bank.lattice import BankLattice
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 
 HEIGHT, WIDTH = SIZE = (64, 96)
 HALF_DIAGONAL_PX = 0.5 * float(np.hypot(*SIZE))

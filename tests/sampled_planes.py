@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import qmc
 
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.lens import Lens
 
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)
 Picture = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
 from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
 

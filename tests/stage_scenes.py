@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
-from mrbokeh.staging.assets import Assets
-from mrbokeh.staging.scene_description import SceneDescription
-from mrbokeh.staging.scene_file import read_scene_file
-from mrbokeh.staging.staged_scene import StagedScene
+from mrbokeh.scene.staging.assets import Assets
+from mrbokeh.scene.staging.scene_description import SceneDescription
+from mrbokeh.scene.staging.scene_file import read_scene_file
+from mrbokeh.scene.staging.staged_scene import StagedScene
 from tests.test_scene_gltf import GlbWriter
 from viewfinder.stage.drawn_layer import Brushes
 from viewfinder.stage.layer_depth import LayerDepth

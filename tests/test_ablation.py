@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.system.errors import InputError
 from tests.card_stack import SIZE, make_card_stack
 from training import train
 from training.ablation.plan import Ablation, planned_runs, read_data_sets, settings_of

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from shapely import Polygon, box
 
-from mrbokeh._polygon_coverage_numba import _shown_diameter_px
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.psf import shown_diameter_px
+from mrbokeh.optics._polygon_coverage_numba import _shown_diameter_px
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.psf import shown_diameter_px
+from mrbokeh.system.errors import InputError
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 APERTURES = {

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.aperture_shapes import centroid, net_area
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.aperture_shapes import centroid, net_area
+from mrbokeh.system.errors import InputError
 
 SHAPES = {
     "disc": Aperture.disc(),

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.aperture_shapes import area, blades, centroid, net_area
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.aperture_shapes import area, blades, centroid, net_area
+from mrbokeh.system.errors import InputError
 
 
 def light(aperture: Aperture) -> float:

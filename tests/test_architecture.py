@@ -10,91 +10,27 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
 
-# The rows of the house, top first: a module imports from lower rows only. A name ending in a dot is a whole folder.
-ROWS = (
-    ("cli",),
-    ("commands.",),
-    ("demo.",),
-    ("lens_drawing", "psf_bank_drawing", "stack_pictures", "stack_compositing", "transferring"),
-    ("picture_checks.", "refocusing"),
-    ("shots.",),
-    ("camera_track.",),
-    ("staging.",),
-    ("moving_layers.",),
-    ("plate_look.",),
-    ("compositing.", "overlay", "_overlay_numba", "tilt_shift"),
-    ("plate",),
-    ("depth_sources.",),
-    ("renderers.choose_bank",),
-    ("renderers.choose",),
-    ("renderers.",),
-    ("renderers.base",),
-    ("lens_fitting.", "lens_matching."),
-    ("film_plane",),
-    ("psf_models.", "spreadlets_build"),
-    ("psf_bank_export", "bank_fits_file"),
-    ("focal_stack_dataset", "guessed_metres", "focus_places"),
-    ("picture_sources.",),
-    ("focal_stack", "video_io", "scene.", "contact_sheet", "psf_bank_file", "light_field_samples_file", "motion_file"),
-    ("video_packets",),
-    ("video_writer",),
-    ("video_frames", "video_audio"),
-    ("video_encodings", "video_decoding"),
-    ("video_color", "video_alpha", "_video_frames_numba"),
-    ("capture_bundle", "held_lens"),
-    ("lens_file", "camera_file", "charuco.", "photograph"),
-    ("lens_distortion.",),
-    ("lens_file_values",),
-    ("exr_layers.", "finished_picture"),
-    ("plate_alpha",),
-    ("image_io", "camera_rgb"),
-    ("color_management", "blender."),
-    ("exr_primaries",),
-    ("exr_io", "picture_codec"),
-    ("srgb_codes", "tiff_pixels"),
-    ("exif_orientation",),
-    ("tiff_tags",),
-    ("layering",),
-    ("other_view",),
-    ("slices",),
-    ("optics",),
-    ("slice_islands", "_slice_islands_numba"),
-    ("slice_sorting", "_slices_numba"),
-    ("hidden_background", "_hidden_background_numba", "_depth_edges_numba", "_rims_numba"),
-    ("sheets", "_sheets_numba"),
-    ("lit_pixels", "_lit_pixels_numba", "motion", "_motion_numba"),
-    ("spreading", "light_field_samples", "drawn_diameters", "_drawn_diameters_numba"),
-    ("spreadlets_file",),
-    ("spreadlets",),
-    ("spreadlet_values", "_spreadlets_numba"),
-    ("laplacian_integration", "_laplacian_integration_numba"),
-    ("pixel_box", "_pixel_box_numba"),
-    ("lens",),
-    ("bank_apertures", "bank_low_rank"),
-    ("polygon_rectification", "directional_differences", "low_rank", "polygon_fit", "bank_lattice"),
-    ("rectification_walks", "_rectification_lines_numba", "_rectification_corners_numba", "_rectification_walks_numba"),
-    ("outline_symmetry",),
-    ("outline_geometry", "_outline_geometry_numba"),
-    ("aperture",),
-    ("aperture_modifiers",),
-    ("aperture_shapes",),
-    ("psf", "_polygon_coverage_numba", "psf_bank"),
-    ("nested_grid", "proportional_grid", "psf_axis", "level_plane"),
-    ("layer", "camera", "color", "image_metrics", "field_position", "png_chunks", "quiet_opencv", "cut_out"),
-    ("html_page",),
-    (
-        "atomic_files",
-        "progress",
-        "interrupts",
-        "malloc_settings",
-        "workers",
-        "zeroed_memory",
-        "torch_device",
-        "gphoto2_library",
-        "sound_values",
-        "option_names",
-    ),
-    ("errors",),
+# The levels of mrbokeh/, top first: a room imports from lower levels only; inside a room anything without a cycle.
+LEVELS = (
+    {"cli"},
+    {"commands"},
+    {"shots"},
+    {"compositing", "refocus", "demo"},
+    {"scene", "depth", "checks", "figures", "lens_measuring"},
+    {"renderers", "stacks", "distortion"},
+    {"layering", "psf_models", "tracking"},
+    {"optics", "video"},
+    {"images"},
+    {"system"},
+)
+# Those of mrbokeh/renderers: what chooses one; the methods, which never import one another; kernels of banks; fitted kernels; the protocol.
+RENDERER_LEVELS = (
+    {"choose_bank"},
+    {"choose"},
+    {"polygon", "low_rank", "spreadlets", "layered_reconstruction", "network", "scatter_reference", "_scatter_reference_numba"},
+    {"bank"},
+    {"kernels"},
+    {"base", "_vectors_numba"},
 )
 ALLOWED_ACROSS = {
     "capture": {"mrbokeh"},
@@ -133,14 +69,13 @@ def imported(path: Path) -> Iterator[str]:
         yield from (name for name in names if name.split(".")[0] in PACKAGES)
 
 
-def row_of(module: str) -> int:
-    """The row of a module of mrbokeh; an exact name goes before its folder."""
-    name = module.removeprefix("mrbokeh.")
-    for exact in (True, False):
-        for row, entries in enumerate(ROWS):
-            if any(name == entry if exact else entry.endswith(".") and (name + ".").startswith(entry) for entry in entries):
-                return row
-    raise AssertionError(f"{module} has no row in ROWS: say where in the house it belongs")
+def level_of(module: str, levels: tuple[set[str], ...], folder: str) -> tuple[int, str]:
+    """Return (level, room) of a module below a folder."""
+    room = module.removeprefix(folder + ".").split(".")[0]
+    for level, rooms in enumerate(levels):
+        if room in rooms:
+            return level, room
+    raise AssertionError(f"{module} lies in no room of {folder}: say where in the house {room!r} belongs")
 
 
 def arrows() -> list[tuple[str, str]]:
@@ -154,25 +89,12 @@ def test_packages_meet_in_files_only(package: str) -> None:
     assert not wrong
 
 
-def test_arrows_in_mrbokeh_point_downwards() -> None:
-    inner = [(a, b) for a, b in arrows() if a.startswith("mrbokeh.") and b.startswith("mrbokeh.")]
-    wrong = [f"{a} -> {b}" for a, b in inner if row_of(a) > row_of(b) or (row_of(a) == row_of(b) and not _one_room(a, b))]
+@pytest.mark.parametrize(("folder", "levels"), [("mrbokeh", LEVELS), ("mrbokeh.renderers", RENDERER_LEVELS)])
+def test_rooms_import_from_lower_levels_only(folder: str, levels: tuple[set[str], ...]) -> None:
+    inside = [(a, b) for a, b in arrows() if a.startswith(folder + ".") and b.startswith(folder + ".")]
+    places = [(level_of(a, levels, folder), level_of(b, levels, folder), f"{a} -> {b}") for a, b in inside]
+    wrong = [arrow for (above, room), (below, target), arrow in places if room != target and above >= below]
     assert not wrong
-
-
-def _one_room(a: str, b: str) -> bool:
-    """Both in one folder below mrbokeh/, or b is a private part of a's row (a compiled twin)."""
-    folder = b.rsplit(".", 1)[0]
-    return b.split(".")[-1].startswith("_") or (folder != "mrbokeh" and (a == folder or a.startswith(folder + ".")))
-
-
-def test_renderers_do_not_import_their_siblings() -> None:
-    """Twins on devices (torch_*) are no siblings: each belongs to one renderer. Nor is what opens a session."""
-    public = {name for name in MODULES if name.startswith("mrbokeh.renderers.") and not name.split(".")[-1].startswith("_")}
-    siblings = {name for name in public if ".torch_" not in name} - {
-        f"mrbokeh.renderers.{name}" for name in ("base", "choose", "choose_bank", "onnx_sessions")
-    }
-    assert not [f"{a} -> {b}" for a, b in arrows() if a in siblings and b in siblings]
 
 
 def test_no_cycles() -> None:
@@ -204,14 +126,14 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
     """commands/doctor.py may ask torch for a GPU; two renderers have twins on devices; data sets may write metadata.
 
     COLMAP's maps are made by capture and localised in by the viewfinder; tethered cameras shoot for one and look for the other,
-    both through mrbokeh.gphoto2_library.
+    both through mrbokeh.system.gphoto2_library.
     """
     asking = {
         "mrbokeh.commands.doctor",
-        "mrbokeh.plate_look.lensfun_falloff",
-        "mrbokeh.lens_distortion.lensfun_database",
+        "mrbokeh.compositing.plate_look.lensfun_falloff",
+        "mrbokeh.distortion.lensfun_database",
         "datasets_scripts.dng_writer",
-        "mrbokeh.gphoto2_library",
+        "mrbokeh.system.gphoto2_library",
     }
     users = {
         module
@@ -219,7 +141,13 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
         for node in imports_of(path)
         if library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
-    twins = ("mrbokeh.renderers.torch_", "mrbokeh.torch_device", "mrbokeh.psf_models.torch_tracing", "capture.views.torch_plane_sweep")
+    twins = (
+        "mrbokeh.renderers.spreadlets.torch_spreadlets",
+        "mrbokeh.renderers.layered_reconstruction.torch_reconstruction",
+        "mrbokeh.system.torch_device",
+        "mrbokeh.psf_models.torch_tracing",
+        "capture.views.torch_plane_sweep",
+    )
     assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= homes
 
 

@@ -8,20 +8,20 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.bank_apertures import fit_apertures
-from mrbokeh.bank_fits_file import LOW_RANK, POLYGONS, apertures_beside, terms_beside
-from mrbokeh.bank_lattice import SIDES, BankLattice
-from mrbokeh.bank_low_rank import decompose_bank
 from mrbokeh.cli import app
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import read_image
-from mrbokeh.image_metrics import psnr
-from mrbokeh.lens_file import write_lens
-from mrbokeh.polygon_fit import _fit, fit_polygons
-from mrbokeh.psf_bank_file import write_bank
-from mrbokeh.renderers.low_rank_filter import LowRankFilter
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import read_image
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.optics.psf_bank_file import write_bank
+from mrbokeh.renderers.bank.apertures import fit_apertures
+from mrbokeh.renderers.bank.fits_file import LOW_RANK, POLYGONS, apertures_beside, terms_beside
+from mrbokeh.renderers.bank.lattice import SIDES, BankLattice
+from mrbokeh.renderers.bank.low_rank_terms import decompose_bank
+from mrbokeh.renderers.kernels.polygon_fit import _fit, fit_polygons
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+from mrbokeh.system.errors import InputError
 from tests.renderer_banks import (
     BRIGHT_RIM,
     CAT_RING,

@@ -5,22 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.motion import MOTION, with_motion
-from mrbokeh.psf_bank import Axis, PsfBank
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.layering.layering import Layering
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.layering.motion import MOTION, with_motion
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.volume import Volume
-from mrbokeh.renderers._laplacian_bank import BankTables
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.renderers.bank.tables import BankTables
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = SIZE = (64, 90)
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=22.0)

@@ -10,16 +10,16 @@ from typer.testing import CliRunner
 
 from datasets_scripts.bank_pairs import PairsPlan, main, make_bank_pairs
 from datasets_scripts.bank_pairs_scenes import FARTHEST_M, NEAREST_M, random_layers
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import read_focal_stack
-from mrbokeh.focal_stack_dataset import file_troubles, read_focal_stack_dataset
-from mrbokeh.image_metrics import psnr
-from mrbokeh.lens_file import read_lens
-from mrbokeh.nested_grid import NestedGrid
-from mrbokeh.psf_bank import Axis, PsfBank, physical_boxes
-from mrbokeh.psf_bank_file import write_bank
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.optics.psf_bank_file import write_bank
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
+from mrbokeh.system.errors import InputError
 from training.dataset import read_pair
 
 PLAN = PairsPlan(scenes=2, focuses=2, width_px=64, height_px=40)

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.bank_apertures import fit_apertures
-from mrbokeh.bank_lattice import ANGLES, BankLattice
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import opaque
-from mrbokeh.nested_grid import NestedGrid
-from mrbokeh.psf_bank import Axis, PsfBank, physical_boxes
-from mrbokeh.renderers._laplacian_bank import Place
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.renderers.low_rank_filter import LowRankFilter
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.renderers.bank.apertures import fit_apertures
+from mrbokeh.renderers.bank.lattice import ANGLES, BankLattice
+from mrbokeh.renderers.bank.tables import Place
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.system.errors import InputError
 from tests.renderer_banks import (
     CAT_RING,
     FEW,

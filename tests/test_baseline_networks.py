@@ -19,7 +19,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor, nn
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.deepfocus_network import PAPER_BLOCKS, PAPER_HIDDEN, DeepFocusTiles, interleave
 from training.export_onnx import OPSET
 from training.network_settings import NetworkSettings

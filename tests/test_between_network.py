@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from mrbokeh.compositing.choose import insertion_of
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.plate import Plate, plate_of
-from mrbokeh.renderers.onnx_network import OnnxNetwork
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.renderers.network.onnx_network import OnnxNetwork
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from tests.test_onnx_network import FACTS, LENS, SIZE, depth_for
 from training.export_onnx import export_network

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.blender.mrbokeh_export import Film, camera_from_world, check_scene, intrinsics, track_frame
-from mrbokeh.camera_file import camera_from_json
-from mrbokeh.camera_track.formats import read_track
 from mrbokeh.commands.blender_addon import app
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.scene.blender.mrbokeh_export import Film, camera_from_world, check_scene, intrinsics, track_frame
 from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF
-from mrbokeh.staging.upright import UPRIGHT_FROM_WORLD
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.formats import read_track
+from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD
 
 DATA = Path(__file__).parent / "data" / "blender"
 ADDON = Path(__file__).parent.parent / "mrbokeh" / "blender" / "mrbokeh_export.py"
@@ -205,8 +205,8 @@ os._exit(0)
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="the package bpy (Blender as a module) is not installed")
 def test_in_blender_itself(tmp_path: Path) -> None:
     """GLB, camera and render of one scene agree: the cube's corners, projected from the GLB, frame the cube that Cycles rendered."""
-    from mrbokeh.exr_layers.sequence import ExrSequence
     from mrbokeh.scene.gltf_loader import load_glb
+    from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 
     script = tmp_path / "script.py"
     script.write_text(_IN_BLENDER)

@@ -14,21 +14,21 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from datasets_scripts.hand_held import HandHeld
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.camera_track.board_calibration import calibrated
-from mrbokeh.camera_track.board_corners import RollingCorners, Undistorting
-from mrbokeh.camera_track.board_smoothing import Observation, steadied
-from mrbokeh.camera_track.board_track import TrackSettings, poses_of, track_board
-from mrbokeh.camera_track.formats import read_track
-from mrbokeh.camera_track.steady_poses import steady_poses, whittaker
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.board_file import write_board
-from mrbokeh.charuco.detector import Corners
-from mrbokeh.color import display_rgb8
 from mrbokeh.commands.track import app
-from mrbokeh.errors import InputError
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.images.color import display_rgb8
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.board_calibration import calibrated
+from mrbokeh.tracking.camera_track.board_corners import RollingCorners, Undistorting
+from mrbokeh.tracking.camera_track.board_smoothing import Observation, steadied
+from mrbokeh.tracking.camera_track.board_track import TrackSettings, poses_of, track_board
+from mrbokeh.tracking.camera_track.formats import read_track
+from mrbokeh.tracking.camera_track.steady_poses import steady_poses, whittaker
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_file import write_board
+from mrbokeh.tracking.charuco.detector import Corners
+from mrbokeh.video.clip import VideoWriter
 from tests.traced_board_clip import BOARD, MOTION, clip_of, pose_error
 from tests.video_files import turned_clip
 

@@ -21,13 +21,13 @@ from datasets_scripts.truth_mitsuba import LLVM, SCALAR, best_variant
 from datasets_scripts.truth_scene import Lamp, PackedScene, TruthScene, pack
 from datasets_scripts.truth_tracer import Opening
 from datasets_scripts.truth_tracer_choice import make_tracer
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import read_focal_stack
-from mrbokeh.focal_stack_dataset import file_troubles, read_focal_stack_dataset
-from mrbokeh.image_metrics import psnr
-from mrbokeh.lens_file import read_lens
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
+from mrbokeh.system.errors import InputError
 from training.dataset import PairSet, read_pair
 from training.training_data import training_data
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera, depth_m_from_zbuffer
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera, depth_m_from_zbuffer
+from mrbokeh.system.errors import InputError
 
 
 def turned_camera() -> Camera:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.track import CameraTrack, fixed_track
-from mrbokeh.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.camera_track.world_axes import with_up
-from mrbokeh.errors import InputError
-from mrbokeh.staging.upright import UPRIGHT_FROM_WORLD, upright_camera
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.track import CameraTrack, fixed_track
+from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
+from mrbokeh.tracking.camera_track.world_axes import with_up
+from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD, upright_camera
 
 
 def camera_at(place_m: tuple[float, float, float], turn: Rotation) -> Camera:

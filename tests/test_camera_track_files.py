@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.camera_track.formats import FORMATS, read_track, write_track
-from mrbokeh.camera_track.options import ROTATION_ORDERS, TrackOptions
-from mrbokeh.camera_track.track import CameraTrack
-from mrbokeh.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.camera_track.world_axes import with_up
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.formats import FORMATS, read_track, write_track
+from mrbokeh.tracking.camera_track.options import ROTATION_ORDERS, TrackOptions
+from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
+from mrbokeh.tracking.camera_track.world_axes import with_up
 
 SIZE_PX = (640, 360)
 NAMES = {

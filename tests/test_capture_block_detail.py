@@ -8,7 +8,7 @@ from jaxtyping import Float32
 from capture.merging import focus_volume
 from capture.report import detail
 from capture.stacks.block_detail import BLOCK_PX, DETAIL_SIGMA_PX, block_means, detail_of_blocks
-from mrbokeh.color import srgb_to_linear
+from mrbokeh.images.color import srgb_to_linear
 
 PERIOD_PX, AMPLITUDE = 8.0, 0.1
 Plane = Float32[np.ndarray, "height width"]

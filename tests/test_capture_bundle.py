@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.capture_bundle import is_bundle, read_bundle, write_bundle
-from mrbokeh.color import linear_to_srgb
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.plate import bundle_plate
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.compositing.plate import bundle_plate
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.image_io import read_image
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle, write_bundle
+from mrbokeh.system.errors import InputError
 from tests.test_cli import mrbokeh
 
 SIZE = (48, 64)

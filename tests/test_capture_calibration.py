@@ -22,12 +22,12 @@ from capture.views.lens_calibration import (
     write_lens_calibration,
 )
 from capture.views.lens_calibration_stacks import calibrate_scene
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 
 FOCUS = np.linspace(1.6, 0.5, 10)
 LENS = Lens(35.0, 2.0, 1.0, 23.5)

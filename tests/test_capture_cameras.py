@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 import capture.tether.gphoto2_cameras as cameras_module
 from capture.commands.cameras import cameras_command
 from capture.tether.gphoto2_errors import explained
-from mrbokeh.errors import InputError, MissingExtraError
-from mrbokeh.gphoto2_library import library
+from mrbokeh.system.errors import InputError, MissingExtraError
+from mrbokeh.system.gphoto2_library import library
 from tests.test_capture_tether_gphoto2 import card, in_own_interpreter
 
 __all__ = ["card"]

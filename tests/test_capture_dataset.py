@@ -21,12 +21,12 @@ from capture.dataset.stack_writer import StackWriting
 from capture.dataset.verification import verify
 from capture.dataset.writer import DatasetPlan, write_dataset
 from capture.report.exclusion_masks import write_exclusions
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.focal_stack_dataset import network_blocks, read_focal_stack_dataset
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack_dataset import network_blocks, read_focal_stack_dataset
+from mrbokeh.system.errors import InputError
 
 SIZE = (24, 32)
 LENS = Lens(50.0, 1.4, 1.0, 36.0)

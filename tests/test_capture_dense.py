@@ -19,7 +19,7 @@ from capture.views.dense_smoothing import interpolate, smooth, smooth_plainly
 from capture.views.depth_fusion import FocusVote
 from capture.views.patch_match import on_original_pixels, patch_match_clue, patch_match_obstacle
 from capture.views.plane_sweep_view import SweepView
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from tests.plane_sweep_scenes import FOCAL_PX, HEIGHT_PX, WIDTH_PX, TracedViews, card, grey_card, traced, wall
 
 RANGE = (0.4, 1.7)

@@ -19,12 +19,12 @@ from capture.views.patch_match_scene import PatchMatchScene
 from capture.views.scene_depth import DEPTH_SOURCE, SceneDepthSettings, deepen_scene
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera import Camera
 from mrbokeh.demo.plan import DATA, VIEWS
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import find_focal_stacks, read_focal_stack
-from mrbokeh.image_io import read_image
+from mrbokeh.images.image_io import read_image
+from mrbokeh.optics.camera import Camera
+from mrbokeh.stacks.focal_stack import find_focal_stacks, read_focal_stack
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
 from tests.capture_truth import ViewTruth, picture_db, view_truth
 
 RAW = DATA / "raw_stack"

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import mrbokeh.camera_rgb
-import mrbokeh.exr_io
+import mrbokeh.images.camera_rgb
+import mrbokeh.images.exr_io
 from capture.stacks.disk_space import DiskFullError, told_when_full
 from capture.stacks.ingest import ingest
 from capture.stacks.slice_files import find_slices
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.exr_io import ExrPart
-from mrbokeh.image_io import write_image
+from mrbokeh.images.exr_io import ExrPart
+from mrbokeh.images.image_io import write_image
+from mrbokeh.system.atomic_files import atomic_path
 from tests.made_photographs import make_shoot
 
 
@@ -27,7 +27,7 @@ def shoot(tmp_path: Path) -> Path:
 def test_a_full_disk_is_one_clear_line_and_finished_slices_stay(shoot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The third slice finds no space halfway; the next run, with space, makes only what is missing."""
     written: list[Path] = []
-    real_write = mrbokeh.exr_io.write_exr
+    real_write = mrbokeh.images.exr_io.write_exr
 
     def write_until_full(path: Path, part: ExrPart) -> None:
         if len(written) == 2:
@@ -38,7 +38,7 @@ def test_a_full_disk_is_one_clear_line_and_finished_slices_stay(shoot: Path, tmp
         real_write(path, part)
 
     with monkeypatch.context() as patch:
-        patch.setattr(mrbokeh.camera_rgb, "write_exr", write_until_full)
+        patch.setattr(mrbokeh.images.camera_rgb, "write_exr", write_until_full)
         with pytest.raises(DiskFullError, match=r"is full \(\d+ MiB left\): make room .* finished slices are kept"):
             ingest([shoot], tmp_path / "scene")
     folder = tmp_path / "scene" / "shoot"

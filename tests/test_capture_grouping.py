@@ -12,7 +12,7 @@ from capture.photos.photo_files import find_photos
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import Sidecar
 from capture.stacks.grouping import Grouping, Photo, PhotoGroup, by_camera, group_photos, why_aside
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 def photo(name: str, seconds: float | None = None, focus_m: float | None = None, camera: str | None = "A") -> Photo:

@@ -14,10 +14,10 @@ from capture.commands.ingest import parse_white_balance
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import read_focal_stack
-from mrbokeh.image_io import write_image
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import write_image
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.system.errors import InputError
 from tests.made_photographs import DISTANCES_M, LENS, defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, sources
 
 

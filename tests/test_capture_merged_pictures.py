@@ -12,9 +12,9 @@ from PIL import Image, ImageCms
 from capture.merging.merged_pictures import DEPTH_NAME, DNG_NAME, PNG_NAME, TIFF_NAME, readable_names, write_readable_pictures
 from capture.photos.developing import develop
 from capture.stacks.ingest import ingest
-from mrbokeh.color import convert, linear_to_srgb
-from mrbokeh.focal_stack import FocalStack, write_merged
-from mrbokeh.picture_codec import stored_rgb, write_stored
+from mrbokeh.images.color import convert, linear_to_srgb
+from mrbokeh.images.picture_codec import stored_rgb, write_stored
+from mrbokeh.stacks.focal_stack import FocalStack, write_merged
 from tests.made_photographs import Picture, make_shoot, only_stack
 
 

@@ -10,13 +10,13 @@ from capture.merging.guided_all_in_focus import all_in_focus_from_depth
 from capture.merging.nearer_blur import nearer_blur
 from capture.merging.restored_lights import restored_lights, with_restored_lights
 from capture.merging.slice_optics import SliceOptics
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import blur_layer
+from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.errors import InputError
 
 SIZE = (96, 128)
 FOCUS = (2.0, 1.5, 1.0)

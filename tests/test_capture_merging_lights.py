@@ -16,9 +16,9 @@ from capture.merging.restored_lights import Discs, measured_discs, restored_ligh
 from capture.merging.slice_optics import SliceOptics
 from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
 from datasets_scripts.traced_scene import DiscLight, Quad, Scene, emissive_quad
-from mrbokeh.camera import Camera
-from mrbokeh.image_metrics import psnr
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 
 SIZE = (64, 256)
 AT_PX = np.array([40.3, 30.6])

@@ -14,8 +14,8 @@ from capture.merging.lights import no_lights
 from capture.merging.merge import merge_scene
 from capture.merging.preferred_merge import PREFERRED, nearest_end, preferred_lines
 from capture.merging.preferred_side import Preferred, Side, blended, first_of_two_peaks, preferred_places
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, Slice
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from tests.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, THREAD, crossing_slices, crossing_stack, threads, unmoved, wall
 
 INSIDE = (slice(12, -12), slice(12, -12))

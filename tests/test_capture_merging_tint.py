@@ -9,8 +9,8 @@ import pytest
 from capture.merging.merge import merge_stack
 from capture.merging.plane_transforms import about_centre, inverse
 from capture.merging.tint import SmallSlice, tint_gains, with_gain
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 
 SIZE = (240, 360)
 SCALES = (1.03, 1.02, 1.01, 1.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from capture.stacks.ingest import ingest
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_image
+from mrbokeh.images.image_io import write_image
+from mrbokeh.system.errors import InputError
 from tests.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
 
 

@@ -15,8 +15,8 @@ from capture.stacks.grouping import Grouping, Photo
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, strangers
 from capture.stacks.slice_looks import look_at, look_of, one_scene, same_photograph
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_image
+from mrbokeh.images.image_io import write_image
+from mrbokeh.system.errors import InputError
 from tests.made_photographs import Picture, defocused, make_shoot, only_stack, scene_rgb, sources
 
 CHECKS = (blown, duplicates, strangers)

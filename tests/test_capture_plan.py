@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 from capture.commands.plan import plan_command
 from capture.tether.focus_plan import MOST_SLICES, FocusPlan, FocusRange, on_scale, plan_focus, plan_for_motor
 from capture.tether.plan_file import plan_from_json, plan_to_json, read_plan, write_plan
-from mrbokeh.errors import InputError
-from mrbokeh.film_plane import film_plane_m, lens_distance_m
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
+from mrbokeh.optics.film_plane import film_plane_m, lens_distance_m
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(35.0, 2.8, 1.0, 36.0)
 APP = typer.Typer()

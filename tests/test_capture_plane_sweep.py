@@ -12,8 +12,8 @@ from capture.views.plane_sweep_plainly import scores_of_surface
 from capture.views.plane_sweep_planes import by_parallax, dioptre_planes, pixels_per_dioptre
 from capture.views.plane_sweep_refinement import refine
 from capture.views.plane_sweep_view import BRIGHTEST, SweepView, structure_of
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 from tests.plane_sweep_scenes import FOCAL_PX, TracedViews, card, traced, wall
 
 INNER = np.s_[8:-8, 12:-12]

@@ -8,7 +8,7 @@ import pytest
 from capture.views.dense_depth import DenseSettings, dense_depth
 from capture.views.plane_sweep import Matching, plane_sweep
 from capture.views.plane_sweep_view import SweepView
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from tests.plane_sweep_scenes import card, traced, wall
 from tests.test_capture_plane_sweep import turned_view
 

@@ -19,12 +19,12 @@ from capture.views.colmap_pictures import common_exposure_stops, picture_cameras
 from capture.views.colmap_process import run_colmap
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import write_sparse_model
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError, MissingExtraError
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.image_io import write_image
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_io import write_image
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 needs_colmap = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap (extra `capture`) is not installed")
 

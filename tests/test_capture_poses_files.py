@@ -11,8 +11,8 @@ import pytest
 from capture.views.distortion import distorted_px, undistorted_px
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 
 CAMERA = Camera(640, 480, (700.0, 705.0), (323.0, 238.5))
 

@@ -12,9 +12,9 @@ from capture.photos.developing import develop
 from capture.photos.raw import camera_white_balance, decode_raw, read_raw_metadata
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.color import convert, rec709_from_XYZ
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.images.color import convert, rec709_from_XYZ
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 QUIET = {"full_well_electrons": 0.0, "read_noise_electrons": 0.0}
 

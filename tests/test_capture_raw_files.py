@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.raw import decode_raw
-from mrbokeh.color import convert
-from mrbokeh.errors import InputError
+from mrbokeh.images.color import convert
+from mrbokeh.system.errors import InputError
 
 REAL_FILES = {
     # name: (height, width) that LibRaw calls visible; the Kodak's 848 columns of pixels 1.535 wide make 1301 square ones

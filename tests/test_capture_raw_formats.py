@@ -7,8 +7,8 @@ import pytest
 
 from capture.photos.raw import decode_raw
 from capture.photos.x_trans import decode_in_one_thread
-from mrbokeh.color import rec709_from_XYZ
-from mrbokeh.errors import InputError
+from mrbokeh.images.color import rec709_from_XYZ
+from mrbokeh.system.errors import InputError
 
 X_TRANS = np.array([[1, 1, 0, 1, 1, 2], [1, 1, 2, 1, 1, 0], [2, 0, 1, 0, 2, 1], [1, 1, 2, 1, 1, 0], [1, 1, 0, 1, 1, 2], [0, 2, 1, 2, 0, 1]])
 

@@ -10,7 +10,7 @@ from scipy.ndimage import affine_transform, uniform_filter
 
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
-from mrbokeh.image_io import read_image
+from mrbokeh.images.image_io import read_image
 from tests.made_photographs import Picture, only_stack, sources
 
 DEMO_STACK = Path(__file__).resolve().parent.parent / "mrbokeh" / "demo_data" / "raw_stack"

@@ -17,13 +17,13 @@ from capture.report.slice_fit import NAMES, Prediction, fit_slice, normal_equati
 from capture.report.stack_gates import stack_gates
 from capture.report.stack_rules import BLUR, DEPTH, EXPOSURE, FOCUS, MOTION, PLACE, RESIDUAL, SPACING
 from capture.report.stack_view import StackView
-from mrbokeh.aperture import Aperture
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import opaque
-from mrbokeh.layering import Layering
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import opaque
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.stacks.focal_stack import FocalStack
 from tests.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
 
 # Half the usual slices: half the time, and blur here is small.

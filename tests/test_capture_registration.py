@@ -8,8 +8,8 @@ import pytest
 
 from capture.merging.alignment import Registration, register_stack, warp
 from capture.merging.plane_transforms import about_centre, chained, farthest_corner_px, inverse, is_perspective, scale_of
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image
+from mrbokeh.images.image_io import read_image
+from mrbokeh.system.errors import InputError
 from tests.crossing_stack import crossing_slices
 from tests.jittered_stack import HEIGHT_PX, SLICES, WIDTH_PX, JitteredStack, jittered_stack
 

@@ -10,7 +10,7 @@ import pytest
 from capture.merging.breathing import Breathing
 from capture.merging.registration import Registration
 from capture.merging.registration_file import read_registration, write_registration
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 REGISTRATION = Registration(
     reference=1,

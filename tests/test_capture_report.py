@@ -26,13 +26,13 @@ from capture.report.scene_report import report_scene
 from capture.report.stack_gates import stack_gates
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import write_sparse_model
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from mrbokeh.layering import Layering
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.camera import Camera
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.system.atomic_files import write_json
 from tests.traced_focal_stack import FOCUS_M, traced, write_stack
 
 REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=8), threads=1))

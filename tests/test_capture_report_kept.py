@@ -21,11 +21,11 @@ from capture.report.picture_evidence import PictureFindings
 from capture.report.reblur import Reblur
 from capture.report.scene_report import examine_stack, report_scene
 from capture.report.slice_fit import Change, SliceFit
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
+from mrbokeh.system.atomic_files import read_json, write_json
 from tests.traced_focal_stack import HEIGHT_PX, SLICES, WIDTH_PX, traced, write_stack
 
 NAMES = ("view_0", "view_1")

@@ -27,11 +27,11 @@ from capture.report.scene_report import report_scene
 from capture.report.stack_rules import LIGHT, PLACES, SEAMS, SHARP
 from capture.report.strictness import GATE_NAMES
 from capture.stacks.block_detail import BLOCK_PX
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.image_io import read_image
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.image_io import read_image
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Made = tuple[list[Rgb], Rgb]

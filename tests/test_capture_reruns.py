@@ -10,14 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 import capture.stacks.stack_ingest
-import mrbokeh.camera_rgb
+import mrbokeh.images.camera_rgb
 from capture.cli import app
 from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.slice_files import find_slices
 from capture.stacks.stack_ingest import Development
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_image
+from mrbokeh.images.image_io import write_image
+from mrbokeh.system.errors import InputError
 from tests.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
 
 
@@ -27,7 +27,7 @@ def shoot(tmp_path: Path) -> Path:
 
 
 def test_a_rerun_keeps_everything_and_a_merged_stack_too(shoot: Path, tmp_path: Path) -> None:
-    from mrbokeh.focal_stack import write_focal_stack
+    from mrbokeh.stacks.focal_stack import write_focal_stack
 
     stack = only_stack(ingest([shoot], tmp_path / "scene"))
     write_focal_stack(replace(stack, merged=True))
@@ -99,8 +99,8 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(shoot: Path, tmp_path: Pat
 def opened_slices(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Every slice whose pixels are read from now on, once for each time."""
     opened: list[str] = []
-    read = mrbokeh.camera_rgb.read_exr
-    monkeypatch.setattr(mrbokeh.camera_rgb, "read_exr", lambda path: (opened.append(path.name), read(path))[1])
+    read = mrbokeh.images.camera_rgb.read_exr
+    monkeypatch.setattr(mrbokeh.images.camera_rgb, "read_exr", lambda path: (opened.append(path.name), read(path))[1])
     return opened
 
 

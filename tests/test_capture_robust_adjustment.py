@@ -16,7 +16,7 @@ from capture.views.robust_adjustment import adjusted
 from capture.views.scale_board import umeyama
 from datasets_scripts.lab_scene import LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera
 from datasets_scripts.stack_scenes import STACK_SCENES
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 WIDTH_PX, HEIGHT_PX = 960, 640
 NOISE_PX = 0.1

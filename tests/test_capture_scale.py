@@ -28,11 +28,11 @@ from capture.views.scale_robust import squared_under_cauchy, squared_under_cauch
 from capture.views.scale_sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.board_file import read_board
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice
+from mrbokeh.optics.camera import Camera
+from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_file import read_board
 
 METRES_PER_UNIT = 0.2
 BOARD = CharucoBoard((CharucoGrid((8, 6), 30.0, 22.0),))

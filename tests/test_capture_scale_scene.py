@@ -15,9 +15,9 @@ from capture.views.scale_board import Similarity, umeyama
 from capture.views.scale_text import scale_lines
 from capture.views.sparse_model import SparseModel
 from capture.views.sparse_model_file import read_sparse_model
-from mrbokeh.color import display_rgb8
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import read_focal_stack
+from mrbokeh.images.color import display_rgb8
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.system.errors import InputError
 from tests.traced_views import (
     BOARD,
     FOCUS_M,

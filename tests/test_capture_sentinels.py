@@ -18,9 +18,9 @@ from capture.views.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit
 from capture.views.focus_calibration_stacks import StackFocus, focus_start, lens_calibrations
 from capture.views.scale_focus import FocusSample, focus_scale, stated_sigma_dioptre
 from capture.views.scale_sharpness import sharpness_peaks
-from mrbokeh.film_plane import lens_distance_m
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack
-from mrbokeh.lens import Lens
+from mrbokeh.optics.film_plane import lens_distance_m
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack
 from tests.made_photographs import LENS, make_shoot, only_stack, sources
 
 METRES_PER_UNIT = 0.2

@@ -12,9 +12,9 @@ from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestReport, IngestSettings, ingest
 from capture.stacks.session import read_session
 from capture.stacks.stack_ingest import Development
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import write_image
+from mrbokeh.images.image_io import write_image
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
 from tests.made_photographs import defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, set_neutral, sources
 
 

@@ -28,9 +28,9 @@ from capture.tether.simulated import SimulatedCamera
 from capture.tether.simulated_picture import unstated
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import read_focal_stack
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 NEAR_M, FAR_M = 0.5, 2.5

@@ -7,8 +7,8 @@ import pytest
 
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import Sidecar, find_sidecar, read_sidecar, sidecar_of
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 
 def write_sidecar(folder: Path, text: str) -> Path:

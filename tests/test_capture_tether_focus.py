@@ -15,8 +15,8 @@ from capture.tether.live_reading import Spot, read_live
 from capture.tether.live_table import show_live
 from capture.tether.simulated import SimulatedCamera
 from capture.tether.simulated_motor import SimulatedMotor
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 

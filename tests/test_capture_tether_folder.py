@@ -17,8 +17,8 @@ from capture.tether.watched_folder import WatchedFolder
 from capture.tether.whole_photo import is_whole
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 

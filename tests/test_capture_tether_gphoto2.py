@@ -29,8 +29,8 @@ from capture.tether.gphoto2_settings import is_fixed_white_balance, is_manual, i
 from capture.tether.simulated_motor import SimulatedMotor
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 gp = pytest.importorskip("gphoto2", reason="the extra 'tether' is not installed")
 
@@ -39,7 +39,7 @@ import json, sys, warnings
 warnings.simplefilter("error")
 from capture.tether.camera_driver import CameraSettings
 from capture.tether.gphoto2_cameras import list_cameras, open_camera
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 def sentence(what):
     try:

@@ -15,9 +15,9 @@ from capture.tether.focus_steps import Stop
 from capture.tether.simulated import SimulatedCamera
 from capture.tether.simulated_picture import nikon_code, to_centimetre, unstated
 from capture.tether.simulated_scene import Card, SimulatedScene
-from mrbokeh.film_plane import film_plane_m
-from mrbokeh.image_io import read_image
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_io import read_image
+from mrbokeh.optics.film_plane import film_plane_m
+from mrbokeh.optics.lens import Lens
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 Picture = Float32[np.ndarray, "height width 3"]

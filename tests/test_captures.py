@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.capture_bundle import read_bundle
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, clear
-from mrbokeh.lens import Lens
-from mrbokeh.overlay import Overlay
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.capture_bundle import read_bundle
+from mrbokeh.system.errors import InputError
 from viewfinder.captures import Captures
 from viewfinder.frames import CameraFrame, FrameStatus, OutputFrame
 from viewfinder.live_compositor import LiveCompositor, Moment

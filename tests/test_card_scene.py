@@ -12,11 +12,11 @@ from datasets_scripts.card_content import Card, Lamp
 from datasets_scripts.card_shapes import TexelGrid, disc, everywhere, mirrored_beyond, rectangle, wire
 from datasets_scripts.card_tracer import lens_samples
 from datasets_scripts.procedural_textures import fractal_noise
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import energy_ratio, psnr
-from mrbokeh.layer import flatten
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_metrics import energy_ratio, psnr
+from mrbokeh.images.layer import flatten
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 SIZE_PX, MARGIN_PX, DENSITY = 48, 16, 8
 GRID = TexelGrid(SIZE_PX, SIZE_PX, MARGIN_PX, DENSITY)

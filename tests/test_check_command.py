@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.color import linear_to_srgb
+from mrbokeh.checks.checked_picture import Storage
+from mrbokeh.checks.leak_map import reach_of_sharp
 from mrbokeh.commands.check import app
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.image_io import write_image, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.picture_checks.checked_picture import Storage
-from mrbokeh.picture_checks.leak_map import reach_of_sharp
-from mrbokeh.plate import plate_of
+from mrbokeh.compositing.plate import plate_of
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter
 
 LENS = Lens(50.0, 2.0, 1.0, 2.2)
 SIZE = (48, 72)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.cli import EXTRA_OF_MODULE, SUB_COMMANDS
-from mrbokeh.image_io import read_layer, write_layer
-from mrbokeh.layer import Layer
+from mrbokeh.images.image_io import read_layer, write_layer
+from mrbokeh.images.layer import Layer
 
 COMMANDS = [
     ["capture"], ["capture", "ingest"], ["capture", "merge"], ["capture", "plan"], ["capture", "cameras"],

@@ -2,7 +2,16 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrbokeh.color import XYZ_from_rec709, convert, display_rgb8, linear_to_srgb, luminance, rec709_from_XYZ, srgb_to_linear, tone_map
+from mrbokeh.images.color import (
+    XYZ_from_rec709,
+    convert,
+    display_rgb8,
+    linear_to_srgb,
+    luminance,
+    rec709_from_XYZ,
+    srgb_to_linear,
+    tone_map,
+)
 
 
 @given(st.floats(-0.5, 8.0, width=32))

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.camera import Camera
 from mrbokeh.commands.composite import app
 from mrbokeh.demo.plan import DATA
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.exr_layers.composite_exr import read_composite_exr
-from mrbokeh.exr_layers.deep_layers import DeepSurfaces
-from mrbokeh.exr_layers.deep_out import write_deep_exr
-from mrbokeh.exr_layers.deep_samples import DeepSamples
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
-from mrbokeh.layer import Layer, flatten
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.stacks.exr_layers.composite_exr import read_composite_exr
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSurfaces
+from mrbokeh.stacks.exr_layers.deep_out import write_deep_exr
+from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = 96, 144
 LENS = Lens(35.0, 2.0, 2.0, 23.5)

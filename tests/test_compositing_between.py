@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.clean_colours import clean_colours
 from mrbokeh.compositing.light_points import virtual_lights
 from mrbokeh.compositing.near_and_far import NO_LIGHTS, NearAndFar, cut_in_two, nearer_than
+from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.pupil_points import pupil_points, transmission
 from mrbokeh.compositing.pupil_shares import Rays
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
-from mrbokeh.plate import Plate, plate_of
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(100.0, 1.0, 4.0, 36.0)  # 28 px of blur for near things, 13 px for virtual ones
 HEIGHT, WIDTH, EDGE = 40, 96, 48

@@ -11,15 +11,15 @@ from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.choose import DEFAULT_MODE, MODES, insertion_of
 from mrbokeh.compositing.matte import SmoothedMatte
 from mrbokeh.compositing.over import OverPhotograph
+from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.rerender import Rerendered
 from mrbokeh.compositing.touched_box import InTouchedBox, touched_box
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
-from mrbokeh.plate import Plate, plate_of
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(100.0, 1.0, 1.0, 36.0)  # 20 px of blur per dioptre at 64 px
 WIDE = Lens(50.0, 1.4, 1.0, 36.0)

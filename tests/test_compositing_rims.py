@@ -9,14 +9,14 @@ import pytest
 
 from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.choose import insertion_of
+from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.rerender import Rerendered
 from mrbokeh.compositing.rim_colours import RimColours
 from mrbokeh.compositing.true_rims import moved
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
-from mrbokeh.plate import Plate, plate_of
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from tests.mixed_reality_cases import MixedCase, card_cases, wider
 
 RENDERER = PolygonDifferences()

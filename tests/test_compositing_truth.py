@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.compositing.choose import insertion_of
-from mrbokeh.image_metrics import psnr
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from tests.mixed_reality_cases import MixedCase, card_cases
 
 RENDERER = PolygonDifferences()

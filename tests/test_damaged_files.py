@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, write_image
-from mrbokeh.png_chunks import without_chatter
-from mrbokeh.quiet_opencv import quiet_opencv
-from mrbokeh.renderers.onnx_sessions import open_session
+from mrbokeh.images.image_io import read_image, write_image
+from mrbokeh.images.png_chunks import without_chatter
+from mrbokeh.images.quiet_opencv import quiet_opencv
+from mrbokeh.renderers.network.onnx_sessions import open_session
 from mrbokeh.scene.gltf_loader import load_glb
+from mrbokeh.system.errors import InputError
 
 RNG = np.random.default_rng(0)
 SIGNATURE_AND_HEADER = 8 + 25

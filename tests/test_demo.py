@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mrbokeh.camera import Camera
 from mrbokeh.demo.measurements import camera_measurements, depth_error, merge_measurements, placement_measurement
 from mrbokeh.demo.pictures import write_depth_pictures
 from mrbokeh.demo.plan import VIEWS, demo_stages
 from mrbokeh.demo.records import Record, must_be_anew, read_record, write_record
 from mrbokeh.demo.stages import Stage, run_stages
 from mrbokeh.demo.truth import read_truth
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.image_io import write_image, write_layer
-from mrbokeh.layer import Layer
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 
 
 def lens_stage(path: Path, focus_m: float = 1.0) -> Stage:

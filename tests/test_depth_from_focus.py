@@ -9,9 +9,9 @@ from capture.merging.depth_from_focus import FocusMap, focus_map, peak_parabola
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import find_lights, no_lights
 from capture.merging.semi_global import aggregate_costs
-from mrbokeh.aperture import Aperture
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import opaque
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
 
 SLICES = 5

@@ -9,19 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.color import linear_to_srgb, srgb_to_linear
-from mrbokeh.depth_sources.depth_settings import DepthSettings, StereoCalibration, parse_known, parse_near_far, parse_stereo
-from mrbokeh.depth_sources.edge_snapping import refined_dioptres
-from mrbokeh.depth_sources.guided_filter import guided_upsampling
-from mrbokeh.depth_sources.open_depth import open_depth
-from mrbokeh.depth_sources.phone_depth import read_phone_photo
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import read_image
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import opaque
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.depth.depth_settings import DepthSettings, StereoCalibration, parse_known, parse_near_far, parse_stereo
+from mrbokeh.depth.edge_snapping import refined_dioptres
+from mrbokeh.depth.guided_filter import guided_upsampling
+from mrbokeh.depth.open_depth import open_depth
+from mrbokeh.depth.phone_depth import read_phone_photo
+from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import read_image
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.system.errors import InputError
 
 GREY = np.full((24, 32, 3), 0.2, np.float32)
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.color import srgb_to_linear
-from mrbokeh.depth_sources.depth_network import IMAGENET_MEAN, IMAGENET_STD, NetworkInput, predicted, read_network_input
-from mrbokeh.depth_sources.depth_settings import DepthSettings, KnownDistance
-from mrbokeh.depth_sources.open_depth import open_depth
-from mrbokeh.errors import InputError
+from mrbokeh.depth.depth_network import IMAGENET_MEAN, IMAGENET_STD, NetworkInput, predicted, read_network_input
+from mrbokeh.depth.depth_settings import DepthSettings, KnownDistance
+from mrbokeh.depth.open_depth import open_depth
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.system.errors import InputError
 
 onnx = pytest.importorskip("onnx", reason="the extra `train` brings onnx, which makes the test's networks")
 SIZE = (32, 48)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.depth_sources.temporal_filter import TemporalDepthFilter
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.plate import plate_of
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.compositing.plate import plate_of
+from mrbokeh.depth.temporal_filter import TemporalDepthFilter
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.system.errors import InputError
 
 SIZE = (80, 128)
 LENS = Lens(50.0, 2.0, 1.5, 10.0)

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.directional_differences import Direction, Taps, differenced_kernel, downwards, edge_profile, polygon_corners
-from mrbokeh.errors import InputError
-from mrbokeh.polygon_rectification import PAPER_DIRECTIONS, rectify_aperture
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.polygon.directional_differences import Direction, Taps, differenced_kernel, downwards, edge_profile, polygon_corners
+from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, rectify_aperture
+from mrbokeh.system.errors import InputError
 
 Corners = list[tuple[int, int]]
 

@@ -7,9 +7,9 @@ import pytest
 from capture.report.examination import STEP_PX
 from capture.report.reblur import Reblur
 from capture.report.slice_fit import Prediction, SliceFit, fit_slice
-from mrbokeh.aperture import Aperture
-from mrbokeh.drawn_diameters import drawn_diameters_px
-from mrbokeh.image_metrics import psnr
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.renderers.scatter_reference import ScatterReference
 
@@ -94,7 +94,7 @@ def fitted(aperture: Aperture) -> SliceFit:
 def test_a_slice_at_its_focus_is_found_there(aperture: Aperture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawn without regard to the pixels, the very same slice seems to be focused elsewhere, and blurred by another lens."""
     right = fitted(aperture)
-    monkeypatch.setattr("mrbokeh.optics.drawn_diameters_px", lambda coc_px, _: coc_px)
+    monkeypatch.setattr("mrbokeh.layering.psf_over_field.drawn_diameters_px", lambda coc_px, _: coc_px)
     wrong = fitted(aperture)
     assert abs(right.focus_px.value) < 0.1 and abs(right.blur_gain.value) < 0.015
     assert abs(wrong.focus_px.value) > 0.2 and abs(wrong.blur_gain.value) > 0.03
@@ -105,7 +105,7 @@ def test_every_renderer_blurs_a_picture_of_pixels_as_the_lens_does(name: str, mo
     coc_px, photographed = fine_and_coarse(Aperture.disc())
     reblur = Reblur(make_renderer(name))
     right = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
-    for module in ("mrbokeh.optics", "mrbokeh.renderers.layered_reconstruction._layer_samples"):
+    for module in ("mrbokeh.layering.psf_over_field", "mrbokeh.renderers.layered_reconstruction._layer_samples"):
         monkeypatch.setattr(f"{module}.drawn_diameters_px", lambda coc_px, _: coc_px)
     wrong = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
     assert right > wrong + 2.0

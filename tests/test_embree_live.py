@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Mesh, Scene, Texture, matte, rectangle, sphere, sun
 from mrbokeh.scene import embree_raycaster as raycaster_module
 from mrbokeh.scene import prepared_scenes as prepared_scenes_module
@@ -18,6 +17,7 @@ from mrbokeh.scene.environment_filter import LightingMaps, _moments, filtered, l
 from mrbokeh.scene.packed_scene import packed
 from mrbokeh.scene.pixel_edges import edge_pixels
 from mrbokeh.scene.rigid_motion import rigid_motion
+from mrbokeh.system.errors import InputError
 
 LOOKING_DOWN = np.array([[1, 0, 0, 0], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 3.0], [0, 0, 0, 1.0]])
 CAMERA = Camera(201, 115, (160.0, 158.0), (99.3, 60.7), LOOKING_DOWN)

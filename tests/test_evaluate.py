@@ -11,13 +11,13 @@ import pytest
 from onnx import TensorProto, helper
 from typer.testing import CliRunner
 
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import write_focal_stack
-from mrbokeh.image_metrics import psnr
-from mrbokeh.nested_grid import NestedGrid
-from mrbokeh.psf_bank import Axis, PsfBank, physical_boxes
-from mrbokeh.psf_bank_file import write_bank
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.optics.psf_bank_file import write_bank
+from mrbokeh.stacks.focal_stack import write_focal_stack
+from mrbokeh.system.errors import InputError
 from tests.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_stack
 from training import train
 from training.blur_functions import blur_of

@@ -10,12 +10,12 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.field_position import field_positions
-from mrbokeh.lens import Lens
-from mrbokeh.renderers import onnx_network
-from mrbokeh.renderers.onnx_network import METADATA_KEY, OnnxNetwork
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.network import onnx_network
+from mrbokeh.renderers.network.onnx_network import METADATA_KEY, OnnxNetwork
+from mrbokeh.system.errors import InputError
 from training import export_onnx
 from training.cli import app
 from training.export_onnx import LARGEST_DIFFERENCE, export_network, largest_difference, picture_for_parity

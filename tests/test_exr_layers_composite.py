@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.exr_layers.composite_exr import CompositeLayers, read_composite_exr, write_composite_exr
-from mrbokeh.exr_layers.flat_render import FlatRender
-from mrbokeh.exr_primaries import REC709
-from mrbokeh.image_io import read_depth, read_image
-from mrbokeh.layer import Layer
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.exr_primaries import REC709
+from mrbokeh.images.image_io import read_depth, read_image
+from mrbokeh.images.layer import Layer
+from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, read_composite_exr, write_composite_exr
+from mrbokeh.stacks.exr_layers.flat_render import FlatRender
+from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = 10, 14
 SIZE = (HEIGHT, WIDTH)

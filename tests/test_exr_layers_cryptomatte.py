@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.exr_layers.cryptomatte import cryptomattes
-from mrbokeh.exr_layers.flat_render import FlatRender
-from mrbokeh.exr_layers.murmur_hash import id_bits, murmur3_32
-from mrbokeh.exr_layers.object_split import ObjectSplit
-from mrbokeh.exr_layers.render_channels import RenderChannels
-from mrbokeh.layer import flatten
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.layer import flatten
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.stacks.exr_layers.cryptomatte import cryptomattes
+from mrbokeh.stacks.exr_layers.flat_render import FlatRender
+from mrbokeh.stacks.exr_layers.murmur_hash import id_bits, murmur3_32
+from mrbokeh.stacks.exr_layers.object_split import ObjectSplit
+from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
+from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = 6, 10
 BLENDER = Path(__file__).parent / "data" / "blender" / "render.0002.exr"

@@ -8,18 +8,18 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.exr_layers.deep_layers import DeepSlices, DeepSurfaces, even_edges_m, peeled, sliced
-from mrbokeh.exr_layers.deep_out import write_deep_exr
-from mrbokeh.exr_layers.deep_samples import DeepSamples, is_deep, merged
-from mrbokeh.exr_layers.deep_tidy import DeepSample, flattened, split, tidied
-from mrbokeh.exr_layers.deep_tidy import merged as merged_samples
-from mrbokeh.exr_layers.reader import LayerReader
-from mrbokeh.exr_layers.sequence import ExrSequence
-from mrbokeh.layer import Layer, flatten
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSlices, DeepSurfaces, even_edges_m, peeled, sliced
+from mrbokeh.stacks.exr_layers.deep_out import write_deep_exr
+from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples, is_deep, merged
+from mrbokeh.stacks.exr_layers.deep_tidy import DeepSample, flattened, split, tidied
+from mrbokeh.stacks.exr_layers.deep_tidy import merged as merged_samples
+from mrbokeh.stacks.exr_layers.reader import LayerReader
+from mrbokeh.stacks.exr_layers.sequence import ExrSequence
+from mrbokeh.system.errors import InputError
 
 Pixels = dict[tuple[int, int], list[DeepSample]]
 

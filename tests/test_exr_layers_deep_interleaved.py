@@ -7,17 +7,17 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.commands.composite import app
-from mrbokeh.errors import InputError
-from mrbokeh.exr_layers.deep_interleaved import cut_at, interleaved
-from mrbokeh.exr_layers.deep_layers import peeled, sliced
-from mrbokeh.exr_layers.deep_samples import DeepSamples, merged
-from mrbokeh.exr_layers.deep_tidy import DeepSample, flattened, tidied
-from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
-from mrbokeh.layer import Layer, flatten
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.hooks import Moment
 from mrbokeh.shots.layer_sources import AmongDeep, LayerFiles, sources_by_depth
+from mrbokeh.stacks.exr_layers.deep_interleaved import cut_at, interleaved
+from mrbokeh.stacks.exr_layers.deep_layers import peeled, sliced
+from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples, merged
+from mrbokeh.stacks.exr_layers.deep_tidy import DeepSample, flattened, tidied
+from mrbokeh.system.errors import InputError
 from tests.test_exr_layers_deep import Pixels, fog, point, random_pixels, write_deep
 
 SIZE = (6, 9)

@@ -7,19 +7,19 @@ import pytest
 from typer.testing import CliRunner
 
 from capture.photos.developing import develop
-from mrbokeh.camera_rgb import chromaticities, matrix3x3, read_camera_rgb, write_camera_rgb
-from mrbokeh.color import convert
 from mrbokeh.commands.render import app as render
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.exr_primaries import rec709_from_chromaticities
-from mrbokeh.focal_stack import FocalStack, write_merged
-from mrbokeh.image_io import read_image, read_layer, read_linear, write_image
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.light_field_samples_file import read_samples, write_samples
-from mrbokeh.plate import open_plate
+from mrbokeh.compositing.plate import open_plate
+from mrbokeh.images.camera_rgb import chromaticities, matrix3x3, read_camera_rgb, write_camera_rgb
+from mrbokeh.images.color import convert
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_primaries import rec709_from_chromaticities
+from mrbokeh.images.image_io import read_image, read_layer, read_linear, write_image
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.stacks.focal_stack import FocalStack, write_merged
+from mrbokeh.stacks.light_field_samples_file import read_samples, write_samples
+from mrbokeh.system.errors import InputError
 
 # Primaries and white of the Academy's documents S-2014-004 (ACEScg) and SMPTE ST 2065-1 (ACES), of ITU-R BT.2020 and BT.709.
 ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
@@ -35,7 +35,7 @@ PUBLISHED = {
     # ITU-R BT.2407, linear BT.2020 to BT.709: both with D65, no adaptation.
     BT2020: ((1.6605, -0.5876, -0.0728), (-0.1246, 1.1329, -0.0083), (-0.0182, -0.1006, 1.1187)),
 }
-# mrbokeh.color's XYZ_from_rec709 is rounded and has white at 0.31273, 0.32902: its own digits are off by up to 2.3e-4.
+# mrbokeh.images.color's XYZ_from_rec709 is rounded and has white at 0.31273, 0.32902: its own digits are off by up to 2.3e-4.
 DIGITS = 3e-4
 # Linear Rec.709 from the balanced RGB of a plausible camera.
 CAMERA = ((1.7, -0.6, -0.1), (-0.3, 1.6, -0.3), (0.05, -0.55, 1.5))

@@ -9,10 +9,10 @@ import onnxruntime
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.onnx_network import OnnxNetwork
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.system.errors import InputError
 from tests.made_networks import GATED, PARITY, PUBLISHED, SIZE, TOP, blurred, pictures, session_of, twin, untrained
 from training.commands.export import export_command
 from training.export_onnx import network_facts_of, record_path

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.color_management import NamedSpace
 from mrbokeh.commands.composite import app
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.exr_primaries import AP0, AP1, BT2020, P3_D65, REC709, known_primaries, rec709_from_chromaticities
-from mrbokeh.finished_picture import write_finished
-from mrbokeh.image_io import read_image, read_layer, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.plate_alpha import alpha_with, read_alpha
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_primaries import AP0, AP1, BT2020, P3_D65, REC709, known_primaries, rec709_from_chromaticities
+from mrbokeh.images.finished_picture import write_finished
+from mrbokeh.images.image_io import read_image, read_layer, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.images.plate_alpha import alpha_with, read_alpha
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 
 SIZE = (24, 36)
 COLOUR = np.array([0.4, 0.2, 0.1], np.float32)

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_rgb import write_camera_rgb, write_masks
-from mrbokeh.color import rec709_from_XYZ
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, find_focal_stacks, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.image_io import write_image
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
+from mrbokeh.images.color import rec709_from_XYZ
+from mrbokeh.images.image_io import write_image
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, find_focal_stacks, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 
 
 def stack_in(folder: Path, distances_m: tuple[float | None, ...] = (0.6, 0.9, 1.8)) -> FocalStack:

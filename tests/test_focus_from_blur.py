@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 from tests.thin_lens_board import DARK, LIGHT, Shot, camera_over, display_bgr, photograph
 from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus, BlurSettings
 from viewfinder.focus.board_edges import board_edges

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera_track.focus_metadata import read_focus_pull
-from mrbokeh.camera_track.focus_pull import FocusPull, focus_of_track, parse_focus_keys
-from mrbokeh.camera_track.focus_steps import quantisation_steps, smoothed_within_steps
-from mrbokeh.camera_track.track import CameraTrack
-from mrbokeh.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.focus_metadata import read_focus_pull
+from mrbokeh.tracking.camera_track.focus_pull import FocusPull, focus_of_track, parse_focus_keys
+from mrbokeh.tracking.camera_track.focus_steps import quantisation_steps, smoothed_within_steps
+from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
 from tests.test_camera_track import two_frames
 
 

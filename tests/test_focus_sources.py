@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.focus.first_known import FirstKnown
 from viewfinder.focus.frame_focus import FrameFocus
 from viewfinder.focus.manual_focus import ManualFocus

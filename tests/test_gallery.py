@@ -10,9 +10,9 @@ from datasets_scripts.gallery import build
 from datasets_scripts.gallery_entries import Entry, read_entries
 from datasets_scripts.gallery_pictures import WIDEST_PX, result_jpeg
 from mrbokeh.cli import SUB_COMMANDS
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_image, write_layer
-from mrbokeh.layer import Layer
+from mrbokeh.images.image_io import write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.system.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 ENTRIES = read_entries((ROOT / "README.md").read_text(encoding="utf-8"))

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.gphoto2_library import NoCameraError, chosen_of, explanation, library
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, explanation, library
 
 TWO = [("A", "usb:001,001"), ("B", "usb:001,002")]
 
@@ -68,5 +68,5 @@ def test_the_codes_are_those_of_the_library() -> None:
 
 def test_it_is_imported_late() -> None:
     """In an interpreter of its own, for this one may have it already."""
-    script = "import sys, mrbokeh.gphoto2_library; sys.exit('gphoto2' in sys.modules)"
+    script = "import sys, mrbokeh.system.gphoto2_library; sys.exit('gphoto2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.staging.upright import turned
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.upright import turned
 from viewfinder.ground_plane import ground_from_picture
 
 

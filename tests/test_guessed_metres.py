@@ -9,12 +9,17 @@ import pytest
 
 from capture.merging.preferred_merge import PREFERRED
 from capture.views.lens_calibration_stacks import write_calibrated
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr, write_exr
-from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack
-from mrbokeh.focal_stack_dataset import read_focal_stack_dataset
-from mrbokeh.focus_places import Seen, parse_focus, slice_names
-from mrbokeh.guessed_metres import (
+from mrbokeh.images.exr_io import read_exr, write_exr
+from mrbokeh.images.image_io import read_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.lens_measuring.fitting.stack_views import StackSlices
+from mrbokeh.optics.lens_file import lens_to_json, write_lens
+from mrbokeh.refocus.refocusing import leave_one_out
+from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
+from mrbokeh.stacks.focus_places import Seen, parse_focus, slice_names
+from mrbokeh.stacks.guessed_metres import (
     POSITION,
     POSITION_ERROR,
     SLICE_POSITION,
@@ -23,12 +28,7 @@ from mrbokeh.guessed_metres import (
     metres_note,
     metres_notes,
 )
-from mrbokeh.image_io import read_image, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens_file import lens_to_json, write_lens
-from mrbokeh.lens_fitting.stack_views import StackSlices
-from mrbokeh.refocusing import leave_one_out
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system.errors import InputError
 from tests.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.guessed_stack import guessed_twin
 from tests.test_composite_command import CAKE

@@ -8,17 +8,17 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.commands.composite import app
-from mrbokeh.cut_out import cut_from_px
-from mrbokeh.held_lens import lens_as_held, turned_by
-from mrbokeh.image_io import write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens, write_lens
-from mrbokeh.lens_matching.photo_facts import read_facts
-from mrbokeh.photograph import Photograph, read_photograph
-from mrbokeh.plate import open_plate
+from mrbokeh.compositing.plate import open_plate
+from mrbokeh.images.cut_out import cut_from_px
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.lens_measuring.matching.photo_facts import read_facts
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens, write_lens
+from mrbokeh.stacks.held_lens import lens_as_held, turned_by
+from mrbokeh.stacks.photograph import Photograph, read_photograph
 
 LEVEL = Lens(50.0, 2.0, 2.0, 36.0)
 UPRIGHT = Lens(50.0, 2.0, 2.0, 24.0, sensor_height_mm=36.0)

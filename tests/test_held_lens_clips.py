@@ -9,15 +9,15 @@ import tifffile
 from PIL import Image
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.commands.video import app
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, read_layer, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.picture_sources.choose import open_source
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.images.image_io import read_image, read_layer, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.picture_sources.choose import open_source
 from tests.video_files import turned_clip
 
 WIDTH, HEIGHT = 96, 64

@@ -3,11 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.image_io import read_image, read_layer, write_image, write_layer, write_preview
-from mrbokeh.layer import Layer
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer, write_preview
+from mrbokeh.images.layer import Layer
+from mrbokeh.system.errors import InputError
 
 
 def picture(highest: float = 1.0) -> np.ndarray:

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import depth_edge_mask, edge_psnr, energy_ratio, flicker, leak, light_error, psnr, ssim
+from mrbokeh.images.image_metrics import depth_edge_mask, edge_psnr, energy_ratio, flicker, leak, light_error, psnr, ssim
+from mrbokeh.system.errors import InputError
 
 
 def picture(seed: int) -> np.ndarray:

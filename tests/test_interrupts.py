@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mrbokeh import cli
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.video.clip import VideoWriter
 
 WORK = {
     "ingest": ("capture.stacks.ingest.ingest", ["{0}", "--out", "{0}/scene"], "finished slices are kept in {0}/scene"),

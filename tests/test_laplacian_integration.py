@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.laplacian_integration import STENCIL, integrate, integrate_by_pyramid, integrate_plainly, laplacian
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.kernels.laplacian_integration import STENCIL, integrate, integrate_by_pyramid, integrate_plainly, laplacian
+from mrbokeh.system.errors import InputError
 
 
 def disc(diameter_px: float, size: int) -> np.ndarray:

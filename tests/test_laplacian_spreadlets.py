@@ -4,18 +4,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr, ssim
-from mrbokeh.layer import opaque
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.psf_bank import Axis, PsfBank
-from mrbokeh.renderers._laplacian_bank import Place, turned_kernel
-from mrbokeh.renderers._laplacian_lamps import lamps_among, lamps_among_plainly
-from mrbokeh.renderers._laplacian_layout import FOUR, Laid, Window, gains_for
-from mrbokeh.renderers._laplacian_sums import _Splatting, splat, splat_plainly
-from mrbokeh.renderers._laplacian_tables import (
+from mrbokeh.images.image_metrics import psnr, ssim
+from mrbokeh.images.layer import opaque
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf_bank import Axis, PsfBank
+from mrbokeh.renderers.bank.tables import Place, turned_kernel
+from mrbokeh.renderers.choose import make_renderer
+from mrbokeh.renderers.kernels.laplacian_tables import (
     LEVELS_PER_OCTAVE,
     SPARSE,
     KernelTables,
@@ -26,10 +23,13 @@ from mrbokeh.renderers._laplacian_tables import (
     stands_out_plainly,
     taps_of,
 )
-from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.spreadlets import UNRELAXED, sparsify, whole_laplacian
+from mrbokeh.renderers.spreadlets.lamps import lamps_among, lamps_among_plainly
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.renderers.spreadlets.layout import FOUR, Laid, Window, gains_for
+from mrbokeh.renderers.spreadlets.sums import _Splatting, splat, splat_plainly
+from mrbokeh.system.errors import InputError
 
 DISC, PENTAGON = Aperture.disc(), Aperture.blades(5)
 SIZE = (96, 120)
@@ -287,7 +287,7 @@ def test_no_light_is_too_much_for_whole_numbers() -> None:
 
 def test_rounding_of_an_even_area_does_not_add_up() -> None:
     """Dithers spread evenly: those of any 100 x 100 pixels leave at most a few of 10 000; all alike would leave thousands."""
-    from mrbokeh.renderers._laplacian_splat_numba import dither_of
+    from mrbokeh.renderers.spreadlets._splat_numba import dither_of
 
     dithers = np.array([[dither_of(x, y) for x in range(100)] for y in range(700, 800)])
     assert np.abs(dithers).max() <= 0.5
@@ -381,7 +381,7 @@ def test_a_kernel_of_very_many_points_is_turned_as_a_whole(monkeypatch: pytest.M
     place = Place(motion_px=np.broadcast_to(np.float32([3.0, 2.0]), (*SIZE, 2)))
     dense = LaplacianSpreadlets(bank).spread_bank(values, circles, place, densely=True)
     assert np.abs(LaplacianSpreadlets(bank).spread_bank(values, circles, place) - dense).max() > 1e-3
-    monkeypatch.setattr("mrbokeh.renderers._laplacian_bank._MOST_TURNED", 10)
+    monkeypatch.setattr("mrbokeh.renderers.bank.tables._MOST_TURNED", 10)
     np.testing.assert_allclose(LaplacianSpreadlets(bank).spread_bank(values, circles, place), dense, atol=1e-4)
 
 

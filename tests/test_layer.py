@@ -3,8 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, clear, flatten, opaque, over
+from mrbokeh.images.layer import Layer, clear, flatten, opaque, over
+from mrbokeh.system.errors import InputError
 
 
 def flat(rgb: tuple[float, float, float], alpha: float, depth_m: float) -> Layer:

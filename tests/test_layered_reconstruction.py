@@ -7,13 +7,13 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.motion import MOTION
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.layering.motion import MOTION
+from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
+from mrbokeh.system.errors import InputError
 from tests.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth, waves
 
 SIZE_PX = 64

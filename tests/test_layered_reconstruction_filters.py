@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.layered_reconstruction import footprint_sigmas
 from mrbokeh.renderers.layered_reconstruction._direct_gaussian_numba import direct_gaussian
 from mrbokeh.renderers.layered_reconstruction._filter_numba import axes

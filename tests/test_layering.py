@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.layering import Layering, render_layers
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.layering.layering import Layering, render_layers
+from mrbokeh.layering.spreading import Frame, spread_light
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.spreading import Frame, spread_light
+from mrbokeh.system.errors import InputError
 
 SIZE = (72, 96)
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)  # up to 64 px of blur at infinity

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 NIKKOR = Lens(focal_length_mm=35.0, f_number=1.8, focus_distance_m=0.8, sensor_width_mm=35.9)
 

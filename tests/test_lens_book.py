@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import LensState
 from viewfinder.lens_book import LensBook
 

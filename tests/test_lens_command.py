@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.commands.lens import app
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.lens_drawing import draw_lens, kernel_rgb
-from mrbokeh.lens_file import read_lens, write_lens
+from mrbokeh.figures.lens_drawing import draw_lens, kernel_rgb
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens, write_lens
+from mrbokeh.system.errors import InputError
 
 BODY = ["--focal-length", "50", "--f-number", "1.8", "--focus", "2"]
 

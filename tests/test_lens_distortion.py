@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.lens_distortion import LensDistortion
-from mrbokeh.lens_distortion.colmap import colmap_distortion
-from mrbokeh.lens_distortion.distortion_json import distortion_from_json, distortion_to_json
-from mrbokeh.lens_distortion.st_map import StMap, read_st_map
+from mrbokeh.distortion import LensDistortion
+from mrbokeh.distortion.colmap import colmap_distortion
+from mrbokeh.distortion.distortion_json import distortion_from_json, distortion_to_json
+from mrbokeh.distortion.st_map import StMap, read_st_map
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 
 CAMERA = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
 OPENCV = {"k1": -0.21, "k2": 0.06, "p1": 1.5e-3, "p2": -0.8e-3, "k3": 0.01, "k4": 0.03, "k5": -0.01, "k6": 0.002}
@@ -139,7 +139,7 @@ def test_lensfun_undistorts_alike(camera_model: str, lens_model: str, focal_mm: 
     of four pixels of a row that it takes at once, three are off by up to 0.2 px (0.3.4). It counts in float32.
     """
     lensfunpy = pytest.importorskip("lensfunpy")
-    from mrbokeh.lens_distortion.lensfun_database import _found, lensfun_distortion
+    from mrbokeh.distortion.lensfun_database import _found, lensfun_distortion
 
     width, height = size_px
     found, lens = _found(None, camera_model, lens_model)
@@ -157,7 +157,7 @@ def test_lensfun_undistorts_alike(camera_model: str, lens_model: str, focal_mm: 
 
 def test_lensfun_says_what_it_does_not_know() -> None:
     pytest.importorskip("lensfunpy")
-    from mrbokeh.lens_distortion.lensfun_database import lensfun_distortion
+    from mrbokeh.distortion.lensfun_database import lensfun_distortion
 
     with pytest.raises(InputError, match="knows no camera"):
         lensfun_distortion("Zorki 99", "any", 50.0)

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, clear
-from mrbokeh.lens_distortion import LensDistortion, distorted, overscan_camera
-from mrbokeh.lens_distortion.overscan import source_positions_px
-from mrbokeh.lens_distortion.resampling import resampled
-from mrbokeh.lens_distortion.st_map import StMap
-from mrbokeh.lens_distortion.warping import sampled_positions_px
-from mrbokeh.motion import MOTION, with_motion
-from mrbokeh.pixel_box import Box, lit_box
+from mrbokeh.distortion import LensDistortion, distorted, overscan_camera
+from mrbokeh.distortion.overscan import source_positions_px
+from mrbokeh.distortion.resampling import resampled
+from mrbokeh.distortion.st_map import StMap
+from mrbokeh.distortion.warping import sampled_positions_px
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.layering.motion import MOTION, with_motion
+from mrbokeh.layering.pixel_box import Box, lit_box
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 
 PLATE = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
 BARREL = LensDistortion.of("opencv", k1=-0.25, k2=0.08, p1=1e-3, p2=-8e-4)

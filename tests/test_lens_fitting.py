@@ -9,30 +9,30 @@ import typer
 from scipy.ndimage import convolve
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.commands.lens_fit import fit as fit_command
 from mrbokeh.commands.lens_pictures import export, show
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.image_io import write_image
-from mrbokeh.layer import opaque
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.lens_fitting._pupil_rows_numba import gather_rows
-from mrbokeh.lens_fitting.evidence import Evidence
-from mrbokeh.lens_fitting.knots import Knots
-from mrbokeh.lens_fitting.lens_fit import FitSettings, LensFit, fit_lens
-from mrbokeh.lens_fitting.measured_bank import bank_of, picture_at
-from mrbokeh.lens_fitting.point_lights import PointLight, find_lights
-from mrbokeh.lens_fitting.pupil_picture import PupilGrid, kernel_of
-from mrbokeh.lens_fitting.sharing import Sharing, simplest_of
-from mrbokeh.lens_fitting.solving import on_simplex
-from mrbokeh.lens_fitting.stack_equations import SliceView, drawn_pixels, equations_of, smoothed_coc, usable_pixels
-from mrbokeh.lens_fitting.stack_views import StackSlices
-from mrbokeh.psf_bank import Axis, PsfBank
-from mrbokeh.psf_bank_file import read_bank
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.layer import opaque
+from mrbokeh.layering.layering import Layering
+from mrbokeh.lens_measuring.fitting._pupil_rows_numba import gather_rows
+from mrbokeh.lens_measuring.fitting.evidence import Evidence
+from mrbokeh.lens_measuring.fitting.knots import Knots
+from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit, fit_lens
+from mrbokeh.lens_measuring.fitting.measured_bank import bank_of, picture_at
+from mrbokeh.lens_measuring.fitting.point_lights import PointLight, find_lights
+from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid, kernel_of
+from mrbokeh.lens_measuring.fitting.sharing import Sharing, simplest_of
+from mrbokeh.lens_measuring.fitting.solving import on_simplex
+from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, drawn_pixels, equations_of, smoothed_coc, usable_pixels
+from mrbokeh.lens_measuring.fitting.stack_views import StackSlices
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf_bank import Axis, PsfBank
+from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.scatter_reference import ScatterReference, scatter
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 
 SIZE = (132, 196)
 FOCI_M = (0.5, 0.68, 1.3)  # the wall lies from 0.6 m to 0.9 m

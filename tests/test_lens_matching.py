@@ -11,24 +11,24 @@ from PIL import Image
 from shapely import Polygon
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.cli import main
-from mrbokeh.color import linear_to_srgb, srgb_to_linear
 from mrbokeh.commands.lens import app
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, write_image
-from mrbokeh.layer import opaque
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens
-from mrbokeh.lens_matching.discs import Disc, find_discs
-from mrbokeh.lens_matching.focus_from_size import depth_from_size, effective_f_number, focus_from_size
-from mrbokeh.lens_matching.lens_match import LensMatch, match_lens
-from mrbokeh.lens_matching.match_table import table_of
-from mrbokeh.lens_matching.outline_fit import fit_outlines
-from mrbokeh.lens_matching.outline_model import Opening, outline_radius
-from mrbokeh.lens_matching.photo_facts import PhotoFacts, read_facts
+from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
+from mrbokeh.images.image_io import read_image, write_image
+from mrbokeh.images.layer import opaque
+from mrbokeh.layering.layering import Layering
+from mrbokeh.lens_measuring.matching.discs import Disc, find_discs
+from mrbokeh.lens_measuring.matching.focus_from_size import depth_from_size, effective_f_number, focus_from_size
+from mrbokeh.lens_measuring.matching.lens_match import LensMatch, match_lens
+from mrbokeh.lens_measuring.matching.match_table import table_of
+from mrbokeh.lens_measuring.matching.outline_fit import fit_outlines
+from mrbokeh.lens_measuring.matching.outline_model import Opening, outline_radius
+from mrbokeh.lens_measuring.matching.photo_facts import PhotoFacts, read_facts
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = 214, 320
 LENS = Lens(50.0, 1.8, 1.0, 14.0)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque, over
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque, over
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import neutral_environment
 from mrbokeh.scene.light_change import LEAST_CHANGE, LightChange, light_change
+from mrbokeh.system.errors import InputError
 from tests.test_scene_backends import DARK, rays
 
 LOOKING_DOWN = np.array([[1, 0, 0, 0], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 3.0], [0, 0, 0, 1.0]])

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples, joined
-from mrbokeh.light_field_samples_file import CHANNELS, read_samples, write_samples
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.layering.light_field_samples import LightFieldSamples, joined
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.light_field_samples_file import CHANNELS, read_samples, write_samples
+from mrbokeh.system.errors import InputError
 from tests.sampled_planes import LENS, Plane, even, fence_scene, sample_planes, waves
 
 SIZE_PX = 16

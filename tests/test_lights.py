@@ -9,8 +9,8 @@ from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Lights, find_lights, no_lights
 from capture.merging.restored_lights import restored_lights, with_restored_lights
 from capture.photos.clipped_highlights import neutral_where_full
-from mrbokeh.aperture import Aperture
-from mrbokeh.layer import opaque
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
 
 SIZE = (80, 400)

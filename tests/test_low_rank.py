@@ -7,9 +7,9 @@ counts of blades with a flat side on top (a corner on top gives 8 blades a large
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.low_rank import aperture_errors, decompose, relative_errors
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.kernels.low_rank_kernel import aperture_errors, decompose, relative_errors
+from mrbokeh.system.errors import InputError
 
 SIDES_PX = (65.0, 121.0)
 

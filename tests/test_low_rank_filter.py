@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.low_rank import decompose
-from mrbokeh.renderers import _low_rank_exact
-from mrbokeh.renderers._low_rank_per_pixel import depth_edge_mask
-from mrbokeh.renderers.low_rank_filter import LowRankFilter
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.kernels.low_rank_kernel import decompose
+from mrbokeh.renderers.low_rank import exact as _low_rank_exact
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+from mrbokeh.renderers.low_rank.per_pixel import depth_edge_mask
+from mrbokeh.renderers.low_rank.tilt_shift import tilt_shift
 from mrbokeh.renderers.scatter_reference import scatter
-from mrbokeh.tilt_shift import tilt_shift
+from mrbokeh.system.errors import InputError
 
 HEIGHT_PX, WIDTH_PX = 150, 190
 SLOPE = np.tile(np.linspace(1.0, 36.0, WIDTH_PX, dtype=np.float32), (HEIGHT_PX, 1))

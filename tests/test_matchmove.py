@@ -18,11 +18,11 @@ from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip
 from capture.matchmove.only_turning import model_residual_px, turning_residual_px
 from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.formats import read_track
-from mrbokeh.camera_track.track import CameraTrack
-from mrbokeh.errors import InputError
-from mrbokeh.video_io import VideoWriter, probe
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.formats import read_track
+from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.video.clip import VideoWriter, probe
 from tests.textured_room import picture, room_camera
 
 

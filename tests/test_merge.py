@@ -16,14 +16,14 @@ from capture.merging.slice_optics import SliceOptics
 from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera_rgb import read_camera_rgb
 from mrbokeh.demo.plan import DATA
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from mrbokeh.image_io import read_image, write_image
-from mrbokeh.image_metrics import depth_edge_mask, psnr
+from mrbokeh.images.camera_rgb import read_camera_rgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image, write_image
+from mrbokeh.images.image_metrics import depth_edge_mask, psnr
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.system.errors import InputError
 
 VIEW = "view_1"
 

@@ -14,7 +14,7 @@ from datasets_scripts.mixed_reality_objects import OBJECT_DISTANCES_M, scene_aro
 from datasets_scripts.truth_plan import TruthPlan
 from datasets_scripts.truth_scene import pack
 from datasets_scripts.truth_scenes import make_scene
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from tests.mixed_reality_cases import traced_cases
 
 PLAN = TruthPlan(width_px=64, height_px=36, samples=4, scenes=("fence",), shapes=("disc",))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrbokeh.motion import drawn_out, motion_reach_px
+from mrbokeh.layering.motion import drawn_out, motion_reach_px
 
 
 def point(motion_px: tuple[float, float], size: int = 41) -> np.ndarray:

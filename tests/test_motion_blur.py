@@ -8,19 +8,19 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.cli import app
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.image_io import read_image, read_layer, write_layer
-from mrbokeh.image_metrics import psnr, ssim
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens, write_lens
-from mrbokeh.motion import with_motion
-from mrbokeh.motion_file import taken_from_channels
-from mrbokeh.psf_bank_file import read_bank
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.image_io import read_image, read_layer, write_layer
+from mrbokeh.images.image_metrics import psnr, ssim
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.layering.motion import with_motion
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens, write_lens
+from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.stacks.motion_file import taken_from_channels
+from mrbokeh.system.errors import InputError
 
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)
 SIZE = (70, 110)

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer
-from mrbokeh.lens_distortion import LensDistortion, distorted, overscan_camera
-from mrbokeh.motion import MOTION, drawn_out, motion_of
-from mrbokeh.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer, moving_shadow_layer
-from mrbokeh.moving_layers.moving_layer import MotionQuality
-from mrbokeh.moving_layers.moving_shadow import ShadowCatcher
-from mrbokeh.moving_layers.paths import paths_of
+from mrbokeh.distortion import LensDistortion, distorted, overscan_camera
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.motion import MOTION, drawn_out, motion_of
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, emitter, rectangle, shadow_catcher, sun, world_from_scene_placing
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf_loader import GltfAsset, load_glb
+from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer, moving_shadow_layer
+from mrbokeh.scene.moving_layers.moving_layer import MotionQuality
+from mrbokeh.scene.moving_layers.moving_shadow import ShadowCatcher
+from mrbokeh.scene.moving_layers.paths import paths_of
 from mrbokeh.scene.surface_motion import SurfacePoints, drawn_meshes
+from mrbokeh.system.errors import InputError
 
 OBJECTS = Path(__file__).resolve().parent.parent / "mrbokeh" / "demo_data" / "objects"
 CAMERA = Camera(160, 107, (173.0, 170.0), (79.0, 55.0))

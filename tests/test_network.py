@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import network_blocks
+from mrbokeh.stacks.focal_stack_dataset import network_blocks
+from mrbokeh.system.errors import InputError
 from training.gated_bins import bins_px, blocks_for_gates, hat_lines
 from training.gated_kernels import disc_kernel
 from training.gated_network import GatedTiles

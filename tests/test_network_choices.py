@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.network import BlurNetwork
 from training.network_settings import NetworkSettings
 from training.presets import PRESETS, better_settings, demo_settings

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.field_position import field_positions
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.field_position import field_positions
+from mrbokeh.system.errors import InputError
 from training.gated_kernels import disc_kernel, fresh_kernels
 from training.network import BlurNetwork
 from training.network_settings import NetworkSettings

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.onnx_network import OnnxNetwork
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.system.errors import InputError
 from tests.test_onnx_network import LARGEST_COC_PX, LENS, SIZE, card
 from training.export_onnx import export_network, network_facts_of
 from training.lens_scale import LensScale

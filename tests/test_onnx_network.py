@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.onnx_network import OnnxNetwork
+from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.system.errors import InputError
 from training.export_onnx import export_network
 from training.network_settings import NetworkSettings
 from training.presets import demo_settings

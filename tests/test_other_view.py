@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import opaque
-from mrbokeh.layering import Layering, render_layers
-from mrbokeh.lens import Lens
-from mrbokeh.other_view import layer_from_view
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import opaque
+from mrbokeh.layering.layering import Layering, render_layers
+from mrbokeh.layering.other_view import layer_from_view
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system.errors import InputError
 
 WIDTH, HEIGHT = 96, 64
 CAMERA = Camera(WIDTH, HEIGHT, (96.0, 96.0), (WIDTH / 2, HEIGHT / 2))

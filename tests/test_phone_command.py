@@ -16,11 +16,11 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.world_axes import inverted
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_layer
-from mrbokeh.layer import clear
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.images.layer import clear
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.world_axes import inverted
 from tests.phone_on_camera import (
     CAMERA_FROM_PHONE,
     PHONE,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from mrbokeh.color import srgb_to_linear
-from mrbokeh.errors import InputError
-from mrbokeh.exif_orientation import as_stored, upright
-from mrbokeh.photograph import read_photograph
-from mrbokeh.plate import open_plate
+from mrbokeh.compositing.plate import open_plate
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.images.exif_orientation import as_stored, upright
+from mrbokeh.stacks.photograph import read_photograph
+from mrbokeh.system.errors import InputError
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 shared = pytest.mark.skipif(not DATA.is_dir(), reason="the photographs beside the project are not here")

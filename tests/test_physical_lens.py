@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.nested_grid import NestedGrid
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import BANDS_UM, GREEN_UM
 from mrbokeh.psf_models._ray_tracing_numba import trace_ray
@@ -18,6 +17,7 @@ from mrbokeh.psf_models.glass import cauchy_coefficients, index_at
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.system.errors import InputError
 
 RAYS = 1 << 15
 

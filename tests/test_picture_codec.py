@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.picture_codec import codes_of, even_codes, linear_from_codes, stored_pixels, stored_rgb, write_stored
+from mrbokeh.images.picture_codec import codes_of, even_codes, linear_from_codes, stored_pixels, stored_rgb, write_stored
 
 
 @pytest.mark.parametrize("suffix", [".png", ".TIF"])

@@ -1,14 +1,14 @@
-"""mrbokeh.pixel_box: what is cut out of a picture, beyond its border too, comes back to its place; its camera and lens see the same."""
+"""layering.pixel_box: what is cut out of a picture, beyond its border too, comes back to its place; its camera and lens see the same."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.layer import Layer, clear
-from mrbokeh.lens import Lens
-from mrbokeh.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 
 FRAME = (6, 8)
 PICTURE = np.arange(48, dtype=np.float32).reshape(FRAME)

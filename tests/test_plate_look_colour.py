@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image
-from mrbokeh.layer import Layer
-from mrbokeh.plate_look.black_level import darkest_black, picked_black
-from mrbokeh.plate_look.colour_match import ColourMatch
-from mrbokeh.plate_look.exposure_match import Exposure, exposure_of_metadata, exposure_of_photo, matched_exposure
-from mrbokeh.plate_look.grey_card import PixelBox, grey_card_match, patch_colour
-from mrbokeh.plate_look.white_balance import kelvin_of_photo, white_balance_gain, white_of_kelvin
+from mrbokeh.compositing.plate_look.black_level import darkest_black, picked_black
+from mrbokeh.compositing.plate_look.colour_match import ColourMatch
+from mrbokeh.compositing.plate_look.exposure_match import Exposure, exposure_of_metadata, exposure_of_photo, matched_exposure
+from mrbokeh.compositing.plate_look.grey_card import PixelBox, grey_card_match, patch_colour
+from mrbokeh.compositing.plate_look.white_balance import kelvin_of_photo, white_balance_gain, white_of_kelvin
+from mrbokeh.images.image_io import read_image
+from mrbokeh.images.layer import Layer
+from mrbokeh.system.errors import InputError
 
 CAST, BLACK = (1.6, 0.9, 0.5), (0.012, 0.015, 0.021)
 
@@ -151,7 +151,7 @@ def test_light_source_of_exif_is_a_temperature(tmp_path: Path) -> None:
 
 def test_white_of_known_illuminants() -> None:
     """D65 is the white of Rec.709 (0.3127, 0.3290). Illuminant A is XYZ 1.0985, 1, 0.3558 (CIE 15): through the matrix of Rec.709."""
-    from mrbokeh.color import rec709_from_XYZ
+    from mrbokeh.images.color import rec709_from_XYZ
 
     np.testing.assert_allclose(white_of_kelvin(6504.0), 1.0, atol=0.003)
     of_a = rec709_from_XYZ @ (1.0985, 1.0, 0.3558)

@@ -8,15 +8,15 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import ks_2samp
 
-from mrbokeh.atomic_files import write_json
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image
-from mrbokeh.plate_look.grain import Grain, measured_grain, measured_grain_of_pair
-from mrbokeh.plate_look.grain_file import read_grain, write_grain
-from mrbokeh.plate_look.noise_blocks import noise_blocks
-from mrbokeh.plate_look.noise_correlation import REACH_PX, white
-from mrbokeh.plate_look.noise_level import NoiseLevel, fit_noise_level
-from mrbokeh.video_io import read_frames
+from mrbokeh.compositing.plate_look.grain import Grain, measured_grain, measured_grain_of_pair
+from mrbokeh.compositing.plate_look.grain_file import read_grain, write_grain
+from mrbokeh.compositing.plate_look.noise_blocks import noise_blocks
+from mrbokeh.compositing.plate_look.noise_correlation import REACH_PX, white
+from mrbokeh.compositing.plate_look.noise_level import NoiseLevel, fit_noise_level
+from mrbokeh.images.image_io import read_image
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import read_frames
 
 SIZE = (256, 384)
 SHOT, READ = np.array([4e-4, 2e-4, 6e-4]), np.array([2e-5, 1e-5, 4e-5])
@@ -116,7 +116,7 @@ def test_clipped_light_does_not_count_as_grainless(monkeypatch: pytest.MonkeyPat
     levels = ((0.2, 0.2, 0.4), (0.4, 0.3, 0.5))
     assert variance_error(measured_grain(clipped), levels) < 0.11
     all_blocks = replace(noise_blocks(clipped), usable=np.ones(noise_blocks(clipped).usable.shape, bool))
-    monkeypatch.setattr("mrbokeh.plate_look.grain.noise_blocks", lambda _: all_blocks)
+    monkeypatch.setattr("mrbokeh.compositing.plate_look.grain.noise_blocks", lambda _: all_blocks)
     assert variance_error(measured_grain(clipped), levels) > 0.2
 
 

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_image
-from mrbokeh.plate_look.finishing import Finishing
-from mrbokeh.plate_look.grain import measured_grain
-from mrbokeh.plate_look.grain_file import write_grain
-from mrbokeh.plate_look.lensfun_falloff import CameraAndLens, lensfun_falloff
-from mrbokeh.plate_look.light_wrap import LightWrap
-from mrbokeh.plate_look.look_options import LookOptions, finishing_of
-from mrbokeh.plate_look.vignetting import FlatField, RadialFalloff
+from mrbokeh.compositing.plate_look.finishing import Finishing
+from mrbokeh.compositing.plate_look.grain import measured_grain
+from mrbokeh.compositing.plate_look.grain_file import write_grain
+from mrbokeh.compositing.plate_look.lensfun_falloff import CameraAndLens, lensfun_falloff
+from mrbokeh.compositing.plate_look.light_wrap import LightWrap
+from mrbokeh.compositing.plate_look.look_options import LookOptions, finishing_of
+from mrbokeh.compositing.plate_look.vignetting import FlatField, RadialFalloff
+from mrbokeh.images.image_io import write_image
+from mrbokeh.system.errors import InputError
 from tests.test_plate_look_grain import plate, smooth_scene
 
 LENS_MODEL = "Canon EF 100mm f/2.8L Macro IS USM"

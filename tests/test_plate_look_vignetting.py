@@ -6,12 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError, MissingExtraError
-from mrbokeh.image_io import write_image
-from mrbokeh.layer import Layer
-from mrbokeh.pixel_box import Box
-from mrbokeh.plate_look.lensfun_falloff import CameraAndLens, lensfun_falloff
-from mrbokeh.plate_look.vignetting import FlatField, RadialFalloff, Vignetting, darkened, falloff_at, flat_field_of, read_flat_field
+from mrbokeh.compositing.plate_look.lensfun_falloff import CameraAndLens, lensfun_falloff
+from mrbokeh.compositing.plate_look.vignetting import (
+    FlatField,
+    RadialFalloff,
+    Vignetting,
+    darkened,
+    falloff_at,
+    flat_field_of,
+    read_flat_field,
+)
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.pixel_box import Box
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 FRAME = (112, 160)
 WHOLE = Box(0, 112, 0, 160)

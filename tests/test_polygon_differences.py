@@ -7,16 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.directional_differences import PolygonCorners, edge_profile, polygon_corners
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import opaque
-from mrbokeh.lens import Lens
-from mrbokeh.polygon_rectification import PAPER_DIRECTIONS, rectify_aperture
-from mrbokeh.renderers import _polygon_bands
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon import bands as _polygon_bands
+from mrbokeh.renderers.polygon.directional_differences import PolygonCorners, edge_profile, polygon_corners
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, rectify_aperture
 from mrbokeh.renderers.scatter_reference import scatter
+from mrbokeh.system.errors import InputError
 
 APERTURES = {
     "octagon": Aperture.blades(8, np.pi / 8),

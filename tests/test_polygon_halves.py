@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.system.errors import InputError
 from tests.test_polygon_differences import picture, plain_scatter
 
 OCTAGON, HEART = Aperture.blades(8, np.pi / 8), Aperture.heart()

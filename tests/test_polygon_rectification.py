@@ -7,9 +7,9 @@ import pytest
 import shapely
 from shapely import Polygon, affinity
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.polygon_rectification import PAPER_DIRECTIONS, area_excess, rectify, rectify_aperture, same_area_and_centroid
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, area_excess, rectify, rectify_aperture, same_area_and_centroid
+from mrbokeh.system.errors import InputError
 
 EIGHTHS = ((1, 0), (0, 1), (1, 1), (1, -1))
 UPRIGHT = ((1, 0), (0, 1))

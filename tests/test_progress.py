@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import pytest
 from rich.console import Console
 
-from mrbokeh import progress
-from mrbokeh.progress import PlainLines, track
+from mrbokeh.system import progress
+from mrbokeh.system.progress import PlainLines, track
 
 
 class Clock:

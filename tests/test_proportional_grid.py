@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.nested_grid import NestedGrid
-from mrbokeh.proportional_grid import ProportionalGrid
-from mrbokeh.psf_bank import Axis, PsfBank, grid_over
-from mrbokeh.psf_bank_drawing import draw_bank, sampled_cells
-from mrbokeh.psf_bank_file import read_bank, write_bank
+from mrbokeh.figures.psf_bank_drawing import draw_bank, sampled_cells
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.proportional_grid import ProportionalGrid
+from mrbokeh.optics.psf_bank import Axis, PsfBank, grid_over
+from mrbokeh.optics.psf_bank_file import read_bank, write_bank
 from mrbokeh.psf_models.build import bank_head
 from mrbokeh.psf_models.combined import PAPER_COUNTS, PAPER_EXPONENTS, Combined
+from mrbokeh.system.errors import InputError
 from tests.bench_combined_bank import overlaps
 
 GRIDS = [

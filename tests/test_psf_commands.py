@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.commands.lens import app
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, write_image
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.psf_bank_file import cell_path, missing_cells, read_bank, read_head
+from mrbokeh.images.image_io import read_image, write_image
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.optics.psf_bank_file import cell_path, missing_cells, read_bank, read_head
 from mrbokeh.psf_models.build import build_bank
 from mrbokeh.psf_models.choose import MODEL_NAMES, ModelOptions, choose_model
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.simple_lens import SimpleLens
-from mrbokeh.spreadlets import Sparsification, Spreadlet, sparsify
-from mrbokeh.spreadlets_build import build_spreadlets
-from mrbokeh.spreadlets_file import spreadlets_beside
+from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify
+from mrbokeh.renderers.kernels.spreadlets_build import build_spreadlets
+from mrbokeh.renderers.kernels.spreadlets_file import spreadlets_beside
+from mrbokeh.system.errors import InputError
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 
@@ -228,7 +228,7 @@ def test_interrupted_spreadlets_go_on(tmp_path: Path, monkeypatch: pytest.Monkey
         made.append(kernel)
         return sparsify(kernel, settings)
 
-    monkeypatch.setattr("mrbokeh.spreadlets_build.sparsify", counted)
+    monkeypatch.setattr("mrbokeh.renderers.kernels.spreadlets_build.sparsify", counted)
     most = 2
     with pytest.raises(KeyboardInterrupt):
         build_spreadlets(tmp_path / "bank", Sparsification(), threads=1)

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.psf_bank import Axis
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.psf_bank import Axis
 from mrbokeh.psf_models.base import PsfModel
 from mrbokeh.psf_models.combined import PAPER_COUNTS, Combined
 from mrbokeh.psf_models.quasi_random import sobol_blocks
 from mrbokeh.psf_models.simple_lens import SimpleLens, banded_edges
 from mrbokeh.psf_models.stylized import Stylized
+from mrbokeh.system.errors import InputError
 
 RAYS = 1 << 20
 ODD_LENS = Aperture(Aperture.heart().outlines, (1.0,), spherical_aberration=0.6, axial_chromatic=(0.1, 0.0, -0.1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 from mrbokeh.psf_models.base import PsfModel, centred
 from mrbokeh.psf_models.biconvex_lens import biconvex_lens
 from mrbokeh.psf_models.combined import Combined

@@ -13,13 +13,13 @@ from datasets_scripts.public_conversion import Conversion, convert
 from datasets_scripts.public_datasets import KINDS, crop_of, main
 from datasets_scripts.public_depth import DepthMaps, sharpest_depth_m
 from datasets_scripts.public_stack import f_number_of
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import read_focal_stack
-from mrbokeh.focal_stack_dataset import FocalStackDataset, read_focal_stack_dataset
-from mrbokeh.image_io import write_image
-from mrbokeh.lens import Lens
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import write_image
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, read_focal_stack_dataset
+from mrbokeh.system.errors import InputError
 from training.classical_blur import scatter_reference
 from training.dataset import read_pair
 from training.training_data import training_data

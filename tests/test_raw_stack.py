@@ -18,11 +18,11 @@ from datasets_scripts.raw_stack_truth import StackPlan, truth_document
 from datasets_scripts.sensor_model import CFA_PATTERNS, SensorModel
 from datasets_scripts.thin_lens_tracer import trace, trace_pinhole
 from datasets_scripts.traced_scene import Scene, emissive_quad
-from mrbokeh.camera_file import camera_from_json
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import read_image
-from mrbokeh.lens import Lens
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image
+from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 SHIPPED = Path(__file__).resolve().parent.parent / "mrbokeh" / "demo_data" / "raw_stack"
 LENS = Lens(35.0, 2.8, 0.7, 23.5)

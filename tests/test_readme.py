@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.image_io import write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ import pytest
 
 from capture.report.detail import SharpestSlices, block_detail
 from capture.stacks.block_detail import BLOCK_PX
-from mrbokeh.color import linear_to_srgb, srgb_to_linear
+from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
 from tests.fusion_measures import FusionScores
 from tests.process_cost import attempted
 from tests.real_bench_crops import worst_places, write_crops

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.camera_rgb import read_camera_rgb, write_camera_rgb
 from mrbokeh.commands.refocus import app
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from mrbokeh.focus_places import Seen, parse_focus
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer
-from mrbokeh.lens_file import write_lens
-from mrbokeh.refocusing import Refocusing, leave_one_out, lens_at
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.compositing.stack_compositing import composite_stack
+from mrbokeh.images.camera_rgb import read_camera_rgb, write_camera_rgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.refocus.refocusing import Refocusing, leave_one_out, lens_at
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.stack_compositing import composite_stack
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.stacks.focus_places import Seen, parse_focus
+from mrbokeh.system.errors import InputError
 from tests.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 
 BETWEEN_M = 0.52
@@ -208,7 +208,7 @@ def test_every_slice_holds_the_scene_with_its_own_blur(tmp_path: Path) -> None:
     assert read.focus_distances_m == stack.focus_distances_m == made.focus_distances_m
     alone = OverPhotograph().insert
     for index in range(len(stack)):
-        from mrbokeh.plate import plate_of
+        from mrbokeh.compositing.plate import plate_of
 
         expected = alone(plate_of(stack.slice_rgb(index), stack.lens_of(index), stack.depth_m()), [lamp()], renderer).rgb
         np.testing.assert_allclose(read.slice_rgb(index), expected, atol=2e-5)

@@ -15,14 +15,14 @@ from capture.merging.focus_order import focus_order
 from capture.merging.merge import merge_scene
 from capture.merging.relative_focus import RelativeFocus, _Places, solve_relative_focus
 from capture.merging.relative_stack import FROM_DISTANCES, gauge_of, told_direction
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.drawn_diameters import drawn_diameters_px
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.layer import opaque
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.drawn_diameters import drawn_diameters_px
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from tests.test_user_mistakes import said
 
 SIZE = (200, 280)

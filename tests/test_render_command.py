@@ -10,13 +10,13 @@ from typer.testing import CliRunner
 
 from mrbokeh.cli import app as everything
 from mrbokeh.commands.render import app
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.image_io import read_image, read_layer, write_layer
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens_file import read_lens
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.image_io import read_image, read_layer, write_layer
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system.errors import InputError
 
 WIDTH, HEIGHT = 48, 32
 LENS = {

@@ -22,14 +22,14 @@ from datasets_scripts.samples_scenes import LENS, SCENES, checkerboard, make_sce
 from datasets_scripts.samples_tracer import SampleArrays, SampleTracer, mirrored_sobol
 from datasets_scripts.traced_scene import Quad, plain_texture
 from datasets_scripts.truth_sampling import owen_scrambled, reversed_bits, scramble_seed
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, read_layer
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import over
-from mrbokeh.lens_file import read_lens
-from mrbokeh.light_field_samples_file import read_samples
+from mrbokeh.images.image_io import read_image, read_layer
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import over
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.stacks.light_field_samples_file import read_samples
+from mrbokeh.system.errors import InputError
 
 W, H = 48, 32
 STAGE = Stage(LENS, H / W)
@@ -364,7 +364,7 @@ def test_mistakes_are_told_in_a_sentence(tmp_path: Path) -> None:
 def test_the_shipped_samples_are_what_the_sampler_makes(name: str) -> None:
     """Up to rounding, which may turn a ray at the edge of a body to the other side."""
     folder = DATA / name
-    from mrbokeh.atomic_files import read_json
+    from mrbokeh.system.atomic_files import read_json
 
     meta = read_json(folder / "meta.json", "the description of a set of samples (meta.json)")
     plan = SamplesPlan(

@@ -21,15 +21,15 @@ from datasets_scripts.truth_shapes import SHAPE_NAMES, lens_shape
 from datasets_scripts.truth_sharp import sharp_layer
 from datasets_scripts.truth_tracer import Opening, Part, TruthTracer, lamp_flux
 from datasets_scripts.truth_tracer_choice import make_tracer
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import read_image, read_layer
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import over
-from mrbokeh.lens import Lens
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image, read_layer
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import over
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import scatter
+from mrbokeh.system.errors import InputError
 
 SIZE_PX = 96
 FOCAL_PX = 900.0

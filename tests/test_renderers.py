@@ -6,17 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.drawn_diameters import drawn_diameters_px
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import Layer, clear, opaque
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import Layer, clear, opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.drawn_diameters import drawn_diameters_px
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction
-from mrbokeh.renderers.low_rank_filter import LowRankFilter
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def test_an_even_field_stays_even_inside(renderer: Renderer) -> None:
 
 
 def drawn_radius_px(coc_px: float) -> float:
-    """Of the disc (see mrbokeh.drawn_diameters): 0.01 px smaller at 16."""
+    """Of the disc (see mrbokeh.optics.drawn_diameters): 0.01 px smaller at 16."""
     return 0.5 * float(drawn_diameters_px(np.full((1, 1), coc_px, np.float32), LENS.aperture)[0, 0])
 
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions, neutral_environment, solid_angles_sr
+from mrbokeh.system.errors import InputError
 
 
 def wgpu_rasterizer() -> SceneRenderer:

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.color import srgb_to_linear
-from mrbokeh.errors import InputError
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Scene, world_from_scene_placing
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf_loader import GltfAsset, load_glb
+from mrbokeh.system.errors import InputError
 
 OBJECTS = ("DepthOfFieldExample", "FlightHelmet", "Fox", "GolfBall", "alien", "cakeBirthday")
 CORNERS = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], np.float32)

@@ -12,8 +12,7 @@ import pytest
 
 pytest.importorskip("mitsuba", reason="Mitsuba is not installed: pip install 'mrbokeh[mitsuba]'")
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import (
     Environment,
     Light,
@@ -34,6 +33,7 @@ from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions, neutral_environment, solid_angles_sr
 from mrbokeh.scene.gltf_loader import load_glb
 from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
+from mrbokeh.system.errors import InputError, MissingExtraError
 from tests import test_scene_backends as laws
 
 SMALL = Camera(80, 48, (65.0, 64.0), (37.3, 25.7))

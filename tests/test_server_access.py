@@ -280,7 +280,7 @@ def test_the_oldest_guest_leaves_when_too_many_came() -> None:
 
 
 def test_a_taken_port_is_named() -> None:
-    from mrbokeh.errors import InputError
+    from mrbokeh.system.errors import InputError
     from viewfinder.server.app import serving_site
     from viewfinder.server.site import Site
 

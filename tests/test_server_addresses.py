@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.server.addresses import Interface, choose, interfaces, page_url, qr_text
 
 LOOPBACK = Interface("lo", "127.0.0.1")

@@ -9,7 +9,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from tests.made_viewfinder import MadeControls, in_time, made_viewfinder
 from viewfinder.server.control_messages import (
     Capture,

@@ -9,7 +9,7 @@ from pathlib import Path
 import aiohttp
 import pytest
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from tests.made_viewfinder import in_time, made_viewfinder
 from viewfinder.server.access import Access
 from viewfinder.server.origins import LOOPBACK_NAMES

@@ -17,9 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, read_layer, write_image
-from mrbokeh.picture_sources.choose import open_source
+from mrbokeh.images.image_io import read_image, read_layer, write_image
 from mrbokeh.shots.crew import Crew, OneProcess
 from mrbokeh.shots.frame_maker import FrameMaker, MakerRecipe
 from mrbokeh.shots.making import make_shot
@@ -29,7 +27,9 @@ from mrbokeh.shots.segment_task import SegmentTask, make_segment
 from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.video_target import VideoTarget
-from mrbokeh.video_io import VideoWriter, probe, read_frames
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter, probe, read_frames
+from mrbokeh.video.picture_sources.choose import open_source
 from tests.shot_makers import Brighter, wait_for
 
 INTRA = [

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
 from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_distortion import LensDistortion
-from mrbokeh.lens_file import write_lens
-from mrbokeh.motion import with_motion
-from mrbokeh.plate import Plate, plate_of
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.distortion import LensDistortion
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.motion import with_motion
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.scene.staging.filming import Filming
 from mrbokeh.shots.boxed_insertion import BoxedInsertion
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.frame_sources import DepthFiles, FocusPulled
@@ -28,7 +28,7 @@ from mrbokeh.shots.hooks import Description, LayerSource, Moment
 from mrbokeh.shots.kept import Kept
 from mrbokeh.shots.layer_sources import LayerFiles
 from mrbokeh.shots.scene_layers import SceneLayers
-from mrbokeh.staging.filming import Filming
+from mrbokeh.system.errors import InputError
 from tests.stage_scenes import ONE_CARD, camera, scene_file
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=8.0)

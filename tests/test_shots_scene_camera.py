@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.camera_track.formats import write_track
-from mrbokeh.camera_track.options import TrackOptions
-from mrbokeh.camera_track.track import CameraTrack
-from mrbokeh.camera_track.tracked_frame import TrackedFrame
 from mrbokeh.commands import composite, track, video
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_layer, write_image
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.image_io import read_layer, write_image
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.scene_camera import scene_track
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.formats import write_track
+from mrbokeh.tracking.camera_track.options import TrackOptions
+from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
 from tests.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
 
 SIZE = (WIDTH, HEIGHT)

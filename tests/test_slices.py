@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh._slices_numba import claim, share_out
-from mrbokeh.aperture import Aperture
-from mrbokeh.layer import Layer, clear
-from mrbokeh.layering import Layering, render_layers
-from mrbokeh.lens import Lens
-from mrbokeh.optics import ThroughAperture
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.layering._slices_numba import claim, share_out
+from mrbokeh.layering.layering import Layering, render_layers
+from mrbokeh.layering.psf_over_field import ThroughAperture
+from mrbokeh.layering.sheets import Pixels
+from mrbokeh.layering.slice_islands import islands
+from mrbokeh.layering.slice_sorting import Part, sorted_slices
+from mrbokeh.layering.slices import Slicing, composited
+from mrbokeh.layering.spreading import Frame, Spread, spread_light
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.sheets import Pixels
-from mrbokeh.slice_islands import islands
-from mrbokeh.slice_sorting import Part, sorted_slices
-from mrbokeh.slices import Slicing, composited
-from mrbokeh.spreading import Frame, Spread, spread_light
-from mrbokeh.workers import CallingThread
-from mrbokeh.zeroed_memory import ZeroedMemory
+from mrbokeh.system.workers import CallingThread
+from mrbokeh.system.zeroed_memory import ZeroedMemory
 
 SIZE, MARGIN = (40, 52), 7
 FRAME = Frame(SIZE[1] - 2 * MARGIN, SIZE[0] - 2 * MARGIN, -MARGIN, -MARGIN)
@@ -208,7 +208,7 @@ def test_a_spread_may_return_what_it_was_given() -> None:
 def test_slices_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit."""
     alone = composited(two_sheets(), slicing(DISC), by_depth=False)
-    for module in ("workers", "slices"):
+    for module in ("system.workers", "layering.slices"):
         monkeypatch.setattr(f"mrbokeh.{module}.cores", lambda: 5)
     with ThreadPoolExecutor(5) as pool:
         together = composited(two_sheets(), replace(slicing(DISC), pool=pool), by_depth=False)

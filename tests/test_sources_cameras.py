@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.video_color import linear_from_code
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.color import linear_from_code
 from viewfinder.frames import LensState
 from viewfinder.sources.newest_of import newest_of
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
@@ -146,7 +146,7 @@ def test_the_thread_ends_when_nobody_asks_any_more() -> None:
 SCRIPT = """
 import json, sys, threading, warnings
 warnings.simplefilter("error")
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.gphoto2_lens import lens_state
 

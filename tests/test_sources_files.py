@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mrbokeh.errors import InputError, MissingExtraError
-from mrbokeh.lens_matching.photo_facts import read_facts
-from mrbokeh.video_color import linear_from_code
-from mrbokeh.video_io import VideoWriter, probe
+from mrbokeh.lens_measuring.matching.photo_facts import read_facts
+from mrbokeh.system.errors import InputError, MissingExtraError
+from mrbokeh.video.clip import VideoWriter, probe
+from mrbokeh.video.color import linear_from_code
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.sources.base import FrameSource
 from viewfinder.sources.choose import open_source

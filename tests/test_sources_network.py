@@ -323,7 +323,7 @@ def test_a_recording_behind_a_url_plays_in_its_own_time(tmp_path: Path) -> None:
 
 def test_turned_and_untagged_pictures_are_upright() -> None:
     """What a stream says by its display matrix: a quarter turn, within a limit that counts for the upright picture."""
-    from mrbokeh.video_color import color_of
+    from mrbokeh.video.color import color_of
     from viewfinder.sources.received_frame import upright_bgr
     from viewfinder.sources.size_limit import SizeLimit
 
@@ -349,8 +349,8 @@ def test_turned_and_untagged_pictures_are_upright() -> None:
 
 
 def test_an_iphone_film_as_a_stream_stands_upright(shared_data: Path) -> None:
-    """A real film with a display matrix, over HTTP: the size of the upright picture, as mrbokeh.video_io has it."""
-    from mrbokeh.video_io import probe
+    """A real film with a display matrix, over HTTP: the size of the upright picture, as mrbokeh.video.clip has it."""
+    from mrbokeh.video.clip import probe
 
     clip = shared_data / "video" / "iphone_xr_chart.mov"
     info, data = probe(clip), clip.read_bytes()

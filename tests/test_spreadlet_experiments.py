@@ -17,13 +17,13 @@ from datasets_scripts.psf_corpus import Corpus, alike, around, is_line, likeness
 from datasets_scripts.psf_quad_tree import quad_tree, quad_tree_points
 from datasets_scripts.spreadlet_analysis import analyse
 from datasets_scripts.spreadlet_tables import make_tables
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, opaque
-from mrbokeh.lens import Lens
-from mrbokeh.psf_bank import Axis, PsfBank
-from mrbokeh.renderers._laplacian_tables import Points, joined_points, taps_of
-from mrbokeh.spreadlets import whole_laplacian
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf_bank import Axis, PsfBank
+from mrbokeh.renderers.kernels.laplacian_tables import Points, joined_points, taps_of
+from mrbokeh.renderers.kernels.spreadlets import whole_laplacian
+from mrbokeh.system.errors import InputError
 
 DIAMETERS_PX = (3.0, 9.0, 30.0)
 KERNELS = [Aperture.disc().rasterize(size).kernel for size in DIAMETERS_PX]

@@ -4,13 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh._spreadlets_numba import cell_sums, nearest, solve, throw_darts
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.laplacian_integration import integrate
-from mrbokeh.spreadlet_values import biharmonic_table, fitted_values, potential_of, turned
-from mrbokeh.spreadlets import Sparsification, Spreadlet, Spreadlets, outline_px, sparsify, whole_laplacian
-from mrbokeh.spreadlets_file import fingerprint, read_spreadlets, write_spreadlets
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.kernels._spreadlets_numba import cell_sums, nearest, solve, throw_darts
+from mrbokeh.renderers.kernels.laplacian_integration import integrate
+from mrbokeh.renderers.kernels.spreadlet_values import biharmonic_table, fitted_values, potential_of, turned
+from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, Spreadlets, outline_px, sparsify, whole_laplacian
+from mrbokeh.renderers.kernels.spreadlets_file import fingerprint, read_spreadlets, write_spreadlets
+from mrbokeh.system.errors import InputError
 
 QUICK = Sparsification(annealing_steps=20)
 KERNEL = Aperture.disc().rasterize(40.0).kernel

@@ -7,16 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.layer import Layer
-from mrbokeh.overlay import Overlay
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_to_json
 from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.staging.picture_box import box_around
-from mrbokeh.staging.scene_description import RealThings
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.scene.staging.picture_box import box_around
+from mrbokeh.scene.staging.scene_description import RealThings
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.upright import upright_camera
 from tests.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
 from viewfinder.stage.drawn_layer import Drawing, DrawRequest, draw
 from viewfinder.stage.layer_depth import LayerDepth

@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.image_io import read_linear
+from mrbokeh.images.image_io import read_linear
 from mrbokeh.scene import split_sun
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import Environment
 from mrbokeh.scene.rigid_motion import rigid_motion
-from mrbokeh.staging.assets import Assets
-from mrbokeh.staging.picture_box import drawn_points_m
-from mrbokeh.staging.scene_description import Lighting, Sun
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.scene.staging.assets import Assets
+from mrbokeh.scene.staging.picture_box import drawn_points_m
+from mrbokeh.scene.staging.scene_description import Lighting, Sun
+from mrbokeh.tracking.upright import upright_camera
 from tests.stage_scenes import LENS, ONE_CARD, brushes, camera, scene_file, staged
 from viewfinder.stage.drawn_layer import DrawRequest, draw, sharp_layers
 from viewfinder.stage.stage_setup import SetupLoader, live_backend

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.level_plane import level_plane_dioptres
-from mrbokeh.overlay import code_tables
-from mrbokeh.staging.upright import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
+from mrbokeh.compositing.overlay import code_tables
+from mrbokeh.optics.level_plane import level_plane_dioptres
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
 from tests.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
 from viewfinder.stage.drawn_layer import DrawRequest, draw
 from viewfinder.stage.occlusion import Occlusion, RealDepth

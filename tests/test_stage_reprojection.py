@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.overlay import Overlay
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.optics.camera import Camera
 from tests.stage_scenes import looking
 from viewfinder.stage.layer_depth import GRID_PX, filled_outwards
 from viewfinder.stage.reprojection import NODE_PX, MovableLayer

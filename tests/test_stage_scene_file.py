@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.staging.assets import Assets
-from mrbokeh.staging.scene_file import read_scene_file
-from mrbokeh.staging.staged_scene import StagedScene
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.scene.staging.assets import Assets
+from mrbokeh.scene.staging.scene_file import read_scene_file
+from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.system.errors import InputError
 from tests.stage_scenes import ONE_CARD, card, described, scene_file, staged
 from viewfinder.stage.scene_watch import SceneWatch
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.shadow_layer import shadow_layer
-from mrbokeh.staging.filming import FilmedLayers, Filming
-from mrbokeh.staging.one_object import OneObject
-from mrbokeh.staging.picture_box import shadow_box
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.scene.staging.filming import FilmedLayers, Filming
+from mrbokeh.scene.staging.one_object import OneObject
+from mrbokeh.scene.staging.picture_box import shadow_box
+from mrbokeh.tracking.upright import upright_camera
 
 ALIEN = Path(__file__).resolve().parent.parent / "mrbokeh" / "demo_data" / "objects" / "alien.glb"
 CAMERA = Camera(160, 112, (220.0, 220.0), (80.0, 56.0))

@@ -5,8 +5,8 @@ import threading
 import numpy as np
 import pytest
 
-from mrbokeh.overlay import Overlay, code_tables
-from mrbokeh.video_color import code_from_linear
+from mrbokeh.compositing.overlay import Overlay, code_tables
+from mrbokeh.video.color import code_from_linear
 from tests.streaming_viewers import output, streaming
 from tests.test_streaming_fan_out import ignore, taken, until
 from viewfinder.streaming.alpha_stream import AlphaStream, color_over_alpha

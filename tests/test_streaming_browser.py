@@ -11,8 +11,8 @@ import pytest
 from aiohttp import web
 
 from datasets_scripts.headless_chromium import CHROMIUM, chromium_page
-from mrbokeh.overlay import Overlay
-from mrbokeh.video_color import code_from_linear
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.video.color import code_from_linear
 from tests.streaming_viewers import BARS, Feed, bars, in_time, output, streaming
 from viewfinder.streaming.alpha_stream import AlphaStream, obs_routes
 from viewfinder.streaming.whep import Whep

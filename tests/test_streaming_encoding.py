@@ -7,8 +7,8 @@ import av
 import numpy as np
 import pytest
 
-from mrbokeh.video_color import BT709, LIMITED, VideoColor
-from mrbokeh.video_frames import display_bgr
+from mrbokeh.video.color import BT709, LIMITED, VideoColor
+from mrbokeh.video.frames import display_bgr
 from tests.streaming_viewers import BARS, HEIGHT, WIDTH, bar_centres, bars, noise
 from viewfinder.streaming.encoder import StreamQuality, VideoEncoder
 from viewfinder.streaming.h264 import h264_encoder

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.video_color import code_from_linear
-from mrbokeh.video_io import probe, read_frames
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import probe, read_frames
+from mrbokeh.video.color import code_from_linear
 from tests.streaming_viewers import BARS, HEIGHT, WIDTH, bar_centres, bars, output
 from viewfinder.frames import OutputFrame
 from viewfinder.streaming.recording import Recorder, Recording, recording_path

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mrbokeh.video_color import color_of
-from mrbokeh.video_frames import display_bgr
+from mrbokeh.video.color import color_of
+from mrbokeh.video.frames import display_bgr
 from tests.streaming_viewers import HEIGHT, WIDTH, Feed, comes_true, in_time, streaming, watching
 from tests.whep_viewers import Line, whep_of
 

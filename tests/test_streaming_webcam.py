@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_layer
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.errors import InputError
 from tests.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, write_plate
 from viewfinder.commands.serve import opened as serving
 from viewfinder.commands.serve_options import ServeOptions

@@ -8,8 +8,8 @@ import aiohttp
 import numpy as np
 import pytest
 
-from mrbokeh.video_color import color_of
-from mrbokeh.video_frames import display_bgr
+from mrbokeh.video.color import color_of
+from mrbokeh.video.frames import display_bgr
 from tests.streaming_viewers import BARS, HEIGHT, WIDTH, Feed, Viewer, bar_centres, comes_true, in_time, serving, streaming, watching
 from tests.whep_viewers import PATIENT, SDP, whep_of
 from viewfinder.streaming.whep import Whep

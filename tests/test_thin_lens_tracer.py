@@ -7,10 +7,10 @@ import pytest
 
 from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
 from datasets_scripts.traced_scene import DiscLight, Scene, Sphere, emissive_quad, plain_texture
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 SIZE_PX = 96
 # A crop of 0.48 mm with 96 px: 90 px of blur per dioptre, so that a small picture shows large blur.

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from mrbokeh.exif_orientation import stored_orientation
-from mrbokeh.picture_codec import stored_pixels, stored_rgb, write_stored
-from mrbokeh.tiff_tags import tiff_tags
+from mrbokeh.images.exif_orientation import stored_orientation
+from mrbokeh.images.picture_codec import stored_pixels, stored_rgb, write_stored
+from mrbokeh.images.tiff_tags import tiff_tags
 
 SHADES = (np.uint8, np.uint16, np.float32)
 

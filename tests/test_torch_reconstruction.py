@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.image_metrics import psnr
-from mrbokeh.lens_file import read_lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.light_field_samples_file import read_samples
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.renderers.layered_reconstruction._filter_numba import extents as extents_compiled
 from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_axes as sheared_axes_compiled
@@ -25,16 +23,25 @@ from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_slope
 from mrbokeh.renderers.layered_reconstruction._filter_numba import slope_distance as slope_distance_compiled
 from mrbokeh.renderers.layered_reconstruction._samples_numba import morton as morton_compiled
 from mrbokeh.renderers.layered_reconstruction._statistics_numba import seeded, xorshift
+from mrbokeh.stacks.light_field_samples_file import read_samples
+from mrbokeh.system.errors import InputError
 from tests.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth
 
 torch = pytest.importorskip("torch")
 
-from mrbokeh.renderers.torch_reconstruction import DeviceSamples, TorchReconstruction, _picture  # noqa: E402
-from mrbokeh.renderers.torch_reconstruction._filter import Slopes, extents, features, sheared_axes, sheared_slopes, slope_distance  # noqa: E402
-from mrbokeh.renderers.torch_reconstruction._light import TileLight, morton, tile_light  # noqa: E402
-from mrbokeh.renderers.torch_reconstruction._screen import transform_size  # noqa: E402
-from mrbokeh.renderers.torch_reconstruction._statistics import chance, chosen_samples, tile_rows  # noqa: E402
-from mrbokeh.renderers.torch_reconstruction._windows import PupilTables, line_kernels, pupil_kernels  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction, _picture  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._filter import (  # noqa: E402
+    Slopes,
+    extents,
+    features,
+    sheared_axes,
+    sheared_slopes,
+    slope_distance,
+)
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight, morton, tile_light  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._screen import transform_size  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import chance, chosen_samples, tile_rows  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._windows import PupilTables, line_kernels, pupil_kernels  # noqa: E402
 
 CPU = torch.device("cpu")
 SIZE_PX = 45
@@ -325,9 +332,9 @@ def test_without_torch_it_says_what_to_install() -> None:
     code = """
 import sys
 sys.modules["torch"] = None
-from mrbokeh.errors import MissingExtraError
+from mrbokeh.system.errors import MissingExtraError
 try:
-    import mrbokeh.renderers.torch_reconstruction
+    import mrbokeh.renderers.layered_reconstruction.torch_reconstruction
 except MissingExtraError as error:
     assert "mrbokeh[train]" in str(error)
     print("said so")
@@ -343,9 +350,9 @@ def test_the_kernels_for_gpus_do_what_torch_does() -> None:
     pytest.importorskip("triton")
     code = """
 import torch
-from mrbokeh.renderers.torch_reconstruction import TorchReconstruction, _merging, _reprojection
-from mrbokeh.renderers.torch_reconstruction._reprojection_triton import splat_by_kernel
-from mrbokeh.renderers.torch_reconstruction._sweep_triton import sweep_by_kernel
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _merging, _reprojection
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._reprojection_triton import splat_by_kernel
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._sweep_triton import sweep_by_kernel
 from tests.sampled_planes import LENS, fence_scene, sample_planes
 
 torch.set_num_threads(1)
@@ -380,8 +387,8 @@ def test_the_kernels_compile_for_gpus() -> None:
 from triton import compile
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from mrbokeh.renderers.torch_reconstruction._reprojection_triton import _splat
-from mrbokeh.renderers.torch_reconstruction._sweep_triton import _sweep
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._reprojection_triton import _splat
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._sweep_triton import _sweep
 
 def ptx(kernel, types, sizes, **options):
     signature = {name: "constexpr" if name in sizes else types.get(name, "*i64") for name in kernel.arg_names}

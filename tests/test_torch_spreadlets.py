@@ -13,29 +13,29 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.laplacian_integration import integrate as integrate_compiled
-from mrbokeh.laplacian_integration import integrate_plainly
-from mrbokeh.psf_bank import Axis, PsfBank
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.psf_models.build import build_bank
 from mrbokeh.psf_models.combined import Combined
-from mrbokeh.renderers._laplacian_bank import BankTables, Place
-from mrbokeh.renderers._laplacian_layout import window_of
-from mrbokeh.renderers._laplacian_sums import add_light, splat_plainly
-from mrbokeh.renderers._laplacian_tables import Points, by_rows, joined_points, taps_of
-from mrbokeh.renderers._laplacian_tables import stands_out as stands_out_compiled
-from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.spreadlets import UNRELAXED, sparsify, whole_laplacian
+from mrbokeh.renderers.bank.tables import BankTables, Place
+from mrbokeh.renderers.kernels.laplacian_integration import integrate as integrate_compiled
+from mrbokeh.renderers.kernels.laplacian_integration import integrate_plainly
+from mrbokeh.renderers.kernels.laplacian_tables import Points, by_rows, joined_points, taps_of
+from mrbokeh.renderers.kernels.laplacian_tables import stands_out as stands_out_compiled
+from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
+from mrbokeh.renderers.spreadlets.layout import window_of
+from mrbokeh.renderers.spreadlets.sums import add_light, splat_plainly
+from mrbokeh.system.errors import InputError
 
 torch = pytest.importorskip("torch")
 
-from mrbokeh.renderers.torch_spreadlets import DeviceLayer, TorchSpreadlets  # noqa: E402
-from mrbokeh.renderers.torch_spreadlets._cells import BankCells, stands_out  # noqa: E402
-from mrbokeh.renderers.torch_spreadlets._integration import integrate  # noqa: E402
-from mrbokeh.renderers.torch_spreadlets._points import table_of  # noqa: E402
-from mrbokeh.renderers.torch_spreadlets._splat import splat, splat_in_chunks  # noqa: E402
-from mrbokeh.renderers.torch_spreadlets._sums import add_light_on  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets import DeviceLayer, TorchSpreadlets  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets._cells import BankCells, stands_out  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets._integration import integrate  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets._points import table_of  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets._splat import splat, splat_in_chunks  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import add_light_on  # noqa: E402
 
 CPU = torch.device("cpu")
 SIZE = (48, 54)
@@ -280,12 +280,12 @@ def test_mistakes() -> None:
 def test_without_torch_the_renderer_is_there_and_the_device_is_not() -> None:
     code = """
 import sys
-import mrbokeh.renderers.laplacian_spreadlets
+import mrbokeh.renderers.spreadlets.laplacian_spreadlets
 assert "torch" not in sys.modules
 sys.modules["torch"] = None
-from mrbokeh.errors import MissingExtraError
+from mrbokeh.system.errors import MissingExtraError
 try:
-    import mrbokeh.renderers.torch_spreadlets
+    import mrbokeh.renderers.spreadlets.torch_spreadlets
 except MissingExtraError as error:
     assert "mrbokeh[train]" in str(error)
     print("said so")
@@ -301,12 +301,12 @@ def test_the_kernel_for_gpus_gives_the_same_bits() -> None:
 from dataclasses import replace
 import numpy as np
 import torch
-from mrbokeh.aperture import Aperture
-from mrbokeh.renderers._laplacian_layout import window_of
-from mrbokeh.renderers._laplacian_tables import by_rows, joined_points, taps_of
-from mrbokeh.renderers.torch_spreadlets._points import table_of
-from mrbokeh.renderers.torch_spreadlets._splat import splat_in_chunks
-from mrbokeh.renderers.torch_spreadlets._splat_triton import _SEGMENT, splat_by_kernel
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.spreadlets.layout import window_of
+from mrbokeh.renderers.kernels.laplacian_tables import by_rows, joined_points, taps_of
+from mrbokeh.renderers.spreadlets.torch_spreadlets._points import table_of
+from mrbokeh.renderers.spreadlets.torch_spreadlets._splat import splat_in_chunks
+from mrbokeh.renderers.spreadlets.torch_spreadlets._splat_triton import _SEGMENT, splat_by_kernel
 
 rng = np.random.default_rng(13)
 points = joined_points([by_rows(taps_of(Aperture.disc().rasterize(size).kernel)) for size in (3.0, 14.0)])
@@ -332,7 +332,7 @@ def test_the_kernel_compiles_for_gpus_with_atomic_whole_numbers() -> None:
 from triton import compile
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from mrbokeh.renderers.torch_spreadlets._splat_triton import _splat
+from mrbokeh.renderers.spreadlets.torch_spreadlets._splat_triton import _splat
 sizes = {"CHANNELS": 6, "COLUMNS": 3, "WIDE": 8, "PIXELS": 64, "SEGMENT": 128}
 types = {"sums": "*i64", "values": "*fp32", "weights": "*fp64", **dict.fromkeys(("pixels", "width", "window_width", "corner"), "i32")}
 signature = {name: "constexpr" if name in sizes else types.get(name, "*i32") for name in _splat.arg_names}

@@ -15,10 +15,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.commands.lens import app
-from mrbokeh.errors import InputError, MissingExtraError
-from mrbokeh.psf_bank_file import cell_path, read_bank
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.psf_bank_file import cell_path, read_bank
 from mrbokeh.psf_models import _volume_numba as compiled
 from mrbokeh.psf_models.base import PsfModel
 from mrbokeh.psf_models.build import bank_head, build_bank
@@ -29,6 +28,7 @@ from mrbokeh.psf_models.quasi_random import sobol_blocks
 from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.psf_models.stylized import Stylized
 from mrbokeh.psf_models.volume import Volume
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 torch = pytest.importorskip("torch")
 

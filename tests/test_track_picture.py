@@ -9,10 +9,10 @@ import typer
 from typer.testing import CliRunner
 
 from datasets_scripts.track_picture import axes_of, main, with_axes
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.formats import write_track
-from mrbokeh.camera_track.track import fixed_track
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.camera_track.formats import write_track
+from mrbokeh.tracking.camera_track.track import fixed_track
+from mrbokeh.video.clip import VideoWriter
 
 CAMERA = Camera(160, 112, (100.0, 100.0), (80.5, 56.5))
 

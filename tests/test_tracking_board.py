@@ -11,15 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from datasets_scripts.hand_held import HandHeld
 from datasets_scripts.sheet_tracer import Sheet, pack_table, trace_sheet
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.board_calibration import calibrated
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.board_file import board_from_json, board_to_json, read_board, write_board
-from mrbokeh.charuco.detector import CharucoDetector, Corners
-from mrbokeh.charuco.drawing import black_rectangles_mm
-from mrbokeh.color import display_rgb8
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.images.color import display_rgb8
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.board_calibration import calibrated
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_file import board_from_json, board_to_json, read_board, write_board
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
+from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
 from tests.traced_board_clip import BOARD
 from viewfinder.tracking.board_pdf import MARGIN_MM, page_for, write_board_pdf
 from viewfinder.tracking.board_planner import View, plan_board

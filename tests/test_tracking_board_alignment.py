@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board_alignment import AlignedDetector, aligned_corners
-from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
 from tests.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.fixed_pose import read_fixed_pose
 

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.corner_flow import FrameHistory, flow
-from mrbokeh.charuco.detector import CharucoDetector, Corners, Grey
-from mrbokeh.video_io import read_display_frames
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.corner_flow import FrameHistory, flow
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
+from mrbokeh.video.clip import read_display_frames
 from tests.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose

@@ -9,12 +9,12 @@ from datasets_scripts._sheet_tracer_numba import is_black
 from datasets_scripts.charuco_clip import BoardClip, read_clip_cameras, read_sheet, write_clip
 from datasets_scripts.hand_held import HandHeld
 from datasets_scripts.sheet_tracer import Sheet, pack_table, trace_sheet, with_noise
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board_file import write_board
-from mrbokeh.charuco.drawing import black_rectangles_mm
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.video_io import read_frames
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board_file import write_board
+from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
+from mrbokeh.video.clip import read_frames
 from tests.traced_board_clip import BOARD
 
 ONE_EDGE = Sheet(np.array([[0.0, -500.0, 500.0, 1000.0]]), margin_mm=600.0, paper=1.0, ink=0.0)

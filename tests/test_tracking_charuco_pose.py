@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.pose_branches import pose_from_plane
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.charuco.pose_branches import pose_from_plane
 from tests.traced_board_clip import BOARD
 
 CAMERA = Camera(640, 360, (590.0, 590.0), (320.0, 180.0))

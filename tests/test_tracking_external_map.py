@@ -11,9 +11,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.world_axes import inverted, rigid
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
 from tests.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.detection_thread import ImmediateDetections

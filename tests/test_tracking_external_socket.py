@@ -8,8 +8,8 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 from viewfinder.focus.tracked_lens_focus import TrackedLensFocus
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, write_freed

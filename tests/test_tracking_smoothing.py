@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.one_euro import OneEuroPose

@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 from datasets_scripts.charuco_clip import BoardClip
 from datasets_scripts.hand_held import HandHeld
 from datasets_scripts.sheet_tracer import Sheet
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.board_track import poses_of
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.board_alignment import AlignedDetector
-from mrbokeh.charuco.detector import Corners
-from mrbokeh.charuco.drawing import black_rectangles_mm
-from mrbokeh.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot, pose_from_plane
-from mrbokeh.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.tracking.camera_track.board_track import poses_of
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_alignment import AlignedDetector
+from mrbokeh.tracking.charuco.detector import Corners
+from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
+from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot, pose_from_plane
+from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
 from tests.traced_board_clip import BOARD, camera_frames
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker

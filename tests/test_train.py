@@ -9,12 +9,12 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.image_io import write_image
-from mrbokeh.image_metrics import psnr
-from mrbokeh.lens import Lens
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 from training import train
 from training.batches import draw_batch
 from training.blur_functions import blur_of

@@ -11,12 +11,12 @@ import torch
 from typer.testing import CliRunner
 
 from capture.dataset.split import slices_of_a_single_stack
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.focal_stack_dataset import slices_to_hold_out
-from mrbokeh.image_io import write_image
-from mrbokeh.image_metrics import psnr
-from mrbokeh.renderers._onnx_facts import facts_from_json
+from mrbokeh.images.image_io import write_image
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.renderers.network.facts import facts_from_json
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack_dataset import slices_to_hold_out
+from mrbokeh.system.errors import InputError
 from tests.test_train import DEMO_LIKE, LENS
 from training import held_out, train
 from training.blur_functions import blur_of

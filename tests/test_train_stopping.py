@@ -16,7 +16,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from tests.test_train import DEMO_LIKE, make_wall
 from training import train
 from training.checkpoint import Progress

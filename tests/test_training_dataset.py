@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 
 from capture.dataset.writer import DatasetPlan, write_dataset
 from capture.report.exclusion_masks import REASONS, write_exclusions
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.focal_stack_dataset import read_focal_stack_dataset
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
+from mrbokeh.system.errors import InputError
 from tests import traced_focal_stack
 from training import train
 from training.cli import app

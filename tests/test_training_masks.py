@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.camera_rgb import write_camera_rgb, write_masks
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from training.dataset import read_pair
 from training.weights import WHERE_TRUTH_IS_KNOWN
 

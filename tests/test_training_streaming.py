@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from mrbokeh.camera_rgb import write_camera_rgb, write_masks
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.field_position import field_positions
-from mrbokeh.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
 from training.batches import Batch, draw_batch, draw_share, network_inputs, stack_pairs
 from training.crops import Drawing
 from training.data_facts import gather_facts

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.color import linear_to_srgb
 from mrbokeh.commands.transfer import app
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import read_focal_stack
-from mrbokeh.image_io import read_depth, read_image, write_image
-from mrbokeh.image_metrics import psnr
-from mrbokeh.layer import opaque
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.photograph import Photograph
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import read_depth, read_image, write_image
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.refocus.transferring import seen_like, with_recovered_highlights
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.transferring import seen_like, with_recovered_highlights
-from mrbokeh.video_io import read_frames
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.stacks.photograph import Photograph
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import read_frames
 
 LENS = Lens(50.0, 2.0, 1.0, 9.0)
 SIZE = (48, 72)
@@ -149,7 +149,7 @@ def test_what_is_missing_or_odd_is_one_sentence(files: dict[str, Path]) -> None:
 
 def test_a_phones_photograph_brings_its_depth_its_original_and_its_focus(files: dict[str, Path], shared_data: Path) -> None:
     """The face of the file is blurred by the phone; what is blurred here is the sharp original, small enough for a quick test."""
-    from mrbokeh.depth_sources.phone_depth import read_phone_photo
+    from mrbokeh.depth.phone_depth import read_phone_photo
 
     path = shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg"
     phone = read_phone_photo(path)

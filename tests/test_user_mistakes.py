@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from mrbokeh import cli
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.picture_checks.findings import CheckReport
-from mrbokeh.picture_checks.light_checks import check_numbers
-from mrbokeh.picture_checks.shots import open_shot
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.checks.findings import CheckReport
+from mrbokeh.checks.light_checks import check_numbers
+from mrbokeh.checks.shots import open_shot
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter
 
 RNG = np.random.default_rng(0)
 

@@ -10,28 +10,28 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import mrbokeh.picture_sources.image_sequence as image_sequence
-import mrbokeh.picture_sources.video_source as video_source
-from mrbokeh.color_management import NamedSpace
+import mrbokeh.video.picture_sources.image_sequence as image_sequence
+import mrbokeh.video.picture_sources.video_source as video_source
 from mrbokeh.commands.video import app
-from mrbokeh.exr_io import read_exr
-from mrbokeh.finished_picture import write_finished
-from mrbokeh.image_io import read_image, read_layer, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.picture_sources.base import PictureSource
-from mrbokeh.picture_sources.choose import open_source
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.finished_picture import write_finished
+from mrbokeh.images.image_io import read_image, read_layer, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.crew import OneProcess
 from mrbokeh.shots.making import make_shot
 from mrbokeh.shots.process_crew import ProcessCrew
 from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot
 from mrbokeh.shots.video_target import VideoTarget
-from mrbokeh.video_alpha import has_alpha, stored_alpha
-from mrbokeh.video_color import color_of
-from mrbokeh.video_frames import linear_rgb
-from mrbokeh.video_io import VideoWriter, read_frames
+from mrbokeh.video.alpha import has_alpha, stored_alpha
+from mrbokeh.video.clip import VideoWriter, read_frames
+from mrbokeh.video.color import color_of
+from mrbokeh.video.frames import linear_rgb
+from mrbokeh.video.picture_sources.base import PictureSource
+from mrbokeh.video.picture_sources.choose import open_source
 from tests.shot_makers import Brighter
 from tests.video_files import turned_clip
 

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.camera_track.focus_pull import parse_focus_keys
 from mrbokeh.commands.video import app, parse_frames
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.plate import plate_of
+from mrbokeh.compositing.plate import plate_of
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.video_io import VideoWriter, read_frames
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys
+from mrbokeh.video.clip import VideoWriter, read_frames
 from tests.shot_makers import wait_for
 from tests.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
 from tests.test_exr_layers_cryptomatte import beauty, crypto_channels, header
@@ -173,7 +173,7 @@ def test_ctrl_c_keeps_finished_segments_and_the_same_command_goes_on(clip: Path,
 
 
 def test_the_focus_is_pulled(clip: Path, settings: list[str], tmp_path: Path) -> None:
-    """Each frame is blurred as by the lens at its own focus; between keys focus goes smoothly in dioptres (mrbokeh.camera_track)."""
+    """Each frame is blurred as by the lens at its own focus; between keys focus goes smoothly in dioptres (tracking.camera_track)."""
     out = tmp_path / "out.mkv"
     run(clip, *settings, "--focus-pull", "0:2.0,11:1.0", "--renderer", "scatter", "--out", out)
     pull, layer = parse_focus_keys("0:2.0,11:1.0", "smooth"), read_layer(tmp_path / "layer.exr")

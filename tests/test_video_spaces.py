@@ -9,14 +9,14 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.commands.video import app
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.exr_primaries import AP1
-from mrbokeh.image_io import read_image, read_layer, write_image, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
-from mrbokeh.video_io import VideoWriter, read_frames
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_primaries import AP1
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter, read_frames
 
 pytest.importorskip("PyOpenColorIO")
 

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import clear
-from mrbokeh.overlay import Overlay, code_tables
+from mrbokeh.compositing.overlay import Overlay, code_tables
+from mrbokeh.images.layer import clear
+from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.video_color import code_from_linear, linear_from_code
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.color import code_from_linear, linear_from_code
 from tests.layer_viewfinder import (
     HEIGHT,
     LENS,

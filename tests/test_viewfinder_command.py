@@ -14,9 +14,9 @@ import aiohttp
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_layer
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.errors import InputError
 from tests.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, in_time, watching, write_plate
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.exact_size import ExactSize

@@ -26,16 +26,16 @@ import typer
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from mrbokeh.atomic_files import write_json
-from mrbokeh.camera_file import camera_to_json
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.board_file import read_board, write_board
 from mrbokeh.cli import SUB_COMMANDS
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import write_layer
-from mrbokeh.layer import clear
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import write_lens
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.images.layer import clear
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_file import read_board, write_board
 from tests.phone_on_camera import PHONE
 from tests.thin_lens_board import Shot, camera_over, display_bgr, photograph
 from viewfinder.commands.board import board_command

@@ -16,12 +16,12 @@ import aiohttp
 import numpy as np
 import pytest
 
-from mrbokeh.capture_bundle import read_bundle
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.plate import bundle_plate
+from mrbokeh.compositing.plate import bundle_plate
 from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.video_color import code_from_linear
-from mrbokeh.video_io import read_display_frames
+from mrbokeh.stacks.capture_bundle import read_bundle
+from mrbokeh.video.clip import read_display_frames
+from mrbokeh.video.color import code_from_linear
 from tests.live_clip import (
     ClipCamera,
     LiveClip,

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.overlay import Overlay
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system.errors import InputError
 from tests.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square
 from tests.stage_scenes import LENS as SCENE_LENS
 from tests.stage_scenes import ONE_CARD, backend, camera, scene_file

@@ -10,7 +10,7 @@ import aiohttp
 import numpy as np
 import pytest
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from tests.layer_viewfinder import (
     HEIGHT,
     WIDTH,

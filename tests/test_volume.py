@@ -6,9 +6,9 @@ from numpy.testing import assert_allclose
 from scipy.integrate import dblquad, quad
 from scipy.stats import kstest
 
-from mrbokeh.errors import InputError
 from mrbokeh.psf_models import _volume_numba as compiled
 from mrbokeh.psf_models.volume import Volume
+from mrbokeh.system.errors import InputError
 
 RAYS = 1 << 17
 

@@ -8,12 +8,12 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from capture.stacks.ingest import ingest
-from mrbokeh.color import srgb_to_linear
 from mrbokeh.commands.composite import app
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_image, write_image, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.photograph import read_photograph
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.images.image_io import read_image, write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.stacks.photograph import read_photograph
+from mrbokeh.system.errors import InputError
 from tests.made_photographs import only_stack, sources
 
 CODES = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Scene, Texture, matte, rectangle, sphere, sun
 from mrbokeh.scene.choose import described_device, has_graphics_card, scene_renderer
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions
+from mrbokeh.system.errors import InputError
 
 pytest.importorskip("wgpu", reason="wgpu is not installed: pip install 'mrbokeh[viewfinder]'")
 

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.world_axes import inverted, rigid
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
 
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 400, 300, 380.0
 _TEXTURE_PX = 1024

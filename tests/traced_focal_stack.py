@@ -10,11 +10,11 @@ from datasets_scripts.desk_scene import desk_camera
 from datasets_scripts.procedural_textures import bricks, checks, mottled, page_of_text
 from datasets_scripts.thin_lens_tracer import trace, trace_pinhole
 from datasets_scripts.traced_scene import Quad, Scene, emissive_quad
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.lens import Lens
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 
 WIDTH_PX, HEIGHT_PX = 160, 107
 SLICES = 6

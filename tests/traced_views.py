@@ -10,12 +10,12 @@ import numpy as np
 from datasets_scripts.procedural_textures import mottled, page_of_text, spots
 from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
 from datasets_scripts.traced_scene import Quad, Scene, Vector, emissive_quad
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.image_io import write_image
-from mrbokeh.lens import MM_PER_M, Lens
+from mrbokeh.images.image_io import write_image
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import MM_PER_M, Lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 
 WIDTH_PX, HEIGHT_PX = 400, 280
 GRID = CharucoGrid((6, 5), 50.0, 37.0)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from mrbokeh.renderers.onnx_network import OnnxNetwork
+from mrbokeh.renderers.network.onnx_network import OnnxNetwork
 from training.batches import network_inputs
 from training.dataset import Pair
 from training.run_folder import load_run

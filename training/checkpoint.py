@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.errors import InputError
 from training.curve import CurvePoint
 from training.learner import Learner
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 
 SIGMA_STEP_PX = 0.25
 
@@ -69,7 +69,7 @@ def scatter_reference(
 
     The picture is continued beyond its border, from where light enters it.
     """
-    from mrbokeh.layer import opaque
+    from mrbokeh.images.layer import opaque
     from mrbokeh.renderers.scatter_reference import blur_layer
 
     margin = int(np.ceil(np.abs(coc_px).max(initial=0.0) / 2.0)) + 1

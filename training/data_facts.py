@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.focal_stack_dataset import FocalStackDataset
-from mrbokeh.lens import Lens
-from mrbokeh.progress import track
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 from training.dataset import PairSet
 from training.stacks import stack_name
 

@@ -5,8 +5,8 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.workers import cores
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.workers import cores
 from training.pairs import Pair, read_pair
 from training.read_ahead import ReadAhead, Window
 from training.slice_rows import StackRows, read_stack_rows, slice_size_px

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.network_settings import NetworkSettings
 
 PAPER_BLOCKS, PAPER_HIDDEN = 9, 128

@@ -15,7 +15,7 @@ from typing import TypeVar
 import torch
 from torch import distributed
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 # Others wait while the first process reads the data, looks at held-out slices or writes.
 _PATIENCE = timedelta(hours=2)
@@ -105,6 +105,6 @@ def _own_device(name: str, local: int, local_count: int) -> torch.device:
 
 
 def _device(name: str) -> torch.device:
-    from mrbokeh.torch_device import device_named
+    from mrbokeh.system.torch_device import device_named
 
     return device_named(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)

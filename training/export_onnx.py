@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mrbokeh.atomic_files import atomic_path, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.field_position import field_positions
-from mrbokeh.renderers.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
+from mrbokeh.optics.field_position import field_positions
+from mrbokeh.renderers.network.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
+from mrbokeh.system.atomic_files import atomic_path, write_json
+from mrbokeh.system.errors import InputError
 from training.network import BlurNetwork
 from training.network_settings import NetworkSettings
 from training.run_folder import RunFacts, load_run

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.system.errors import InputError
 from training._exr_blocks_numba import without_prediction
 
 Rows = Float32[np.ndarray, "rows width"]

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 
 FLAT_SHARE, FLAT_SHARE_IN_FOCUS = 0.05, 0.005  # of a fresh kernel, so that every one of its pixels can learn
 # Several bases of a bin must begin apart, or they would all learn the same: discs clipped from different sides, as cat-eyes are, on

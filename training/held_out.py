@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from mrbokeh.contact_sheet import SheetRow
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.images.contact_sheet import SheetRow
+from mrbokeh.stacks.focal_stack import FocalStack
 from training.batches import Batch, stack_pairs
 from training.dataset import Pair, PairSet
 from training.sheets import small_picture

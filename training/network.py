@@ -11,8 +11,8 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack_dataset import network_blocks
+from mrbokeh.stacks.focal_stack_dataset import network_blocks
+from mrbokeh.system.errors import InputError
 from training.lens_scale import LensRanges, LensScale
 from training.network_settings import NetworkSettings
 from training.tiling import TileGrid, assemble, split

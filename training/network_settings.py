@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.network_settings import NetworkSettings
 
 PAPER_BLOCKS = 3  # "a few" Gaussians; the number is ours

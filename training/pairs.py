@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from mrbokeh.field_position import field_positions
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.optics.field_position import field_positions
+from mrbokeh.stacks.focal_stack import FocalStack
 from training.slice_rows import StackRows, read_slice_rows, slice_size_px
 from training.weights import Counting, pixel_weight
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.run_folder import FILE_NAME as FACTS_NAME
 from training.run_folder import RunFacts, read_facts

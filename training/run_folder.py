@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from mrbokeh.atomic_files import atomic_path, read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import lens_from_json, lens_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
+from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.errors import InputError
 from training.lens_scale import LensRanges
 from training.network import BlurNetwork
 from training.settings import TrainSettings, read_settings

@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 from training.network_settings import NetworkSettings
 
 FORMAT = "mrbokeh-training-settings"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass, replace
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.settings import TrainSettings
 
 _TRUTH = {"true": True, "false": False}

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from mrbokeh.camera_rgb import MASK_PREFIX, SATURATED, VALID
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.images.camera_rgb import MASK_PREFIX, SATURATED, VALID
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
 from training.exr_rows import exr_size_px, read_rows
 
 Mask = Bool[np.ndarray, "height width"]

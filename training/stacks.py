@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
 
 ChosenSlices = Mapping[str, Sequence[int]]
 """Indices of slices by the name of their stack; of stacks that are not named, all slices are meant."""

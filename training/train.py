@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from mrbokeh.errors import InputError
-from mrbokeh.guessed_metres import is_lens_guessed
+from mrbokeh.stacks.guessed_metres import is_lens_guessed
+from mrbokeh.system.errors import InputError
 from training.checkpoint import Progress
 from training.dataset import PairSet
 from training.distributed import Ranks, joined

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks, read_focal_stack
-from mrbokeh.focal_stack_dataset import FILE_NAME, FocalStackDataset, file_troubles, read_focal_stack_dataset, slices_to_hold_out
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, read_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, file_troubles, read_focal_stack_dataset, slices_to_hold_out
+from mrbokeh.system.errors import InputError
 from training.data_facts import DataFacts, gather_facts, manifest_facts
 from training.dataset import PairSet
 from training.stacks import Split, drawn, named, require_usable, split_stacks, stack_name

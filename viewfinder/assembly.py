@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT, WITH_BANKS
+from mrbokeh.system.errors import InputError
 from viewfinder.lens_book import LensBook
 from viewfinder.scenery import Scenery
 from viewfinder.stage.stage import Stage
@@ -24,7 +24,7 @@ def read_lenses(paths: Sequence[Path], of_scene: Lens | None) -> tuple[LensBook,
     networks: dict[str, MakeRenderer] = {}
     for path in paths:
         if path.suffix.lower() == ".onnx":
-            from mrbokeh.renderers.onnx_network import OnnxNetwork
+            from mrbokeh.renderers.network.onnx_network import OnnxNetwork
 
             network = OnnxNetwork(path)
             lenses[path.stem], networks[path.stem] = network.lens, partial(_same, network)
@@ -86,7 +86,7 @@ def open_scenery(
     """Exactly one of scene and layer. The first renderer is used first. backend: what draws the scene (mrbokeh.scene.choose)."""
     name, make = next(iter(renderers.items()))
     if layer is not None:
-        from mrbokeh.image_io import read_layer
+        from mrbokeh.images.image_io import read_layer
 
         return StillLayer(read_layer(layer), lens_of(), make(), name)
     assert scene is not None, "checked by the command"

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from mrbokeh.capture_bundle import write_bundle
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.errors import InputError
-from mrbokeh.overlay import code_tables
+from mrbokeh.compositing.overlay import code_tables
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.stacks.capture_bundle import write_bundle
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import Bgr, CameraFrame
 from viewfinder.live_compositor import LiveCompositor, Moment
 

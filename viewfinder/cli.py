@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.commands import option_words as words
 from viewfinder.commands.board import board_command
 from viewfinder.commands.calibrate_phone import calibrate_phone_command

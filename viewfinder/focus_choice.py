@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Sequence
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.tracking.charuco.board import CharucoBoard
 from viewfinder.focus.base import FocusSource
 from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus
 from viewfinder.focus.first_known import FirstKnown

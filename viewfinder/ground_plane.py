@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.camera import Camera
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.upright import upright_camera
 
 _LEAST_DETERMINANT = 1e-12
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import MM_PER_M, Lens
+from mrbokeh.optics.lens import MM_PER_M, Lens
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import LensState
 
 F_NUMBERS = (0.95, 1.2, 1.4, 1.8, 2.0, 2.4, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0)

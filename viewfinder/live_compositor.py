@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from mrbokeh.camera import Camera
-from mrbokeh.lens import Lens
-from mrbokeh.overlay import Overlay, code_tables
+from mrbokeh.compositing.overlay import Overlay, code_tables
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from viewfinder.focus.base import FocusSource
 from viewfinder.frames import Bgr, CameraFrame, FrameStatus, OutputFrame
 from viewfinder.lens_book import LensBook

@@ -4,9 +4,9 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from mrbokeh.errors import InputError
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.staging.upright import turned, turned_back
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.upright import turned, turned_back
 from viewfinder.captures import Captures
 from viewfinder.focus.first_known import FirstKnown
 from viewfinder.focus.manual_focus import ManualFocus

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from threading import Event, Lock, Thread
 from typing import Protocol, runtime_checkable
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame, OutputFrame
 from viewfinder.newest import Newest
 from viewfinder.sources.base import FrameSource

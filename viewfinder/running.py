@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.lens import Lens
-from mrbokeh.malloc_settings import keep_few_arenas
-from mrbokeh.overlay import Overlay
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.malloc_settings import keep_few_arenas
+from mrbokeh.tracking.charuco.board import CharucoBoard
 from viewfinder.assembly import MakeRenderer
 from viewfinder.captures import Captures
 from viewfinder.focus.base import FocusSource

@@ -2,12 +2,12 @@
 
 from typing import Protocol, runtime_checkable
 
-from mrbokeh.camera import Camera
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.overlay import CodeTables, Overlay
+from mrbokeh.compositing.overlay import CodeTables, Overlay
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.staging.scene_description import Triple
+from mrbokeh.scene.staging.scene_description import Triple
 from viewfinder.frames import Bgr
 from viewfinder.stage.stage_status import StageStatus
 from viewfinder.tracking.base import TrackedPose

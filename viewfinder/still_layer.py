@@ -7,13 +7,13 @@ from threading import Event, Thread
 
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.overlay import CodeTables, Overlay
+from mrbokeh.compositing.overlay import CodeTables, Overlay
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.staging.scene_description import Triple
+from mrbokeh.scene.staging.scene_description import Triple
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import Bgr
 from viewfinder.newest import Newest
 from viewfinder.stage.stage_setup import live_renderer

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 from viewfinder.sources.base import FrameSource
 from viewfinder.sources.choose import open_source
 from viewfinder.tracking.base import Tracker
@@ -74,7 +74,7 @@ def open_phone(source: str, max_width_px: int | None = _PHONE_WIDTH_PX) -> Frame
 
 
 def _board(choice: TrackingChoice) -> Tracker:
-    from mrbokeh.charuco.board_file import read_board
+    from mrbokeh.tracking.charuco.board_file import read_board
     from viewfinder.tracking.charuco_tracker import CharucoTracker
 
     assert choice.board is not None, "chosen"

@@ -17,7 +17,7 @@ def cameras_command() -> None:
 
     from capture.tether.camera_driver import Ability
     from capture.tether.gphoto2_cameras import list_cameras
-    from mrbokeh.gphoto2_library import NOTHING_FOUND
+    from mrbokeh.system.gphoto2_library import NOTHING_FOUND
 
     cameras = list_cameras()
     if not cameras:

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from mrbokeh.focal_stack_dataset import FocalStackDataset
+    from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset
 
 HELP = "\n\n".join(
     (
@@ -44,8 +44,8 @@ def dataset_command(
     from capture.dataset.stack_writer import StackWriting
     from capture.dataset.writer import DatasetPlan, write_dataset
     from capture.report.reblur import reblur_by
-    from mrbokeh.guessed_metres import metres_notes
-    from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.stacks.guessed_metres import metres_notes
+    from mrbokeh.system.interrupts import kept_when_interrupted
 
     if not scenes:
         raise InputError("expected the folders of scenes, got none: mrbokeh capture dataset SCENE... --out DATASET --licence TEXT")
@@ -82,7 +82,7 @@ def licence_text(text_or_file: str) -> str:
 
 def _verify(out: Path) -> None:
     from capture.dataset.verification import verify
-    from mrbokeh.focal_stack_dataset import read_focal_stack_dataset
+    from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
 
     dataset = read_focal_stack_dataset(out)
     troubles = verify(dataset)

@@ -30,8 +30,8 @@ def depth_command(
     from capture.merging.retouch import retouched_stacks, retouches_text, stacks_before
     from capture.views.dense_depth import DenseSettings
     from capture.views.scene_depth import SceneDepthSettings, deepen_scene
-    from mrbokeh.interrupts import kept_when_interrupted
-    from mrbokeh.stack_pictures import SHEET_NAME
+    from mrbokeh.figures.stack_pictures import SHEET_NAME
+    from mrbokeh.system.interrupts import kept_when_interrupted
 
     retouched = retouched_stacks(stacks_before(scene))
     settings = SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device))

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.atomic_files import require_safe_outputs
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.errors import InputError
 
 HELP = "\n\n".join(
     (
@@ -37,9 +37,9 @@ def matchmove_command(
 ) -> None:
     from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
     from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
-    from mrbokeh.camera_track.formats import format_of_name, write_track
-    from mrbokeh.charuco.board_file import read_board
-    from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.tracking.camera_track.formats import format_of_name, write_track
+    from mrbokeh.tracking.charuco.board_file import read_board
 
     if not clip.is_file():
         raise InputError(f"expected a video at {clip}, but {'it is a folder' if clip.is_dir() else 'there is none'}")

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from mrbokeh.focal_stack import FocalStack
+    from mrbokeh.stacks.focal_stack import FocalStack
 
 HELP = "\n\n".join(
     (
@@ -53,9 +53,9 @@ def merge_command(
     from capture.merging.preferred_merge import preferred_lines, preferred_side
     from capture.merging.relative_stack import ORDER
     from capture.merging.retouch import retouched_stacks, stacks_before
-    from mrbokeh.guessed_metres import metres_facts, metres_note
-    from mrbokeh.interrupts import kept_when_interrupted
-    from mrbokeh.malloc_settings import keep_freed_pictures
+    from mrbokeh.stacks.guessed_metres import metres_facts, metres_note
+    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.malloc_settings import keep_freed_pictures
 
     if from_slice or mask:
         if overwrite or registration is not None or prefer is not None:
@@ -87,7 +87,7 @@ def merge_command(
 
 def _tell(stack: "FocalStack") -> None:
     from capture.merging.merged_pictures import readable_names
-    from mrbokeh.stack_pictures import SHEET_NAME
+    from mrbokeh.figures.stack_pictures import SHEET_NAME
 
     depth = "depth in metres" if stack.metres_known else "depth in guessed metres"
     files = ", ".join([*readable_names(stack), SHEET_NAME])

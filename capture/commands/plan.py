@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
     from capture.tether.focus_plan import FocusPlan, FocusRange
-    from mrbokeh.lens import Lens
+    from mrbokeh.optics.lens import Lens
 
 HELP = "\n\n".join(
     (
@@ -49,8 +49,8 @@ def plan_command(
     from capture.tether.focus_plan import plan_focus, plan_for_motor
     from capture.tether.plan_file import write_plan, write_plan_table
     from capture.tether.plan_table import print_plan
-    from mrbokeh.atomic_files import require_safe_outputs
-    from mrbokeh.image_io import require_suffix
+    from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.system.atomic_files import require_safe_outputs
 
     if scale is not None and motor_step is not None:
         raise InputError("give either --scale, for a ring turned by hand, or --motor-step, for a motor")
@@ -80,8 +80,8 @@ def planned_for(
     """The lens of a file, or of three numbers; an f-number goes before the file's."""
     from dataclasses import replace
 
-    from mrbokeh.lens import Lens
-    from mrbokeh.lens_file import read_lens
+    from mrbokeh.optics.lens import Lens
+    from mrbokeh.optics.lens_file import read_lens
 
     if path is not None:
         if focal_length is not None or sensor_width is not None:
@@ -106,7 +106,7 @@ def range_from(origin: str, near_m: float, far_m: float, lens: "Lens") -> "Focus
 def rounded_to(plan: "FocusPlan", text: str) -> "FocusPlan":
     """--scale: marks count from the film plane, as they are engraved."""
     from capture.tether.focus_plan import on_scale
-    from mrbokeh.film_plane import lens_distance_m
+    from mrbokeh.optics.film_plane import lens_distance_m
 
     try:
         marks_m = [float(each) for each in text.split(",")]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 HELP = "\n\n".join(
     (
@@ -36,7 +36,7 @@ def poses_command(
 ) -> None:
     from capture.views.colmap import PoseSettings, find_picture_poses, find_scene_poses
     from capture.views.colmap_matches import median_parallax_deg
-    from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.system.interrupts import kept_when_interrupted
 
     settings = PoseSettings(mapper, camera_model, cameras, max_image_size, seed, threads, overwrite)
     if scene is not None and images is None and out is None:

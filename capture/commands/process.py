@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 if TYPE_CHECKING:
-    from mrbokeh.focal_stack import FocalStack
+    from mrbokeh.stacks.focal_stack import FocalStack
 
 HELP = "\n\n".join(
     (
@@ -50,8 +50,8 @@ def process_command(
     from capture.stacks.session import FILE_NAME as SESSION_NAME
     from capture.views.board_options import board_from_options
     from capture.views.scale_distance import parse_distance
-    from mrbokeh.errors import InputError
-    from mrbokeh.focal_stack import find_focal_stacks
+    from mrbokeh.stacks.focal_stack import find_focal_stacks
+    from mrbokeh.system.errors import InputError
 
     require_gates(allow_absent or [], strict)
     if distance is not None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 HELP = "\n\n".join(
     (
@@ -40,7 +40,7 @@ def report_command(
     from capture.report.scene_report import report_scene
     from capture.report.stack_rules import picture_verdict
     from capture.report.strictness import require_gates, unmet
-    from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.system.interrupts import kept_when_interrupted
 
     allowed = require_gates(allow_absent or [], strict)
     if not scene.is_dir():

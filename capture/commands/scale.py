@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _DICTIONARY = "DICT_4X4_50"
 HELP = "\n\n".join(
@@ -93,8 +93,8 @@ def scale_command(
 def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | None, overwrite: bool) -> None:
     from capture.merging.known_metres import Fact, parse_known_distance, parse_length
     from capture.merging.stack_metres import lines_of, tell_metres, tell_nearest
-    from mrbokeh.focal_stack import find_focal_stacks
-    from mrbokeh.guessed_metres import metres_note
+    from mrbokeh.stacks.focal_stack import find_focal_stacks
+    from mrbokeh.stacks.guessed_metres import metres_note
 
     facts: list[Fact] = [*[parse_length(each) for each in rulers], *[parse_known_distance(each) for each in distances]]
     stacks = find_focal_stacks(folder)

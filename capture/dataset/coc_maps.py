@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.stacks.focal_stack import FocalStack
 
 CHANNEL = "coc_px"
 FOLDER = "coc"

@@ -5,8 +5,8 @@ import os
 import shutil
 from pathlib import Path
 
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.focal_stack_dataset import FileRecord
+from mrbokeh.stacks.focal_stack_dataset import FileRecord
+from mrbokeh.system.atomic_files import atomic_path
 
 _CHUNK_BYTES = 1 << 20
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from mrbokeh.focal_stack_dataset import RadianceRange
+from mrbokeh.stacks.focal_stack_dataset import RadianceRange
 
 QUANTILES = ("0.5", "0.99", "0.999", "0.9999")
 _LOWEST_STOP, _STOPS, _PER_STOP = -16, 40, 128

@@ -3,9 +3,9 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.focal_stack_dataset import Part, slices_to_hold_out
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack_dataset import Part, slices_to_hold_out
+from mrbokeh.system.errors import InputError
 
 
 def split_by_viewpoint(names: Sequence[str], test: Sequence[str] = (), test_share: float = 0.2, seed: int = 0) -> dict[str, Part]:

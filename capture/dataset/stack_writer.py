@@ -16,13 +16,13 @@ from capture.report.exclusion_masks import exclusion_masks, has_fresh_exclusions
 from capture.report.reblur import Reblur
 from capture.report.stack_view import StackView
 from capture.views.scene_depth import is_depth_stale
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.camera_rgb import VALID
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FILE_NAME as STACK_FILE
-from mrbokeh.focal_stack import FocalStack, read_focal_stack
-from mrbokeh.focal_stack_dataset import Part, StackRecord, record_from_json, record_to_json
+from mrbokeh.images.camera_rgb import VALID
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import Part, StackRecord, record_from_json, record_to_json
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 RECORD_NAME = "record.json"
 _ROWS_AT_ONCE = 256

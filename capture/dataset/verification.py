@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from capture.dataset.file_placing import record_of
-from mrbokeh.focal_stack_dataset import FocalStackDataset, file_troubles
-from mrbokeh.progress import track
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, file_troubles
+from mrbokeh.system.progress import track
 
 
 def verify(dataset: FocalStackDataset) -> list[str]:

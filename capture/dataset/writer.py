@@ -8,11 +8,11 @@ from pathlib import Path
 from capture.dataset.split import slices_of_a_single_stack, split_by_viewpoint
 from capture.dataset.stack_writer import StackWriting, require_usable, write_stack
 from mrbokeh import __version__
-from mrbokeh.atomic_files import write_json
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks
-from mrbokeh.focal_stack_dataset import FILE_NAME, FocalStackDataset, StackRecord, write_focal_stack_dataset
-from mrbokeh.progress import track
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, StackRecord, write_focal_stack_dataset
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 UNFINISHED_NAME = "unfinished.json"
 MAXIMUM = "maximum"

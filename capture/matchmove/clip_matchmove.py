@@ -16,14 +16,14 @@ from capture.views.colmap_matches import median_parallax_deg
 from capture.views.scale_board import board_scale
 from capture.views.scale_distance import distance_scale
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.track import CameraTrack
-from mrbokeh.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.charuco.detector import Grey
-from mrbokeh.errors import InputError
-from mrbokeh.progress import track as with_progress
-from mrbokeh.video_io import VideoInfo, probe, read_display_frames
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track as with_progress
+from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
+from mrbokeh.tracking.charuco.board import CharucoBoard
+from mrbokeh.tracking.charuco.detector import Grey
+from mrbokeh.video.clip import VideoInfo, probe, read_display_frames
 
 _STILL_SHARE = 0.02
 

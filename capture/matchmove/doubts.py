@@ -7,7 +7,7 @@ import numpy as np
 from capture.matchmove.frame_poses import FramePose
 from capture.matchmove.only_turning import model_residual_px, turning_residual_px
 from capture.views.sparse_model import SparseModel
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _TURNS_AS_WELL = 3.0
 """Times the model's residual up to which a camera that only turns explains the clip: 1.2 for one that does, 22 for one that walks."""

@@ -10,11 +10,11 @@ from jaxtyping import Float64, Int64
 
 from capture.views.distortion import Distortion, undistorted_px
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.between_frames import camera_between
-from mrbokeh.charuco.corner_flow import flow
-from mrbokeh.charuco.detector import Grey
-from mrbokeh.charuco.pose_from_points import Pose, opencv_matrix
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.camera_track.between_frames import camera_between
+from mrbokeh.tracking.charuco.corner_flow import flow
+from mrbokeh.tracking.charuco.detector import Grey
+from mrbokeh.tracking.charuco.pose_from_points import Pose, opencv_matrix
 
 FEWEST_POINTS = 12
 """With fewer, wrong points agree on a pose now and then."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _FEWEST_POINTS = 12
 _TRIALS = 500

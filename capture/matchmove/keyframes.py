@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.charuco.corner_flow import flow
-from mrbokeh.charuco.detector import Grey
-from mrbokeh.progress import track
-from mrbokeh.video_io import VideoInfo, read_display_frames
+from mrbokeh.system.progress import track
+from mrbokeh.tracking.charuco.corner_flow import flow
+from mrbokeh.tracking.charuco.detector import Grey
+from mrbokeh.video.clip import VideoInfo, read_display_frames
 
 _SEARCH_WIDTH_PX = 480
 _FEATURES = 200

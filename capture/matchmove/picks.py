@@ -3,7 +3,7 @@
 import numpy as np
 
 from capture.matchmove.ground import GroundPicks, Ruler
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 def parse_ground(text: str) -> GroundPicks:

@@ -21,7 +21,7 @@ LARGEST_WORKING_PX = 0.6e6
 """Larger pictures are compared at this size."""
 DIAMETERS_PX = (0.0, 1.25, 1.75, 2.25, 3.0, 4.0, 5.25, 7.0, 9.25, 12.0, 16.0, 21.0)
 DRAWN_PX = (0.0, 1.2407, 1.5986, 1.9489, 2.7846, 3.8978, 5.1770, 6.9342, 9.2071, 11.9664, 15.9751, 20.9811)
-"""Discs to draw for these diameters: `mrbokeh.drawn_diameters`, whose table takes longer to make than all evidence of a stack."""
+"""Discs to draw for these diameters: `mrbokeh.optics.drawn_diameters`, whose table takes longer to make than all evidence of a stack."""
 _SUBPIXELS = 32
 _WIDE_SHRINK = 3.0
 _CELL_PX = 4

@@ -8,10 +8,10 @@ from jaxtyping import Float32
 
 from capture.merging.merged_pictures import write_depth_picture
 from capture.merging.preferred_merge import PREFERRED
-from mrbokeh.exr_io import read_exr, write_exr
-from mrbokeh.focal_stack import FocalStack, Slice, write_focal_stack
-from mrbokeh.guessed_metres import POSITION, SLICE_POSITION
-from mrbokeh.stack_pictures import write_merge_sheet
+from mrbokeh.figures.stack_pictures import write_merge_sheet
+from mrbokeh.images.exr_io import read_exr, write_exr
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.stacks.guessed_metres import POSITION, SLICE_POSITION
 
 
 def with_known_nearest(stack: FocalStack, turned: bool) -> FocalStack:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.guessed_metres import TOLD, is_near_first, metres_facts
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import TOLD, is_near_first, metres_facts
+from mrbokeh.system.errors import InputError
 
 NEAREST_OPTION = "--nearest"
 

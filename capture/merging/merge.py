@@ -28,13 +28,13 @@ from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FO
 from capture.merging.slice_optics import SliceOptics
 from capture.stacks.disk_space import told_when_full
 from capture.stacks.sentinel_focus import stated_by_sentinel
-from mrbokeh.camera import Camera
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
-from mrbokeh.lens import Lens
-from mrbokeh.progress import track
-from mrbokeh.stack_pictures import depth_codes, write_merge_sheet
+from mrbokeh.figures.stack_pictures import depth_codes, write_merge_sheet
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 FEWEST_SLICES = 2
 HIGHLIGHTS = "highlights"

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from capture.merging.tiff_writer import BYTE, LONG, RATIONAL, SHORT, UNDEFINED, TiffTag, fractions_tag, text_tag, write_tiff
-from mrbokeh.camera_rgb import Matrix3x3
-from mrbokeh.color import rec709_from_XYZ
-from mrbokeh.exif_orientation import upright
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.picture_codec import codes_of, even_codes, write_stored
-from mrbokeh.stack_pictures import depth_codes, orientation_of, write_upright_png
+from mrbokeh.figures.stack_pictures import depth_codes, orientation_of, write_upright_png
+from mrbokeh.images.camera_rgb import Matrix3x3
+from mrbokeh.images.color import rec709_from_XYZ
+from mrbokeh.images.exif_orientation import upright
+from mrbokeh.images.picture_codec import codes_of, even_codes, write_stored
+from mrbokeh.stacks.focal_stack import FocalStack
 
 PNG_NAME, TIFF_NAME, DNG_NAME, DEPTH_NAME = "all_in_focus.png", "all_in_focus.tif", "all_in_focus.dng", "depth.png"
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from capture.merging.slice_optics import SliceOptics
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

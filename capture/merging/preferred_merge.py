@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float32
 from capture.merging.focus_volume import FocusVolume
 from capture.merging.preferred_side import Side, blended, preferred_places
 from capture.merging.replaced_places import replaced_depth
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.exr_io import read_exr, write_exr
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.guessed_metres import is_near_first, metres_facts
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.exr_io import read_exr, write_exr
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import is_near_first, metres_facts
 
 PREFERRED = "preferred"
 """Key in a stack's metadata: the side that was asked for, the share of the picture that changed, and whether near is known."""

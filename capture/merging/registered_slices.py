@@ -14,10 +14,10 @@ from capture.merging.plane_transforms import Transform
 from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.tint import Gains, SmallSlice, tint_gains, with_gain
 from capture.merging.warping import sampled
-from mrbokeh.camera_rgb import SATURATED, half_of, single_of, write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, Slice
+from mrbokeh.images.camera_rgb import SATURATED, half_of, single_of, write_camera_rgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.errors import InputError
 
 REGISTERED_FOLDER = "registered"
 LARGEST_HELD_BYTES = 256e6

@@ -8,8 +8,8 @@ import numpy as np
 from capture.merging.breathing import Breathing
 from capture.merging.plane_transforms import Transform
 from capture.merging.registration import Registration
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FILE_NAME = "registration.json"
 FORMAT = "mrbokeh-registration"

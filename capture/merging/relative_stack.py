@@ -17,14 +17,14 @@ from capture.merging.focus_direction import Contours, Direction
 from capture.merging.focus_order import focus_order
 from capture.merging.registered_slices import IngestedSlices, RegisteredSlices, source_path
 from capture.merging.relative_focus import RelativeFocus, solve_relative_focus
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_from_json, camera_to_json
-from mrbokeh.camera_rgb import half_of
-from mrbokeh.exr_io import ExrPart, write_exr
-from mrbokeh.focal_stack import GROWTH, GROWTH_WIDTH, METRES, FocalStack, Slice
-from mrbokeh.guessed_metres import POSITION, POSITION_ERROR, SLICE_POSITION, SLICE_POSITION_ERROR, STATED_BEFORE, STATED_DISTANCE
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import lens_from_json, lens_to_json
+from mrbokeh.images.camera_rgb import half_of
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
+from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH, METRES, FocalStack, Slice
+from mrbokeh.stacks.guessed_metres import POSITION, POSITION_ERROR, SLICE_POSITION, SLICE_POSITION_ERROR, STATED_BEFORE, STATED_DISTANCE
 
 ORDER = "order_by_focus"
 """Key in a stack's metadata: said in words that its slices were put in the order of their focus, which their names are not."""

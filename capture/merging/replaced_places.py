@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.guessed_metres import POSITION, POSITION_ERROR, SLICE_POSITION, SLICE_POSITION_ERROR
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import POSITION, POSITION_ERROR, SLICE_POSITION, SLICE_POSITION_ERROR
 
 _OF_SLICES = {POSITION: SLICE_POSITION, POSITION_ERROR: SLICE_POSITION_ERROR}
 _LEAST_DIOPTRES = 1e-6

@@ -12,12 +12,12 @@ from capture.merging.all_in_focus import BANDS, painted
 from capture.merging.merged_pictures import readable_names, write_readable_pictures
 from capture.merging.replaced_places import replaced_depth
 from capture.merging.retouch_mask import read_mask
-from mrbokeh.atomic_files import require_safe_outputs
-from mrbokeh.camera_rgb import write_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr, write_exr
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack
-from mrbokeh.stack_pictures import SHEET_NAME, orientation_of, write_merge_sheet
+from mrbokeh.figures.stack_pictures import SHEET_NAME, orientation_of, write_merge_sheet
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.exr_io import read_exr, write_exr
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack
+from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.errors import InputError
 
 RETOUCHES = "retouches"
 """Key in a stack's metadata: which slice was put where a mask is white, in the order of the calls (slice, source, mask, share)."""

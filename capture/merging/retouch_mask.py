@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.errors import InputError
-from mrbokeh.exif_orientation import as_stored, stored_orientation, upright
-from mrbokeh.exr_io import read_exr
-from mrbokeh.image_io import require_suffix
-from mrbokeh.picture_codec import stored_pixels
+from mrbokeh.images.exif_orientation import as_stored, stored_orientation, upright
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import require_suffix
+from mrbokeh.images.picture_codec import stored_pixels
+from mrbokeh.system.errors import InputError
 
 MASK_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 _ALPHA, _COLOURS = 3, 3

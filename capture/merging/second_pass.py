@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Float32
 from capture.merging.guided_all_in_focus import all_in_focus_from_depth
 from capture.merging.restored_lights import restored_lights, with_restored_lights
 from capture.merging.slice_optics import SliceOptics
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.camera_rgb import read_camera_rgb
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.images.camera_rgb import read_camera_rgb
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.errors import InputError
 
 FIRST_PASS_FOLDER = "first_pass"
 DEPTH_SOURCE = "depth_source"

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
 

@@ -18,11 +18,11 @@ from scipy.optimize import least_squares
 from capture.merging.changed_metres import with_known_nearest, write_changed_metres
 from capture.merging.known_metres import NEAREST_OPTION, Fact, told_facts
 from capture.merging.relative_stack import FROM_DISTANCES
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import GROWTH, METRES, FocalStack, Slice
-from mrbokeh.guessed_metres import (
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import GROWTH, METRES, FocalStack, Slice
+from mrbokeh.stacks.guessed_metres import (
     POSITION_ERROR,
     STATED_DISTANCE,
     TOLD,
@@ -32,7 +32,7 @@ from mrbokeh.guessed_metres import (
     is_view_guessed,
     metres_facts,
 )
-from mrbokeh.lens import Lens
+from mrbokeh.system.errors import InputError
 
 _NEAR_PIXEL_PX = 2
 _FARTHEST_SHARE = 0.01

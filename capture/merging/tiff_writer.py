@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt16
 
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.errors import InputError
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _CODES = {BYTE: "B", ASCII: "B", SHORT: "H", LONG: "I", RATIONAL: "I", UNDEFINED: "B", SRATIONAL: "i"}

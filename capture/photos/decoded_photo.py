@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.photos.libraw import WhiteBalance
-from mrbokeh.camera_rgb import Matrix3x3
+from mrbokeh.images.camera_rgb import Matrix3x3
 
 
 @dataclass(frozen=True)

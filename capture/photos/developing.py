@@ -9,8 +9,8 @@ from jaxtyping import Float32
 from capture.photos.decoded_photo import DecodedPhoto, Photosites
 from capture.photos.raw import RAW_SUFFIXES, decode_raw
 from capture.photos.saturation import dilated, resized_share
-from mrbokeh.image_io import ENCODED_SUFFIXES, read_image
-from mrbokeh.picture_codec import linear_from_codes, stored_rgb
+from mrbokeh.images.image_io import ENCODED_SUFFIXES, read_image
+from mrbokeh.images.picture_codec import linear_from_codes, stored_rgb
 
 _LARGEST_HALF = 65504.0
 _FULL = 1.0 - 1e-6

@@ -13,7 +13,7 @@ import csv
 from pathlib import Path
 
 from capture.photos.stated_focus import StatedFocus
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 FILE_NAME = "focus.csv"
 _NEEDED = ("file", "focus_distance_m")

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mrbokeh.film_plane import lens_distance_m
-from mrbokeh.lens import MM_PER_M
+from mrbokeh.optics.film_plane import lens_distance_m
+from mrbokeh.optics.lens import MM_PER_M
 
 Tags = Mapping[str, str]
 

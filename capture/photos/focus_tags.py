@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 
 from capture.photos.focus_metadata import FocusReading, Tags, at_infinity, number, rational
-from mrbokeh.lens import MM_PER_M
+from mrbokeh.optics.lens import MM_PER_M
 
 UINT32_MAX = 0xFFFFFFFF
 UINT16_MAX = 0xFFFF

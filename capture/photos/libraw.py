@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.color import XYZ_from_rec709
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.images.color import XYZ_from_rec709
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 if TYPE_CHECKING:
     import rawpy

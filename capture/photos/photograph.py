@@ -7,10 +7,10 @@ import numpy as np
 from capture.photos.developing import develop, is_raw
 from capture.photos.metadata import read_metadata
 from capture.photos.photo_metadata import PhotoMetadata
-from mrbokeh.color import convert
-from mrbokeh.cut_out import cut_from_px
-from mrbokeh.exif_orientation import known_orientation, quarter_turns, stored_orientation, upright
-from mrbokeh.photograph import Photograph
+from mrbokeh.images.color import convert
+from mrbokeh.images.cut_out import cut_from_px
+from mrbokeh.images.exif_orientation import known_orientation, quarter_turns, stored_orientation, upright
+from mrbokeh.stacks.photograph import Photograph
 
 
 def read_photograph(path: Path) -> Photograph:

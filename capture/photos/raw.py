@@ -15,8 +15,8 @@ from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.saturation import full_photosites, saturated_share
 from capture.photos.whole_file import require_whole_tiff
 from capture.photos.x_trans import X_TRANS_SIZE, decode_in_one_thread, decodes_reproducibly
-from mrbokeh.camera_rgb import matrix3x3
-from mrbokeh.errors import InputError
+from mrbokeh.images.camera_rgb import matrix3x3
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
     import rawpy

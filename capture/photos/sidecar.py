@@ -29,8 +29,8 @@ from capture.photos.focus_metadata import FocusReading
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar_values import checked
 from capture.photos.stated_focus import StatedFocus
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.system.errors import InputError
 
 FILE_NAME = "lens.toml"
 

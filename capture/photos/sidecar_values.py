@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.photos.stated_focus import StatedFocus
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _ORIGINS = ("lens", "film_plane")
 

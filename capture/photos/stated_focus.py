@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from capture.photos.focus_metadata import FocusReading
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

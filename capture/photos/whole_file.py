@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from capture.photos.metadata import read_tags
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _BLOCKS = (("TileOffsets", "TileByteCounts"), ("StripOffsets", "StripByteCounts"))
 

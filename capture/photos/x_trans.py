@@ -14,7 +14,7 @@ from pathlib import Path
 
 from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.libraw import WhiteBalance
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 X_TRANS_SIZE = (6, 6)
 _VARIABLE = "OMP_NUM_THREADS"

@@ -5,7 +5,7 @@ import sys
 
 from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.raw import decode_raw
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 def main() -> None:

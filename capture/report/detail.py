@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped
 
 from capture.stacks.block_detail import BLOCK_PX, detail_of_blocks
-from mrbokeh.color import linear_to_srgb
+from mrbokeh.images.color import linear_to_srgb
 
 BORDER_BLOCKS = 2
 """Blocks at the border of the picture that are left out: slices have no data there, or mirrored data."""

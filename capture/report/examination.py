@@ -19,9 +19,9 @@ from capture.report.reblur import Reblur
 from capture.report.slice_fit import Prediction, fit_slice
 from capture.report.stack_rules import DEPTH_OFF_PX
 from capture.report.stack_view import StackView
-from mrbokeh.color import luminance
-from mrbokeh.image_metrics import psnr
-from mrbokeh.progress import track
+from mrbokeh.images.color import luminance
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.system.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

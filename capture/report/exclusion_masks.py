@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from mrbokeh.atomic_files import read_json
-from mrbokeh.camera_rgb import write_masks
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.images.camera_rgb import write_masks
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
 
 Mask = Bool[np.ndarray, "height width"]
 

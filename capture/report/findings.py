@@ -12,8 +12,8 @@ from capture.report.picture_evidence import PictureFindings
 from capture.report.registration_drift import RegistrationDrift, registration_drift
 from capture.report.slice_fit import SliceFit
 from capture.stacks.sentinel_focus import stated_by_sentinel
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.guessed_metres import STATED_DISTANCE
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import STATED_DISTANCE
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from capture.report.json_numbers import exact
 from capture.report.neighbour_places import NeighbourPlace
 from capture.report.picture_evidence import PictureFindings
 from capture.report.slice_fit import NAMES, Change, SliceFit
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack import FocalStack
 
 Number = Callable[[float | None], float | str | None]
 

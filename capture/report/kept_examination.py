@@ -19,11 +19,11 @@ from capture.report.pictures import Shown
 from capture.report.reblur import Reblur
 from capture.report.registration_drift import FILE_NAME as REGISTRATION_FILE
 from capture.report.worst_places import ShownPlace
-from mrbokeh.atomic_files import atomic_path, read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME as STACK_FILE
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.html_page import inline_figure
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.html_page import inline_figure
 
 Mask = Bool[np.ndarray, "height width"]
 Signature = dict[str, Any]

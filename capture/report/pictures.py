@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from capture.report.stack_view import StackView
-from mrbokeh.color import display_rgb8
-from mrbokeh.html_page import inline_figure
-from mrbokeh.stack_pictures import depth_picture
+from mrbokeh.figures.stack_pictures import depth_picture
+from mrbokeh.images.color import display_rgb8
+from mrbokeh.system.html_page import inline_figure
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.layer import opaque
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

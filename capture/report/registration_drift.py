@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.merging.plane_transforms import Transform, middle_of, moved, scale_of
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack import FocalStack
 
 FILE_NAME = "registration.json"
 

@@ -10,8 +10,8 @@ import numpy as np
 from capture.report.gates import Gate, Rule
 from capture.views.sparse_model import SparseModel
 from capture.views.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
-from mrbokeh.atomic_files import read_json
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.atomic_files import read_json
 
 FOLDER = "reconstruction"
 LARGEST_REPROJECTION_PX = 1.0

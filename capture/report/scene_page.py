@@ -12,7 +12,7 @@ from capture.report.scene_gates import WHERE, Reconstruction
 from capture.report.stack_rules import PICTURE_RULES, picture_verdict
 from capture.report.stack_section import ExaminedStack, gate_table, stack_section
 from mrbokeh import __version__
-from mrbokeh.html_page import cell, section, table, write_page
+from mrbokeh.system.html_page import cell, section, table, write_page
 
 MOST_WITH_PICTURES = 12
 _STYLE = """

@@ -18,8 +18,8 @@ from capture.report.stack_section import ExaminedStack
 from capture.report.stack_view import DEFAULT_WIDTH_PX, StackView
 from capture.report.worst_places import ShownPlace, shown_places, worst_places
 from mrbokeh import __version__
-from mrbokeh.atomic_files import write_json
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.system.atomic_files import write_json
 
 JSON_NAME = "report.json"
 FORMAT, VERSION = "mrbokeh-capture-report", 2

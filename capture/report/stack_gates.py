@@ -38,7 +38,7 @@ from capture.report.stack_rules import (
     SPACING,
     TEXTURE,
 )
-from mrbokeh.guessed_metres import metres_facts
+from mrbokeh.stacks.guessed_metres import metres_facts
 
 
 def stack_gates(findings: StackFindings) -> list[Gate]:

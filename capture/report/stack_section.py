@@ -11,7 +11,7 @@ from capture.report.findings import StackFindings
 from capture.report.gates import Gate, counts
 from capture.report.kept_examination import KeptPicture, KeptPlace
 from capture.report.stack_rules import LARGEST_BLUR_GAIN, LARGEST_EXPOSURE, LARGEST_FOCUS_PX, LEAST_DB
-from mrbokeh.html_page import cell, table
+from mrbokeh.system.html_page import cell, table
 
 _MARKS = {"passed": ("met", "✓"), "failed": ("missed", "✗"), "absent": ("muted", "–")}
 

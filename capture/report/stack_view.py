@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from capture.merging.slice_optics import SliceOptics
-from mrbokeh.aperture import Aperture
-from mrbokeh.camera_rgb import SliceMasks, read_slice
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.images.camera_rgb import SliceMasks, read_slice
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.stacks.focal_stack import FocalStack
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

@@ -6,7 +6,7 @@ from capture.report.gates import Gate
 from capture.report.scene_gates import SCENE_RULES
 from capture.report.scene_page import SceneReport
 from capture.report.stack_rules import STACK_RULES
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 GATE_NAMES = tuple(each.name for each in (*SCENE_RULES, *STACK_RULES))
 

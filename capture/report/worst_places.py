@@ -11,7 +11,7 @@ from capture.report.picture_evidence import PictureLook
 from capture.report.pictures import Shown, crops_shown
 from capture.report.stack_rules import LARGEST_FLAT, LARGEST_LOST, LARGEST_TOP, LIGHT, PLACES, SEAMS, SHARP
 from capture.stacks.block_detail import BLOCK_PX
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack import FocalStack
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Crop = Float32[np.ndarray, "crop_height crop_width 3"]

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from capture.stacks.disk_space import DiskFullError
 from capture.stacks.session import FILE_NAME
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME as STACK_FILE_NAME
-from mrbokeh.focal_stack import FocalStack, read_focal_stack
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE_NAME
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
+from mrbokeh.system.errors import InputError
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _MIB = 2**20

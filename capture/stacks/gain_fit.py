@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-from mrbokeh.camera_rgb import Matrix3x3
-from mrbokeh.color import convert, luminance
+from mrbokeh.images.camera_rgb import Matrix3x3
+from mrbokeh.images.color import convert, luminance
 
 LONG_SIDE_PX = 96
 LARGEST_SCALE_CHANGE = 0.15

@@ -13,7 +13,7 @@ from capture.photos.developing import is_raw
 from capture.photos.photo_files import SkippedFile
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import Sidecar
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _PAUSE_TIMES_MEDIAN = 5.0
 _LEAST_PAUSE_S = 20.0

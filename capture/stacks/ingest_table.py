@@ -10,7 +10,7 @@ from rich.table import Table
 from capture.stacks.ingest import IngestReport
 from capture.stacks.stack_description import StackReport
 from capture.stacks.stack_lens import lens_text
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack import FocalStack
 
 _MOST_NAMED = 5
 

@@ -7,7 +7,7 @@ from statistics import median
 
 from capture.stacks.grouping import Photo
 from capture.stacks.slice_looks import SliceLook, one_scene, same_photograph
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _BLOWN = 0.9
 _OTHERS_WELL = 0.6

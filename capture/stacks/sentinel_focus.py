@@ -15,7 +15,7 @@ from jaxtyping import Bool
 
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.stacks.slice_metadata import focus_record
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.stacks.focal_stack import FocalStack
 
 
 def bounded_focus_records(metadata: Sequence[PhotoMetadata]) -> list[dict[str, Any] | None]:

@@ -15,9 +15,9 @@ from capture.photos.libraw import WhiteBalance
 from capture.photos.photo_metadata import StatedExposure
 from capture.photos.raw import camera_white_balance
 from capture.stacks.grouping import Photo, PhotoGroup, in_focus_order
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME as STACK_FILE_NAME
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE_NAME
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FILE_NAME = "session.json"
 FORMAT = "mrbokeh-capture-session"

@@ -6,9 +6,9 @@ from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.photo_metadata import PhotoMetadata, StatedExposure
 from capture.stacks.exposure import ExposureGain, overlap_gain
 from capture.stacks.gain_fit import LowFrequency, low_frequency
-from mrbokeh.camera_rgb import read_slice
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import read_focal_stack
+from mrbokeh.images.camera_rgb import read_slice
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.system.errors import InputError
 
 
 def stated_gain(wanted: StatedExposure | None, metadata: PhotoMetadata) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.stacks.disk_space import told_when_full
-from mrbokeh.camera_rgb import Matrix3x3, write_camera_rgb
+from mrbokeh.images.camera_rgb import Matrix3x3, write_camera_rgb
 
 FOLDER = "slices"
 _ATTRIBUTE = "mrbokehIngest"

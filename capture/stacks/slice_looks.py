@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float32, UInt8
 from capture.photos.decoded_photo import DecodedPhoto
 from capture.stacks.block_detail import block_means, detail_of_blocks
 from capture.stacks.gain_fit import LowFrequency, correlation, fit_gain, low_frequency
-from mrbokeh.camera_rgb import Matrix3x3
-from mrbokeh.color import convert, luminance
+from mrbokeh.images.camera_rgb import Matrix3x3
+from mrbokeh.images.color import convert, luminance
 
 _LONG_SIDE_PX = 1000
 _FEATURE_SIDE_PX = 480

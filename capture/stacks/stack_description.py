@@ -15,8 +15,8 @@ from capture.stacks.slice_files import FOLDER, arrange_slices, source_record
 from capture.stacks.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
 from capture.stacks.stack_lens import camera_of_lens, lens_of_photo, optics_of_photo, reference_index
 from capture.stacks.stack_remarks import stack_remarks
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.system.errors import InputError
 
 _RAW_COLOUR = "linear white-balanced camera RGB; 1.0 is the white level of green at the exposure of the session"
 _DEVELOPED_COLOUR = "scene-linear Rec.709; 1.0 is white"

@@ -24,9 +24,9 @@ from capture.stacks.session_exposure import gain_to_session, stated_gain
 from capture.stacks.slice_files import FOLDER, find_slices, source_record, write_slice
 from capture.stacks.slice_looks import SliceLook, look_at, look_of
 from capture.stacks.slice_metadata import slice_metadata
-from mrbokeh.camera_rgb import Matrix3x3, matrix3x3, read_slice
-from mrbokeh.color import convert
-from mrbokeh.errors import InputError
+from mrbokeh.images.camera_rgb import Matrix3x3, matrix3x3, read_slice
+from mrbokeh.images.color import convert
+from mrbokeh.system.errors import InputError
 
 # To be raised when the same photograph would become another slice, so that old slices are made again.
 PROCESS_VERSION = 4

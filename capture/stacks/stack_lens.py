@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 from capture.stacks.grouping import Photo
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import lens_to_json
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import lens_to_json
+from mrbokeh.system.errors import InputError
 
 
 def lens_of_photo(photo: Photo, native_size_px: tuple[int, int]) -> tuple[Lens | None, str | None]:

@@ -8,7 +8,7 @@ from capture.stacks.grouping import Photo
 from capture.stacks.session import GIVEN
 from capture.stacks.stack_ingest import StackWork
 from capture.stacks.stack_lens import lens_remarks
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 
 FEWEST_TO_MERGE = 2
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from capture.tether.focus_steps import FocusSteps, Stop
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 Preview = UInt8[np.ndarray, "height width 3"]
 

@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from mrbokeh.errors import InputError
-from mrbokeh.film_plane import lens_distance_m
-from mrbokeh.lens import MM_PER_M, Lens
+from mrbokeh.optics.film_plane import lens_distance_m
+from mrbokeh.optics.lens import MM_PER_M, Lens
+from mrbokeh.system.errors import InputError
 
 MOST_SLICES = 999
 _ROUNDING = 1e-9

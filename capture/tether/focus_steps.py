@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-focus-steps"
 VERSION = 1

@@ -10,7 +10,7 @@ from capture.tether.camera_driver import CameraDriver
 from capture.tether.focus_axis import FocusAxis, TravelEndError
 from capture.tether.focus_steps import FocusSteps
 from capture.tether.live_reading import Spot, sharpness
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _MOST_POSITIONS = 2000
 _LEVEL = 0.5

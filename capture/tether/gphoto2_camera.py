@@ -15,7 +15,7 @@ from capture.tether.gphoto2_config import CameraConfig
 from capture.tether.gphoto2_errors import explained
 from capture.tether.gphoto2_focus import BUSY, FocusDrive, focus_drive
 from capture.tether.gphoto2_settings import FILE_FORMATS, configure, is_raw_only
-from mrbokeh.gphoto2_library import library
+from mrbokeh.system.gphoto2_library import library
 
 _LIVE_VIEW_SWITCH = ("viewfinder", "eosviewfinder")
 _LIVE_VIEW_SIGNS = (*_LIVE_VIEW_SWITCH, "liveviewsize", "liveviewimagequality", "evfmode")

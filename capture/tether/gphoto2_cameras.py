@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from capture.tether.camera_driver import CameraDescription, CameraError
 from capture.tether.gphoto2_camera import Gphoto2Camera
 from capture.tether.gphoto2_errors import explained
-from mrbokeh import gphoto2_library
-from mrbokeh.gphoto2_library import NoCameraError, chosen_of, opened
+from mrbokeh.system import gphoto2_library
+from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, opened
 
 
 @dataclass(frozen=True)

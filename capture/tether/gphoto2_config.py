@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from capture.tether.gphoto2_errors import explained
-from mrbokeh.errors import InputError
-from mrbokeh.gphoto2_library import library
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.gphoto2_library import library
 
 
 class CameraConfig:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from capture.tether.camera_driver import CameraError
-from mrbokeh.gphoto2_library import explanation, library
+from mrbokeh.system.gphoto2_library import explanation, library
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from capture.tether.focus_steps import Stop
 from capture.tether.gphoto2_config import CameraConfig
 from capture.tether.gphoto2_errors import explained
 from capture.tether.gphoto2_settings import FOCUS_DRIVE
-from mrbokeh.gphoto2_library import library
+from mrbokeh.system.gphoto2_library import library
 
 LARGEST_NIKON_STEPS = 32767
 # "Nikon manual focus at limit" and "stepping too small": the motor could not make its steps.

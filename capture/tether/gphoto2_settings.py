@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from capture.tether.camera_driver import CameraSettings
 from capture.tether.gphoto2_config import CameraConfig
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 EXPOSURE_MODES = ("expprogram", "autoexposuremode", "shootingmode")
 FILE_FORMATS = ("imagequality", "imageformat")

@@ -7,8 +7,8 @@ from jaxtyping import Float64, UInt8
 
 from capture.merging.focus_volume import focus_energy
 from capture.tether.camera_driver import Preview
-from mrbokeh.color import luminance, srgb_to_linear
-from mrbokeh.errors import InputError
+from mrbokeh.images.color import luminance, srgb_to_linear
+from mrbokeh.system.errors import InputError
 
 HISTOGRAM_BINS = 32
 _CLIPPED = 254

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from capture.tether.camera_driver import CameraDriver
 from capture.tether.focus_plan import FocusPlan
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 def open_named(name: str, plan: FocusPlan, *, timeout_s: float, focus_level: int, reverse_focus: bool) -> CameraDriver:

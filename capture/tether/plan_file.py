@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from capture.tether.focus_plan import FocusPlan, FocusRange
-from mrbokeh.atomic_files import atomic_path, read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.film_plane import film_plane_m
-from mrbokeh.lens_file import lens_from_json, lens_to_json
+from mrbokeh.optics.film_plane import film_plane_m
+from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
+from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-focus-plan"
 VERSION = 1

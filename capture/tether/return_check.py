@@ -16,7 +16,7 @@ from jaxtyping import Float32, Float64
 
 from capture.merging.focus_volume import focus_energy
 from capture.photos.developing import develop, is_raw
-from mrbokeh.color import luminance
+from mrbokeh.images.color import luminance
 
 WIDTH_PX = 960
 LARGEST_FOCUS_ERROR = 0.15

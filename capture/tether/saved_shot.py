@@ -12,7 +12,7 @@ from capture.photos.raw import read_raw_metadata
 from capture.stacks.slice_metadata import focus_record
 from capture.tether.camera_driver import CameraError, Shot
 from capture.tether.whole_photo import is_whole
-from mrbokeh.atomic_files import atomic_path
+from mrbokeh.system.atomic_files import atomic_path
 
 # EXIF rounds exposure times; a third of a stop is 26 %.
 _SAME_EXPOSURE = 0.03

@@ -6,7 +6,7 @@ from capture.tether.focus_plan import FocusPlan
 from capture.tether.focus_steps import FocusSteps, Stop
 from capture.tether.focus_sweep import Target
 from capture.tether.live_reading import Spot
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 def steps_between(plan: FocusPlan, near_steps: int | None, far_steps: int | None, home: str) -> FocusSteps | None:

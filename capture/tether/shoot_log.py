@@ -13,8 +13,8 @@ from typing import Any
 from capture.photos.photo_files import PHOTO_SUFFIXES
 from capture.tether.focus_plan import FocusPlan
 from capture.tether.plan_file import plan_to_json
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FILE_NAME = "shoot.json"
 FORMAT = "mrbokeh-shoot"

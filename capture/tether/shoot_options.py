@@ -8,7 +8,7 @@ from datetime import datetime
 from capture.tether.camera_driver import CameraSettings
 from capture.tether.focus_steps import FocusSteps
 from capture.tether.live_reading import Spot
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 from capture.photos.sidecar import FILE_NAME
 from capture.tether.focus_plan import FocusPlan
 from capture.tether.shoot_log import ShootLog
-from mrbokeh.atomic_files import atomic_path
+from mrbokeh.system.atomic_files import atomic_path
 
 _HEAD = "# written by mrbokeh capture shoot: what the photographs themselves do not state\n"
 

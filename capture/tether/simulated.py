@@ -12,8 +12,8 @@ from capture.tether.focus_steps import Stop
 from capture.tether.simulated_motor import SimulatedMotor
 from capture.tether.simulated_picture import CAMERA_MODEL, FocusQuantum, encoded_tiff, exif_of, exposed, nikon_code
 from capture.tether.simulated_scene import Rgb, SimulatedScene
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.lens import Lens
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.optics.lens import Lens
 
 NORMAL_EXPOSURE_S = 1.0 / 60.0
 NORMAL_ISO = 100.0

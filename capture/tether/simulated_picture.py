@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.tether.camera_driver import CameraError
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.errors import MissingExtraError
-from mrbokeh.film_plane import film_plane_m
-from mrbokeh.lens import Lens
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.optics.film_plane import film_plane_m
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import MissingExtraError
 
 Rgb = Float32[np.ndarray, "height width 3"]
 CAMERA_MODEL = "Simulated Thin Lens"

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.renderers.polygon_differences import PolygonDifferences
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 
 _TEXELS_PER_WIDTH = 960
 _FINEST_TEXELS = 6

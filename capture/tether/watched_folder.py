@@ -10,7 +10,7 @@ from capture.photos.raw import RAW_SUFFIXES
 from capture.tether.camera_driver import CameraDescription, CameraError, CameraSettings, Preview, Shot
 from capture.tether.focus_steps import Stop
 from capture.tether.whole_photo import is_whole
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 @dataclass

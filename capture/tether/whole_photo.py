@@ -4,7 +4,7 @@ from pathlib import Path
 
 from capture.photos.raw import RAW_SUFFIXES
 from capture.photos.whole_file import require_whole_tiff
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _LAST_BYTES = 64
 _ENDS = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.charuco.board_file import read_board
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_file import read_board
 
 
 def board_from_options(board: str, square_mm: float | None, marker_mm: float | None, dictionary: str) -> CharucoBoard:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.charuco.detector import CharucoDetector, Corners
+from mrbokeh.tracking.charuco.board import CharucoBoard
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
 
 _ENLARGED_UP_TO_PX = 2000
 
@@ -15,7 +15,7 @@ _ENLARGED_UP_TO_PX = 2000
 class BoardSearch:
     """Takes the board as printed by OpenCV before and since 4.6: nobody knows which version made a print.
 
-    The whole print is not laid over the picture (mrbokeh.charuco.board_alignment). On a traced board with white paper around it
+    The whole print is not laid over the picture (mrbokeh.tracking.charuco.board_alignment). On a traced board with white paper around it
     that took the corners' error from 0.070 to 0.016 px and their share of the scale's from 0.02 to 0.004 %, where poses leave 0.05 %;
     but its homography knows no distortion, which photographs keep here, and a board cut off at its squares does not fit.
     """

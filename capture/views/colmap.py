@@ -20,9 +20,9 @@ from capture.views.colmap_pictures import (
 from capture.views.colmap_process import DATABASE_NAME, run_colmap
 from capture.views.sparse_model import SparseModel
 from capture.views.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import find_focal_stacks
+from mrbokeh.stacks.focal_stack import find_focal_stacks
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 RECONSTRUCTION_FOLDER = "reconstruction"
 IMAGES_FOLDER = "images"

@@ -8,7 +8,7 @@ import numpy as np
 from capture.views.colmap_job import ColmapPicture
 from capture.views.distortion import Distortion
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 
 def sparse_model_of(reconstruction: Any, pictures: Sequence[ColmapPicture]) -> SparseModel:

@@ -9,11 +9,11 @@ import numpy as np
 from capture.merging.relative_stack import as_stated
 from capture.views.colmap_job import ColmapPicture
 from capture.views.lens_calibration import stated_distances_m
-from mrbokeh.color import luminance
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import write_preview
-from mrbokeh.progress import track
+from mrbokeh.images.color import luminance
+from mrbokeh.images.image_io import write_preview
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 CAMERA_CHOICES = ("auto", "shared", "separate")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

@@ -19,7 +19,7 @@ from capture.views.colmap_matches import match_statistics
 from capture.views.colmap_model import sparse_model_of
 from capture.views.robust_adjustment import adjusted
 from capture.views.sparse_model_file import write_sparse_model
-from mrbokeh.atomic_files import read_json
+from mrbokeh.system.atomic_files import read_json
 
 DATABASE_NAME = "database.db"
 JOB_NAME = "colmap_job.json"

@@ -11,10 +11,10 @@ from capture.merging.preferred_merge import PREFERRED
 from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, first_pass_path, second_pass
 from capture.views.dense_finish import DenseDepth
-from mrbokeh.camera_rgb import read_camera_rgb
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, write_focal_stack, write_merged
-from mrbokeh.stack_pictures import write_merge_sheet
+from mrbokeh.figures.stack_pictures import write_merge_sheet
+from mrbokeh.images.camera_rgb import read_camera_rgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.stacks.focal_stack import FocalStack, write_focal_stack, write_merged
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

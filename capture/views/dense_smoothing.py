@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.workers import in_bands, workers
+from mrbokeh.system.workers import in_bands, workers
 
 Plane = Float32[np.ndarray, "height width"]
 

@@ -7,7 +7,7 @@ focal length from the principal point and r^2 = u^2 + v^2, the picture has (u, v
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 Distortion = tuple[float, float]
 Positions = Float[np.ndarray, "*batch 2"]

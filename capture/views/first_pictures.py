@@ -7,8 +7,8 @@ from jaxtyping import Float32
 
 from capture.merging.second_pass import first_pass_path
 from capture.views.plane_sweep_view import structure_of
-from mrbokeh.camera_rgb import read_camera_rgb
-from mrbokeh.focal_stack import FocalStack
+from mrbokeh.images.camera_rgb import read_camera_rgb
+from mrbokeh.stacks.focal_stack import FocalStack
 
 _HELD = 8
 

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from capture.views.focus_calibration_blur import MOST_BLUR_PX, BlurSamples
 from capture.views.scale_robust import CAUCHY_95, squared_under_cauchy, squared_under_cauchy_slope
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 FEWEST_SAMPLES = 60
 LEAST_BLUR_PX = 2.0

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 
 MOST_BLUR_PX = 14.0
 

@@ -20,11 +20,11 @@ from capture.views.lens_calibration import (
 )
 from capture.views.scale_focus import FocusSample
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.aperture import Aperture
-from mrbokeh.color import luminance
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import METRES, FocalStack
-from mrbokeh.progress import track
+from mrbokeh.images.color import luminance
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.stacks.focal_stack import METRES, FocalStack
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 _WIDEST_PX = 1600
 _UNKNOWN_SIGMA_DIOPTRE = 0.5

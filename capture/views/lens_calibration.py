@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import GROWTH, GROWTH_WIDTH, FocalStack, Slice
-from mrbokeh.guessed_metres import STATED_DISTANCE
+from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH, FocalStack, Slice
+from mrbokeh.stacks.guessed_metres import STATED_DISTANCE
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-lens-calibration"
 VERSION = 1

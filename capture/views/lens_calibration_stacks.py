@@ -5,8 +5,8 @@ from pathlib import Path
 from capture.merging.changed_metres import with_known_nearest, write_changed_metres
 from capture.merging.replaced_places import depth_m_of
 from capture.views.lens_calibration import LensCalibration, apply_lens_calibration, check_lens
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks, write_focal_stack
-from mrbokeh.guessed_metres import is_near_first
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack
+from mrbokeh.stacks.guessed_metres import is_near_first
 
 
 def calibrate_scene(scene: Path, calibration: LensCalibration) -> list[FocalStack]:

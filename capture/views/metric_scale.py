@@ -20,12 +20,12 @@ from capture.views.scale_file import ScaleResult, read_scale, write_scale
 from capture.views.scale_focus import FocusSample, focus_sample, focus_scale
 from capture.views.sparse_model import SparseModel
 from capture.views.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
-from mrbokeh.atomic_files import read_json
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FILE_NAME as STACK_NAME
-from mrbokeh.focal_stack import FocalStack, read_focal_stack, write_focal_stack
-from mrbokeh.guessed_metres import metres_facts
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_NAME
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
+from mrbokeh.stacks.guessed_metres import metres_facts
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard
 
 RECONSTRUCTION_FOLDER = "reconstruction"
 JOB_NAME = "colmap_job.json"

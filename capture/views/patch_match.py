@@ -14,8 +14,8 @@ from jaxtyping import Float32
 
 from capture.views.dense_clues import SparseDepths
 from capture.views.distortion import Distortion, undistorted_px
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
 

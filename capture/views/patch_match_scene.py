@@ -9,8 +9,8 @@ from capture.views.colmap_job import job_from_json
 from capture.views.dense_clues import SparseDepths
 from capture.views.patch_match import patch_match_clue, patch_match_obstacle, read_patch_match, run_patch_match
 from capture.views.sparse_model import SparseModel
-from mrbokeh.atomic_files import read_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
 
 WORKSPACE = "patch_match"
 _FINISHED = "finished"

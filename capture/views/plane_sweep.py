@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from capture.views.plane_sweep_view import Plane, SweepView, packed_view, rays_of
-from mrbokeh.errors import InputError
-from mrbokeh.workers import in_bands, workers
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.workers import in_bands, workers
 
 Costs = UInt8[np.ndarray, "height width planes"]
 

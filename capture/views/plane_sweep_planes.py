@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.views.plane_sweep_view import SweepView, neighbour_from_reference
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 LEAST_PARALLAX_PX = 8.0
 _PROBES = 5

@@ -8,7 +8,7 @@ from jaxtyping import Float32
 
 from capture.views.plane_sweep import Matching, PlaneScores
 from capture.views.plane_sweep_view import Plane, SweepView
-from mrbokeh.workers import in_bands, workers
+from mrbokeh.system.workers import in_bands, workers
 
 _LEAST_BAND = 32
 _LEAST_CURVATURE = 1e-4

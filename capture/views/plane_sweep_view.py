@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture.views.distortion import Distortion, undistorted_px
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 
 Plane = Float32[np.ndarray, "height width"]
 

@@ -12,9 +12,9 @@ from capture.views.board_search import BoardSearch
 from capture.views.distortion import undistorted_px
 from capture.views.scale_answer import ScaleAnswer
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.errors import InputError
-from mrbokeh.lens import MM_PER_M
+from mrbokeh.optics.lens import MM_PER_M
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard
 
 FEWEST_CORNERS = 6
 POSES_SIGMA, POSES_SIGMA_WITH_DISTORTION = 5e-4, 1e-3

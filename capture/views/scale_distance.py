@@ -4,7 +4,7 @@ import numpy as np
 
 from capture.views.scale_answer import ScaleAnswer
 from capture.views.sparse_model import SparseModel
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _RULER_M = 0.001
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from capture.views.scale_answer import METHODS, ScaleAnswer
 from capture.views.sparse_model_file import SCALE_NAME
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-scale"
 VERSION = 1

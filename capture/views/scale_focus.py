@@ -17,9 +17,9 @@ from capture.views.scale_answer import ScaleAnswer
 from capture.views.scale_robust import CAUCHY_95, deviation
 from capture.views.scale_sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
 from capture.views.sparse_model import SparseModel
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.progress import track
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 FEWEST_POINTS = 50
 OFFSET_SIGMA_M = 0.03

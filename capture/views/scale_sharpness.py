@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from mrbokeh.color import luminance
+from mrbokeh.images.color import luminance
 
 _SMOOTHING_PX = 0.7
 _WINDOW_PX = 4.0

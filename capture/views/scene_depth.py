@@ -24,10 +24,10 @@ from capture.views.patch_match_scene import PatchMatchScene
 from capture.views.plane_sweep_view import SweepView
 from capture.views.sparse_model import SparseModel, SparseView
 from capture.views.sparse_model_file import read_sparse_model
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack, find_focal_stacks
-from mrbokeh.progress import track
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capture.views.distortion import Distortion, distorted_px, undistorted_px
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from capture.views.sparse_model import SparseModel, SparseView
-from mrbokeh.atomic_files import atomic_path, read_json, write_json
-from mrbokeh.camera_file import camera_from_json, camera_to_json
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-poses"
 VERSION = 1

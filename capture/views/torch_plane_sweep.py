@@ -10,8 +10,8 @@ from torch import Tensor
 
 from capture.views.plane_sweep import UNSEEN, WORST_COST, Costs, Matching
 from capture.views.plane_sweep_view import Plane, SweepView, packed_view, rays_of
-from mrbokeh.errors import InputError
-from mrbokeh.torch_device import device_named
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.torch_device import device_named
 
 Picture = Float32[Tensor, "height width"]
 

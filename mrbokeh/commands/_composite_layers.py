@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.capture_bundle import CaptureBundle
 from mrbokeh.commands._composite_options import ObjectOptions, RenderingOptions
 from mrbokeh.commands._insertion_options import VirtualOptions
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, flatten
-from mrbokeh.plate import Plate
-from mrbokeh.staging.scene_description import SceneDescription
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene.staging.scene_description import SceneDescription
+from mrbokeh.stacks.capture_bundle import CaptureBundle
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from mrbokeh.exr_layers.deep_samples import DeepSamples
+    from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples
 
 _COVERED = 0.5
 _HIGH_SHARE = 0.25
@@ -83,14 +83,14 @@ class _FileLayers:
         """The deep ones among others, front first."""
         if not self.deep:
             return layers
-        from mrbokeh.exr_layers.deep_interleaved import interleaved
+        from mrbokeh.stacks.exr_layers.deep_interleaved import interleaved
 
         return interleaved(self.deep, layers)
 
 
 def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate) -> LayersFor:
-    from mrbokeh.staging.one_object import OneObject
-    from mrbokeh.staging.scene_description import Lighting
+    from mrbokeh.scene.staging.one_object import OneObject
+    from mrbokeh.scene.staging.scene_description import Lighting
 
     if options.at and options.at_pixel:
         raise InputError("--at and --at-pixel both say where the object stands: give one of them")
@@ -116,8 +116,8 @@ def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
 
 def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) -> LayersFor:
     """Without a camera file the world of the scene is the plate's camera."""
+    from mrbokeh.scene.staging.scene_file import read_scene_file
     from mrbokeh.shots.scene_camera import scene_track
-    from mrbokeh.staging.scene_file import read_scene_file
 
     description = read_scene_file(path)
 
@@ -129,7 +129,7 @@ def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) 
 
 
 def _filmed(description: SceneDescription, rendering: RenderingOptions, seen_by: Callable[[Plate], Camera]) -> LayersFor:
-    from mrbokeh.staging.filming import FilmedLayers
+    from mrbokeh.scene.staging.filming import FilmedLayers
 
     filmed = FilmedLayers(rendering.filming(), description)
 

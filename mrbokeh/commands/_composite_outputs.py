@@ -5,16 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.atomic_files import require_safe_outputs
 from mrbokeh.commands._composite_options import ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.compositing.base import Inserted
-from mrbokeh.errors import InputError
-from mrbokeh.guessed_metres import GUESSED
-from mrbokeh.image_io import INTEGER_SUFFIXES, require_suffix
-from mrbokeh.layer import Layer, flatten
-from mrbokeh.plate import Plate
-from mrbokeh.plate_alpha import HOLDING_ALPHA, alpha_with
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.images.plate_alpha import HOLDING_ALPHA, alpha_with
+from mrbokeh.stacks.guessed_metres import GUESSED
+from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.errors import InputError
 
 
 def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None], *, all_slices: bool) -> None:
@@ -59,8 +59,8 @@ def write_results(
     out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions, result: ResultOptions
 ) -> None:
     """sharp: the layers that were put in, front first."""
-    from mrbokeh.exr_layers.deep_out import write_deep_exr
-    from mrbokeh.image_io import write_layer
+    from mrbokeh.images.image_io import write_layer
+    from mrbokeh.stacks.exr_layers.deep_out import write_deep_exr
 
     write_picture(out, inserted, plate, sharp, colour)
     if result.save_layer is not None:
@@ -71,7 +71,7 @@ def write_results(
 
 def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions) -> None:
     """With an output space the picture alone; else linear Rec.709 with its layers, or sRGB."""
-    from mrbokeh.finished_picture import write_finished
+    from mrbokeh.images.finished_picture import write_finished
 
     if out.suffix.lower() == ".exr" and colour.of_result is None:
         _write_layers(out, inserted, plate, flatten(sharp))
@@ -88,7 +88,7 @@ def alpha_lost(out: Path, plate: Plate) -> str | None:
 
 def _write_layers(out: Path, inserted: Inserted, plate: Plate, sharp: Layer) -> None:
     """Depth is that of the frontmost sharp surface; circles of confusion follow from it."""
-    from mrbokeh.exr_layers.composite_exr import CompositeLayers, write_composite_exr
+    from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, write_composite_exr
 
     scene_m = np.full(sharp.depth_m.shape, np.inf, np.float32) if plate.depth_m is None else plate.depth_m
     depth_m = np.where(sharp.alpha > 0.5, np.minimum(sharp.depth_m, scene_m), scene_m).astype(np.float32)

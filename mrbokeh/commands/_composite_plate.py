@@ -3,15 +3,15 @@
 from dataclasses import replace
 from pathlib import Path
 
-from mrbokeh.capture_bundle import CaptureBundle
-from mrbokeh.color_management import NamedSpace
 from mrbokeh.commands._composite_options import PlateOptions
 from mrbokeh.commands._insertion_options import ColourOptions
-from mrbokeh.depth_sources.depth_settings import DepthSettings, parse_near_far
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.picture_sources.stored_numbers import read_numbers
-from mrbokeh.plate import Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
+from mrbokeh.compositing.plate import Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
+from mrbokeh.depth.depth_settings import DepthSettings, parse_near_far
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.capture_bundle import CaptureBundle
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.picture_sources.stored_numbers import read_numbers
 
 
 def plate_by(

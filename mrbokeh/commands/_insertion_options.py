@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from mrbokeh.color_management import NamedSpace
-    from mrbokeh.moving_layers import ShutterTiming
-    from mrbokeh.staging.filming import Filming
+    from mrbokeh.images.color_management import NamedSpace
+    from mrbokeh.scene.moving_layers import ShutterTiming
+    from mrbokeh.scene.staging.filming import Filming
 
 PLATE, VIRTUAL, LENS, RESULT = "The plate", "What is put in", "The lens", "The result"
 
@@ -109,8 +109,8 @@ class RenderingOptions:
 
     def filming(self, shutter: "ShutterTiming | None" = None) -> "Filming":
         """shutter: None stands still."""
-        from mrbokeh.lens_distortion.distortion_json import read_distortion
-        from mrbokeh.staging.filming import Filming
+        from mrbokeh.distortion.distortion_json import read_distortion
+        from mrbokeh.scene.staging.filming import Filming
 
         distortion = read_distortion(self.distortion)
         return Filming(self.scene_renderer, self.samples, catches=self.catch, distortion=distortion, shutter=shutter)
@@ -140,6 +140,6 @@ class ColourOptions:
         return self._space(self.output_space)
 
     def _space(self, name: str | None) -> "NamedSpace | None":
-        from mrbokeh.color_management import NamedSpace
+        from mrbokeh.images.color_management import NamedSpace
 
         return None if name is None else NamedSpace.of(name, self.ocio)

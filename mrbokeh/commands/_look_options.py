@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mrbokeh.plate_look.look_options import LookOptions
+    from mrbokeh.compositing.plate_look.look_options import LookOptions
 
 LOOK = "Its look"
 
 
 @dataclass(frozen=True)
 class LookGroup:
-    """Texts as typed, as `mrbokeh.plate_look.look_options.LookOptions` has them."""
+    """Texts as typed, as `mrbokeh.compositing.plate_look.look_options.LookOptions` has them."""
 
     match_grey: Annotated[
         str | None,
@@ -56,7 +56,7 @@ class LookGroup:
 
     @property
     def wanted(self) -> "LookOptions":
-        from mrbokeh.plate_look.look_options import LookOptions
+        from mrbokeh.compositing.plate_look.look_options import LookOptions
 
         matched = (self.match_grey, self.grey_value, self.match_exposure, self.match_white, self.match_black)
         return LookOptions(*matched, self.vignetting, self.grain, self.light_wrap, self.seed, self.plate_exposure)

@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, flatten
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.system.errors import InputError
 
 
 def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) -> Layer:
     """A picture from noisy samples, by a renderer that takes them."""
-    from mrbokeh.light_field_samples_file import read_samples
+    from mrbokeh.stacks.light_field_samples_file import read_samples
 
     if not hasattr(renderer, "reconstruct"):
         raise InputError(f"--samples are for --method lrdm or laplacian, got --method {method}")

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def _read(sources: Sources) -> dict[str, Layer]:
 
 
 def _whole_layer(path: Path) -> Layer:
-    from mrbokeh.image_io import read_layer
-    from mrbokeh.sound_values import require_numbers
+    from mrbokeh.images.image_io import read_layer
+    from mrbokeh.images.sound_values import require_numbers
 
     layer = read_layer(path, extra=True)
     require_numbers(path, {"colour": layer.rgb, "alpha": layer.alpha})
@@ -59,8 +59,8 @@ def _whole_layer(path: Path) -> Layer:
 
 
 def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
-    from mrbokeh.image_io import read_depth, read_image, read_linear
-    from mrbokeh.layer import opaque
+    from mrbokeh.images.image_io import read_depth, read_image, read_linear
+    from mrbokeh.images.layer import opaque
 
     linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
     colour, depth_m = read_image(rgb) if srgb else read_linear(rgb, linear_or), read_depth(depth)
@@ -72,8 +72,8 @@ def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
 
 def _moving(sharp: dict[str, Layer], sources: Sources) -> dict[str, Layer]:
     """With motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
-    from mrbokeh.motion import with_motion
-    from mrbokeh.motion_file import read_motion, taken_from_channels
+    from mrbokeh.layering.motion import with_motion
+    from mrbokeh.stacks.motion_file import read_motion, taken_from_channels
 
     if sources.motion is not None and sources.rgb is None:
         raise InputError("--motion belongs to --rgb: layers have their motion in their own channels forward.u and forward.v")

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice
-from mrbokeh.lens import Lens
-from mrbokeh.progress import track
-from mrbokeh.transferring import SharpPhotograph
+from mrbokeh.optics.lens import Lens
+from mrbokeh.refocus.transferring import SharpPhotograph
+from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Blurred = Callable[[float], Rgb]
@@ -33,7 +33,7 @@ def write_blurred(
     if out.suffix.lower() in FILMS:
         _write_film(out, distances_m, blurred, frame_rate)
     elif out.suffix:
-        from mrbokeh.image_io import write_image
+        from mrbokeh.images.image_io import write_image
 
         write_image(out, blurred(distances_m[0]))
     else:
@@ -41,7 +41,7 @@ def write_blurred(
 
 
 def _write_film(out: Path, distances_m: Sequence[float], blurred: Blurred, frame_rate: float) -> None:
-    from mrbokeh.video_io import VideoWriter
+    from mrbokeh.video.clip import VideoWriter
 
     rate = Fraction(frame_rate).limit_denominator(1001)
     first = blurred(distances_m[0])
@@ -52,17 +52,17 @@ def _write_film(out: Path, distances_m: Sequence[float], blurred: Blurred, frame
 
 def is_transferred(folder: Path) -> bool:
     """Whether a folder is a focal stack of this command's, which --overwrite may replace."""
-    from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
+    from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 
     return (folder / FILE_NAME).is_file() and _MADE in read_focal_stack(folder).metadata
 
 
 def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tuple[float, ...], blurred: Blurred) -> None:
-    from mrbokeh.atomic_files import atomic_folder
-    from mrbokeh.focal_stack import write_focal_stack, write_merged
-    from mrbokeh.focus_places import index_between, slice_names
-    from mrbokeh.guessed_metres import inherited_facts
-    from mrbokeh.image_io import write_image
+    from mrbokeh.images.image_io import write_image
+    from mrbokeh.stacks.focal_stack import write_focal_stack, write_merged
+    from mrbokeh.stacks.focus_places import index_between, slice_names
+    from mrbokeh.stacks.guessed_metres import inherited_facts
+    from mrbokeh.system.atomic_files import atomic_folder
 
     slices = tuple(map(Slice, slice_names(distances_m), distances_m))
     depth = sharp.depth
@@ -79,7 +79,7 @@ def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tup
 
 
 def write_sheet(path: Path, distances_m: Sequence[float], blurred: Blurred, sharp_rgb: Rgb) -> None:
-    from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
+    from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
 
     pictures = {"all in focus": sharp_rgb} | {f"{each:.4g} m": blurred(each) for each in distances_m}
     write_contact_sheet(path, [SheetRow("focus", pictures)])

@@ -7,13 +7,8 @@ from mrbokeh.commands import _video_options as options
 from mrbokeh.commands._insertion_options import ColourOptions, VirtualOptions
 from mrbokeh.commands._look_options import LookGroup
 from mrbokeh.compositing.choose import DEFAULT_MODE
-from mrbokeh.errors import InputError
-from mrbokeh.held_lens import Holding, lens_held
-from mrbokeh.lens_file import read_lens
-from mrbokeh.picture_sources.base import PictureSource
-from mrbokeh.picture_sources.choose import parse_rate
-from mrbokeh.picture_sources.numbered_files import is_pattern
-from mrbokeh.plate_look.look_options import LookOptions
+from mrbokeh.compositing.plate_look.look_options import LookOptions
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.choose import BY_NAME
 from mrbokeh.shots.clip_look import ClipLook
 from mrbokeh.shots.composite_recipe import CompositeRecipe
@@ -22,7 +17,12 @@ from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
 from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.video_target import VideoTarget
-from mrbokeh.video_encodings import with_alpha
+from mrbokeh.stacks.held_lens import Holding, lens_held
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.encodings import with_alpha
+from mrbokeh.video.picture_sources.base import PictureSource
+from mrbokeh.video.picture_sources.choose import parse_rate
+from mrbokeh.video.picture_sources.numbered_files import is_pattern
 
 if TYPE_CHECKING:
     from mrbokeh.shots.scene_layers import SceneLayers
@@ -105,7 +105,7 @@ def _check_virtual(virtual: VirtualOptions, rendering: options.RenderingOptions)
 def _scene_layers(source: PictureSource, virtual: VirtualOptions, rendering: options.RenderingOptions) -> "tuple[SceneLayers, ...]":
     if virtual.scene is None:
         return ()
-    from mrbokeh.moving_layers import ShutterTiming
+    from mrbokeh.scene.moving_layers import ShutterTiming
     from mrbokeh.shots.scene_layers import SceneLayers
 
     rate, shutter = float(source.info.frame_rate), rendering.shutter
@@ -116,7 +116,7 @@ def _scene_layers(source: PictureSource, virtual: VirtualOptions, rendering: opt
 def _camera(source: PictureSource, virtual: VirtualOptions) -> CameraFile | None:
     if virtual.camera is None or virtual.scene is None:
         return None
-    from mrbokeh.staging.scene_file import read_scene_file
+    from mrbokeh.scene.staging.scene_file import read_scene_file
 
     return CameraFile.of_clip(virtual.camera.resolve(), source.info, read_scene_file(virtual.scene).up)
 

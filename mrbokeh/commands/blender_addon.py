@@ -21,12 +21,12 @@ def blender_addon(
     """
     from importlib.resources import files
 
-    from mrbokeh.atomic_files import atomic_path, refuse_existing
-    from mrbokeh.errors import InputError
+    from mrbokeh.system.atomic_files import atomic_path, refuse_existing
+    from mrbokeh.system.errors import InputError
 
     if out.exists() and not out.is_dir():
         raise InputError(f"expected a folder for the add-on, but {out} is a file: name a folder")
-    source, target = files("mrbokeh.blender") / "mrbokeh_export.py", out / "mrbokeh_export.py"
+    source, target = files("mrbokeh.scene.blender") / "mrbokeh_export.py", out / "mrbokeh_export.py"
     refuse_existing(target, overwrite)
     with atomic_path(target) as temporary:
         temporary.write_bytes(source.read_bytes())

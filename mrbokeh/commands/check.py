@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.picture_checks.check_shot import CheckSettings, check_shot
-from mrbokeh.picture_checks.findings import CheckReport
-from mrbokeh.picture_checks.shots import open_shot
+from mrbokeh.checks.check_shot import CheckSettings, check_shot
+from mrbokeh.checks.findings import CheckReport
+from mrbokeh.checks.shots import open_shot
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
 
@@ -54,8 +54,8 @@ def check(
 
     Example: mrbokeh check out.exr --against plate.exr --virtual blurred_layer.exr --json check.json --map leaks.png
     """
-    from mrbokeh.atomic_files import require_safe_outputs, write_json
-    from mrbokeh.image_io import require_suffix
+    from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.system.atomic_files import require_safe_outputs, write_json
 
     for name, path, suffix in (("--map", map_out, ".png"), ("--json", json_out, ".json")):
         if path is not None:
@@ -79,7 +79,7 @@ def _layer_files(virtual: Path | None, sharp: Path | None) -> dict[str, Path]:
 
 
 def _lens(path: Path | None) -> Lens | None:
-    from mrbokeh.lens_file import read_lens
+    from mrbokeh.optics.lens_file import read_lens
 
     return None if path is None else read_lens(path)
 

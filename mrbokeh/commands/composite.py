@@ -13,7 +13,7 @@ from mrbokeh.commands._option_groups import grouped
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_layers import LayersFor
     from mrbokeh.compositing.base import Insertion
-    from mrbokeh.lens import Lens
+    from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.base import Renderer
 
 app = typer.Typer(add_completion=False)
@@ -43,15 +43,15 @@ def composite(
 
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
-    from mrbokeh.capture_bundle import is_bundle, read_bundle
     from mrbokeh.commands._composite_layers import layers_by
     from mrbokeh.commands._composite_outputs import alpha_lost, blur_told, check_outputs, write_results
     from mrbokeh.commands._composite_plate import best_mode, plate_by
     from mrbokeh.compositing.choose import insertion_of
-    from mrbokeh.plate_look.finishing import finished
-    from mrbokeh.plate_look.look_options import finishing_of
-    from mrbokeh.progress import working
+    from mrbokeh.compositing.plate_look.finishing import finished
+    from mrbokeh.compositing.plate_look.look_options import finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
+    from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
+    from mrbokeh.system.progress import working
 
     read = (photo, taken.depth, taken.matte, *virtual.files, standing.object_, standing.environment, rendering.distortion, optics.lens)
     check_outputs(out, result, read, all_slices=taken.all_slices)
@@ -79,8 +79,8 @@ def composite(
 
 def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions) -> None:
     """What of a stack's metres is guessed, and what follows for layers."""
-    from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
-    from mrbokeh.guessed_metres import metres_note
+    from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
+    from mrbokeh.stacks.guessed_metres import metres_note
 
     if not (photo / FILE_NAME).is_file():
         return
@@ -94,8 +94,8 @@ def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectO
 def _into_all_slices(
     stack: Path, out: Path, layers_for: "LayersFor", insertion: "Insertion", renderer: "Renderer", lens: "Lens | None"
 ) -> None:
-    from mrbokeh.focal_stack import read_focal_stack
-    from mrbokeh.stack_compositing import composite_stack
+    from mrbokeh.compositing.stack_compositing import composite_stack
+    from mrbokeh.stacks.focal_stack import read_focal_stack
 
     composite_stack(read_focal_stack(stack), layers_for, insertion, renderer, out, lens)
     typer.echo(f"wrote the focal stack {out}")

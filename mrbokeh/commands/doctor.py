@@ -95,8 +95,8 @@ def _llvm() -> Finding:
 
 
 def _described_device() -> str | None:
-    from mrbokeh.errors import InputError
     from mrbokeh.scene.choose import described_device
+    from mrbokeh.system.errors import InputError
 
     try:
         return described_device()

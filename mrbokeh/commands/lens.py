@@ -10,7 +10,7 @@ from mrbokeh.commands.lens_fit import fit
 from mrbokeh.commands.lens_match import match
 from mrbokeh.commands.lens_pictures import export, show
 from mrbokeh.commands.lens_psf import psf, spreadlets
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="Make, inspect and draw lens files and banks of PSFs.")
 
@@ -64,9 +64,9 @@ def new(
 
     Example: mrbokeh lens new lens.json --focal-length 50 --f-number 1.8 --focus 0.8 --blades 7 --curvature 0.3
     """
-    from mrbokeh.atomic_files import refuse_existing
-    from mrbokeh.image_io import require_suffix
-    from mrbokeh.lens_file import lens_from_json, write_lens
+    from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.optics.lens_file import lens_from_json, write_lens
+    from mrbokeh.system.atomic_files import refuse_existing
 
     require_suffix(out, (".json",), "LENS")
     refuse_existing(out, overwrite)
@@ -115,7 +115,7 @@ def coc(
 
     Example: mrbokeh lens coc lens.json 0.5 1 2 inf --image-width 1920
     """
-    from mrbokeh.lens_file import read_lens
+    from mrbokeh.optics.lens_file import read_lens
 
     if not min(depths) > 0:
         raise InputError(f"depths must be positive metres, got {depths}")

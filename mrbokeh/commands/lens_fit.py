@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from mrbokeh.lens_fitting.lens_fit import LensFit
-    from mrbokeh.lens_fitting.point_lights import PointLight
-    from mrbokeh.psf_bank import PsfBank
+    from mrbokeh.lens_measuring.fitting.lens_fit import LensFit
+    from mrbokeh.lens_measuring.fitting.point_lights import PointLight
+    from mrbokeh.optics.psf_bank import PsfBank
 
 RINGS = 4
 
@@ -41,10 +41,10 @@ def fit(
 
     Example: mrbokeh lens fit scene --out my_lens --regions 3x3
     """
-    from mrbokeh.guessed_metres import metres_notes
-    from mrbokeh.lens_fitting.lens_fit import FitSettings, fit_lens
-    from mrbokeh.lens_fitting.measured_bank import bank_of
-    from mrbokeh.psf_bank_file import refuse_existing_bank, write_bank
+    from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
+    from mrbokeh.lens_measuring.fitting.measured_bank import bank_of
+    from mrbokeh.optics.psf_bank_file import refuse_existing_bank, write_bank
+    from mrbokeh.stacks.guessed_metres import metres_notes
 
     refuse_existing_bank(out, overwrite)
     _check(smoothness, pixels)
@@ -61,15 +61,15 @@ def fit(
 
 
 def _stacks(folders: list[Path]) -> list:  # type: ignore[type-arg]
-    from mrbokeh.focal_stack import find_focal_stacks
+    from mrbokeh.stacks.focal_stack import find_focal_stacks
 
     return [stack for folder in folders for stack in find_focal_stacks(folder)]
 
 
 def _lights(behind: list[Path], in_front: list[Path]) -> "tuple[list[PointLight], tuple[int, int] | None]":
     """All lights of all frames, and the size of the frames."""
-    from mrbokeh.image_io import read_linear
-    from mrbokeh.lens_fitting.point_lights import find_lights
+    from mrbokeh.images.image_io import read_linear
+    from mrbokeh.lens_measuring.fitting.point_lights import find_lights
 
     found, size = [], None
     for path, near in [*((path, False) for path in behind), *((path, True) for path in in_front)]:
@@ -104,9 +104,9 @@ def _regions(text: str) -> tuple[int, int]:
 
 
 def _draw(out: Path, fitted: "LensFit", bank: "PsfBank") -> None:
-    from mrbokeh.atomic_files import atomic_path
-    from mrbokeh.lens_fitting.evidence_picture import draw_evidence
-    from mrbokeh.psf_bank_drawing import draw_bank
+    from mrbokeh.figures.psf_bank_drawing import draw_bank
+    from mrbokeh.lens_measuring.fitting.evidence_picture import draw_evidence
+    from mrbokeh.system.atomic_files import atomic_path
 
     for name, figure in (("kernels.png", draw_bank(bank)), ("evidence.png", draw_evidence(fitted))):
         with atomic_path(out / name) as temporary:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _SIDES = {"behind": 1, "front": -1}
 
@@ -32,13 +32,13 @@ def match(
 
     Example: mrbokeh lens match night.jpg --out lens.json --evidence lens.png
     """
-    from mrbokeh.atomic_files import atomic_path, refuse_existing
-    from mrbokeh.image_io import ENCODED_SUFFIXES, read_image
-    from mrbokeh.lens_file import write_lens
-    from mrbokeh.lens_matching.lens_match import match_lens
-    from mrbokeh.lens_matching.match_picture import draw_match
-    from mrbokeh.lens_matching.match_table import as_text, table_of
-    from mrbokeh.lens_matching.photo_facts import read_facts
+    from mrbokeh.images.image_io import ENCODED_SUFFIXES, read_image
+    from mrbokeh.lens_measuring.matching.lens_match import match_lens
+    from mrbokeh.lens_measuring.matching.match_picture import draw_match
+    from mrbokeh.lens_measuring.matching.match_table import as_text, table_of
+    from mrbokeh.lens_measuring.matching.photo_facts import read_facts
+    from mrbokeh.optics.lens_file import write_lens
+    from mrbokeh.system.atomic_files import atomic_path, refuse_existing
 
     _check(side, encoding, evidence)
     for path in (out, *([evidence] if evidence else [])):

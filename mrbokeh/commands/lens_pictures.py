@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 def show(
@@ -20,8 +20,8 @@ def show(
 
     Example: mrbokeh lens show lens.json --out lens.png
     """
-    from mrbokeh.atomic_files import atomic_path, refuse_existing
-    from mrbokeh.progress import working
+    from mrbokeh.system.atomic_files import atomic_path, refuse_existing
+    from mrbokeh.system.progress import working
 
     if lens.suffix.lower() == ".onnx":
         raise InputError(f"expected a lens file or a bank of PSFs to draw, got the network {lens}: `mrbokeh train evaluate` shows it")
@@ -36,15 +36,15 @@ def show(
 
 
 def _drawn_lens(path: Path, width_px: int) -> Any:
-    from mrbokeh.lens_drawing import draw_lens
-    from mrbokeh.lens_file import read_lens
+    from mrbokeh.figures.lens_drawing import draw_lens
+    from mrbokeh.optics.lens_file import read_lens
 
     return draw_lens(read_lens(path), width_px)
 
 
 def _drawn_bank(folder: Path) -> Any:
-    from mrbokeh.psf_bank_drawing import draw_bank
-    from mrbokeh.psf_bank_file import read_bank
+    from mrbokeh.figures.psf_bank_drawing import draw_bank
+    from mrbokeh.optics.psf_bank_file import read_bank
 
     return draw_bank(read_bank(folder))
 
@@ -59,8 +59,8 @@ def export(
 
     Example: mrbokeh lens export combined_bank --out kernels --format exr
     """
-    from mrbokeh.psf_bank_export import export_bank
-    from mrbokeh.psf_bank_file import read_bank
+    from mrbokeh.figures.psf_bank_export import export_bank
+    from mrbokeh.optics.psf_bank_file import read_bank
 
     if format_ not in ("exr", "png"):
         raise InputError(f"kernels are exported as exr or png, got --format {format_}")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 def psf(
@@ -60,9 +60,9 @@ def psf(
     Example: mrbokeh lens psf physical --prescription dgauss.50mm.dat --focus 1.5 --f-number 2.8 --sensor-width 23.5
     --image-width 1920 --counts 40,40 --out double_gauss
     """
-    from mrbokeh.interrupts import kept_when_interrupted
     from mrbokeh.psf_models.build import build_bank
     from mrbokeh.psf_models.choose import ModelOptions, choose_model
+    from mrbokeh.system.interrupts import kept_when_interrupted
 
     options = ModelOptions(
         lens=lens,
@@ -116,10 +116,10 @@ def spreadlets(
     """
     import numpy as np
 
-    from mrbokeh.interrupts import kept_when_interrupted
-    from mrbokeh.psf_bank_file import SPREADLETS
-    from mrbokeh.spreadlets import Sparsification
-    from mrbokeh.spreadlets_build import build_spreadlets
+    from mrbokeh.optics.psf_bank_file import SPREADLETS
+    from mrbokeh.renderers.kernels.spreadlets import Sparsification
+    from mrbokeh.renderers.kernels.spreadlets_build import build_spreadlets
+    from mrbokeh.system.interrupts import kept_when_interrupted
 
     settings = Sparsification(points_per_px=points_per_px, lloyd_steps=lloyd_steps, annealing_steps=annealing_steps, seed=seed)
     with kept_when_interrupted(f"finished kernels are kept in {bank}", overwrite):

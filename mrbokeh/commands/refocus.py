@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
-from mrbokeh.focal_stack import FocalStack, Slice
-from mrbokeh.refocusing import Refocusing
+from mrbokeh.refocus.refocusing import Refocusing
+from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
 
@@ -50,12 +50,12 @@ def refocus(
 
     Example: mrbokeh refocus STACK --focus @300,200,#2.5 --out refocused
     """
-    from mrbokeh.atomic_files import require_safe_outputs
-    from mrbokeh.focal_stack import read_focal_stack, write_focal_stack
-    from mrbokeh.focus_places import Seen, parse_focus
-    from mrbokeh.guessed_metres import inherited_facts, metres_note, unit_of
-    from mrbokeh.image_io import require_suffix
-    from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.stacks.focal_stack import read_focal_stack, write_focal_stack
+    from mrbokeh.stacks.focus_places import Seen, parse_focus
+    from mrbokeh.stacks.guessed_metres import inherited_facts, metres_note, unit_of
+    from mrbokeh.system.atomic_files import require_safe_outputs
+    from mrbokeh.system.interrupts import kept_when_interrupted
 
     if out.resolve() == stack.resolve():
         raise InputError("--out must be another folder than the stack's own")
@@ -84,9 +84,9 @@ def refocus(
 
 def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float, ...]) -> None:
     """Write all_in_focus.exr and depth.exr with all that the source knows, its focus index counted in the new slices."""
-    from mrbokeh.camera_rgb import write_camera_rgb
-    from mrbokeh.exr_io import read_exr, write_exr
-    from mrbokeh.focus_places import index_between
+    from mrbokeh.images.camera_rgb import write_camera_rgb
+    from mrbokeh.images.exr_io import read_exr, write_exr
+    from mrbokeh.stacks.focus_places import index_between
 
     write_camera_rgb(made.all_in_focus_path, source.all_in_focus(), None, half=False)
     part = read_exr(source.depth_path)[0]
@@ -96,7 +96,7 @@ def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float,
 
 def _make_room(out: Path, overwrite: bool) -> None:
     """Only what this command wrote is ever replaced; a run that was stopped has no stack.json yet and goes on."""
-    from mrbokeh.focal_stack import FILE_NAME, read_focal_stack
+    from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 
     if out.exists() and not (out / _SETTINGS).is_file():
         raise InputError(f"{out} exists and was not made by refocus: give another name")
@@ -123,11 +123,11 @@ def _way(source: FocalStack, f_number: float | None, lens: Path | None, renderer
 
 def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, settings: dict, overwrite: bool) -> tuple[Slice, ...]:
     """Slices that are there already, made with the same settings by a run that was stopped, are kept."""
-    from mrbokeh.atomic_files import read_json, write_json
-    from mrbokeh.focus_places import slice_names
-    from mrbokeh.image_io import write_image
-    from mrbokeh.progress import track
-    from mrbokeh.stack_pictures import write_upright_png
+    from mrbokeh.figures.stack_pictures import write_upright_png
+    from mrbokeh.images.image_io import write_image
+    from mrbokeh.stacks.focus_places import slice_names
+    from mrbokeh.system.atomic_files import read_json, write_json
+    from mrbokeh.system.progress import track
 
     kept = not overwrite and (out / _SETTINGS).is_file() and read_json(out / _SETTINGS, "settings of refocus") == settings
     write_json(out / _SETTINGS, settings)
@@ -145,7 +145,7 @@ def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, se
 
 def _growth(way: Refocusing, distance_m: float) -> dict:
     """How fast blur grows in a new slice, where that was measured of the captured ones."""
-    from mrbokeh.focal_stack import GROWTH, GROWTH_WIDTH
+    from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH
 
     width_px = way.stack.slices[0].metadata.get(GROWTH_WIDTH)
     if way.lens is not None or width_px is None:
@@ -160,8 +160,8 @@ def _times_as_fast(way: Refocusing) -> float:
 
 
 def _write_sheet(path: Path, made: FocalStack) -> None:
-    from mrbokeh.contact_sheet import SheetRow, write_contact_sheet
-    from mrbokeh.guessed_metres import unit_of
+    from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+    from mrbokeh.stacks.guessed_metres import unit_of
 
     pictures = {f"{each.focus_distance_m:.5g} {unit_of(made)}": made.slice_rgb(index) for index, each in enumerate(made.slices)}
     write_contact_sheet(path, [SheetRow("focus", pictures)])

@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 
 from mrbokeh.commands._former_names import formerly
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
 from mrbokeh.renderers.choose import DEFAULT
+from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
 
@@ -55,14 +55,14 @@ def render(
 
     Example: mrbokeh render --rgb aif.exr --depth z.exr --lens lens.json --focus-at 640,360 --out blurred.exr
     """
-    from mrbokeh.atomic_files import require_safe_outputs
     from mrbokeh.commands._render_method import focused, reconstructed
     from mrbokeh.commands._render_sharp import Sources, read_sharp
-    from mrbokeh.image_io import INTEGER_SUFFIXES, require_suffix
-    from mrbokeh.layering import Layering
-    from mrbokeh.lens_file import read_lens
-    from mrbokeh.progress import working
+    from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
+    from mrbokeh.layering.layering import Layering
+    from mrbokeh.optics.lens_file import read_lens
     from mrbokeh.renderers.choose_bank import chosen_renderer
+    from mrbokeh.system.atomic_files import require_safe_outputs
+    from mrbokeh.system.progress import working
 
     require_suffix(out, (".exr", *INTEGER_SUFFIXES), "--out")
     require_safe_outputs((out,), (lens, rgb, depth, motion, samples, *(layer or ()), *(behind or ())), overwrite)
@@ -81,7 +81,7 @@ def render(
 
 
 def _write(out: Path, blurred: Layer, alpha_out: bool) -> None:
-    from mrbokeh.image_io import write_image, write_layer
+    from mrbokeh.images.image_io import write_image, write_layer
 
     if alpha_out:
         write_layer(out, blurred)

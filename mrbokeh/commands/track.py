@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.atomic_files import refuse_existing, require_safe_outputs
 from mrbokeh.commands._former_names import formerly
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import refuse_existing, require_safe_outputs
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from mrbokeh.camera import Camera
-    from mrbokeh.camera_track.board_track import BoardTrack
-    from mrbokeh.camera_track.options import TrackOptions
-    from mrbokeh.camera_track.track import CameraTrack
-    from mrbokeh.camera_track.tracked_frame import Distortion
+    from mrbokeh.optics.camera import Camera
+    from mrbokeh.tracking.camera_track.board_track import BoardTrack
+    from mrbokeh.tracking.camera_track.options import TrackOptions
+    from mrbokeh.tracking.camera_track.track import CameraTrack
+    from mrbokeh.tracking.camera_track.tracked_frame import Distortion
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="The camera of every frame of a clip, and its files.")
 
@@ -47,9 +47,9 @@ def track(
 
     Example: mrbokeh track clip clip.mp4 --board board.json --calibrate --out track.json
     """
-    from mrbokeh.camera_track.board_track import TrackSettings, calibrate_clip, track_board
-    from mrbokeh.camera_track.formats import format_of_name
-    from mrbokeh.charuco.board_file import read_board
+    from mrbokeh.tracking.camera_track.board_track import TrackSettings, calibrate_clip, track_board
+    from mrbokeh.tracking.camera_track.formats import format_of_name
+    from mrbokeh.tracking.charuco.board_file import read_board
 
     require_safe_outputs((out,), (clip, board, camera), overwrite)
     if format_ is None:
@@ -97,8 +97,8 @@ def convert(
 
     Example: mrbokeh track convert track.json track.chan
     """
-    from mrbokeh.camera_track.formats import read_track
-    from mrbokeh.camera_track.options import TrackOptions
+    from mrbokeh.tracking.camera_track.formats import read_track
+    from mrbokeh.tracking.camera_track.options import TrackOptions
 
     refuse_existing(out, overwrite)
     options = TrackOptions(up, _size_px(size), rotation_order, sensor_width, metric, distortion)
@@ -110,7 +110,7 @@ def convert(
 
 
 def _intrinsics(path: Path) -> "tuple[Camera, Distortion | None]":
-    from mrbokeh.camera_track.formats import read_track
+    from mrbokeh.tracking.camera_track.formats import read_track
 
     known = read_track(path)
     first = known.at(known.numbers[0])
@@ -118,7 +118,7 @@ def _intrinsics(path: Path) -> "tuple[Camera, Distortion | None]":
 
 
 def _write(out: Path, made: "CameraTrack", options: "TrackOptions | None", format_: str | None) -> None:
-    from mrbokeh.camera_track.formats import write_track
+    from mrbokeh.tracking.camera_track.formats import write_track
 
     missing = write_track(out, made, options, format_)
     if missing:

@@ -8,10 +8,10 @@ import typer
 from jaxtyping import Float32
 
 from mrbokeh.commands._former_names import formerly
-from mrbokeh.depth_sources.depth_settings import DepthSettings, parse_known, parse_near_far, parse_stereo
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.transferring import SharpPhotograph
+from mrbokeh.depth.depth_settings import DepthSettings, parse_known, parse_near_far, parse_stereo
+from mrbokeh.optics.lens import Lens
+from mrbokeh.refocus.transferring import SharpPhotograph
+from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
 
@@ -64,10 +64,10 @@ def transfer(
     Example: mrbokeh transfer aif.png --depth midas.onnx --disparity 0.5:inf --lens lens.json --focus 0.5:inf:48 --out pull.mp4
     """
     from mrbokeh.commands._transfer_outputs import check_out, write_blurred, write_sheet
-    from mrbokeh.guessed_metres import metres_note, note_of_file
-    from mrbokeh.held_lens import lens_as_held
+    from mrbokeh.refocus.transferring import open_sharp, seen_like, with_recovered_highlights
     from mrbokeh.renderers.choose import lens_and_renderer
-    from mrbokeh.transferring import open_sharp, seen_like, with_recovered_highlights
+    from mrbokeh.stacks.guessed_metres import metres_note, note_of_file
+    from mrbokeh.stacks.held_lens import lens_as_held
 
     _require_outputs(out, sheet, save_depth, (photo, lens, depth), overwrite)
     settings = DepthSettings(
@@ -90,7 +90,7 @@ def transfer(
     rgb = sharp.photograph.rgb if highlights == 0.0 else with_recovered_highlights(sharp.photograph.rgb, highlights)
 
     def blurred(distance_m: float) -> Float32[np.ndarray, "height width 3"]:
-        from mrbokeh.layer import opaque
+        from mrbokeh.images.layer import opaque
 
         return blurs.render([opaque(rgb, sharp.depth.depth_m)], chosen.focused_at(distance_m)).rgb
 
@@ -104,9 +104,9 @@ def transfer(
 
 
 def _require_outputs(out: Path, sheet: Path | None, save_depth: Path | None, inputs: tuple[Path | None, ...], overwrite: bool) -> None:
-    from mrbokeh.atomic_files import require_safe_outputs
     from mrbokeh.commands._transfer_outputs import FILMS, is_transferred
-    from mrbokeh.image_io import INTEGER_SUFFIXES, require_suffix
+    from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
+    from mrbokeh.system.atomic_files import require_safe_outputs
 
     named = (
         (out, ("", ".exr", *INTEGER_SUFFIXES, *FILMS), "--out"),
@@ -124,7 +124,7 @@ def _require_outputs(out: Path, sheet: Path | None, save_depth: Path | None, inp
 def _distances(lens: Lens, sharp: SharpPhotograph, focus: str | None, focus_at: str | None) -> tuple[float, ...]:
     """From --focus, from the depth at a pixel, else where the phone had focused, else as the lens file says."""
     from mrbokeh.commands._render_method import focused
-    from mrbokeh.focus_places import Seen, parse_focus
+    from mrbokeh.stacks.focus_places import Seen, parse_focus
 
     if focus is not None and focus_at is not None:
         raise InputError("give either --focus or --focus-at, not both")
@@ -137,7 +137,7 @@ def _distances(lens: Lens, sharp: SharpPhotograph, focus: str | None, focus_at: 
 
 
 def _write_depth(path: Path, sharp: SharpPhotograph) -> None:
-    from mrbokeh.exr_io import ExrPart, write_exr
+    from mrbokeh.images.exr_io import ExrPart, write_exr
 
     channels = {"Z": sharp.depth.depth_m, "mask.valid": sharp.depth.valid.astype(np.float16)}
     write_exr(path, ExrPart(channels, attributes={"comments": sharp.depth.note}))

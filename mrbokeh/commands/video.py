@@ -4,24 +4,24 @@ from pathlib import Path
 
 import typer
 
-from mrbokeh.atomic_files import require_safe_outputs
 from mrbokeh.commands import _video_options as options
 from mrbokeh.commands._insertion_options import ColourOptions, VirtualOptions
 from mrbokeh.commands._look_options import LookGroup
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands._video_shot import parse_frames as parse_frames
 from mrbokeh.commands._video_shot import recipe_of, shot_of, target_of
-from mrbokeh.interrupts import kept_when_interrupted
-from mrbokeh.picture_sources.base import PictureSource
-from mrbokeh.picture_sources.choose import open_source
-from mrbokeh.progress import progress_bars
 from mrbokeh.shots.crew import Crew, OneProcess
 from mrbokeh.shots.dask_crew import DaskCrew
 from mrbokeh.shots.making import make_shot
 from mrbokeh.shots.process_crew import ProcessCrew
 from mrbokeh.shots.shot import Shot, Target
-from mrbokeh.video_io import has_alpha_apart
-from mrbokeh.workers import cores
+from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.interrupts import kept_when_interrupted
+from mrbokeh.system.progress import progress_bars
+from mrbokeh.system.workers import cores
+from mrbokeh.video.clip import has_alpha_apart
+from mrbokeh.video.picture_sources.base import PictureSource
+from mrbokeh.video.picture_sources.choose import open_source
 
 app = typer.Typer(add_completion=False)
 

@@ -15,10 +15,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.plate import Plate
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.layer import Layer
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

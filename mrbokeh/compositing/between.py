@@ -20,15 +20,15 @@ from jaxtyping import Bool, Float32
 from mrbokeh.compositing.base import Inserted, same_size
 from mrbokeh.compositing.clean_colours import clean_colours
 from mrbokeh.compositing.near_and_far import NO_LIGHTS, NearAndFar, continued, cut_in_two, nearer_than
+from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.pupil_shares import Rays
 from mrbokeh.compositing.three_parts import put_together
 from mrbokeh.compositing.true_rims import TrueRims
 from mrbokeh.compositing.virtual_surface import shows_anything, virtual_depth_m
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, clear, flatten
-from mrbokeh.lens import Lens
-from mrbokeh.plate import Plate
+from mrbokeh.images.layer import Layer, clear, flatten
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]

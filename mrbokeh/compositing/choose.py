@@ -6,7 +6,7 @@ from mrbokeh.compositing.matte import SmoothedMatte
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.rerender import Rerendered
 from mrbokeh.compositing.touched_box import InTouchedBox
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 MODES: dict[str, Insertion] = {
     "front": InTouchedBox(OverPhotograph(by_depth=False)),

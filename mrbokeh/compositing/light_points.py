@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32
 from mrbokeh.compositing.near_and_far import Lights
 from mrbokeh.compositing.pupil_points import pupil_points
 from mrbokeh.compositing.pupil_shares import Rays
-from mrbokeh.lit_pixels import lights
+from mrbokeh.layering.lit_pixels import lights
 
 _LEAST_POINTS, _MOST_POINTS = 64, 16384
 _POINTS_PER_PX = 4.0

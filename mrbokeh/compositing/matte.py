@@ -9,10 +9,10 @@ from jaxtyping import Float32
 from mrbokeh.compositing.base import Inserted, same_size
 from mrbokeh.compositing.occlusion import covered_by, occlusion_matte
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.plate import Plate
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.layer import Layer
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
 _LEAST = np.float32(1e-6)

@@ -1,6 +1,6 @@
 """The sharp photographed scene cut in two by a virtual surface: what is nearer, with soft rims, and the rest, continued behind it.
 
-A pixel on the rim of a near thing holds both colours; they are taken apart as mrbokeh.hidden_background does, but at depth edges
+A pixel on the rim of a near thing holds both colours; they are taken apart as mrbokeh.layering.hidden_background does, but at depth edges
 alone: where the virtual surface cuts through a smooth surface (a table that an object stands on), the cut is hard. Lights are kept
 apart from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
 """
@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from mrbokeh.hidden_background import apart
-from mrbokeh.layer import Layer
-from mrbokeh.lit_pixels import lights, without_lights
-from mrbokeh.sheets import Sheet
-from mrbokeh.workers import workers
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.hidden_background import apart
+from mrbokeh.layering.lit_pixels import lights, without_lights
+from mrbokeh.layering.sheets import Sheet
+from mrbokeh.system.workers import workers
 
 _TWO_DEEP = 2.0
 _SPECK_PX = 5

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
 
 Plane = Float32[np.ndarray, "height width"]
 

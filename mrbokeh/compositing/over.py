@@ -8,8 +8,8 @@ from jaxtyping import Float32
 
 from mrbokeh.compositing.base import Inserted, same_size
 from mrbokeh.compositing.occlusion import covered_by, occlusion_matte
-from mrbokeh.layer import Layer, clear, flatten
-from mrbokeh.plate import Plate
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.renderers.base import Renderer
 
 

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 
 # The root of x^3 = x + 1: steps of 1/g and 1/g^2 fill the square evenly (Roberts 2018, the R2 sequence).
 _PLASTIC_NUMBER = 1.32471795724474602596

@@ -12,14 +12,14 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from mrbokeh.aperture import Aperture
 from mrbokeh.compositing.near_and_far import NearAndFar
 from mrbokeh.compositing.pupil_points import pupil_points
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lit_pixels import without_lights
-from mrbokeh.spreading import FIELD_CELLS, Frame
-from mrbokeh.workers import in_bands, workers
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.lit_pixels import without_lights
+from mrbokeh.layering.spreading import FIELD_CELLS, Frame
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.workers import in_bands, workers
 
 _BAND_PLACES = 2048
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from mrbokeh.compositing.base import Inserted, same_size
 from mrbokeh.compositing.between import Between
+from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.three_parts import LEAST_LIGHT
 from mrbokeh.compositing.virtual_surface import shows_anything
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, clear, flatten
-from mrbokeh.plate import Plate
+from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

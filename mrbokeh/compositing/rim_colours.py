@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from mrbokeh.lit_pixels import lights
-from mrbokeh.workers import in_bands, workers
+from mrbokeh.layering.lit_pixels import lights
+from mrbokeh.system.workers import in_bands, workers
 
 REACH_PX = 2
 """How far depth may be off."""

@@ -5,9 +5,9 @@ from jaxtyping import Float32, Float64, Int64
 
 from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.light_points import far_lights, virtual_lights
+from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.pupil_shares import PupilMeans, Rays
-from mrbokeh.layer import Layer
-from mrbokeh.plate import Plate
+from mrbokeh.images.layer import Layer
 
 LEAST_LIGHT = np.float32(1e-5)
 """Less coverage or light than this is rounding of the renderer, not light of a layer."""

@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.compositing.base import Inserted, Insertion, same_size
+from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.virtual_surface import shows
-from mrbokeh.layer import Layer, clear, flatten
-from mrbokeh.lens import Lens
-from mrbokeh.motion import farthest_px
-from mrbokeh.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
-from mrbokeh.plate import Plate
+from mrbokeh.images.layer import Layer, clear, flatten
+from mrbokeh.layering.motion import farthest_px
+from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
+from mrbokeh.layering.spreading import reach_px
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.spreading import reach_px
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -49,7 +49,7 @@ class InTouchedBox:
 def touched_box(plate: Plate, layers: Sequence[Layer]) -> Box:
     """The box of all pixels that virtual light can reach, grown to all whose light mixes with it there; NOWHERE where there is none.
 
-    For lenses whose blur is the same everywhere (`mrbokeh.pixel_box.is_same_everywhere`).
+    For lenses whose blur is the same everywhere (`mrbokeh.layering.pixel_box.is_same_everywhere`).
     """
     lit = _lit_boxes(layers)
     return _touched_box(plate, lit) if lit else NOWHERE

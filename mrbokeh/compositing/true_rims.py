@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from mrbokeh.compositing.near_and_far import NearAndFar, continued, without_edge
+from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.rim_colours import RimColours
-from mrbokeh.plate import Plate
 from mrbokeh.renderers.base import Renderer
 
 _AROUND_PX = 4.0

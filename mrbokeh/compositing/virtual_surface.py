@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from mrbokeh.compositing.near_and_far import continued
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
 
 Plane = Float32[np.ndarray, "height width"]
 

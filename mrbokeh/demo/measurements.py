@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.atomic_files import read_json
-from mrbokeh.camera import Camera
 from mrbokeh.demo.truth import Truth, first_pass, has_second_pass, read_truth
-from mrbokeh.focal_stack import FocalStack, read_focal_stack
-from mrbokeh.image_io import read_layer
-from mrbokeh.image_metrics import psnr
+from mrbokeh.images.image_io import read_layer
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.camera import Camera
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
+from mrbokeh.system.atomic_files import read_json
 
 TRUSTED = 0.3
 LEAST_ALL_IN_FOCUS_DB = 38.0

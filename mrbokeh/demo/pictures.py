@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.color import srgb_to_linear
 from mrbokeh.demo.truth import Truth, first_pass, has_second_pass
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import write_preview
-from mrbokeh.stack_pictures import depth_picture
+from mrbokeh.figures.stack_pictures import depth_picture
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.images.image_io import write_preview
+from mrbokeh.stacks.focal_stack import FocalStack
 
 Plane = Float[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.system.atomic_files import read_json, write_json
 
 
 @dataclass(frozen=True)

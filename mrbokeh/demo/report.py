@@ -10,7 +10,7 @@ from pathlib import Path
 from mrbokeh import __version__
 from mrbokeh.demo.measurements import Measurement
 from mrbokeh.demo.stages import Done
-from mrbokeh.html_page import cell, section, table, write_page
+from mrbokeh.system.html_page import cell, section, table, write_page
 
 PACKAGES = ("numpy", "opencv-python-headless", "OpenEXR", "rawpy", "pycolmap", "torch", "onnxruntime", "embreex", "numba")
 

@@ -13,7 +13,7 @@ from uuid import uuid4
 from rich.console import Console
 
 from mrbokeh.demo.records import Record, must_be_anew, read_record, write_record
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mrbokeh.atomic_files import write_json
 from mrbokeh.demo.measurements import (
     Measurement,
     camera_measurements,
@@ -17,9 +16,10 @@ from mrbokeh.demo.plan import BOARD, DATA, DESK, HELD_OUT_VIEW, VIEWS, Placement
 from mrbokeh.demo.report import figure, link, write_report
 from mrbokeh.demo.stages import Done
 from mrbokeh.demo.truth import has_second_pass, read_truth, true_cameras
-from mrbokeh.focal_stack import read_focal_stack
-from mrbokeh.html_page import section
-from mrbokeh.stack_pictures import write_stack_pictures
+from mrbokeh.figures.stack_pictures import write_stack_pictures
+from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.html_page import section
 
 
 def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.atomic_files import read_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_from_json
-from mrbokeh.exr_io import read_exr
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_io import read_image
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_io import read_image
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.atomic_files import read_json
 
 FIRST_PASS_FOLDER = "first_pass"
 

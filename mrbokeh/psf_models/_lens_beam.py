@@ -5,11 +5,11 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.errors import InputError
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._ray_tracing_numba import find_chief
 from mrbokeh.psf_models.lens_prescription import LensPrescription
 from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.system.errors import InputError
 
 BANDS_UM = np.array([[0.6114, 0.04], [0.5491, 0.04], [0.4642, 0.04]])
 """Middle and half width of a triangular band for red, green and blue. The middles are the dominant wavelengths of the Rec.709

@@ -6,8 +6,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from mrbokeh.errors import InputError
-from mrbokeh.psf_bank import Axis, Turns
+from mrbokeh.optics.psf_bank import Axis, Turns
+from mrbokeh.system.errors import InputError
 
 Kernel = Float32[np.ndarray, "size size channels"]
 

@@ -2,8 +2,8 @@
 
 from math import sqrt
 
-from mrbokeh.errors import InputError
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
+from mrbokeh.system.errors import InputError
 
 
 def biconvex_lens(

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.errors import InputError
-from mrbokeh.progress import track
-from mrbokeh.psf_bank import PsfBank, check_kernel, physical_boxes
-from mrbokeh.psf_bank_file import (
+from mrbokeh.optics.psf_bank import PsfBank, check_kernel, physical_boxes
+from mrbokeh.optics.psf_bank_file import (
     HEAD,
     BankHead,
     clear_bank,
@@ -22,7 +20,9 @@ from mrbokeh.psf_bank_file import (
     write_head,
 )
 from mrbokeh.psf_models.base import PsfModel
-from mrbokeh.workers import cores
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
+from mrbokeh.system.workers import cores
 
 
 def bank_head(model: PsfModel, rays: int, seed: int) -> BankHead:

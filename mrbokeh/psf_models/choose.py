@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from mrbokeh.errors import InputError
-from mrbokeh.option_names import flag
 from mrbokeh.psf_models.base import PsfModel
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.option_names import flag
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class ModelOptions:
 
 
 def _simple(options: ModelOptions) -> PsfModel:
-    from mrbokeh.aperture import Aperture
-    from mrbokeh.lens_file import read_lens
+    from mrbokeh.optics.aperture import Aperture
+    from mrbokeh.optics.lens_file import read_lens
     from mrbokeh.psf_models.simple_lens import SimpleLens
 
     aperture = Aperture.disc() if options.lens is None else read_lens(options.lens).aperture
@@ -71,7 +71,7 @@ def _volume(options: ModelOptions) -> PsfModel:
 
 
 def _stylized(options: ModelOptions) -> PsfModel:
-    from mrbokeh.image_io import read_image
+    from mrbokeh.images.image_io import read_image
     from mrbokeh.psf_models.stylized import Stylized
 
     if options.image is None:

@@ -16,7 +16,7 @@ at 20 m (63 to 95 %). No published numbers were found for the other two lenses.
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 # Fraunhofer lines in micrometres; n_d is the index a prescription states, V = (n_d - 1) / (n_F - n_C) the Abbe number.
 LINE_C_UM, LINE_D_UM, LINE_F_UM = 0.65627, 0.58756, 0.48613

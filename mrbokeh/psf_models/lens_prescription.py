@@ -7,9 +7,9 @@ from math import inf, isfinite
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.errors import InputError
 from mrbokeh.psf_models.glass import LINE_C_UM, LINE_D_UM, LINE_F_UM, cauchy_coefficients, index_at
 from mrbokeh.psf_models.paraxial import Paraxial
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)

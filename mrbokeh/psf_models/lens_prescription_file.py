@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.errors import InputError
 from mrbokeh.psf_models.glass import estimated_abbe_number
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
+from mrbokeh.system.errors import InputError
 
 _COLUMNS = "radius, distance to the next surface, index behind it, [Abbe number,] aperture diameter, in mm"
 _HALVINGS = 30

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 Matrix = Float64[np.ndarray, "2 2"]
 

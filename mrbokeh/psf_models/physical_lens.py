@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.errors import InputError
-from mrbokeh.psf_bank import Axis, Turns
+from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import GREEN_UM, LensBeam, area_of
 from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest
@@ -23,6 +22,7 @@ from mrbokeh.psf_models.biconvex_lens import biconvex_lens
 from mrbokeh.psf_models.lens_prescription import LensPrescription
 from mrbokeh.psf_models.lens_prescription_file import read_prescription
 from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.system.errors import InputError
 
 EXPONENTS = (2.5, 1.2)
 COUNTS = (554, 554)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.psf import kernel_radius_px
-from mrbokeh.psf_bank import Axis, Turns
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.psf import kernel_radius_px
+from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, nodes
 from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.system.errors import InputError
 
 EXPONENT = 2.0
 SAMPLES = 100

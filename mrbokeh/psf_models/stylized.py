@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Float64
 
-from mrbokeh.errors import InputError
-from mrbokeh.psf import kernel_radius_px
-from mrbokeh.psf_bank import Axis, Turns
+from mrbokeh.optics.psf import kernel_radius_px
+from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models.base import Kernel, check_positive, digest, nodes
 from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -14,8 +14,8 @@ Learned renderers hold them within their stated accuracy.
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.lens import Lens
 
 
 @runtime_checkable

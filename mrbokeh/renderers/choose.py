@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.errors import InputError
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.system.errors import InputError
 
 _log = logging.getLogger(__name__)
 
@@ -23,19 +23,19 @@ def _scatter(**settings: Any) -> Renderer:
 
 
 def _polygon(**settings: Any) -> Renderer:
-    from mrbokeh.renderers.polygon_differences import PolygonDifferences
+    from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 
     return PolygonDifferences(**settings)
 
 
 def _low_rank(**settings: Any) -> Renderer:
-    from mrbokeh.renderers.low_rank_filter import LowRankFilter
+    from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 
     return LowRankFilter(**settings)
 
 
 def _laplacian(**settings: Any) -> Renderer:
-    from mrbokeh.renderers.laplacian_spreadlets import LaplacianSpreadlets
+    from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 
     return LaplacianSpreadlets(**settings)
 
@@ -67,7 +67,7 @@ def make_renderer(
         on = {"device": device} if device else {}
         return BY_NAME[name](threads=threads, layering=layering or Layering(), **on, **kernels or {})
     if name.lower().endswith(".onnx"):
-        from mrbokeh.renderers.onnx_network import OnnxNetwork
+        from mrbokeh.renderers.network.onnx_network import OnnxNetwork
 
         return OnnxNetwork(Path(name), threads)
     raise InputError(f"expected a renderer ({', '.join(BY_NAME)}) or the path of a network (.onnx), got {name!r}")
@@ -76,7 +76,7 @@ def make_renderer(
 def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | None, Renderer]:
     """What `--lens` and `--renderer` mean together: a network brings its lens, a lens file is rendered by the default."""
     if lens is not None and lens.suffix.lower() == ".onnx":
-        from mrbokeh.renderers.onnx_network import OnnxNetwork
+        from mrbokeh.renderers.network.onnx_network import OnnxNetwork
 
         network = OnnxNetwork(lens)
         if network.facts.lens_guessed:

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.errors import InputError
-from mrbokeh.layering import Layering
-from mrbokeh.psf_bank import PsfBank
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import WITH_BANKS, make_renderer
+from mrbokeh.system.errors import InputError
 
 
 def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:
@@ -18,7 +18,7 @@ def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering
         raise InputError(
             f"--psf is for --method {', '.join(WITH_BANKS)}, got --method {method}: other methods take the opening of the lens file"
         )
-    from mrbokeh.psf_bank_file import read_bank
+    from mrbokeh.optics.psf_bank_file import read_bank
 
     kernels = {"bank": read_bank(psf)}
     return make_renderer(method, threads=threads, layering=layering, device=device, kernels=kernels | _beside(method, psf, kernels["bank"]))
@@ -26,17 +26,17 @@ def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering
 
 def _beside(method: str, psf: Path, bank: PsfBank) -> dict[str, Any]:
     """What the method keeps in files beside a bank."""
-    from mrbokeh.bank_fits_file import apertures_beside, terms_beside
-    from mrbokeh.bank_lattice import BankLattice
+    from mrbokeh.renderers.bank.fits_file import apertures_beside, terms_beside
+    from mrbokeh.renderers.bank.lattice import BankLattice
 
     if method == "laplacian":
-        from mrbokeh.spreadlets_file import spreadlets_beside
+        from mrbokeh.renderers.kernels.spreadlets_file import spreadlets_beside
 
         return {"spreadlets": spreadlets_beside(psf, bank.kernels)}
     if method == "polygon":
         return {"apertures": apertures_beside(psf, BankLattice(bank))}
     if method == "low-rank":
-        from mrbokeh.renderers.low_rank_filter import LowRankFilter
+        from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 
         filters = LowRankFilter()
         return {"terms": terms_beside(psf, BankLattice(bank), filters.decomposed, [filters.relative_error, filters.max_rank])}

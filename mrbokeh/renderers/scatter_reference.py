@@ -12,21 +12,21 @@ from os import cpu_count
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.layering import Layering, render_layers
-from mrbokeh.lens import Lens
-from mrbokeh.psf import kernel_radius_px
-from mrbokeh.psf_bank import PsfBank
-from mrbokeh.renderers._bank_renderers import BankRenderer, by_scatter
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.layering import Layering, render_layers
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf import kernel_radius_px
+from mrbokeh.optics.psf_bank import PsfBank
+from mrbokeh.renderers.bank.renderers import BankRenderer, by_scatter
+from mrbokeh.system.errors import InputError
 
 _BAND_PX = 64  # rows that are summed by themselves; fixed, so that the sum does not depend on the number of threads
 
 
 @dataclass(frozen=True)
 class ScatterReference:
-    """A Renderer that spreads by exact kernels; layers, slices and hidden background as in mrbokeh.layering.
+    """A Renderer that spreads by exact kernels; layers, slices and hidden background as in mrbokeh.layering.layering.
 
     threads: 0 takes all cores. bank: kernels to use instead of the lens's aperture, each pixel's blended from those of the bank
     around it (bilinearly over the frame, linearly over the diameter).
@@ -48,7 +48,7 @@ class ScatterReference:
     def spread(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.spreading.Spread."""
+        """See mrbokeh.layering.spreading.Spread."""
         return scatter(values.astype(np.float64), coc_px, aperture, self.threads).astype(np.float32)
 
 

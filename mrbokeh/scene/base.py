@@ -5,8 +5,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.camera import Camera
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.virtual_scene import Scene
 

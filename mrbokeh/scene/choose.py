@@ -1,10 +1,10 @@
 """Which backend renders virtual objects on this machine."""
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
 from mrbokeh.scene.wgpu_device import gpu
 from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
+from mrbokeh.system.errors import InputError
 
 
 def scene_renderer(name: str = "auto", threads: int = 0) -> EmbreeRaycaster | WgpuRasterizer | MitsubaTracer:

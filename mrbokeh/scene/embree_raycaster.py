@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, clear
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.embree_scene import PreparedScene
 from mrbokeh.scene.embree_shading import RaySamples, shaded
 from mrbokeh.scene.embree_shadows import lit_share
@@ -22,7 +21,8 @@ from mrbokeh.scene.pixel_edges import SAMPLE_COUNTS, edge_pixels, sample_offsets
 from mrbokeh.scene.prepared_scenes import PlacedScene, PreparedScenes
 from mrbokeh.scene.silhouettes import silhouette_pixels
 from mrbokeh.scene.virtual_scene import Scene
-from mrbokeh.workers import cores
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.workers import cores
 
 _RAYS_AT_ONCE = 1 << 14
 """So few that the shading points of one part stay in the processor's cache, and that Python's lock is free again after 2 ms."""

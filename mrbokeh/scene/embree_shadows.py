@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64
 
-from mrbokeh.color import luminance
+from mrbokeh.images.color import luminance
 from mrbokeh.scene._catcher_numba import mark_reachable
 from mrbokeh.scene._surface_numba import empty_surfaces, fill_surfaces
 from mrbokeh.scene.embree_scene import NOTHING_LEFT, STEP, PreparedScene, closest, float32

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Float64
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.embree_scene import PreparedScene
 
 ROWS_AT_ONCE = 512

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.light import Light
+from mrbokeh.system.errors import InputError
 
 NEUTRAL_RADIANCE = 1.0
 """Radiance from every direction where a scene brings no light of its own: a white matte surface then shows 1."""

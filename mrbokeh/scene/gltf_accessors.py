@@ -11,7 +11,7 @@ import numpy as np
 import pygltflib
 from jaxtyping import Float32, Shaped
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.gltf_accessors import GltfFile
 from mrbokeh.scene.mesh import unit
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

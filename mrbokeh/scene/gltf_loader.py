@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.gltf_accessors import GltfFile, open_gltf
 from mrbokeh.scene.gltf_animation import NodePose, animation_durations_s, poses_at
 from mrbokeh.scene.gltf_materials import materials_of
@@ -17,6 +16,7 @@ from mrbokeh.scene.light import Light
 from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh, unit
 from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF, Scene
+from mrbokeh.system.errors import InputError
 
 
 def load_glb(path: str | Path, time_s: float = 0.0, animation: str | int | None = None) -> Scene:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.color import srgb_to_linear
+from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.scene.gltf_accessors import GltfFile
 from mrbokeh.scene.material import Material, Texture, Wrap
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.gltf_accessors import GltfFile
 from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh, face_normals, unit
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.material import Triple
+from mrbokeh.system.errors import InputError
 
 LightKind = Literal["directional", "point", "spot"]
 

@@ -5,7 +5,7 @@ that objects take away is a share of what there was, so it multiplies the photog
 surface's texture comes from the photograph alone, and a rough guess of its material does.
 """
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.base import SceneRenderer
 from mrbokeh.scene.light_change_cast import cast_light_change
 from mrbokeh.scene.light_change_pictures import LEAST_CHANGE, LightChange

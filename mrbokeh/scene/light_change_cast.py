@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from scipy.stats.qmc import Sobol
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene._lighting_numba import add_environment
 from mrbokeh.scene._surface_numba import Surfaces, empty_surfaces, fill_surfaces
 from mrbokeh.scene.base import SceneRenderer

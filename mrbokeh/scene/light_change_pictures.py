@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from mrbokeh.camera import Camera
-from mrbokeh.color import luminance
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.images.color import luminance
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.virtual_scene import Scene
+from mrbokeh.system.errors import InputError
 
 LEAST_CHANGE = 1.0 / 1024
 """Changes of less than this share of the surface's light are cut off, so that far from the objects a photograph stays what it is."""

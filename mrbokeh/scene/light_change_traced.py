@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.light_change_pictures import LightChange, changed, seen_surface
 from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh

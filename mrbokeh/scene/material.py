@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 Wrap = Literal["repeat", "clamp", "mirror"]
 AlphaMode = Literal["OPAQUE", "MASK", "BLEND"]

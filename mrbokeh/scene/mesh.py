@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.material import Material
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)

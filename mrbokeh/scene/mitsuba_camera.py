@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 from jaxtyping import Float, Int64
 
-from mrbokeh.camera import Camera
-from mrbokeh.progress import track
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.mitsuba_paths import Seen
+from mrbokeh.system.progress import track
 
 _RAYS_AT_ONCE = 1 << 20
 

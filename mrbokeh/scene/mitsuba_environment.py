@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrbokeh.color import luminance
+from mrbokeh.images.color import luminance
 from mrbokeh.scene.environment import Environment, solid_angles_sr
 
 

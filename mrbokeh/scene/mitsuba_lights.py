@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from jaxtyping import Float, Float64
 
-from mrbokeh.color import luminance
+from mrbokeh.images.color import luminance
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.material import Texture
 from mrbokeh.scene.mesh import Mesh

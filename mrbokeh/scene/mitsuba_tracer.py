@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.mitsuba_variant import load
 from mrbokeh.scene.path_denoising import Guides, denoised, require_denoiser
 from mrbokeh.scene.virtual_scene import Scene
+from mrbokeh.system.errors import InputError
 
 
 class MitsubaTracer:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 LLVM = "llvm_ad_rgb"
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from mrbokeh.errors import MissingExtraError
+from mrbokeh.system.errors import MissingExtraError
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.embree_scene import PreparedScene, prepared
 from mrbokeh.scene.environment import Environment
 from mrbokeh.scene.environment_filter import LightingMaps, lighting_maps

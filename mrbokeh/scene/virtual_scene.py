@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.errors import InputError
 from mrbokeh.scene.environment import Environment, neutral_environment
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.material import Triple
 from mrbokeh.scene.mesh import Mesh
+from mrbokeh.system.errors import InputError
 
 WORLD_FROM_GLTF = np.diag([1.0, -1.0, -1.0, 1.0])
 """glTF (x right, y up, z towards the viewer) to ours (x right, y down, z forward): half a turn about x, no mirroring.

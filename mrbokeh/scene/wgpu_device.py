@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 _WANTED_LIMITS = (
     "max-buffer-size",

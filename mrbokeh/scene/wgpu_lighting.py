@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.color import luminance
+from mrbokeh.images.color import luminance
 from mrbokeh.scene.environment_filter import LightingMaps, reflected_share_table
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.wgpu_device import Gpu

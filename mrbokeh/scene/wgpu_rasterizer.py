@@ -9,9 +9,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from jaxtyping import Float32, Float64, UInt32
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, clear
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene._wgpu_depth_numba import fill_depth
 from mrbokeh.scene.environment import Environment
 from mrbokeh.scene.environment_filter import lighting_maps
@@ -25,6 +24,7 @@ from mrbokeh.scene.wgpu_shading import Canvas, Job, Lighting, Shading
 from mrbokeh.scene.wgpu_textures import TexelPool, texel_pool
 from mrbokeh.scene.wgpu_views import nearest_m
 from mrbokeh.scene.wgpu_visibility import Visibility, sample_places, targets, tiles
+from mrbokeh.system.errors import InputError
 
 _TILE_PX = (2048, 512)
 _ROUNDED_TO_PX = 64

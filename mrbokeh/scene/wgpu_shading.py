@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt32
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.wgpu_device import READ_ONLY, UNIFORM, WRITABLE, Gpu, sampled
 from mrbokeh.scene.wgpu_geometry import GpuGeometry
 from mrbokeh.scene.wgpu_lighting import GpuLights, GpuPanorama

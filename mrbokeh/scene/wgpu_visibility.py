@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.wgpu_device import READ_ONLY, UNIFORM, Gpu, sampled
 from mrbokeh.scene.wgpu_geometry import GpuGeometry
 from mrbokeh.scene.wgpu_views import View, camera_view

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.color_management import NamedSpace
 from mrbokeh.compositing.base import Inserted
-from mrbokeh.picture_sources.base import PictureSource
-from mrbokeh.picture_sources.choose import open_source
-from mrbokeh.plate import Plate
-from mrbokeh.plate_look.colour_match import ColourMatch, triple_of
-from mrbokeh.plate_look.finishing import Finishing, finished
-from mrbokeh.plate_look.look_options import LookOptions, finishing_of
-from mrbokeh.plate_look.stated_exposure import stated_exposure
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.compositing.plate_look.colour_match import ColourMatch, triple_of
+from mrbokeh.compositing.plate_look.finishing import Finishing, finished
+from mrbokeh.compositing.plate_look.look_options import LookOptions, finishing_of
+from mrbokeh.compositing.plate_look.stated_exposure import stated_exposure
+from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.shots.hooks import Finisher
+from mrbokeh.video.picture_sources.base import PictureSource
+from mrbokeh.video.picture_sources.choose import open_source
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.camera import Camera
 from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
-from mrbokeh.held_lens import Holding, lens_held
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens
-from mrbokeh.plate import Plate, plate_of
-from mrbokeh.plate_alpha import coverage_with
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.images.layer import Layer
+from mrbokeh.images.plate_alpha import coverage_with
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
 from mrbokeh.shots.boxed_insertion import BoxedInsertion
 from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.hooks import CameraSource, DepthSource, Description, Finisher, FocusSource, LayerSource, MatteSource, Moment
+from mrbokeh.stacks.held_lens import Holding, lens_held
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

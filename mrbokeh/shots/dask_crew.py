@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from mrbokeh import __version__
-from mrbokeh.errors import InputError, MissingExtraError
 from mrbokeh.shots.crew import Progress
 from mrbokeh.shots.segment_task import SegmentTask, make_segment
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 
 class DaskCrew:
@@ -79,7 +79,7 @@ def require_same_files(client: Any, folder: Path, clip: Path) -> None:
 
 def _report(token: str, clip: str) -> tuple[str, bool, str]:
     """On a worker: (what stands in the token, whether the clip is there, version)."""
-    from mrbokeh.picture_sources.numbered_files import NumberedFiles, is_pattern
+    from mrbokeh.video.picture_sources.numbered_files import NumberedFiles, is_pattern
 
     try:
         read = Path(token).read_text(encoding="utf-8")

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
 
 
 @dataclass(frozen=True)

@@ -8,26 +8,26 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.camera import Camera
-from mrbokeh.camera_track.focus_metadata import read_focus_pull
-from mrbokeh.camera_track.focus_pull import parse_focus_keys
-from mrbokeh.camera_track.track import CameraTrack
-from mrbokeh.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.depth_sources.temporal_filter import TemporalDepthFilter
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_depth, read_image
-from mrbokeh.picture_sources.numbered_files import is_pattern, numbered
+from mrbokeh.depth.temporal_filter import TemporalDepthFilter
+from mrbokeh.images.image_io import read_depth, read_image
+from mrbokeh.optics.camera import Camera
 from mrbokeh.shots.hooks import CameraSource, DepthSource, FocusSource, MatteSource, Moment
 from mrbokeh.shots.kept import Kept
 from mrbokeh.shots.scene_camera import scene_track
-from mrbokeh.video_io import VideoInfo
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.focus_metadata import read_focus_pull
+from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys
+from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
+from mrbokeh.video.clip import VideoInfo
+from mrbokeh.video.picture_sources.numbered_files import is_pattern, numbered
 
 Plane = Float32[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Description of a fixed camera (JSON) or a track, in any form that mrbokeh.camera_track reads.
+    """Description of a fixed camera (JSON) or a track, in any form that mrbokeh.tracking.camera_track reads.
 
     size_px, frame_rate: of the clip. up: what points up in the world of the scene that it looks at (mrbokeh.shots.scene_camera).
     """

@@ -13,10 +13,10 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.camera import Camera
 from mrbokeh.compositing.base import Inserted
-from mrbokeh.layer import Layer
-from mrbokeh.plate import Plate
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
 
 Opened = TypeVar("Opened", covariant=True)
 
@@ -55,7 +55,7 @@ class CameraSource(Protocol):
 @runtime_checkable
 class FocusSource(Protocol):
     def at(self, frame: float | int) -> float:
-        """The focus distance in metres at a frame's number (mrbokeh.camera_track.FocusPull is one)."""
+        """The focus distance in metres at a frame's number (mrbokeh.tracking.camera_track.FocusPull is one)."""
         ...
 
 
@@ -75,7 +75,7 @@ class MatteSource(Protocol):
 
 @runtime_checkable
 class Finisher(Protocol):
-    """What makes virtual light look photographed (mrbokeh.plate_look)."""
+    """What makes virtual light look photographed (mrbokeh.compositing.plate_look)."""
 
     def finished(self, inserted: Inserted, plate: Plate, number: int) -> Inserted:
         """Whole frames; the photograph's own pixels stay as they are."""

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from mrbokeh import __version__
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.picture_sources.numbered_files import NumberedFiles, is_pattern
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import MANIFEST, Shot
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.picture_sources.numbered_files import NumberedFiles, is_pattern
 
 
 @dataclass(frozen=True, eq=False)

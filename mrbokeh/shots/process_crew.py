@@ -9,10 +9,10 @@ from multiprocessing import get_context, parent_process
 from os import _exit
 from typing import Any
 
-from mrbokeh.errors import InputError
 from mrbokeh.shots.crew import Progress
 from mrbokeh.shots.segment_task import SegmentTask, make_segment
-from mrbokeh.workers import cores
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.workers import cores
 
 _TRIES = 3
 _POLL_S = 0.25

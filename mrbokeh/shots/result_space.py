@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from mrbokeh.color_management import NamedSpace
-from mrbokeh.finished_picture import in_named_space
-from mrbokeh.layer import Layer
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.images.finished_picture import in_named_space
+from mrbokeh.images.layer import Layer
 from mrbokeh.shots.frame_maker import Picture, Rgba
 
 

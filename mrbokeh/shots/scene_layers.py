@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene.staging.filming import FilmedLayers, Filming
+from mrbokeh.scene.staging.scene_file import read_scene_file
 from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
-from mrbokeh.staging.filming import FilmedLayers, Filming
-from mrbokeh.staging.scene_file import read_scene_file
+from mrbokeh.system.errors import InputError
 
 
 @dataclass(frozen=True)
 class SceneLayers:
-    """Description of a scene file (mrbokeh.staging) and how it is filmed; begin_s: when in the clip its animations start."""
+    """Description of a scene file (mrbokeh.scene.staging) and how it is filmed; begin_s: when in the clip its animations start."""
 
     path: Path
     filming: Filming = field(default_factory=Filming)

@@ -10,7 +10,7 @@ from mrbokeh.shots.frame_maker import FrameMaker, MakerRecipe, Picture
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import Shot
 from mrbokeh.shots.streaming import stream
-from mrbokeh.video_io import Frame
+from mrbokeh.video.clip import Frame
 
 _built = threading.local()
 

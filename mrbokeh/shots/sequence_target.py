@@ -5,18 +5,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mrbokeh.atomic_files import write_json
-from mrbokeh.color_management import NamedSpace
-from mrbokeh.errors import InputError
-from mrbokeh.exr_io import write_exr
-from mrbokeh.finished_picture import exr_part, in_named_space, write_finished
-from mrbokeh.image_io import INTEGER_SUFFIXES, write_layer
-from mrbokeh.layer import Layer
-from mrbokeh.picture_sources.numbered_files import numbered
-from mrbokeh.plate_alpha import HOLDING_ALPHA
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.images.exr_io import write_exr
+from mrbokeh.images.finished_picture import exr_part, in_named_space, write_finished
+from mrbokeh.images.image_io import INTEGER_SUFFIXES, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.images.plate_alpha import HOLDING_ALPHA
 from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import PartSink, Shot
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.picture_sources.numbered_files import numbered
 
 _EXR = ".exr"
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from mrbokeh.picture_sources.base import PictureSource
 from mrbokeh.shots.frame_maker import MakerRecipe, Picture
 from mrbokeh.shots.segment import Segment, segments_between
+from mrbokeh.video.picture_sources.base import PictureSource
 
 MANIFEST = "manifest.json"
 """In the folder of the parts: what they were made with."""

@@ -6,8 +6,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import repeat
 
 from mrbokeh.shots.frame_maker import Picture
-from mrbokeh.video_io import Frame
-from mrbokeh.workers import CallingThread, ahead
+from mrbokeh.system.workers import CallingThread, ahead
+from mrbokeh.video.clip import Frame
 
 Make = Callable[[int, Frame], Picture]
 Write = Callable[[int, Frame, Picture], None]

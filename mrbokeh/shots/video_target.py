@@ -16,17 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.atomic_files import refuse_existing
-from mrbokeh.color_management import NamedSpace
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.images.layer import Layer
 from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.result_space import in_space
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import PartSink, Shot
-from mrbokeh.video_encodings import encoding_for, encoding_name, with_alpha
-from mrbokeh.video_packets import PacketWriter, packets_of
-from mrbokeh.video_writer import VideoWriter
+from mrbokeh.system.atomic_files import refuse_existing
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
+from mrbokeh.video.packets import PacketWriter, packets_of
+from mrbokeh.video.writer import VideoWriter
 
 _THREADS = 1
 

@@ -4,8 +4,8 @@ import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from mrbokeh.atomic_files import atomic_path
-from mrbokeh.html_page import cell, inline_figure, section, table, write_page
+from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.html_page import cell, inline_figure, section, table, write_page
 from training.ablation.rows import FILE_NAMES, TITLES, TableName
 from training.ablation.tables import Line, markdown_of, provenance, table_cells
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.ablation.rows import Row
 from training.presets import PRESETS
 from training.settings import TrainSettings

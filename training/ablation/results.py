@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.atomic_files import read_json, write_json
+from mrbokeh.system.atomic_files import read_json, write_json
 from training.ablation.rows import Row
 from training.evaluation.scores import mean_known
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.atomic_files import atomic_path
+from mrbokeh.system.atomic_files import atomic_path
 from training.ablation.results import RunResult, Summary, summary
 from training.ablation.rows import FILE_NAMES, TABLES, TITLES, PaperNumbers, TableName, paper_numbers
 from training.evaluation.perceptual import NOT_MEASURED

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
     from training.ablation.plan import Ablation, PlannedRun
@@ -75,7 +75,7 @@ def ablate_command(
 
 
 def _run(planned: "Sequence[PlannedRun]", out: Path, tables: "tuple[TableName, ...]", shared: "Ablation", lpips: object) -> None:
-    from mrbokeh.interrupts import kept_when_interrupted
+    from mrbokeh.system.interrupts import kept_when_interrupted
     from training.ablation.report import Report
     from training.ablation.runs import result_of
 

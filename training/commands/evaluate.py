@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.atomic_files import refuse_existing
-from mrbokeh.errors import InputError
+from mrbokeh.system.atomic_files import refuse_existing
+from mrbokeh.system.errors import InputError
 
 
 def evaluate_command(
@@ -50,7 +50,7 @@ def evaluate_command(
 
     Example: mrbokeh train evaluate runs/50mm --data lens_50mm --psf lens_50mm.bank --renderer polygon --out measured
     """
-    from mrbokeh.guessed_metres import metres_notes
+    from mrbokeh.stacks.guessed_metres import metres_notes
     from training.evaluation.comparison import Extras, compare, unseen_of
     from training.evaluation.methods import bank_methods, nearest_method, network_methods, plain_methods, renderer_methods
     from training.evaluation.perceptual import OnnxPerceptualDistance

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mrbokeh.renderers.onnx_network import NetworkFacts
+    from mrbokeh.renderers.network.onnx_network import NetworkFacts
 
 
 def export_command(
@@ -29,9 +29,9 @@ def export_command(
 
     Example: mrbokeh train export runs/attic --out attic_fast.onnx --fast --max-psnr-loss 0.1 --data scenes/attic
     """
-    from mrbokeh.atomic_files import require_safe_outputs
-    from mrbokeh.errors import InputError
-    from mrbokeh.image_io import require_suffix
+    from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.system.atomic_files import require_safe_outputs
+    from mrbokeh.system.errors import InputError
 
     if data and not fast:
         raise InputError("--data measures what --fast loses: add --fast, or leave --data out")

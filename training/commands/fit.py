@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.commands.arguments import Scenes
 from training.settings_overrides import with_overrides
 
@@ -91,7 +91,7 @@ def fit_command(
 
 
 def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str], overwrite: bool) -> None:
-    from mrbokeh.guessed_metres import metres_notes
+    from mrbokeh.stacks.guessed_metres import metres_notes
     from training.interruption import StoppedError
     from training.train import fit
     from training.training_data import training_data

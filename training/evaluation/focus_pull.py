@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.image_metrics import flicker
-from mrbokeh.progress import track
+from mrbokeh.images.image_metrics import flicker
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.progress import track
 from training.dataset import PairSet
 from training.evaluation.methods import Method, renderer_method
 from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
@@ -36,7 +36,7 @@ class FocusPull:
     against: str
 
     def flicker_of(self, method: Method) -> float:
-        """Radiance, 0 for a result that is as calm as the truth (mrbokeh.image_metrics.flicker)."""
+        """Radiance, 0 for a result that is as calm as the truth (mrbokeh.images.image_metrics.flicker)."""
         return flicker([shown(method.blur(frame), frame) for frame in self.frames], self.truth)
 
 

@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.errors import InputError
-from mrbokeh.layer import opaque
+from mrbokeh.images.layer import opaque
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import BY_NAME, WITH_BANKS, make_renderer
 from mrbokeh.renderers.choose_bank import chosen_renderer
+from mrbokeh.system.errors import InputError
 from training.blur_functions import Blur, blur_of
 from training.classical_blur import gaussian_gather, gaussian_scatter, sigma_per_coc
 from training.evaluation.unseen_slice import UnseenSlice

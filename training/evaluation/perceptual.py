@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.color import linear_to_srgb
-from mrbokeh.errors import InputError
-from mrbokeh.renderers.onnx_sessions import open_session
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.renderers.network.onnx_sessions import open_session
+from mrbokeh.system.errors import InputError
 
 Image = Float32[np.ndarray, "height width 3"]
 NOT_MEASURED = "LPIPS is not measured: no weights are shipped (see --lpips)."

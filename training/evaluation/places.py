@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Bool
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.image_metrics import depth_edge_mask
+from mrbokeh.images.image_metrics import depth_edge_mask
+from mrbokeh.optics.aperture import Aperture
 from training.evaluation.unseen_slice import UnseenSlice
 
 EDGE_STEP_PX = 2.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.image_metrics import energy_ratio, leak, light_error, psnr, ssim
+from mrbokeh.images.image_metrics import energy_ratio, leak, light_error, psnr, ssim
 from training.evaluation.places import edge_band, light_discs, sharp_side
 from training.evaluation.unseen_slice import UnseenSlice
 

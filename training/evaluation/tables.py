@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.atomic_files import atomic_path
+from mrbokeh.system.atomic_files import atomic_path
 from training.evaluation.methods import NO_BLUR
 from training.evaluation.perceptual import NOT_MEASURED
 from training.evaluation.scores import Evaluation, Score

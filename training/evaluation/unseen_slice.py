@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from mrbokeh.focal_stack import FocalStack
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack
 from training.dataset import Pair, PairSet
 from training.stacks import stack_name
 

@@ -11,11 +11,11 @@ import numpy as np
 import onnx
 import onnxruntime
 
-from mrbokeh.atomic_files import atomic_path, write_json
-from mrbokeh.errors import InputError
-from mrbokeh.progress import track
-from mrbokeh.renderers.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
-from mrbokeh.renderers.onnx_sessions import open_session
+from mrbokeh.renderers.network.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
+from mrbokeh.renderers.network.onnx_sessions import open_session
+from mrbokeh.system.atomic_files import atomic_path, write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
 from training.export_onnx import export_network, largest_difference, network_facts_of, record_path
 from training.fast_export.measured_loss import Look, looks_at, loss_db, made_up_look
 from training.fast_export.plans import Plan, model_of, plans

@@ -10,8 +10,8 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from mrbokeh.field_position import field_positions
-from mrbokeh.renderers.onnx_network import NetworkFacts
+from mrbokeh.optics.field_position import field_positions
+from mrbokeh.renderers.network.onnx_network import NetworkFacts
 from training.batches import stack_pairs
 from training.dataset import PairSet
 from training.network import BlurNetwork

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from onnx import ModelProto
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.fast_export.fewer_bins import thinned
 from training.fast_export.gated_graph import gated_model
 from training.fast_export.gated_groups import cost, reach_px, shared

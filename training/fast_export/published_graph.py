@@ -14,7 +14,7 @@ import numpy as np
 from onnx import ModelProto
 from torch import nn
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from training.fast_export.coarse_kernels import binned
 from training.fast_export.graph_builder import GraphBuilder, enlarged
 from training.fast_export.separable import convolve_separably, separable_kernels

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.low_rank import decompose
+from mrbokeh.renderers.kernels.low_rank_kernel import decompose
 from training.fast_export.graph_builder import GraphBuilder
 
 
@@ -35,7 +35,7 @@ class SeparableKernels:
 
 
 def separable_kernels(kernels: Float[np.ndarray, "maps size size"], rank: int) -> SeparableKernels:
-    """The best of this rank with the sum of each kernel kept (`mrbokeh.low_rank`); a kernel of all zeros stays so."""
+    """The best of this rank with the sum of each kernel kept (`kernels.low_rank_kernel`); a kernel of all zeros stays so."""
     columns, rows = (np.zeros((len(kernels), rank, kernels.shape[1])) for _ in range(2))
     for index, kernel in enumerate(kernels):
         if kernel.any():

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
 
 
 def board_command(
@@ -25,9 +25,9 @@ def board_command(
 
     Example: mrbokeh viewfinder board --lens lens.json --distance-m 0.5,1.2 --paper a4 --out board.pdf
     """
-    from mrbokeh.atomic_files import refuse_existing
-    from mrbokeh.charuco.board_file import write_board
-    from mrbokeh.lens_file import read_lens
+    from mrbokeh.optics.lens_file import read_lens
+    from mrbokeh.system.atomic_files import refuse_existing
+    from mrbokeh.tracking.charuco.board_file import write_board
     from viewfinder.tracking.board_pdf import write_board_pdf
     from viewfinder.tracking.board_planner import View, plan_board
 

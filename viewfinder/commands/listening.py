@@ -9,7 +9,7 @@ from pathlib import Path
 
 import typer
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.server.access import Access
 from viewfinder.server.addresses import lan_address, qr_text
 from viewfinder.server.origins import LOOPBACK_NAMES

@@ -10,12 +10,12 @@ from threading import Event
 import typer
 from aiohttp import web
 
-from mrbokeh.atomic_files import refuse_existing
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board_file import read_board
-from mrbokeh.errors import InputError
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.system.atomic_files import refuse_existing
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board_file import read_board
 from viewfinder.commands.browser_cameras import CAMERA_PAGE, browser_cameras
 from viewfinder.commands.listening import Door, ListeningOptions, on_stop, open_door
 from viewfinder.server.access import Access

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import typer
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.charuco.board_file import read_board
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.tracking.charuco.board import CharucoBoard
+from mrbokeh.tracking.charuco.board_file import read_board
 from viewfinder.assembly import open_scenery, read_lenses, renderers_of
 from viewfinder.commands.browser_cameras import CAMERA_PAGE, browser_cameras
 from viewfinder.commands.listening import Door, on_stop, open_door
@@ -101,7 +101,7 @@ async def _served(viewfinder: Viewfinder, door: Door) -> None:
 def _lens_of(scene: Path | None) -> Lens | None:
     if scene is None:
         return None
-    from mrbokeh.staging.scene_file import read_scene_file
+    from mrbokeh.scene.staging.scene_file import read_scene_file
 
     path = read_scene_file(scene).lens
     return None if path is None else read_lens(path)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.commands.listening import ListeningOptions
 from viewfinder.focus_choice import FOCUS_SOURCES
 from viewfinder.tracking_choice import TrackingChoice

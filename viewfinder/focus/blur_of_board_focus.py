@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.color import srgb_to_linear
-from mrbokeh.lens import Lens
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.tracking.charuco.board import CharucoBoard
 from viewfinder.focus.board_edges import board_edges
 from viewfinder.focus.edge_spread import EdgeBlurs, edge_blurs
 from viewfinder.focus.focus_from_blur import FocusCandidate, focus_candidates

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.lens import MM_PER_M
+from mrbokeh.optics.lens import MM_PER_M
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 
 # Of an edge only the middle is used: towards its ends the squares change colour.
 _USED = 0.4

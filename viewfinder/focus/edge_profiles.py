@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from viewfinder.focus.board_edges import BoardEdges
 
 _HALF_WIDTH_PX = 20.0

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import erf
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from viewfinder.focus.board_edges import BoardEdges
 from viewfinder.focus.edge_profiles import EdgeProfiles, Luminance, edge_profiles, offsets_px
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.optimize import minimize_scalar
 
-from mrbokeh.lens import MM_PER_M, Lens
+from mrbokeh.optics.lens import MM_PER_M, Lens
 from viewfinder.focus.edge_spread import EdgeBlurs
 
 FEWEST_EDGES = 8

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 from viewfinder.focus.edge_spread import EdgeBlurs
 from viewfinder.focus.focus_from_blur import FocusCandidate, total_cost
 

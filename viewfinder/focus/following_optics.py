@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from mrbokeh.camera import Camera
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose

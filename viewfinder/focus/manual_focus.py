@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 

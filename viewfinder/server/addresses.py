@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from ipaddress import IPv4Address
 from typing import NamedTuple
 
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.system.errors import InputError, MissingExtraError
 from viewfinder.server.origins import is_loopback
 
 # Routers of mobile networks and Tailscale use 100.64.0.0/10, which is neither private nor public.

@@ -5,7 +5,7 @@ from contextlib import asynccontextmanager
 
 from aiohttp import web
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.server.addresses import page_url
 from viewfinder.server.site import Site
 from viewfinder.server.tls import Tls

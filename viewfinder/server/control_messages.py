@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 _LONGEST_NAME = 80
 # A drag moves an object within a room; more is a slip of the finger over the horizon.

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.system.errors import InputError, MissingExtraError
 
 
 class Tls(NamedTuple):

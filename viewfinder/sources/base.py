@@ -11,7 +11,7 @@ from viewfinder.frames import CameraFrame
 class FrameSource(Protocol):
     """A camera. `name` is for people to read.
 
-    transfer: the curve of its codes (see mrbokeh.video_color); a stream that comes over a network tells it with its first frame.
+    transfer: the curve of its codes (see mrbokeh.video.color); a stream that comes over a network tells it with its first frame.
     status: one sentence while the camera is away or has trouble, None while all is well. Any thread may read both.
     """
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from aiohttp import web
 
-from mrbokeh.errors import InputError
-from mrbokeh.video_color import UNSPECIFIED, color_of
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.color import UNSPECIFIED, color_of
 from viewfinder.frames import CameraFrame
 from viewfinder.mdns_candidates import with_address
 from viewfinder.newest import Newest

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import UNKNOWN_LENS, LensState, Pose
 
 LONGEST_MESSAGE = 4096

@@ -4,7 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.system.errors import InputError, MissingExtraError
 from viewfinder.sources.base import FrameSource
 from viewfinder.sources.size_limit import SizeLimit
 

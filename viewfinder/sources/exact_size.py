@@ -7,7 +7,7 @@ from threading import Event
 import numpy as np
 from jaxtyping import UInt8
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import Bgr, CameraFrame
 from viewfinder.sources.base import FrameSource
 

@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from mrbokeh.gphoto2_library import library
+from mrbokeh.system.gphoto2_library import library
 from viewfinder.frames import LensState
 
 _F_NUMBER = ("f-number", "aperture")

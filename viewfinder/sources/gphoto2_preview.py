@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.errors import InputError
-from mrbokeh.gphoto2_library import NoCameraError, chosen_of, detected, explanation, library, opened
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, detected, explanation, library, opened
 from viewfinder.frames import UNKNOWN_LENS, Bgr, CameraFrame
 from viewfinder.sources.gphoto2_lens import lens_state
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting

@@ -8,7 +8,7 @@ from threading import Event
 from typing import Any
 from urllib.parse import urlsplit
 
-from mrbokeh.video_color import color_of
+from mrbokeh.video.color import color_of
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.newest_of import newest_of
 from viewfinder.sources.received_frame import upright_bgr

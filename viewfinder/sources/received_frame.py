@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.video_color import VideoColor
-from mrbokeh.video_frames import display_bgr
+from mrbokeh.video.color import VideoColor
+from mrbokeh.video.frames import display_bgr
 from viewfinder.frames import Bgr
 from viewfinder.sources.size_limit import SizeLimit
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
 
-from mrbokeh.video_io import probe, read_display_frames
+from mrbokeh.video.clip import probe, read_display_frames
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.rhythm import Rhythm
 from viewfinder.sources.size_limit import SizeLimit

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.size_limit import SizeLimit
 from viewfinder.sources.tethered_picture import SUFFIXES, NotWholeError, TetheredPicture, read_tethered

@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
 from viewfinder.sources.size_limit import SizeLimit

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Event, Lock, Thread
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.newest import Newest
 from viewfinder.stage.drawn_layer import Drawing, DrawRequest, draw
 from viewfinder.stage.redraw import is_outdated

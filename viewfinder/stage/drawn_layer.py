@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.camera import Camera
 from mrbokeh.compositing.occlusion import covered_by
-from mrbokeh.layer import Layer, flatten
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.shadow_layer import shadow_layer
-from mrbokeh.staging.picture_box import NEAREST_M, PictureBox, box_around
-from mrbokeh.staging.staged_scene import StagedScene
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.scene.staging.picture_box import NEAREST_M, PictureBox, box_around
+from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.tracking.upright import upright_camera
 from viewfinder.stage.layer_depth import GRID_PX, LayerDepth
 from viewfinder.stage.occlusion import Occlusion
 from viewfinder.stage.reprojection import MovableLayer

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.layer import Layer
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 

@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.atomic_files import read_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_from_json
 from mrbokeh.compositing.occlusion import occlusion_matte
-from mrbokeh.errors import InputError
-from mrbokeh.image_io import read_depth
-from mrbokeh.lens_file_values import read_transmission
-from mrbokeh.other_view import layer_from_view
-from mrbokeh.staging.scene_description import RealThings
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.images.image_io import read_depth
+from mrbokeh.layering.other_view import layer_from_view
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.lens_file_values import read_transmission
+from mrbokeh.scene.staging.scene_description import RealThings
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.upright import upright_camera
 
 Plane = Float32[np.ndarray, "height width"]
 _FINER = 1.25

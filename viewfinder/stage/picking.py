@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene
-from mrbokeh.staging.scene_description import Triple
-from mrbokeh.staging.upright import rays, turned_back
+from mrbokeh.scene.staging.scene_description import Triple
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.upright import rays, turned_back
 from viewfinder.stage.occlusion import Occlusion
 from viewfinder.stage.seen import Seen
 

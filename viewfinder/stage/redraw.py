@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.camera import Camera
-from mrbokeh.lens import Lens
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from viewfinder.stage.drawn_layer import Drawing, DrawRequest
 
 FARTHEST_PX = 1.0

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.camera import Camera
-from mrbokeh.overlay import Overlay
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.optics.camera import Camera
 from viewfinder.stage._reprojection_numba import sample, source_nodes
 from viewfinder.stage.layer_depth import GRID_PX
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from mrbokeh.staging.assets import modified_s
+from mrbokeh.scene.staging.assets import modified_s
 
 
 class SceneWatch:

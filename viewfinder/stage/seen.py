@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from mrbokeh.camera import Camera
-from mrbokeh.overlay import Overlay
-from mrbokeh.staging.staged_scene import StagedScene
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene.staging.staged_scene import StagedScene
 from viewfinder.stage.drawn_layer import Drawing
 from viewfinder.stage.occlusion import Occlusion
 

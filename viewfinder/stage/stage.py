@@ -5,16 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.camera import Camera
 from mrbokeh.compositing.occlusion import covered_by
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.overlay import CodeTables, Overlay
+from mrbokeh.compositing.overlay import CodeTables, Overlay
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.scene import SceneRenderer
-from mrbokeh.staging.scene_description import PlacedObject, Triple
-from mrbokeh.staging.upright import upright_camera
+from mrbokeh.scene.staging.scene_description import PlacedObject, Triple
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.upright import upright_camera
 from viewfinder.frames import Bgr
 from viewfinder.stage.drawing_thread import DrawingThread
 from viewfinder.stage.drawn_layer import DrawRequest, sharp_layers
@@ -37,7 +37,7 @@ class Stage:
     views = VIEWS
 
     def __init__(self, scene: Path, backend: SceneRenderer | None = None) -> None:
-        """scene: a scene file (mrbokeh.staging.scene_file); InputError for what is wrong in it.
+        """scene: a scene file (mrbokeh.scene.staging.scene_file); InputError for what is wrong in it.
 
         backend: None takes the graphics card where there is one, else the ray caster.
         """

@@ -3,15 +3,15 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mrbokeh.layering import Layering
-from mrbokeh.lens import Lens
-from mrbokeh.lens_file import read_lens
+from mrbokeh.layering.layering import Layering
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene import SceneRenderer
-from mrbokeh.staging.assets import Assets
-from mrbokeh.staging.scene_file import read_scene_file
-from mrbokeh.staging.staged_scene import StagedScene
+from mrbokeh.scene.staging.assets import Assets
+from mrbokeh.scene.staging.scene_file import read_scene_file
+from mrbokeh.scene.staging.staged_scene import StagedScene
 from viewfinder.stage.drawn_layer import Brushes
 from viewfinder.stage.layer_depth import LayerDepth
 from viewfinder.stage.occlusion import read_occlusion

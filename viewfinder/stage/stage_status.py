@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 
-from mrbokeh.lens import Lens
+from mrbokeh.optics.lens import Lens
 from viewfinder.stage.drawing_thread import DrawingThread, Drawn
 from viewfinder.stage.drawn_layer import DrawRequest
 from viewfinder.stage.redraw import blur_changed

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from mrbokeh.errors import InputError
-from mrbokeh.overlay import CodeTables, Overlay
+from mrbokeh.compositing.overlay import CodeTables, Overlay
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import Bgr
 from viewfinder.stage.seen import Seen
 

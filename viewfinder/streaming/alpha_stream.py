@@ -12,8 +12,8 @@ import numpy as np
 from aiohttp import web
 from jaxtyping import Float32, UInt8
 
-from mrbokeh.overlay import Overlay
-from mrbokeh.video_color import code_from_linear
+from mrbokeh.compositing.overlay import Overlay
+from mrbokeh.video.color import code_from_linear
 from viewfinder.frames import OutputFrame
 from viewfinder.newest import Newest
 from viewfinder.streaming.encoded_stream import EncodedStream

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from mrbokeh.video_color import LIMITED, VideoColor
+from mrbokeh.video.color import LIMITED, VideoColor
 from viewfinder.frames import Bgr
 from viewfinder.streaming._i420_numba import SHIFT, i420_from_bgr
 
@@ -22,7 +22,7 @@ def even_size(bgr: Bgr) -> tuple[int, int]:
 def i420_frame(bgr: Bgr, color: VideoColor = STREAM_COLOR) -> Any:
     """A tagged PyAV frame (yuv420p) of 8-bit display codes. Chroma belongs to the middle of 2x2 pixels, as browsers show it.
 
-    FFmpeg's own conversion is half a code too dark in the mean (see mrbokeh.video_frames); OpenCV's takes the chroma of one pixel
+    FFmpeg's own conversion is half a code too dark in the mean (see mrbokeh.video.frames); OpenCV's takes the chroma of one pixel
     in four, so that coloured edges flicker.
     """
     import av

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from mrbokeh.errors import InputError
-from mrbokeh.overlay import CodeTables
-from mrbokeh.video_frames import encoding_for
-from mrbokeh.video_io import VideoWriter
+from mrbokeh.compositing.overlay import CodeTables
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.frames import encoding_for
 from viewfinder.frames import Bgr, OutputFrame
 from viewfinder.streaming.encoder import TIME_BASE
 from viewfinder.streaming.i420 import even_size
@@ -22,7 +22,7 @@ _LIVE_H264 = {"crf": "14", "preset": "superfast"}
 
 @dataclass(frozen=True)
 class FileForm:
-    """tables: of the codes of the pictures. encoding: of mrbokeh.video_frames, None goes by the suffix."""
+    """tables: of the codes of the pictures. encoding: of mrbokeh.video.frames, None goes by the suffix."""
 
     tables: CodeTables
     frame_rate: Fraction

@@ -9,10 +9,10 @@ from fractions import Fraction
 from pathlib import Path
 from threading import Event, Thread
 
-from mrbokeh.atomic_files import refuse_existing
-from mrbokeh.errors import InputError
-from mrbokeh.overlay import code_tables
-from mrbokeh.video_frames import encoding_for
+from mrbokeh.compositing.overlay import code_tables
+from mrbokeh.system.atomic_files import refuse_existing
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.frames import encoding_for
 from viewfinder.frames import OutputFrame
 from viewfinder.streaming.recorded_file import FileForm, Written, write_recording
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from aiortc import RTCConfiguration, RTCDataChannel, RTCPeerConnection, RTCRtpSender, RTCSessionDescription
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.packet_track import PacketTrack
 from viewfinder.streaming.status_channel import LABEL, StatusChannel

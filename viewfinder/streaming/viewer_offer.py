@@ -5,7 +5,7 @@ from typing import Any
 from aiortc import RTCRtpSender
 from aiortc.sdp import SessionDescription
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.streaming.encoded_stream import ENCODERS
 
 # Browsers offer a picture, sound and a channel; each further section would open sockets here.

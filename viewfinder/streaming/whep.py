@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aiohttp import web
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 from viewfinder.mdns_candidates import with_address
 from viewfinder.streaming.encoded_stream import EncodedStream
 

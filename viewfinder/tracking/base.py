@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from viewfinder.frames import CameraFrame, Pose
 
 

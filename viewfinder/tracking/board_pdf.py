@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.atomic_files import atomic_path, refuse_existing
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.charuco.drawing import black_rectangles_mm
-from mrbokeh.errors import InputError, MissingExtraError
+from mrbokeh.system.atomic_files import atomic_path, refuse_existing
+from mrbokeh.system.errors import InputError, MissingExtraError
+from mrbokeh.tracking.charuco.board import CharucoBoard
+from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
 
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 MARGIN_MM = 10.0

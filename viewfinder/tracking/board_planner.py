@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrbokeh.camera_track.board_calibration import FEWEST_CORNERS
-from mrbokeh.charuco.board import DICTIONARY, CharucoBoard, CharucoGrid
-from mrbokeh.errors import InputError
-from mrbokeh.lens import MM_PER_M, Lens
+from mrbokeh.optics.lens import MM_PER_M, Lens
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.board_calibration import FEWEST_CORNERS
+from mrbokeh.tracking.charuco.board import DICTIONARY, CharucoBoard, CharucoGrid
 from viewfinder.tracking.board_pdf import PAPERS_MM, Page, page_of
 
 BLURS_PER_MARKER = 6.0

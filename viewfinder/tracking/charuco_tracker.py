@@ -5,13 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.board import CharucoBoard
-from mrbokeh.charuco.board_alignment import AlignedDetector
-from mrbokeh.charuco.corner_flow import FrameHistory
-from mrbokeh.charuco.detector import NO_CORNERS, Corners
-from mrbokeh.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit
-from mrbokeh.charuco.pose_from_points import poses_from_plane
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.charuco.board import CharucoBoard
+from mrbokeh.tracking.charuco.board_alignment import AlignedDetector
+from mrbokeh.tracking.charuco.corner_flow import FrameHistory
+from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners
+from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit
+from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.detection_thread import Detections, DetectionThread

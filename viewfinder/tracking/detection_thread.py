@@ -6,7 +6,7 @@ from threading import Event, Thread
 from time import monotonic
 from typing import Protocol, runtime_checkable
 
-from mrbokeh.charuco.detector import Corners, Grey
+from mrbokeh.tracking.charuco.detector import Corners, Grey
 from viewfinder.newest import Newest
 
 _POLL_S = 0.1

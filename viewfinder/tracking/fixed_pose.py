@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from mrbokeh.atomic_files import read_json
-from mrbokeh.camera import Camera
-from mrbokeh.camera_file import camera_from_json
-from mrbokeh.camera_track.track import is_rigid
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.track import is_rigid
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 
@@ -27,7 +27,7 @@ class FixedPose:
 
 
 def read_fixed_pose(path: Path | str) -> FixedPose:
-    """From the JSON of `mrbokeh.camera_file`."""
+    """From the JSON of `mrbokeh.optics.camera_file`."""
     document = read_json(path, "a camera with its pose")
     camera = camera_from_json(document if isinstance(document, dict) else {}, str(path))
     if not is_rigid(camera.camera_from_world):

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import MissingExtraError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import MissingExtraError
 from viewfinder.frames import Pose
 
 FEWEST_POINTS = 12

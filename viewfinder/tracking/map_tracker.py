@@ -5,9 +5,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from mrbokeh.camera import Camera
-from mrbokeh.charuco.corner_flow import FrameHistory
-from mrbokeh.charuco.detector import NO_CORNERS, Corners
+from mrbokeh.optics.camera import Camera
+from mrbokeh.tracking.charuco.corner_flow import FrameHistory
+from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.detection_thread import Detections, DetectionThread

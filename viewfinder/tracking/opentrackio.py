@@ -1,6 +1,6 @@
 """OpenTrackIO 1.0.1 (SMPTE RIS, opentrackio.org): the payload, JSON or CBOR, to and from a TrackingSample.
 
-What a sample says is read by `mrbokeh.camera_track.opentrackio_sample`, as it is from files. Our world has the stage's ground for its
+What a sample says is read by `camera_track.opentrackio_sample`, as it is from files. Our world has the stage's ground for its
 board: x along X, y along -Y, z along -Z, so that what stands on the board stands on the stage.
 """
 
@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mrbokeh.camera_track.opentrackio_sample import (
+from mrbokeh.system.errors import MissingExtraError
+from mrbokeh.tracking.camera_track.opentrackio_sample import (
     camera_from_stage,
     is_sample,
     is_scaled,
@@ -19,8 +20,7 @@ from mrbokeh.camera_track.opentrackio_sample import (
     pose_document,
     sampled_s,
 )
-from mrbokeh.camera_track.world_axes import inverted
-from mrbokeh.errors import MissingExtraError
+from mrbokeh.tracking.camera_track.world_axes import inverted
 from viewfinder.frames import LensState, Pose
 from viewfinder.tracking.opentrackio_packets import CBOR, JSON
 from viewfinder.tracking.tracking_sample import STAGE_FROM_BOARD, MalformedMessageError, TrackingSample

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import Tracker
 from viewfinder.tracking.phone_rig import FEWEST_PAIRS, PhoneRig, calibrate_in_one_world

@@ -16,10 +16,10 @@ from jaxtyping import Float64
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.atomic_files import read_json, write_json
-from mrbokeh.camera_track.world_axes import inverted, rigid
-from mrbokeh.errors import InputError
-from mrbokeh.lens import MM_PER_M
+from mrbokeh.optics.lens import MM_PER_M
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
 from viewfinder.frames import Pose
 from viewfinder.tracking.rigid_motion import angle_deg, parameters_of, rigid_of
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from threading import Event, Thread
 from typing import Protocol, runtime_checkable
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.base import TrackedPose, Tracker
 from viewfinder.tracking.phone_rig import PhoneRig

@@ -4,7 +4,7 @@ from bisect import bisect_right, insort
 from dataclasses import dataclass
 from threading import Lock
 
-from mrbokeh.camera_track.between_frames import pose_between
+from mrbokeh.tracking.camera_track.between_frames import pose_between
 from viewfinder.frames import LensState, Pose
 from viewfinder.tracking.tracking_sample import TrackingSample, lens_between
 

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.camera_track.world_axes import rigid
+from mrbokeh.tracking.camera_track.world_axes import rigid
 from viewfinder.frames import Pose
 
 

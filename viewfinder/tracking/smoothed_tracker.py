@@ -3,7 +3,7 @@ shown over needs no smoothing, and any smoothing makes the object lag behind the
 
 from dataclasses import replace
 
-from mrbokeh.camera import Camera
+from mrbokeh.optics.camera import Camera
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose, Tracker
 from viewfinder.tracking.one_euro import OneEuroPose

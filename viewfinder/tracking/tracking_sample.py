@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrbokeh.camera_track.between_frames import focus_between_m, stop_between
+from mrbokeh.tracking.camera_track.between_frames import focus_between_m, stop_between
 from viewfinder.frames import UNKNOWN_LENS, LensState, Pose
 
 STAGE_FROM_BOARD = np.diag([1.0, -1.0, -1.0, 1.0])

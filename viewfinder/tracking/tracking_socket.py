@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event, Thread
 
-from mrbokeh.camera import Camera
-from mrbokeh.errors import InputError
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
 from viewfinder.frames import UNKNOWN_LENS, CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.freed import FreeDReading, freed_sample, read_freed

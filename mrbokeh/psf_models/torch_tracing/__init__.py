@@ -16,7 +16,7 @@ torch comes with the extra `train`; without it, importing this package says so.
 try:
     import torch as _torch  # noqa: F401
 except ModuleNotFoundError as missing:
-    from mrbokeh.errors import MissingExtraError
+    from mrbokeh.system.errors import MissingExtraError
 
     raise MissingExtraError("torch", "train") from missing
 

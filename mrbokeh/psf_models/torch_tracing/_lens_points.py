@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from mrbokeh.psf_models.torch_tracing._sums import number, on, pixels, summed
-from mrbokeh.torch_device import device_named
+from mrbokeh.system.torch_device import device_named
 
 Rays = Float64[Tensor, " rays"]
 Kernel = Float64[np.ndarray, "size size"]

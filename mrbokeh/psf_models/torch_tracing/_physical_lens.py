@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mrbokeh.psf_models._lens_beam import BANDS_UM, LensBeam
 from mrbokeh.psf_models.torch_tracing._sums import number, on, pixels, summed
-from mrbokeh.torch_device import device_named
+from mrbokeh.system.torch_device import device_named
 
 Rays = Float64[Tensor, " rays"]
 Vectors = tuple[Rays, Rays, Rays]

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from mrbokeh.psf_models.torch_tracing._sums import number, on, summed
-from mrbokeh.torch_device import device_named
+from mrbokeh.system.torch_device import device_named
 
 
 def _signed(number: int) -> int:

@@ -19,17 +19,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.aperture import Aperture
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer, flatten, opaque
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.images.layer import Layer, flatten, opaque
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.layered_reconstruction._layer_samples import all_sharp, sample_layers
 from mrbokeh.renderers.layered_reconstruction._prepared import prepared
 from mrbokeh.renderers.layered_reconstruction._pupil_spans import packed_pupil
 from mrbokeh.renderers.layered_reconstruction._settings import SCREEN_FILTERS, Settings, footprint_sigmas
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Choice, Pupil
-from mrbokeh.workers import cores
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.workers import cores
 
 __all__ = ["SCREEN_FILTERS", "LayeredReconstruction", "PartitionCounts", "Settings", "footprint_sigmas"]
 
@@ -51,7 +51,7 @@ class LayeredReconstruction:
 
     per_pixel: how many samples of layers are taken a pixel. threads: 0 takes all cores. seed: of these samples and of the choice
     that the sparse statistics look at. device: "" for compiled loops; "cuda", "cuda:1" or "cpu" for torch there, without the
-    texture filter (mrbokeh.renderers.torch_reconstruction).
+    texture filter (mrbokeh.renderers.layered_reconstruction.torch_reconstruction).
     """
 
     settings: Settings = field(default_factory=Settings)
@@ -62,12 +62,12 @@ class LayeredReconstruction:
 
     def __post_init__(self) -> None:
         if self.device:
-            from mrbokeh.renderers.torch_reconstruction import TorchReconstruction
+            from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction
 
             TorchReconstruction(self.settings, self.device, self.seed)  # refuses what is not there
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        """See Renderer. Extra channels `motion_px` (mrbokeh.motion) blur as well.
+        """See Renderer. Extra channels `motion_px` (mrbokeh.layering.motion) blur as well.
 
         Takes openings that are the same over the frame and for all colours; InputError for cat-eyes and chromatic errors.
         """
@@ -113,7 +113,7 @@ class LayeredReconstruction:
         shared_out: bool = True,
     ) -> tuple[Float32[np.ndarray, "height width channels"], PartitionCounts]:
         if self.device:
-            from mrbokeh.renderers.torch_reconstruction import TorchReconstruction
+            from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction
 
             on_device = TorchReconstruction(self.settings, self.device, self.seed)
             found, both = on_device.reconstruct_values(samples, values, coc_px, aperture, shared_out)

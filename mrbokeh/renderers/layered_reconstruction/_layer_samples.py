@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.drawn_diameters import drawn_diameters_px
-from mrbokeh.errors import InputError
-from mrbokeh.layer import Layer
-from mrbokeh.lens import Lens
-from mrbokeh.light_field_samples import LightFieldSamples
-from mrbokeh.motion import MOTION
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.layering.motion import MOTION
+from mrbokeh.layering.spreading import reach_px
+from mrbokeh.optics.drawn_diameters import drawn_diameters_px
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.layered_reconstruction._pupil_spans import STRIPS, pupil_spans
-from mrbokeh.spreading import reach_px
+from mrbokeh.system.errors import InputError
 
 _BAND_ROWS = 16
 
@@ -32,7 +32,7 @@ def motion_of(layer: Layer) -> Float32[np.ndarray, "height width 2"]:
 
 
 def coc_px_of(layer: Layer, lens: Lens) -> Float32[np.ndarray, "height width"]:
-    """Signed diameters to draw (mrbokeh.drawn_diameters); 0 where nothing is covered and up to one pixel, where light stays as it is."""
+    """Signed diameters to draw (optics.drawn_diameters); 0 where nothing is covered and up to one pixel, where light stays as it is."""
     covered = layer.alpha > 0
     if not (layer.depth_m > 0)[covered].all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")

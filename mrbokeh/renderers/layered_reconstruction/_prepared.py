@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from mrbokeh.light_field_samples import LightFieldSamples
+from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.renderers.layered_reconstruction._buckets import bucket_of, motion_cells
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Light

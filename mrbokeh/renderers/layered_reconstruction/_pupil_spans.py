@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from mrbokeh.aperture import Aperture
+from mrbokeh.optics.aperture import Aperture
 
 STRIPS = (8, 16, 32, 64)
 """How many strips a diameter has in the coarse to fine drawings of a pupil."""

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from mrbokeh.errors import InputError
+from mrbokeh.system.errors import InputError
 
 ScreenFilter = Literal["windows", "sheared", "texture", "texture_one_tap", "direct"]
 SCREEN_FILTERS: tuple[ScreenFilter, ...] = ("windows", "sheared", "texture", "texture_one_tap", "direct")

@@ -1,0 +1,141 @@
+"""Plate: the photograph that virtual objects go into, with what is known of its depth, lens and camera."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.depth.depth_settings import DepthSettings
+from mrbokeh.depth.open_depth import open_depth
+from mrbokeh.images.image_io import read_image
+from mrbokeh.images.plate_alpha import is_straight, read_alpha
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.capture_bundle import CaptureBundle
+from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
+from mrbokeh.stacks.guessed_metres import is_lens_guessed
+from mrbokeh.stacks.held_lens import lens_as_held
+from mrbokeh.stacks.photograph import read_photograph
+from mrbokeh.system.errors import InputError
+
+
+@dataclass(frozen=True)
+class Plate:
+    """rgb: (H, W, 3) linear, blurred by the real lens; depth_m: (H, W) of the sharp scene or None; lens: as focused for this photograph.
+
+    sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
+    near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
+    alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
+    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. lens_guessed: the lens has its blur,
+    but its focal length and f-number are made up.
+    """
+
+    rgb: Float32[np.ndarray, "height width 3"]
+    depth_m: Float32[np.ndarray, "height width"] | None
+    lens: Lens
+    camera: Camera
+    sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None
+    near_alpha: Float32[np.ndarray, "height width"] | None = None
+    alpha: Float32[np.ndarray, "height width"] | None = None
+    metres_guessed: bool = False
+    lens_guessed: bool = False
+
+    def __post_init__(self) -> None:
+        size = self.rgb.shape[:2]
+        for what, plane in (("depth map", self.depth_m), ("all-in-focus picture", self.sharp_rgb), ("matte", self.near_alpha)):
+            if plane is not None and plane.shape[:2] != size:
+                raise InputError(
+                    f"the {what} of the photograph is {plane.shape[1]}x{plane.shape[0]} px but the photograph is {size[1]}x{size[0]} px: "
+                    f"resize it to that size"
+                )
+
+    def point_under_pixel_m(self, x_px: float, y_px: float) -> tuple[float, float, float]:
+        """Return the place in the scene (camera axes, metres) that the photograph shows at a pixel."""
+        if self.depth_m is None:
+            raise InputError(
+                "to stand an object on a pixel the photograph needs depth: give --depth, a focal stack, or --at X,Y,Z in metres"
+            )
+        height, width = self.depth_m.shape
+        if not (0 <= x_px < width and 0 <= y_px < height):
+            raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px")
+        depth_m = float(self.depth_m[int(y_px), int(x_px)])
+        x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px]), np.array(depth_m))
+        return float(x_m), float(y_m), float(z_m)
+
+    def length_m(self, pixels: float, depth_m: float) -> float:
+        """Return the length of what covers so many pixels upright at a depth, facing the camera."""
+        return pixels / self.camera.focal_px[1] * depth_m
+
+
+def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
+    """A photograph with a lens, or a merged focal stack with the number of a slice, which brings its own lens and depth.
+
+    lens: overrides what the photograph's metadata or the stack tell, but keeps the focus of a slice. focus_m overrides all.
+    """
+    if photo.is_dir() and not (photo / FILE_NAME).is_file():
+        raise InputError(
+            f"{photo} is a folder, but neither a merged focal stack ({FILE_NAME}) nor a capture of the viewfinder: "
+            f"give a photograph, or make a stack of its photographs by `mrbokeh capture process`"
+        )
+    if photo.is_dir():
+        return _stack_plate(photo, slice_index, lens, focus_m)
+    if slice_index is not None:
+        raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}")
+    photograph = read_photograph(photo)
+    lens = photograph.lens(photo, focus_m) if lens is None else lens_as_held(lens, photograph, photo)
+    focused = lens if focus_m is None else lens.focused_at(focus_m)
+    return with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
+
+
+def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
+    """A picture through the pinhole of its lens, which looks at its middle."""
+    return Plate(rgb, depth_m, lens, _pinhole(lens, rgb))
+
+
+def with_own_alpha(plate: Plate, path: Path, alpha: Float32[np.ndarray, "height width"] | None) -> Plate:
+    """The plate as its file stores it, with that file's alpha; colour is multiplied by it where it is stored straight."""
+    if alpha is None:
+        return replace(plate, alpha=None)
+    return replace(plate, rgb=plate.rgb * alpha[..., None] if is_straight(path) else plate.rgb, alpha=alpha)
+
+
+def bundle_plate(bundle: CaptureBundle, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
+    """What the viewfinder captured; lens: overrides the optics but keeps the focus. Objects are placed in camera axes."""
+    focused = bundle.lens if lens is None else lens.focused_at(bundle.lens.focus_distance_m)
+    focused = focused if focus_m is None else focused.focused_at(focus_m)
+    camera = replace(bundle.camera, camera_from_world=np.eye(4))
+    return Plate(bundle.plate_rgb, None, focused, camera)
+
+
+def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
+    """The plate with depth from a file, or from a network that looks at its sharpest picture."""
+    depth = open_depth(source, plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb, settings)
+    return replace(plate, depth_m=depth.depth_m)
+
+
+def with_matte(plate: Plate, path: Path) -> Plate:
+    """The plate with a user's matte of what stands in front, whose numbers are taken as coverage."""
+    return replace(plate, near_alpha=np.ascontiguousarray(read_image(path, "linear")[..., 1]))
+
+
+def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus_m: float | None) -> Plate:
+    stack = read_focal_stack(folder)
+    if slice_index is None or not 0 <= slice_index < len(stack):
+        raise InputError(
+            f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, or --all-slices"
+        )
+    focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
+    focused = focused if focus_m is None else focused.focused_at(focus_m)
+    rgb = stack.slice_rgb(slice_index)
+    camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)
+    # A stack of a scene knows where its camera stood; objects are placed in camera axes.
+    upright = replace(camera, camera_from_world=np.eye(4))
+    plate = Plate(rgb, stack.depth_m(), focused, upright, stack.all_in_focus())
+    return replace(plate, metres_guessed=not stack.metres_known, lens_guessed=lens is None and is_lens_guessed(stack))
+
+
+def _pinhole(lens: Lens, rgb: Float32[np.ndarray, "height width 3"]) -> Camera:
+    height, width = rgb.shape[:2]
+    focal_px = lens.focal_px(width)
+    return Camera(width, height, (focal_px, focal_px), (width / 2, height / 2))

@@ -1,0 +1,35 @@
+"""The loops over the pixels of mrbokeh.compositing.plate_look, compiled; they run without the GIL."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_grain(
+    light: np.ndarray,
+    alpha: np.ndarray,
+    photo: np.ndarray,
+    plate: np.ndarray,
+    texture: np.ndarray,
+    start: tuple[int, int],
+    sign: np.float32,
+    shot: np.ndarray,
+    read: np.ndarray,
+) -> None:
+    """As grain_light.added_variance says, in place on light (h, w, 3); start: the texture's row and column at (0, 0)."""
+    height, width = alpha.shape
+    side = texture.shape[0]
+    for y in range(height):
+        row = texture[(start[0] + y) % side]
+        for x in range(width):
+            a = alpha[y, x]
+            if a == 0.0 and light[y, x, 0] == 0.0 and light[y, x, 1] == 0.0 and light[y, x, 2] == 0.0:
+                continue
+            kept = (np.float32(1.0) - a) ** 2
+            drawn = row[(start[1] + x) % side]
+            for c in range(3):
+                now = max(photo[y, x, c] + light[y, x, c], np.float32(0.0))
+                before = max(plate[y, x, c], np.float32(0.0))
+                variance = shot[c] * now + read[c] - kept * (shot[c] * before + read[c])
+                if variance > 0.0:
+                    light[y, x, c] += sign * drawn[c] * np.sqrt(variance)

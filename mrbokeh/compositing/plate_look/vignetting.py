@@ -1,0 +1,124 @@
+"""Falloff of the plate's lens towards the corners, put on virtual light alone: the photograph has it already.
+
+Coverage stays as it is: a dark corner of an opaque object hides what is behind it like a bright one. Lenses whose kernels lose light
+towards the corners (measured banks) have their falloff in the blur already: use one or the other.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from mrbokeh.compositing.plate_look.colour_match import Triple, triple_of
+from mrbokeh.images.image_io import read_image
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.pixel_box import Box
+from mrbokeh.optics.field_position import field_positions
+from mrbokeh.system.errors import InputError
+
+Gain = Float32[np.ndarray, "height width channels"]
+_LEAST_GAIN = 1e-3
+_DEGREE, _CELLS = 6, 64
+
+
+@runtime_checkable
+class Vignetting(Protocol):
+    """What share of its light a lens sends to each pixel, 1 in the middle of the frame."""
+
+    def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:
+        """(h, w, 1 or 3) of the pixels of a box within a frame of (height, width)."""
+        ...
+
+
+@dataclass(frozen=True)
+class RadialFalloff:
+    """1 + k1 r^2 + k2 r^4 + k3 r^6, lensfun's "pa" model; r is 1 in the corner of the frame, times `reach`.
+
+    reach: the frame's diagonal as a share of the one that the coefficients were measured on (a smaller sensor sees less of the falloff).
+    """
+
+    k1: float
+    k2: float = 0.0
+    k3: float = 0.0
+    reach: float = 1.0
+
+    def __post_init__(self) -> None:
+        squared = np.linspace(0.0, self.reach**2, 101)
+        least = float(self._polynomial(squared).min())
+        if not least > _LEAST_GAIN:
+            raise InputError(
+                f"expected a falloff that leaves light in the corners, but {self.k1:g}, {self.k2:g}, {self.k3:g} falls to {least:g}: "
+                f"give smaller coefficients"
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> "RadialFalloff":
+        """ "K1,K2,K3", or fewer. Raises InputError."""
+        try:
+            numbers = [float(part) for part in text.split(",")]
+        except ValueError:
+            numbers = []
+        if not 1 <= len(numbers) <= 3 or not np.isfinite(numbers).all():
+            raise InputError(f"--vignetting: expected K1,K2,K3 (such as -0.4,0.1,0), got {text!r}")
+        return cls(*numbers)
+
+    def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:
+        position = field_positions(box.size_px, frame_px, box.origin_px) * np.float32(self.reach)
+        return self._polynomial((position * position).sum(axis=2, keepdims=True)).astype(np.float32)
+
+    def _polynomial(self, squared: np.ndarray) -> np.ndarray:
+        return 1.0 + squared * (self.k1 + squared * (self.k2 + squared * self.k3))
+
+
+@dataclass(frozen=True)
+class FlatField:
+    """The picture that the lens makes of an even surface, 1 in the middle, as a polynomial of the field position.
+
+    coefficients: [i, j, channel] of y^i x^j, with x and y as in CONVENTIONS, "Field position". It is stretched to the frame.
+    """
+
+    coefficients: Float64[np.ndarray, "powers powers 3"]
+
+    def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:
+        position = field_positions(box.size_px, frame_px, box.origin_px)
+        y, x = (np.polynomial.polynomial.polyvander(each, _DEGREE) for each in (position[:, 0, 1], position[0, :, 0]))
+        gain = np.einsum("yi,ijc,xj->yxc", y, self.coefficients, x, optimize=True)
+        return np.maximum(gain, _LEAST_GAIN).astype(np.float32)
+
+
+def flat_field_of(rgb: Float32[np.ndarray, "height width 3"]) -> FlatField:
+    """From a photograph of an even surface: the polynomial of degree 6 in x and y that fits it best, as which any "pa" falloff is exact.
+
+    Its grain averages away; the hard shadow of a lens hood is no polynomial and is smoothed. Raises InputError where the middle is black.
+    """
+    import cv2
+
+    height, width = rgb.shape[:2]
+    scale = min(1.0, _CELLS / max(height, width))
+    cells = cv2.resize(rgb, (max(_DEGREE + 1, round(width * scale)), max(_DEGREE + 1, round(height * scale))), interpolation=cv2.INTER_AREA)
+    position = field_positions(cells.shape[:2]).reshape(-1, 2).astype(np.float64)
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    terms = np.stack([position[:, 1] ** i * position[:, 0] ** j for i, j in powers], axis=1)
+    fitted = np.linalg.lstsq(terms, cells.reshape(-1, 3).astype(np.float64), rcond=None)[0]
+    if not (fitted[0] > 0.0).all():
+        raise InputError("expected a flat field that is bright in the middle, got black: photograph an evenly lit white surface")
+    coefficients = np.zeros((_DEGREE + 1, _DEGREE + 1, 3))
+    for (i, j), values in zip(powers, fitted, strict=True):
+        coefficients[i, j] = values / fitted[0]
+    return FlatField(coefficients)
+
+
+def read_flat_field(path: Path | str) -> FlatField:
+    return flat_field_of(read_image(path))
+
+
+def darkened(layer: Layer, gain: Gain) -> Layer:
+    """A layer's light through a falloff."""
+    return Layer(layer.rgb * gain, layer.alpha, layer.depth_m, layer.extra)
+
+
+def falloff_at(vignetting: Vignetting, x_px: int, y_px: int, frame_px: tuple[int, int]) -> Triple:
+    """At one pixel of a frame (height, width), for `grey_card_match`."""
+    return triple_of(np.broadcast_to(vignetting.gain(Box(y_px, y_px + 1, x_px, x_px + 1), frame_px)[0, 0], 3))

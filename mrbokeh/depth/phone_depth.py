@@ -1,0 +1,129 @@
+"""Depth that phones keep in their JPEGs: Google's GDepth, with the sharp original (GImage) and where it was focused (GFocus).
+
+Formats: developers.google.com/depthmap-metadata. RangeInverse: d = far near / (far - n (far - near)), linear in dioptres;
+RangeLinear: d = near + n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale.
+"""
+
+import base64
+import binascii
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.depth.depth_map import DepthMap
+from mrbokeh.depth.jpeg_xmp import read_xmp
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.system.errors import InputError
+
+_DEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
+_IMAGE = "{http://ns.google.com/photos/1.0/image/}"
+_FOCUS = "{http://ns.google.com/photos/1.0/focus/}"
+_ORIENTATION = 0x0112
+
+
+@dataclass(frozen=True)
+class PhoneFocus:
+    """What GFocus tells. focus_distance_m: in the unit of the depth. blur_at_infinity: RADIUS of the blur of what is infinitely far
+    over the longer side of the picture. x, y: the place in focus, in [0, 1].
+    """
+
+    focus_distance_m: float
+    blur_at_infinity: float
+    x: float = 0.5
+    y: float = 0.5
+
+    def coc_px_per_dioptre(self, width_px: int, height_px: int) -> float:
+        """coc = c_inf (1 - d_f / d), so that it grows by c_inf d_f for each dioptre away from the focus."""
+        return 2.0 * self.blur_at_infinity * max(width_px, height_px) * self.focus_distance_m
+
+
+@dataclass(frozen=True)
+class PhonePhoto:
+    """Upright as the file's Exif says. depth: at its own size. original_rgb: (H, W, 3) linear, before the phone's own blur, or None.
+
+    focus: None where not told.
+    """
+
+    depth: DepthMap
+    original_rgb: Float32[np.ndarray, "height width 3"] | None
+    focus: PhoneFocus | None
+
+
+def read_phone_photo(path: Path, near_far_m: tuple[float, float] | None = None) -> PhonePhoto | None:
+    """None where the file holds no GDepth. near_far_m: takes the place of the file's Near and Far, whose unit is often none.
+
+    Raises InputError where what it holds is damaged or of an unknown format.
+    """
+    xmp = read_xmp(path) if path.suffix.lower() in (".jpg", ".jpeg") else {}
+    if _DEPTH + "Data" not in xmp:
+        return None
+    turned, original = _orientation(path), xmp.get(_IMAGE + "Data")
+    depth = _depth(xmp, path, near_far_m)
+    upright = replace(depth, depth_m=_upright(depth.depth_m, turned), valid=_upright(depth.valid.astype(np.float32), turned) > 0)
+    if original is None:
+        return PhonePhoto(upright, None, _focus(xmp))
+    channels = np.moveaxis(_decoded(original, path)[..., :3], 2, 0)
+    rgb = np.stack([_upright(np.ascontiguousarray(each), turned) for each in channels], axis=2)
+    return PhonePhoto(upright, srgb_to_linear(rgb), _focus(xmp))
+
+
+def _depth(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] | None) -> DepthMap:
+    kind = xmp.get(_DEPTH + "Format", "")
+    if kind not in ("RangeInverse", "RangeLinear"):
+        raise InputError(f"{path}: expected GDepth:Format RangeInverse or RangeLinear, got {kind!r}")
+    try:
+        near, far = near_far_m or (float(xmp[_DEPTH + "Near"]), float(xmp[_DEPTH + "Far"]))
+    except (KeyError, ValueError):
+        raise InputError(f"{path}: GDepth:Near and Far are missing: state them with --disparity NEAR:FAR in metres") from None
+    if kind == "RangeLinear" and not np.isfinite(far):
+        raise InputError(f"{path}: its depth is linear in metres, so that FAR cannot be infinite: give a distance")
+    level = _decoded(xmp[_DEPTH + "Data"], path)[..., 0]
+    units = xmp.get(_DEPTH + "Units", "") or (
+        "metres as stated" if near_far_m else "no unit, taken as metres; --disparity NEAR:FAR says better"
+    )
+    note = f"GDepth of the phone, {near:g} to {far:g} ({units})"
+    everywhere = np.ones(level.shape, bool)
+    if kind == "RangeInverse":
+        return DepthMap.of_dioptres((1.0 - level) / near + level / far, everywhere, note)
+    return DepthMap((near + level * (far - near)).astype(np.float32), everywhere, note)
+
+
+def _orientation(path: Path) -> int:
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        return int(picture.getexif().get(_ORIENTATION, 1))
+
+
+def _upright(plane: Float32[np.ndarray, "height width"], orientation: int) -> Float32[np.ndarray, "rows columns"]:
+    """Turned and mirrored as Exif's orientation, 1 to 8, asks for."""
+    from PIL import Image, ImageOps
+
+    picture = Image.fromarray(plane)
+    picture.getexif()[_ORIENTATION] = orientation
+    return np.ascontiguousarray(ImageOps.exif_transpose(picture), np.float32)
+
+
+def _focus(xmp: Mapping[str, str]) -> PhoneFocus | None:
+    if _FOCUS + "FocalDistance" not in xmp or _FOCUS + "BlurAtInfinity" not in xmp:
+        return None
+    numbers = (float(xmp.get(_FOCUS + name, 0.5)) for name in ("FocalDistance", "BlurAtInfinity", "FocalPointX", "FocalPointY"))
+    return PhoneFocus(*numbers)
+
+
+def _decoded(text: str, path: Path) -> Float32[np.ndarray, "height width channels"]:
+    """A picture in base64 as its codes in [0, 1], RGB."""
+    import cv2
+
+    try:
+        data = np.frombuffer(base64.b64decode(text, validate=False), np.uint8)
+    except (binascii.Error, ValueError):
+        data = np.empty(0, np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if pixels is None:
+        raise InputError(f"{path}: a picture inside its XMP cannot be decoded: copy the file again from the phone")
+    codes = (np.asarray(pixels) / (65535.0 if pixels.dtype == np.uint16 else 255.0)).astype(np.float32)
+    return codes[..., None] if codes.ndim == 2 else np.ascontiguousarray(codes[..., [2, 1, 0]])

@@ -1,0 +1,1 @@
+"""Pictures of lenses, kernels and stacks for people to look at."""

@@ -1,0 +1,184 @@
+"""Colour spaces of other programs by name, through OpenColorIO 2 (extra `ocio`): plates in, pictures out.
+
+    to_ours = ColorConversion.of("aces", "ARRI LogC4", REC709_LINEAR)
+    plate_rgb = to_ours.applied(decoded_rgb)
+
+"aces" is the studio configuration of the Academy that is built into OpenColorIO: ACES spaces, camera log curves, displays.
+"""
+
+import difflib
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.images.exr_primaries import known_primaries
+from mrbokeh.system.errors import InputError, MissingExtraError
+
+REC709_LINEAR = "Linear Rec.709 (sRGB)"
+"""What everything here is in, as the Academy's configurations name it; many others know it by the alias lin_rec709_srgb."""
+BUILT_IN = {"aces": "studio-config-latest", "aces-cg": "cg-config-latest"}
+_OURS = (REC709_LINEAR, "lin_rec709_srgb", "lin_rec709", "lin_srgb", "Utility - Linear - sRGB", "Linear Rec.709")
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class ColorConversion:
+    """From one colour space of a configuration to another."""
+
+    source: str
+    target: str
+    processor: Any
+
+    @classmethod
+    def of(cls, config: Path | str | None, source: str, target: str, view: str = "") -> "ColorConversion":
+        """config: "aces" (studio) or "aces-cg", both built in; a file (.ocio, .ocioz); None is the file that $OCIO names.
+
+        source, target: colour spaces, aliases or roles ("scene_linear"). view: with it target is a display, such as "sRGB - Display",
+        and the view its rendering, such as "Un-tone-mapped". Raises InputError with the nearest names where one is unknown.
+        """
+        opened = open_config(config)
+        import PyOpenColorIO as ocio  # noqa: N813
+
+        _known(opened, source)
+        if view:
+            _one_of("display", target, list(opened.getDisplays()))
+            _one_of(f"view of {target}", view, list(opened.getViews(target)))
+            transform: Any = ocio.DisplayViewTransform(src=source, display=target, view=view)
+            processor = opened.getProcessor(transform)
+        else:
+            _known(opened, target)
+            processor = opened.getProcessor(source, target)
+        return cls(source, f"{target}, {view}" if view else target, processor.getDefaultCPUProcessor())
+
+    @classmethod
+    def to_rec709(cls, config: Path | str | None, source: str) -> "ColorConversion":
+        """From a space of the configuration to ours, linear Rec.709."""
+        return cls.of(config, source, rec709_name(open_config(config)))
+
+    @classmethod
+    def from_rec709(cls, config: Path | str | None, target: str, view: str = "") -> "ColorConversion":
+        """From ours, linear Rec.709, to a space of the configuration, or a view of a display."""
+        return cls.of(config, rec709_name(open_config(config)), target, view)
+
+    def applied(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        """A converted copy; the picture itself stays. Premultiplied pictures have to be divided by alpha before a curve, not a matrix."""
+        copy = np.array(rgb, np.float32, order="C")
+        self.apply(copy)
+        return copy
+
+    def apply(self, rgb: Float32[np.ndarray, "height width 3"]) -> None:
+        """In place, without a copy. Raises InputError where rows or pixels are not packed."""
+        if not rgb.flags.c_contiguous:
+            raise InputError("a picture to be converted in place must lie packed in memory: use `applied`, or make it contiguous")
+        if rgb.size:
+            self.processor.applyRGB(rgb)
+
+
+@dataclass(frozen=True)
+class NamedSpace:
+    """A colour space by its name and its configuration, which can be pickled: opened by whoever uses it.
+
+    config: as of ColorConversion.of, files as absolute paths. Premultiplied pictures may only go through spaces that are linear.
+    """
+
+    name: str
+    config: str = "aces"
+
+    @classmethod
+    def of(cls, name: str, config: Path | str) -> "NamedSpace":
+        """Raises InputError where there is no such configuration, or none of its spaces has that name."""
+        is_file = str(config) not in BUILT_IN and not str(config).startswith("ocio://")
+        space = cls(name, str(Path(config).resolve()) if is_file else str(config))
+        _known(open_config(space.config), name)
+        return space
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """That of the configuration, where it is one."""
+        return (Path(self.config),) if Path(self.config).is_absolute() else ()
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether twice the light is twice the number, as in ACEScg and unlike in camera curves and on displays."""
+        once = np.array([[[0.05, 0.2, 0.3]]], np.float32)
+        return bool(np.allclose(self.from_rec709(2 * once), 2 * self.from_rec709(once), rtol=1e-4))
+
+    @property
+    def primaries(self) -> tuple[float, ...] | None:
+        """CIE x, y of red, green, blue and white, to be stated in an EXR header.
+
+        None of a space that is not linear, or whose primaries are none of those in `mrbokeh.images.exr_primaries`.
+        """
+        if not self.is_linear:
+            return None
+        return known_primaries(self.to_rec709(np.eye(3, dtype=np.float32)[None])[0].T.astype(np.float64))
+
+    def to_rec709(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        """Numbers of this space as linear Rec.709."""
+        return _conversion(self.config, self.name, True).applied(rgb)
+
+    def from_rec709(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        """Linear Rec.709 as numbers of this space."""
+        return _conversion(self.config, self.name, False).applied(rgb)
+
+
+@lru_cache(maxsize=8)
+def _conversion(config: str, name: str, inwards: bool) -> ColorConversion:
+    return ColorConversion.to_rec709(config, name) if inwards else ColorConversion.from_rec709(config, name)
+
+
+def open_config(config: Path | str | None) -> Any:
+    """An OpenColorIO configuration; opening the built-in ones takes a moment, so they are kept."""
+    if config is None:
+        config = os.environ.get("OCIO", "")
+        if not config:
+            raise InputError(
+                "expected an OpenColorIO configuration, but $OCIO is not set: set it, name a file, or take the built-in 'aces'"
+            )
+    return _opened(BUILT_IN.get(str(config), str(config)))
+
+
+def rec709_name(opened: Any) -> str:
+    """What a configuration calls linear Rec.709. Raises InputError where it has none."""
+    for name in _OURS:
+        if opened.getColorSpace(name) is not None:
+            return name
+    raise InputError(f"the colour configuration has no linear Rec.709 (looked for {', '.join(_OURS)}): state its name for it")
+
+
+@lru_cache(maxsize=4)
+def _opened(config: str) -> Any:
+    try:
+        import PyOpenColorIO as ocio  # noqa: N813
+    except ModuleNotFoundError as missing:
+        raise MissingExtraError("opencolorio", "ocio") from missing
+    try:
+        if config in BUILT_IN.values() or config.startswith("ocio://"):
+            return ocio.Config.CreateFromBuiltinConfig(config.removeprefix("ocio://"))
+        return ocio.Config.CreateFromFile(config)
+    except (ocio.Exception, ocio.ExceptionMissingFile) as error:
+        told = str(error).splitlines()[0]
+        raise InputError(f"expected an OpenColorIO configuration, {' or '.join(BUILT_IN)} or a file, at {config}: {told}") from None
+
+
+def _known(opened: Any, name: str) -> None:
+    """Colour spaces, roles and aliases are all good."""
+    if opened.getColorSpace(name) is None:
+        aliases = {alias: each.getName() for each in opened.getColorSpaces() for alias in each.getAliases()}
+        _one_of("colour space", name, list(opened.getColorSpaceNames()), aliases)
+
+
+def _one_of(what: str, name: str, names: list[str], aliases: dict[str, str] | None = None) -> None:
+    """Raises InputError with names like the one that is not there; aliases: other names of some of them."""
+    if name in names:
+        return
+    folded = {each.lower(): told for each, told in [*(aliases or {}).items(), *((each, each) for each in names)]}
+    near = [folded[each] for each in difflib.get_close_matches(name.lower(), folded, n=_NAMED, cutoff=0.4)]
+    near += [each for each in names if name and name.lower() in each.lower()][:_NAMED]
+    told = f"did you mean {', '.join(dict.fromkeys(near))}?" if near else f"there are {', '.join(names)}"
+    raise InputError(f"the colour configuration has no {what} {name!r}: {told}")

@@ -1,0 +1,143 @@
+"""Pictures and layers to and from scene-linear float32: HDR as it is, EXR from the primaries that it states, PNG, TIFF, JPEG and WebP
+through a stated encoding.
+
+WebP is read only: it keeps 8 bits, mostly lossily. HEIC is not read: what decodes it from Python brings x265 (GPL) or must be built.
+
+Files are written without stating primaries: EXR takes Rec.709 where none are stated, and kernels and maps of numbers have none.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mrbokeh.images.color import display_rgb8
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_primaries import in_rec709, stated_primaries
+from mrbokeh.images.layer import Layer
+from mrbokeh.images.picture_codec import Encoding, codes_of, linear_from_codes, stored_pixels, stored_rgb, write_stored
+from mrbokeh.images.sound_values import require_depth_ahead
+from mrbokeh.system.errors import InputError
+
+INTEGER_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+"""Of what is read and written; the others are read only."""
+ENCODED_SUFFIXES = (*INTEGER_SUFFIXES, ".webp")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+HEIF_ADVICE = "HEIC is not read: convert it to PNG or TIFF of 16 bits, or to JPEG"
+_HEIF_BY = "by `heif-convert IN.heic OUT.png` (libheif), `magick IN.heic OUT.png`, or on a Mac `sips -s format jpeg IN.heic --out OUT.jpg`"
+LINEAR_SUFFIXES = (".exr", ".hdr")
+_DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z")
+_LONE_DEPTH_NAMES = (*_DEPTH_NAMES, "Y")
+
+
+def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
+    """A picture as scene-linear Rec.709 (H, W, 3); transparent pictures lose their alpha (see `read_layer`).
+
+    encoding: what the numbers of an integer file (PNG, TIFF, JPEG, WebP) mean; EXR, HDR and float TIFF are linear already. EXR of other
+    primaries (ACES, the camera RGB of focal stacks) is converted; `read_camera_rgb` gives what is stored.
+    """
+    return _read_rgba(Path(path), encoding)[..., :3]
+
+
+def require_suffix(path: Path | str, suffixes: tuple[str, ...], what: str) -> None:
+    """Said before the work, not after it. what: what would be written, such as "--sheet"."""
+    if Path(path).suffix.lower() not in suffixes:
+        raise InputError(f"{what}: expected a name that ends in {' or '.join(suffixes)}, got {path}")
+
+
+def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
+    """Write scene-linear RGB. EXR keeps it (half or float); PNG and TIFF store 16 bit, JPEG 8 bit, clipped to [0, 1]."""
+    suffix = Path(path).suffix.lower()
+    if suffix == ".exr":
+        dtype = np.float16 if half else np.float32
+        write_exr(path, ExrPart({name: rgb[..., i].astype(dtype) for i, name in enumerate("RGB")}))
+    elif suffix in INTEGER_SUFFIXES:
+        integers = np.uint8 if suffix in (".jpg", ".jpeg") else np.uint16
+        write_stored(path, codes_of(np.asarray(rgb, np.float32), integers, encoding))
+    else:
+        raise InputError(f"cannot write {path}: expected .exr, {', '.join(INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
+
+
+def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR first") -> Float32[np.ndarray, "height width 3"]:
+    """A picture that is scene-linear as stored (EXR, HDR, float TIFF); a file of integers is refused, for it is encoded for display.
+
+    instead: what the error advises then.
+    """
+    path = Path(path)
+    if path.is_file() and path.suffix.lower() in ENCODED_SUFFIXES and (stored := stored_pixels(path).dtype).kind != "f":
+        raise InputError(
+            f"{path}: expected scene-linear values (EXR, HDR or float TIFF), but it stores {stored} made for display, without "
+            f"highlights: {instead}"
+        )
+    rgb = read_image(path)
+    if not np.isfinite(rgb).all():
+        raise InputError(f"{path}: {int((~np.isfinite(rgb)).any(axis=2).sum())} pixels are NaN or infinite: mend them first")
+    return rgb
+
+
+def read_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
+    """Depth along the optical axis in metres from an EXR with Z, depth.Z or Y; inf and what is not above 0 is background (inf)."""
+    channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
+    name = next((name for name in _LONE_DEPTH_NAMES if name in channels), None)
+    if name is None:
+        raise InputError(f"{path}: expected depth in a channel {', '.join(_LONE_DEPTH_NAMES)}, but it has {', '.join(sorted(channels))}")
+    depth_m = channels[name].astype(np.float32)
+    if np.isnan(depth_m).any():
+        raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of {name} are NaN: write inf (or 0) where there is background")
+    return np.where(depth_m > 0, depth_m, np.float32(np.inf))
+
+
+def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
+    """A layer from an EXR with R, G, B and, where present, A and Z (or depth.Z), in one part or several.
+
+    Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf. Of several views (stereo)
+    it is the first that has colour, with its own depth. R, G, B become Rec.709 where the file states other primaries.
+    extra: keep all other channels too, each under its own name and as stored.
+    """
+    parts = read_exr(path)
+    colour = next((part for part in parts if set("RGB") <= part.channels.keys()), parts[0])
+    of_one_view = [part for part in parts if part.attributes.get("view") == colour.attributes.get("view")]
+    channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
+    rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
+    alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
+    depth_name = next((name for name in _DEPTH_NAMES if name in channels), None)
+    depth = (np.zeros(rgb.shape[:2]) if depth_name is None else channels[depth_name]).astype(np.float32)
+    require_depth_ahead(path, str(depth_name), depth[alpha > 0])
+    others = sorted(channels.keys() - set("RGBA") - set(_DEPTH_NAMES)) if extra else []
+    depth_m = np.where((depth > 0) & (alpha > 0), depth, np.inf).astype(np.float32)
+    return Layer(rgb, alpha, depth_m, {name: channels[name].astype(np.float32)[..., None] for name in others})
+
+
+def write_layer(path: Path | str, layer: Layer, *, half: bool = True) -> None:
+    """A layer as EXR: R, G, B, A in half or float; Z (metres along the optical axis, not antialiased) and extra channels in float.
+
+    An extra channel of one component keeps its name, others become NAME.0, NAME.1 and so on.
+    """
+    colour = np.float16 if half else np.float32
+    channels = {name: layer.rgb[..., i].astype(colour) for i, name in enumerate("RGB")}
+    channels |= {"A": layer.alpha.astype(colour), "Z": layer.depth_m.astype(np.float32)}
+    for name, values in layer.extra.items():
+        channels |= {name if values.shape[2] == 1 else f"{name}.{i}": values[..., i] for i in range(values.shape[2])}
+    write_exr(path, ExrPart(channels, attributes={"comments": "premultiplied alpha; Z in metres along the optical axis, not antialiased"}))
+
+
+def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height width channels"]:
+    if not path.is_file():
+        raise InputError(f"expected a picture at {path}, but there is no such file")
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        layer = read_layer(path)
+        return np.dstack([layer.rgb, layer.alpha])
+    if suffix in HEIF_SUFFIXES:
+        raise InputError(f"{path}: {HEIF_ADVICE}, such as {_HEIF_BY}")
+    if suffix not in ENCODED_SUFFIXES + LINEAR_SUFFIXES:
+        raise InputError(
+            f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + ENCODED_SUFFIXES)}, not {suffix or 'a file without suffix'}"
+        )
+    pixels = stored_rgb(path)
+    return pixels.astype(np.float32) if pixels.dtype.kind == "f" else linear_from_codes(pixels, encoding, path)
+
+
+def write_preview(path: Path | str, rgb: Float32[np.ndarray, "height width 3"], exposure_stops: float = 0.0) -> None:
+    """An 8-bit tone-mapped sRGB picture for people to look at."""
+    write_stored(path, display_rgb8(rgb, exposure_stops))

@@ -1,0 +1,212 @@
+"""The loops over pixels of mrbokeh.layering.slices, compiled.
+
+Pixels of a sheet go by their number; their places, row times width plus column, ascend. Runs of numbers are of one slice and
+one row, without gaps: what is done for a pixel is done for neighbours in memory.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def cover(
+    shown: np.ndarray,
+    crossing: np.ndarray,
+    free: np.ndarray,
+    nearest_px: np.ndarray,
+    places: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    sharp_px: np.float32,
+    first_place: int,
+    end_place: int,
+) -> None:
+    """Let pixels of values (N, C) take what they cover from what is free (H W); shown (N,) is what was free at their places before.
+    Those from one place to another, so that bands of the frame can be worked through side by side.
+
+    crossing (N,): the rest, where they lie behind the focus and the nearest so far (nearest_px, (H W), not above 0) in front of it.
+    """
+    one, nothing = np.float32(1.0), np.float32(0.0)
+    for i in range(np.searchsorted(places, first_place), np.searchsorted(places, end_place)):
+        place, coverage = places[i], values[i, 3]
+        shown[i] = free[place]
+        crossing[i] = one - free[place] if coc_px[i] > sharp_px and nearest_px[place] < -sharp_px else nothing
+        free[place] *= one - coverage
+        if coverage > nothing:
+            nearest_px[place] = min(nearest_px[place], coc_px[i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def runs_of_slices(
+    places: np.ndarray, coc_px: np.ndarray, shares: np.ndarray, width: int, step_px: np.float32, first: int, end: int
+) -> np.ndarray:
+    """(R, 3) slice, first number and end of the runs of pixels that have a share, among those from first to end."""
+    slices = np.empty(end - first, np.int32)
+    none = np.int32(-(1 << 31))
+    for i in range(first, end):
+        nearest = np.int32(np.floor(coc_px[i] / step_px + np.float32(0.5)))
+        slices[i - first] = nearest if shares[i] > np.float32(0.0) else none
+    runs = np.empty((end - first, 3), np.int32)
+    count, here, place, row_end = 0, none, 0, 0
+    for i in range(first, end):
+        if slices[i - first] != here or places[i] != place or place == row_end:
+            if here != none:
+                runs[count - 1, 2] = i
+            here, place = slices[i - first], places[i]
+            row_end = place + width - place % width
+            if here != none:
+                runs[count, 0], runs[count, 1] = here, i
+                count += 1
+        place += 1
+    if here != none:
+        runs[count - 1, 2] = end
+    return runs[:count].copy()
+
+
+@njit(cache=True)
+def extent(runs: np.ndarray, places: np.ndarray, width: int) -> tuple[int, int, int, int]:
+    """First and end row, first and end column of runs (R, 2), at least one."""
+    left, right = width, 0
+    for r in range(len(runs)):
+        column = places[runs[r, 0]] % width
+        left, right = min(left, column), max(right, column + runs[r, 1] - runs[r, 0])
+    return places[runs[0, 0]] // width, places[runs[-1, 0]] // width + 1, left, right
+
+
+@njit(cache=True, nogil=True)
+def place_light(
+    light: np.ndarray,
+    light_coc_px: np.ndarray,
+    runs: np.ndarray,
+    places: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    shares: np.ndarray,
+    width: int,
+    top: int,
+    left: int,
+) -> np.ndarray:
+    """Put pixels times their shares into light (h, w, C), a window of the frame, zero where nothing is.
+
+    Pixels outside the window and such that cover nothing are left out. Returns those whose place is taken, as runs.
+    """
+    rows, columns, channels = light.shape
+    waiting = [0 for _ in range(0)]
+    for r in range(len(runs)):
+        y, x = places[runs[r, 0]] // width - top, places[runs[r, 0]] % width - left
+        first, end = runs[r, 0] + max(0, -x), min(runs[r, 1], runs[r, 0] + columns - x)
+        if y < 0 or y >= rows or first >= end:
+            continue
+        to, coc_px_there, source = light[y, max(0, x) :], light_coc_px[y, max(0, x) :], values[first:end]
+        if channels == 4 and _is_free(to[: len(source)].reshape(-1), source.reshape(-1)):
+            coc_px_there[: len(source)] = coc_px[first:end]
+            _put_all(to[: len(source)].reshape(-1), source.reshape(-1), shares[first:end])
+            continue
+        for i in range(len(source)):
+            if to[i, 3] > 0.0:
+                waiting.append(first + i)
+            elif source[i, 3] > 0.0:
+                coc_px_there[i] = coc_px[first + i]
+                for c in range(channels):
+                    to[i, c] = source[i, c] * shares[first + i]
+    late = np.empty((len(waiting), 2), np.int32)
+    for i in range(len(waiting)):
+        late[i, 0], late[i, 1] = waiting[i], waiting[i] + 1
+    return late
+
+
+@njit(cache=True, nogil=True)
+def _is_free(light: np.ndarray, values: np.ndarray) -> bool:
+    """Whether all these pixels of four channels cover something, and their places are empty."""
+    least, most = np.float32(np.inf), np.float32(0.0)
+    for i in range(3, len(values), 4):
+        least, most = min(least, values[i]), max(most, light[i])
+    return bool(least > 0.0 and most == 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _put_all(light: np.ndarray, values: np.ndarray, shares: np.ndarray) -> None:
+    """Pixels of four channels times their shares, without a branch so that it vectorises."""
+    for i in range(len(shares)):
+        for c in range(4):
+            light[4 * i + c] = values[4 * i + c] * shares[i]
+
+
+@njit(cache=True, nogil=True)
+def remove_light(
+    light: np.ndarray, light_coc_px: np.ndarray, runs: np.ndarray, places: np.ndarray, width: int, top: int, left: int
+) -> None:
+    """Make light zero again where runs of pixels were put."""
+    rows, columns, _ = light.shape
+    for r in range(len(runs)):
+        y, x = places[runs[r, 0]] // width - top, places[runs[r, 0]] % width - left
+        if 0 <= y < rows:
+            first, end = max(0, x), min(columns, x + runs[r, 1] - runs[r, 0])
+            light_coc_px[y, first:end] = 0.0
+            light[y, first:end] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def claim(colour: np.ndarray, taken: np.ndarray, light: np.ndarray, top: int, left: int) -> None:
+    """Let light (h, w, 3 + K + E) take what is still free of the pupil; in place on colour (H, W, 3 + E) and taken (H, W, K), K 1 or 3.
+
+    The light's first row and column are `top` and `left` in the frame, which may lie outside; what falls outside is lost.
+    """
+    height, width, colours = colour.shape
+    first, end = max(0, left), min(width, left + light.shape[1])
+    for y in range(max(0, top), min(height, top + light.shape[0])):
+        colours_here, taken_here, rays = colour[y, first:end], taken[y, first:end], light[y - top, first - left : end - left]
+        if colours == 3 and taken.shape[2] == 1:
+            _claim_row(colours_here.reshape(-1), taken_here.reshape(-1), rays.reshape(-1))
+        else:
+            _claim_any_row(colours_here, taken_here, rays)
+
+
+@njit(cache=True, nogil=True)
+def _claim_row(colour: np.ndarray, taken: np.ndarray, light: np.ndarray) -> None:
+    """Pixels of R, G, B and one coverage, without a branch so that it vectorises."""
+    one, nothing = np.float32(1.0), np.float32(0.0)
+    for x in range(len(taken)):
+        coverage = light[4 * x + 3]
+        share = min(one, (one - taken[x]) / coverage) if coverage > nothing else nothing
+        colour[3 * x] += light[4 * x] * share
+        colour[3 * x + 1] += light[4 * x + 1] * share
+        colour[3 * x + 2] += light[4 * x + 2] * share
+        taken[x] = min(one, taken[x] + max(nothing, coverage))
+
+
+@njit(cache=True, nogil=True)
+def _claim_any_row(colour: np.ndarray, taken: np.ndarray, light: np.ndarray) -> None:
+    """Each colour by its own coverage, or all by the only one; other channels go with green."""
+    width, colours = colour.shape
+    kinds = taken.shape[1]
+    for x in range(width):
+        for kind in range(kinds):
+            coverage = light[x, 3 + kind]
+            if coverage <= 0.0:
+                continue
+            share = min(np.float32(1.0), (np.float32(1.0) - taken[x, kind]) / coverage)
+            for c in range(kind, 3, kinds):
+                colour[x, c] += light[x, c] * share
+            if kind == kinds // 2:
+                for c in range(3, colours):
+                    colour[x, c] += light[x, c + kinds] * share
+            taken[x, kind] = min(np.float32(1.0), taken[x, kind] + coverage)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def share_out(colour: np.ndarray, taken: np.ndarray, least: np.float32) -> None:
+    """Divide colour (H, W, 3 + E) by what is taken (H, W, K), at least `least`, which then is 1."""
+    height, width, colours = colour.shape
+    kinds = taken.shape[2]
+    for y in range(height):
+        if colours == 3 and kinds == 1:
+            row, shares = colour[y].reshape(-1), taken[y].reshape(-1)
+            for x in range(width):
+                share = max(shares[x], least)
+                row[3 * x], row[3 * x + 1], row[3 * x + 2] = row[3 * x] / share, row[3 * x + 1] / share, row[3 * x + 2] / share
+        else:
+            for x in range(width):
+                for c in range(colours):
+                    colour[y, x, c] /= max(taken[y, x, min(c, kinds - 1) if c < 3 else kinds // 2], least)
+        taken[y] = 1.0

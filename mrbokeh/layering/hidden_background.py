@@ -1,0 +1,110 @@
+"""What a picture does not show: the background behind the edges of what is near, and how edge pixels mix the two.
+
+A pixel beside something nearer holds some of its colour (antialiasing), though its depth is one or the other: such rims
+would stay behind as sharp ghosts of a blurred wire, and a lamp's as a bright dot. They are taken apart. The lens looks past
+an edge by half the difference of the two circles of confusion; no farther is anything filled in. Lights are no source
+for it, or a single lamp beside an edge would shine twice.
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32
+
+from mrbokeh.layering.lit_pixels import find_lights
+from mrbokeh.layering.sheets import Pixels, Sheet
+from mrbokeh.system.workers import in_bands
+
+_STEP_PX = 1.0  # less than this difference of circles of confusion between neighbours is one surface
+_SURFACE_PX = 2.0  # the same, for pixels some way apart
+_RIM_PX = 3
+_DIRECTIONS = 8
+_BAND_ROWS = 32
+_BAND_PIXELS = 256
+
+Values = Float32[np.ndarray, "height width channels"]
+Mask = Bool[np.ndarray, "height width"]
+Places = Int32[np.ndarray, " _"]
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """The circles of confusion with none floating in the air, the pixels beside something nearer, and lights."""
+
+    coc_px: Float32[np.ndarray, "height width"]
+    rims: Places
+    pure: Mask
+    lit: Mask
+
+
+def apart(sheet: Sheet, pool: Executor) -> tuple[Pixels, Pixels]:
+    """An opaque sheet as what is in front, with soft rims, and what lies behind its edges. The front takes over the sheet's memory."""
+    edges = _edges(sheet, pool)
+    rims, places, seeds = _sources(edges)
+    behind = _filled(sheet.values, edges, places, seeds, pool)
+    _unmix(sheet.values, edges, rims, behind)
+    return Pixels.of(Sheet(sheet.values, edges.coc_px, False)), behind
+
+
+def _edges(sheet: Sheet, pool: Executor) -> _Edges:
+    from mrbokeh.layering._depth_edges_numba import find_rims, snap
+
+    coc_px, lit, rim = np.empty_like(sheet.coc_px), np.empty(sheet.coc_px.shape, np.bool_), np.empty(sheet.coc_px.shape, np.bool_)
+
+    def look(top: int, bottom: int) -> None:
+        find_lights(lit, sheet.values, top, bottom)
+        snap(coc_px, sheet.coc_px, lit, _STEP_PX, top, bottom)
+
+    in_bands(pool, len(rim), _BAND_ROWS, look)
+    in_bands(pool, len(rim), _BAND_ROWS, lambda top, bottom: find_rims(rim, coc_px, _STEP_PX, top, bottom))
+    return _Edges(coc_px, np.flatnonzero(rim).astype(np.int32), ~(rim | lit), lit)
+
+
+def _sources(edges: _Edges) -> tuple[Places, Places, Places]:
+    """Rim pixels beside pure ones; where the lens sees behind an edge, those included, and the nearest pure pixel of what it sees there."""
+    from mrbokeh.layering._hidden_background_numba import nearest_behind, pure_neighbours
+
+    pure = pure_neighbours(edges.rims, edges.coc_px, edges.pure, _STEP_PX, _RIM_PX)
+    pixels = edges.coc_px.size
+    seeds, squares, queued = np.zeros(pixels, np.int32), np.zeros(pixels, np.int32), np.zeros(pixels, np.bool_)
+    nearest_behind(seeds, squares, np.empty(pixels + 1, np.int32), queued, edges.coc_px, edges.rims, pure, _STEP_PX)
+    rims = edges.rims[pure >= 0]
+    seeds[rims] = pure[pure >= 0] + 1
+    places = np.flatnonzero(seeds != 0).astype(np.int32)
+    return rims, places, seeds[places] - 1
+
+
+def _filled(values: Values, edges: _Edges, places: Places, seeds: Places, pool: Executor) -> Pixels:
+    """What lies behind at these places, interpolated from what is around on the surface of each one's seed."""
+    from mrbokeh.layering._hidden_background_numba import interpolate
+
+    filled = Pixels(places, np.empty((len(places), values.shape[2]), np.float32), np.empty(len(places), np.float32))
+    pure_coc_px = np.where(edges.pure, edges.coc_px, np.float32(np.nan))
+    paths = _paths(places, seeds, values.shape[1])
+
+    def fill(first: int, end: int) -> None:
+        interpolate(filled.values, filled.coc_px, places, seeds, values, pure_coc_px, paths, _SURFACE_PX, first, end)
+
+    in_bands(pool, len(places), _BAND_PIXELS, fill)
+    return filled
+
+
+def _paths(places: Places, seeds: Places, width: int) -> Int32[np.ndarray, "8 _ 2"]:
+    """Rows down and columns to the right in 8 directions, at every distance that is looked at."""
+    farthest_px = np.hypot(seeds // width - places // width, seeds % width - places % width).max(initial=0.0)
+    angles_rad = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
+    distances_px = np.arange(int(3.0 * farthest_px) + 6)
+    steps = np.stack([np.sin(angles_rad), np.cos(angles_rad)], axis=1)
+    return np.rint(distances_px[:, None] * steps[:, None]).astype(np.int32)
+
+
+def _unmix(values: Values, edges: _Edges, rims: Places, behind: Pixels) -> None:
+    """Part the pixels of rims in place: the front's share stays, the rest goes behind."""
+    from mrbokeh.layering._rims_numba import unmix_rims
+
+    flat_values, flat_coc_px = values.reshape(-1, values.shape[2]), edges.coc_px.reshape(-1)
+    front, front_coc_px = flat_values[rims], flat_coc_px[rims]
+    of_behind = np.searchsorted(behind.places, rims)
+    unmix_rims(front, front_coc_px, behind.values, rims, of_behind, values, edges.coc_px, edges.lit, _STEP_PX)
+    flat_values[rims], flat_coc_px[rims] = front, front_coc_px

@@ -1,0 +1,157 @@
+"""Layering: layers with depth become slices of the circle of confusion, and slices, spread one by one, become a picture again.
+
+Shared by all renderers that spread light; they differ in the `Spread` alone.
+
+Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.drawn_diameters) from here on.
+1. Every layer is continued beyond the frame by the largest blur: the border of an opaque one outwards, one with holes not at all.
+2. Layers are rendered one by one and laid over one another, but an opaque layer together with what is behind it, and
+   layers that interleave in depth together.
+3. Pixels are sorted into slices of equal steps of the signed circle of confusion, hard: a pixel shared between slices
+   would let light through an opaque surface. Within a slice each pixel keeps its own circle of confusion.
+4. Front to back, each slice takes what is still free of the pupil at every pixel, at most its own coverage. Slices of
+   one surface share the pupil side by side, so coverage adds up and neither seams nor slanted surfaces turn
+   translucent, as they would under "over". What the pinhole picture shows goes first. What hides there, real layers before filled-in
+   background (mrbokeh.layering.hidden_background), gets what is left: the part of the pupil that looks past the edge of the occluder.
+   But where the occluder is in front of the focus and what it hides behind it, that part of the pupil looks behind the edge, for
+   kernels are mirrored at the focus: there what hides goes right before the rest of its slice.
+5. What moves while the shutter is open is drawn out along its path, slice by slice, before it is spread (mrbokeh.layering.motion),
+   unless the kernels hold motion themselves.
+6. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage. Coverage counts shares of
+   the pupil as the place sees it: light that a lens or a medium loses darkens the colour once and leaves coverage alone
+   (mrbokeh.layering.psf_over_field), so it is not made up for here, and what is behind does not shine through.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.hidden_background import apart
+from mrbokeh.layering.psf_over_field import Optics, ThroughAperture
+from mrbokeh.layering.sheets import Pixels, Sheet, coc_px_of, sheet_of
+from mrbokeh.layering.slices import Channels, Slicing, composited
+from mrbokeh.layering.spreading import FIELD_CELLS, Frame, Spread
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.workers import cores
+from mrbokeh.system.zeroed_memory import ZeroedMemory
+
+_ONE_SURFACE_PX = 1.0
+_NOTHING_TAKEN = np.float32(1e-6)
+_KEPT = ZeroedMemory(most_bytes=64 << 20)
+"""From frame to frame, as long as these are not larger than about 1920x1080: fresh memory takes a tenth of a small frame's time."""
+
+
+@dataclass(frozen=True)
+class Layering:
+    """How layers are cut and put together.
+
+    slices: how many at most over the whole range of circles of confusion. fill: whether an opaque layer is continued
+    behind what is near. field_cells: columns and rows in which the aperture is taken as the same (cat-eyes).
+    """
+
+    slices: int = 16
+    fill: bool = True
+    field_cells: tuple[int, int] = FIELD_CELLS
+
+
+def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread | Optics, layering: Layering) -> Layer:
+    """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first.
+
+    spread: how kernels of the lens's aperture are summed, or an Optics that takes the aperture's place.
+    """
+    _check(layers)
+    optics = spread if isinstance(spread, Optics) else ThroughAperture.of(layers, lens.aperture, spread, layering.field_cells)
+    coc_px = [optics.drawn_px(coc_px_of(layer, lens)) for layer in layers]
+    margin = optics.margin_px(layers, coc_px)
+    frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
+    with ThreadPoolExecutor(cores()) as pool:
+        slicing = Slicing(optics, layering.slices, frame, pool, _KEPT)
+        groups = _groups([sheet_of(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
+        colour, taken = _rendered(groups[-1], layering, slicing)
+        for group in reversed(groups[:-1]):
+            colour, taken = _over(*_rendered(group, layering, slicing), colour, taken)
+    return _as_layer(colour, taken, layers)
+
+
+def _check(layers: Sequence[Layer]) -> None:
+    if not layers:
+        raise InputError("nothing to render: expected at least one layer, got none")
+    sizes = {layer.alpha.shape for layer in layers}
+    if len(sizes) > 1:
+        raise InputError(f"layers must be of one size, but came as {sorted((w, h) for h, w in sizes)} (width, height): resize them")
+    names = {tuple((name, values.shape[2]) for name, values in layer.extra.items()) for layer in layers}
+    if len(names) > 1:
+        raise InputError(f"layers must have the same extra channels in the same order, but came with {sorted(names)}")
+
+
+def _groups(sheets: Sequence[Sheet]) -> list[list[Sheet]]:
+    """Sheets that must be rendered together, front first."""
+    groups = [[sheets[0]]]
+    for sheet in sheets[1:]:
+        if any(front.is_opaque or _interleave(front, sheet) for front in groups[-1]):
+            groups[-1].append(sheet)
+        else:
+            groups.append([sheet])
+    return groups
+
+
+def _interleave(front: Sheet, behind: Sheet) -> bool:
+    """Whether a sheet listed before another lies behind it anywhere."""
+    both = (front.values[..., 3] > 0) & (behind.values[..., 3] > 0)
+    return bool((both & (front.coc_px > behind.coc_px + _ONE_SURFACE_PX)).any())
+
+
+def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing) -> tuple[Channels, Channels]:
+    """Colour and how much of the pupil is taken of one group, within the frame."""
+    is_filled = layering.fill and group[0].is_opaque
+    sheets = _with_hidden(group, slicing.pool) if is_filled else [Pixels.covered(sheet) for sheet in group]
+    colour, taken = composited(sheets, slicing, by_depth=not group[0].is_opaque)
+    return _shared_out(colour, taken) if any(sheet.is_opaque for sheet in group) else (colour, taken)
+
+
+def _with_hidden(group: Sequence[Sheet], pool: Executor) -> list[Pixels]:
+    """An opaque sheet taken apart, what is known to lie behind it, and last what was filled in where nothing is known."""
+    known = [Pixels.covered(sheet, sheet.coc_px > group[0].coc_px + _ONE_SURFACE_PX) for sheet in group[1:]]
+    front, behind = apart(group[0], pool)
+    if not known:
+        return [front, behind]
+    of_rim = front.values[behind.places, 3] < 1.0
+    rest, filled = behind.only(of_rim), behind.only(~of_rim)
+    free = np.ones(front.coc_px.size, np.float32)
+    for sheet in known:
+        free[sheet.places] *= 1.0 - sheet.values[:, 3]
+    return [front, rest, *known, replace(filled, values=filled.values * free[filled.places, None])]
+
+
+def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
+    """Colour of a scene without holes: what nobody claimed belongs to those who did."""
+    from mrbokeh.layering._slices_numba import share_out
+
+    share_out(colour, taken, _NOTHING_TAKEN)
+    return colour, taken
+
+
+def _over(front: Channels, front_taken: Channels, behind: Channels, behind_taken: Channels) -> tuple[Channels, Channels]:
+    free = 1.0 - front_taken
+    return front + free[..., _kinds(front, front_taken)] * behind, front_taken + free * behind_taken
+
+
+def _kinds(colour: Channels, taken: Channels) -> list[int]:
+    """Which channel of `taken` goes with each channel of colour: its own, or green's for extra channels."""
+    kinds = taken.shape[2]
+    return [min(c, kinds - 1) if c < 3 else kinds // 2 for c in range(colour.shape[2])]
+
+
+def _as_layer(colour: Channels, taken: Channels, layers: Sequence[Layer]) -> Layer:
+    depth_m = layers[-1].depth_m
+    for layer in reversed(layers[:-1]):
+        depth_m = np.where(layer.alpha > 0, layer.depth_m, depth_m)
+    alpha = taken[..., 0] if taken.shape[2] == 1 else taken.mean(axis=2)
+    extra, start = {}, 3
+    for name, values in layers[0].extra.items():
+        extra[name] = np.ascontiguousarray(colour[..., start : start + values.shape[2]])
+        start += values.shape[2]
+    return Layer(np.ascontiguousarray(colour[..., :3]), np.ascontiguousarray(alpha), depth_m, extra)

@@ -1,0 +1,118 @@
+"""LightFieldSamples: what a stochastic renderer saw along single rays through the lens and the shutter."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mrbokeh.optics.lens import Lens
+from mrbokeh.system.errors import InputError
+
+_WIDEST_PUPIL = 2.0
+
+
+@dataclass(frozen=True)
+class LightFieldSamples:
+    """N samples of the light field of one picture, in any order.
+
+    xy_px: (N, 2) where the ray met the sensor, within the picture; the centre of the top left pixel is (0.5, 0.5).
+    lens_uv: (N, 2) where it passed the pupil, in the unit pupil (x right, y down). time: (N,) in the shutter, 0 to 1.
+    rgb: (N, 3) scene-linear light, unclipped. depth_m: (N,) of what the ray met, inf is background.
+    motion_px: (N, 2) how far what it met moves over the picture while the shutter is open.
+    What is seen from the middle of the pupil at half time at x0 appears at x0 + coc/2 uv + motion (time - 1/2), with the
+    signed circle of confusion of `mrbokeh.optics.lens`. Within a pixel, samples spread evenly over area, pupil and shutter.
+    """
+
+    width_px: int
+    height_px: int
+    xy_px: Float32[np.ndarray, "samples 2"]
+    lens_uv: Float32[np.ndarray, "samples 2"]
+    time: Float32[np.ndarray, " samples"]
+    rgb: Float32[np.ndarray, "samples 3"]
+    depth_m: Float32[np.ndarray, " samples"]
+    motion_px: Float32[np.ndarray, "samples 2"]
+
+    def __post_init__(self) -> None:
+        _check_shapes(self)
+        for name in ("xy_px", "lens_uv", "time", "rgb", "motion_px"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(f"{name} of light field samples must be finite numbers, but some are NaN or infinite")
+        if not (self.depth_m > 0).all():
+            raise InputError("depth_m of light field samples must be positive metres (inf: background), but some are 0, negative or NaN")
+        if (self.xy_px < 0).any() or (self.xy_px > (self.width_px, self.height_px)).any():
+            raise InputError(
+                f"light field samples must lie within the picture of {self.width_px} x {self.height_px} px, but x, y reach from "
+                f"{self.xy_px.min(axis=0).tolist()} to {self.xy_px.max(axis=0).tolist()}: give them in pixels from its top left corner"
+            )
+        if (self.time < 0).any() or (self.time > 1).any():
+            raise InputError(
+                f"the time of light field samples counts from 0 (shutter opens) to 1 (it closes), but reaches from "
+                f"{self.time.min():g} to {self.time.max():g}: divide it by the exposure"
+            )
+        if (np.abs(self.lens_uv) > _WIDEST_PUPIL).any():
+            raise InputError(
+                f"lens_uv of light field samples lies in the unit pupil, but reaches "
+                f"{np.abs(self.lens_uv).max():g}: divide it by the pupil's radius"
+            )
+
+    @property
+    def count(self) -> int:
+        return len(self.time)
+
+    @property
+    def per_pixel(self) -> float:
+        """How many samples a pixel has on average (spp)."""
+        return self.count / (self.width_px * self.height_px)
+
+    def coc_px(self, lens: Lens) -> Float32[np.ndarray, " samples"]:
+        """Signed circle of confusion of what each sample met; where the focus is tilted or curved, that of the sample's pixel."""
+        if lens.has_flat_focus:
+            return lens.coc_px(self.depth_m, self.width_px).astype(np.float32)
+        x, y = self.pixels()
+        in_focus = lens.focus_dioptres(self.width_px, self.height_px)[y, x]
+        return (lens.coc_px_per_dioptre(self.width_px) * (in_focus - 1.0 / self.depth_m)).astype(np.float32)
+
+    def pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Column and row of the pixel of each sample; the far border belongs to the last."""
+        x, y = np.floor(self.xy_px).astype(np.int64).T
+        return np.minimum(x, self.width_px - 1), np.minimum(y, self.height_px - 1)
+
+    def positions_at_lens_centre_px(self, lens: Lens) -> Float32[np.ndarray, "samples 2"]:
+        """Where the middle of the pupil sees, at half time, what each sample met: reprojection to (u, v, t) = (0, 0, 1/2)."""
+        moved = self.motion_px * (self.time - 0.5)[:, None]
+        return self.xy_px - 0.5 * self.coc_px(lens)[:, None] * self.lens_uv - moved
+
+    def raw_picture(self) -> Float32[np.ndarray, "height width 3"]:
+        """The mean of the samples of each pixel, noise and all; 0 where a pixel has none."""
+        x, y = self.pixels()
+        place = y * self.width_px + x
+        size = self.width_px * self.height_px
+        counts = np.bincount(place, minlength=size)
+        sums = np.stack([np.bincount(place, self.rgb[:, c], size) for c in range(3)], axis=-1)
+        return (sums / np.maximum(counts, 1)[:, None]).reshape(self.height_px, self.width_px, 3).astype(np.float32)
+
+
+def joined(parts: "list[LightFieldSamples]") -> LightFieldSamples:
+    """All samples of several sets of one picture."""
+    if not parts:
+        raise InputError("nothing to join: expected at least one set of light field samples, got none")
+    sizes = {(part.width_px, part.height_px) for part in parts}
+    if len(sizes) > 1:
+        raise InputError(f"light field samples can be joined only where they are of one picture, but the sizes are {sorted(sizes)}")
+    names = ("xy_px", "lens_uv", "time", "rgb", "depth_m", "motion_px")
+    return LightFieldSamples(*sizes.pop(), *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _check_shapes(samples: LightFieldSamples) -> None:
+    if samples.width_px < 1 or samples.height_px < 1:
+        raise InputError(f"light field samples need the size of their picture, got {samples.width_px} x {samples.height_px} px")
+    count: Float[np.ndarray, "..."] = samples.time
+    expected = {"xy_px": (2,), "lens_uv": (2,), "time": (), "rgb": (3,), "depth_m": (), "motion_px": (2,)}
+    wrong = {name: getattr(samples, name).shape for name, rest in expected.items() if getattr(samples, name).shape != (count.size, *rest)}
+    if wrong:
+        raise InputError(
+            f"light field samples need xy_px, lens_uv, motion_px (N, 2), rgb (N, 3), "
+            f"time, depth_m (N,), but with N = {count.size} came {wrong}"
+        )
+    if count.size == 0:
+        raise InputError("light field samples hold no sample: expected at least one")

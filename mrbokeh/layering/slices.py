@@ -1,0 +1,178 @@
+"""Slices: sheets of light sorted by the circle of confusion, spread one by one and put together front to back."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from heapq import merge
+from operator import itemgetter
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.layering.psf_over_field import Optics
+from mrbokeh.layering.sheets import Pixels
+from mrbokeh.layering.slice_islands import islands
+from mrbokeh.layering.slice_sorting import Part, Shares, Window, sorted_slices, window_of
+from mrbokeh.layering.spreading import Frame
+from mrbokeh.system.workers import ahead, cores, in_bands
+from mrbokeh.system.zeroed_memory import ZeroedMemory
+
+_LEAST_STEP_PX = 0.5
+_HALF_A_SLICE = 0.501  # and what rounding may add
+_BAND_PIXELS = 1 << 16
+_FEWEST_PIXELS = 1 << 19
+_FEW_PIXELS = 1 << 20
+_MANY_PIXELS = 1 << 22
+_SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
+
+Plane = Float32[np.ndarray, "height width"]
+Channels = Float32[np.ndarray, "height width _"]
+
+
+@dataclass(frozen=True)
+class Slicing:
+    """What the light goes through, how many slices at most, and the place in the frame.
+
+    frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them.
+    """
+
+    optics: Optics
+    slices: int
+    frame: Frame
+    pool: Executor
+    memory: ZeroedMemory
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of arrays with their margin."""
+        return self.frame.height_px - 2 * self.frame.top_px, self.frame.width_px - 2 * self.frame.left_px
+
+    @property
+    def at_once(self) -> int:
+        """Pieces under way or waiting to be claimed: many where memory does not count, so that nobody waits for a large one whose turn
+        it is; few where each keeps all cores busy by itself; else one."""
+        pixels = self.size[0] * self.size[1]
+        if pixels <= _FEWEST_PIXELS:
+            return 5 * cores()
+        return cores() + 2 if pixels <= _FEW_PIXELS else 2 if pixels <= _MANY_PIXELS else 1
+
+    def spread_piece(self, piece: tuple[Sequence[Part], int]) -> list[tuple[Channels, Window]]:
+        """The light of parts of a slice, which travels so far at most, and the window where it lies.
+
+        Where pixels of two sheets share a place there are two rounds of that or more.
+        """
+        parts, reach = piece
+        rounds: list[tuple[Channels, Window]] = []
+        while parts and (window := window_of(parts, reach, self.frame)) is not None:
+            light, parts = self._spread_round(parts, window)
+            rounds.append((light, window))
+        return rounds
+
+    def _spread_round(self, parts: Sequence[Part], window: Window) -> tuple[Channels, list[Part]]:
+        """Light spread within a window of the frame, and what finds its place taken."""
+        from mrbokeh.layering._slices_numba import place_light, remove_light
+
+        memory = self.memory.take(self.size[0] * self.size[1] * (parts[0].pixels.values.shape[1] + 1), np.float32)
+        light, coc_px = _laid_out(memory, window, parts[0].pixels.values.shape[1])
+        where = self.size[1], window[0].start, window[1].start
+        late = [
+            place_light(light, coc_px, each.runs, each.pixels.places, each.pixels.values, each.pixels.coc_px, each.shares, *where)
+            for each in parts
+        ]
+        spread = self.optics.spread(light, coc_px, self.frame.moved(window[1].start, window[0].start))
+        spread = spread.copy() if np.may_share_memory(spread, memory) else spread
+        for part in parts:
+            remove_light(light, coc_px, part.runs, part.pixels.places, *where)
+        self.memory.give_back(memory)
+        return spread, [replace(part, runs=runs) for part, runs in zip(parts, late, strict=True) if len(runs) > 0]
+
+
+def _laid_out(memory: Float32[np.ndarray, " elements"], window: Window, channels: int) -> tuple[Channels, Plane]:
+    """The beginning of the memory as light and circles of confusion of a window."""
+    rows, columns = window[0].stop - window[0].start, window[1].stop - window[1].start
+    elements = rows * columns * channels
+    return memory[:elements].reshape(rows, columns, channels), memory[elements : elements + rows * columns].reshape(rows, columns)
+
+
+def composited(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tuple[Channels, Channels]:
+    """All sheets as the lens sees them, put together front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
+
+    by_depth: which sheet the pinhole picture shows at a pixel is a matter of depth, else of their order (slices are always by depth).
+    The pupil is counted per colour where the optics are chromatic.
+    """
+    from mrbokeh.layering._slices_numba import claim
+
+    frame, channels = slicing.frame, sheets[0].values.shape[1]
+    colour = np.zeros((frame.height_px, frame.width_px, channels - 1), np.float32)
+    taken = np.zeros((frame.height_px, frame.width_px, slicing.optics.coverages), np.float32)
+    for rounds in ahead(slicing.pool, slicing.spread_piece, _pieces(sheets, slicing, by_depth), slicing.at_once):
+        for light, (rows, columns) in rounds:
+            claim(colour, taken, light, rows.start + frame.top_px, columns.start + frame.left_px)
+    return colour, taken
+
+
+def _pieces(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[tuple[list[Part], int]]:
+    """Parts of slices that can be spread by themselves, and how far their light travels at most, in the order in which they claim."""
+    nearest, farthest = _range_px(sheets, slicing.size[0] * slicing.size[1])
+    step_px = max((farthest - nearest) / slicing.slices, _LEAST_STEP_PX)
+    for k, parts in _in_turn(sheets, slicing, by_depth, step_px):
+        largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
+        reach = slicing.optics.reach_px(parts, largest_px, slicing.frame)
+        for island in islands(parts, reach, slicing.size):
+            yield island, reach
+
+
+def _in_turn(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px: float) -> Iterator[tuple[int, list[Part]]]:
+    """Numbers and parts of the slices in the order in which they claim the pupil.
+
+    Front to back, what the pinhole picture shows; last what hides. But what hides behind something on the other side of the focus
+    goes right before its slice: kernels are mirrored at the focus, so there the pupil that an edge leaves free looks behind it.
+    """
+
+    def cut(shares: list[Shares]) -> list[tuple[int, list[Part]]]:
+        return sorted_slices(sheets, shares, step_px, slicing.size[1], slicing.pool)
+
+    if len(sheets) == 1:
+        yield from cut([np.ones_like(sheets[0].coc_px)])
+        return
+    seen, crossing = _shown_by_depth(sheets, slicing.size) if by_depth else _shown_in_order(sheets, slicing)
+    yield from merge(cut(crossing), cut(seen), key=itemgetter(0))
+    yield from cut([1.0 - shown - across for shown, across in zip(seen, crossing, strict=True)])
+
+
+def _range_px(sheets: Sequence[Pixels], pixels: int) -> tuple[float, float]:
+    """The least and the greatest circle of confusion; what a sheet leaves uncovered counts as in focus."""
+    in_focus = [0.0] if any(len(sheet.places) < pixels for sheet in sheets) else []
+    used = [sheet.coc_px for sheet in sheets if len(sheet.places) > 0]
+    return float(min([*in_focus, *(coc_px.min() for coc_px in used)])), float(max([*in_focus, *(coc_px.max() for coc_px in used)]))
+
+
+def _shown_in_order(sheets: Sequence[Pixels], slicing: Slicing) -> tuple[list[Shares], list[Shares]]:
+    """How much of each pixel the sheets listed before leave uncovered, and how much hides behind one on the other side of the focus."""
+    from mrbokeh.layering._slices_numba import cover
+
+    pixels = slicing.size[0] * slicing.size[1]
+    free, nearest_px = np.ones(pixels, np.float32), np.zeros(pixels, np.float32)
+    shown, crossing = ([np.empty_like(sheet.coc_px) for sheet in sheets] for _ in range(2))
+
+    def cover_band(first: int, end: int) -> None:
+        for each, across, sheet in zip(shown, crossing, sheets, strict=True):
+            cover(each, across, free, nearest_px, sheet.places, sheet.values, sheet.coc_px, _SHARP_PX, first, end)
+
+    in_bands(slicing.pool, pixels, _BAND_PIXELS, cover_band)
+    return shown, crossing
+
+
+def _shown_by_depth(sheets: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
+    """The same of nearer sheets, and of those at one depth the ones listed before."""
+    shown, crossing = ([np.full_like(sheet.coc_px, value) for sheet in sheets] for value in (1.0, 0.0))
+    for j, front in enumerate(sheets):
+        coverage, coc_px = np.zeros(size[0] * size[1], np.float32), np.zeros(size[0] * size[1], np.float32)
+        coverage[front.places], coc_px[front.places] = front.values[:, 3], front.coc_px
+        for i, sheet in enumerate(sheets):
+            if i != j:
+                there_px, over = coc_px[sheet.places], coverage[sheet.places]
+                nearer = there_px <= sheet.coc_px if j < i else there_px < sheet.coc_px
+                shown[i] *= np.where(nearer, np.float32(1.0) - over, np.float32(1.0))
+                crossing[i][(over > 0) & (there_px < -_SHARP_PX) & (sheet.coc_px > _SHARP_PX)] = 1.0
+    return shown, [across * (np.float32(1.0) - each) for across, each in zip(crossing, shown, strict=True)]

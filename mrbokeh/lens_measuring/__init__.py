@@ -1,0 +1,1 @@
+"""Lenses measured from focal stacks (`fitting`) and from one photograph (`matching`)."""

@@ -1,0 +1,92 @@
+"""The kernels of a fit as a bank of PSFs."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from mrbokeh.lens_measuring.fitting.lens_fit import LensFit
+from mrbokeh.lens_measuring.fitting.pupil_picture import kernel_of
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.psf_models.base import centred
+from mrbokeh.system.progress import track
+
+EXPONENT = 1.5  # steps are fine in focus, where a pixel's step changes a kernel most
+_STEP_PX, _STEP_SHARE = 0.5, 0.03
+_NODES = 3
+
+
+def bank_of(fit: LensFit) -> PsfBank:
+    """A bank over signed diameters and, where the lens varies over the field, positions (or eccentricity, for a symmetric lens).
+
+    Kernels have one channel where colours share theirs, else three.
+    Each kernel is averaged over its cell's diameters. settings hold for each cell of the bank how many pixels and lights tell of it, and
+    how far they disagree with it.
+    """
+    axes, counts = _axes(fit)
+    boxes = physical_boxes(axes, NestedGrid(counts, nested=False))
+    kernels = tuple(_kernel(fit, box) for box in track(list(boxes), "bank"))
+    turns = "field" if fit.knots.rings else "none"
+    return PsfBank("measured", axes, counts, kernels, turns, nested=False, settings=_settings(fit, boxes))
+
+
+def _axes(fit: LensFit) -> tuple[tuple[Axis, ...], tuple[int, ...]]:
+    high = fit.largest_px
+    step = max(_STEP_PX, _STEP_SHARE * high)
+    axes = [Axis("diameter_px", -high, high, EXPONENT)]
+    counts = [2 * int(np.ceil(EXPONENT * high / step)) + 1]
+    if fit.knots.rings:
+        axes.append(Axis("eccentricity", 0.0, 1.0))
+        counts.append(fit.knots.rings)
+    elif fit.knots.fields > 1:
+        axes += [Axis(name, -end, end) for name, end in zip(("field_x", "field_y"), fit.knots.highs, strict=True)]
+        counts += fit.knots.regions
+    return tuple(axes), tuple(counts)
+
+
+def _field(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> int:
+    if fit.knots.fields == 1:
+        return 0
+    middle = box[1:].mean(axis=1)
+    return int(fit.knots.fields_at(np.array([middle[0], 0.0 if fit.knots.rings else middle[1]])))
+
+
+def _kernel(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> Float32[np.ndarray, "size size channels"]:
+    """The mean over diameters of a cell; the one around the focus holds the focus."""
+    low, high = box[0]
+    diameters = [0.0] if low < 0.0 < high else low + (np.arange(_NODES) + 0.5) / _NODES * (high - low)
+    channels = slice(0, 1 if fit.sharing.colours else 3)
+    made = [kernel_of(fit.grid, picture_at(fit, float(each), _field(fit, box))[:, channels], float(each)) for each in diameters]
+    size = max(kernel.shape[0] for kernel in made)
+    mean = np.mean([centred(kernel, size) for kernel in made], axis=0, dtype=np.float64)
+    return (mean / mean.sum(axis=(0, 1))).astype(np.float32)
+
+
+def picture_at(fit: LensFit, diameter_px: float, field: int) -> Float64[np.ndarray, "cells 3"]:
+    """The pupil at a signed diameter, for each colour: between the knots' diameters in proportion to the logarithm."""
+    pictures = fit.pictures.reshape(*fit.knots.shape, *fit.pictures.shape[1:])[int(diameter_px > 0), :, field]
+    known = np.log(fit.knots.diameters_px)
+    place = float(np.interp(np.log(max(abs(diameter_px), 1e-6)), known, np.arange(len(known))))
+    first = min(int(place), max(len(known) - 2, 0))
+    second, share = min(first + 1, len(known) - 1), place - first
+    return np.asarray(((1.0 - share) * pictures[first] + share * pictures[second]).T)
+
+
+def _settings(fit: LensFit, boxes: Float64[np.ndarray, "cells axes 2"]) -> dict[str, Any]:
+    knots = [_knot(fit, box) for box in boxes]
+    return {
+        "pupil_side": fit.grid.side,
+        "shared": [name for name, is_one in vars(fit.sharing).items() if is_one],
+        "knot_diameters_px": [float(each) for each in fit.knots.diameters_px],
+        "pixels": [int(fit.pixels[knot]) for knot in knots],
+        "lights": [int(fit.lights[knot]) for knot in knots],
+        "errors": [None if np.isnan(fit.errors[knot]) else round(float(fit.errors[knot]), 4) for knot in knots],
+        "slices": [vars(score) for score in fit.scores],
+    }
+
+
+def _knot(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> int:
+    """That from which most of a cell of the bank comes."""
+    in_the_middle = int(fit.knots.at(np.array([box[0].mean()]), np.zeros((1, 2)))[0])
+    return in_the_middle // fit.knots.fields * fit.knots.fields + _field(fit, box)

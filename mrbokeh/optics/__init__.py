@@ -1,0 +1,1 @@
+"""Lenses, cameras, apertures and PSFs: formulas and files, no pictures."""

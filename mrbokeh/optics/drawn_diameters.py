@@ -1,0 +1,88 @@
+"""The diameters at which kernels are drawn, so that they blur a picture of pixels as much as the lens blurs the scene.
+
+A kernel holds the share of an opening that lies in each pixel, and a pixel of the sharp picture is a mean over its area already. That
+area would count twice: a disc drawn at 2 px blurs as one of 2.3 px does. Kernels are drawn at the diameter at which they pass an edge
+most like the opening itself does, but never larger than it is: between 1.5 and 3.5 px up to half a pixel smaller, beyond 6 px by one or
+two hundredths. Up to one pixel kernels stay the identity.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mrbokeh.optics.aperture import Aperture
+
+Plane = Float32[np.ndarray, "height width"]
+Transfers = Float[np.ndarray, "_ values"]
+
+STEPS_PER_PX = 16
+"""The table is so fine."""
+_WIDEST_PX = 16.0
+"""Beyond it the difference of the squares stays: variances add, and that of a pixel does not depend on the diameter."""
+_DRAWN_PX = np.concatenate([np.arange(1.0, 4.0, 0.1), np.arange(4.0, 8.0, 0.25), np.arange(8.0, 18.0, 0.5)])
+_BLURS_PX = np.arange(0.0, 18.0, 0.05)
+_FINE_PX = 100.0
+_FREQUENCIES = np.linspace(0.02, 0.5, 25)
+"""Cycles per pixel."""
+_WEIGHTS = _FREQUENCIES**-2.0
+"""The power of an edge along its axis."""
+_RISE = 1e-6
+_EVEN = np.hanning(17)[1:-1]
+"""Over half a pixel to each side: where blur grows from pixel to pixel, a bend here would show as a dip of opacity."""
+
+
+def drawn_diameters_px(coc_px: Plane, aperture: Aperture) -> Plane:
+    """(H, W) signed diameters to draw for blur of diameters coc_px; in the same order, and of the same sign.
+
+    An aperture that changes over the frame, with the side of the focus or with the colour is taken as in the middle of the frame, behind
+    the focus, without colour.
+    """
+    from mrbokeh.optics._drawn_diameters_numba import look_up
+
+    drawn = np.empty(coc_px.shape, np.float32)
+    look_up(drawn.reshape(-1), np.ascontiguousarray(coc_px).reshape(-1), _table(aperture), STEPS_PER_PX)
+    return drawn
+
+
+@lru_cache(maxsize=64)
+def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
+    """Diameters that are drawn for 0, 1 / STEPS_PER_PX, ... px of blur; the last one says how it goes on."""
+    steps_px = np.arange(_WIDEST_PX * STEPS_PER_PX + 1.0) / STEPS_PER_PX
+    off = _distances(_drawn_transfers(aperture), _transfers(aperture))
+    meant = np.maximum.accumulate([_lowest(_BLURS_PX, row) for row in off]) + _RISE * _DRAWN_PX
+    drawn = np.minimum(np.interp(steps_px, meant, _DRAWN_PX), steps_px)
+    around = np.pad(drawn, len(_EVEN) // 2, mode="reflect", reflect_type="odd")
+    return np.where(steps_px > 1.0, np.convolve(around, _EVEN / _EVEN.sum(), mode="valid"), steps_px).astype(np.float32)
+
+
+def _distances(one: Transfers, other: Transfers) -> Float[np.ndarray, "ones others"]:
+    """(ones, others) squared and weighted."""
+    weights = np.tile(_WEIGHTS, 2)
+    return np.stack([((row - other) ** 2) @ weights for row in one])
+
+
+def _lowest(places: Float[np.ndarray, " places"], values: Float[np.ndarray, " places"]) -> float:
+    """Of the parabola through the lowest value and its neighbours."""
+    middle = int(np.clip(np.argmin(values), 1, len(values) - 2))
+    before, here, after = values[middle - 1 : middle + 2]
+    bend = before - 2.0 * here + after
+    step = 0.5 * (before - after) / bend if bend > 0.0 else 0.0
+    return float(places[middle] + (places[1] - places[0]) * np.clip(step, -1.0, 1.0))
+
+
+def _drawn_transfers(aperture: Aperture) -> Transfers:
+    return np.stack([_transfer(aperture.rasterize(float(each)).kernel, _FREQUENCIES) for each in _DRAWN_PX])
+
+
+def _transfers(aperture: Aperture) -> Transfers:
+    """Of blur itself: a kernel so large that its pixels do not matter, made smaller."""
+    fine = aperture.rasterize(_FINE_PX).kernel
+    return _transfer(fine, np.multiply.outer(_BLURS_PX / _FINE_PX, _FREQUENCIES))
+
+
+def _transfer(kernel: Float[np.ndarray, "size size"], frequencies: Float[np.ndarray, "*batch values"]) -> Float[np.ndarray, "*batch _"]:
+    """Cosine parts along x and along y, in cycles per pixel."""
+    along = np.arange(len(kernel)) - len(kernel) // 2
+    waves = np.cos(2.0 * np.pi * frequencies[..., None] * along)
+    return np.concatenate([waves @ kernel.sum(axis=0), waves @ kernel.sum(axis=1)], axis=-1)

@@ -1,0 +1,147 @@
+"""The lens file: a Lens as JSON, so that a lens can be kept, named and passed around.
+
+    {"focal_length_mm": 50, "f_number": 1.8, "focus_distance_m": 2.0, "sensor_width_mm": 36,
+     "tilt_deg": [0, 0], "petzval_radius_mm": null,
+     "aperture": {"shape": "polygon", "blades": 7, "curvature": 0.3, "rotation_deg": 0, "inner": 0.6, "image": "heart.png",
+                  "levels": 1, "points": [[0, 0], [1, 0], [0, 1]], "path": "M0 0 L1 0 L0 1 Z", "squeeze": 1.0, "cat_eye": 0.0,
+                  "spherical_aberration": 0.0, "axial_chromatic": [0, 0, 0], "lateral_chromatic": [0, 0, 0]}}
+
+focus_distance_m null is infinity, petzval_radius_mm null a flat field. sensor_width_mm is that of the camera held level, as data
+sheets have it; where EXIF turned a photograph upright, the lens is turned with it (`mrbokeh.stacks.held_lens`). "sensor_height_mm" may be
+stated too: then the longer side lies along the longer side of any photograph, and 24 by 36 mm is a lens described for upright ones.
+The aperture's shape is one of
+    disc      round
+    polygon   blades, curvature
+    ring      inner
+    star      blades (its points), inner
+    heart
+    image     image (a picture beside the lens file, light where open), levels
+    outline   points or path (the d of an SVG path)
+and what another shape would need is not looked at, so that the shape can be switched by one word. rotation_deg and squeeze
+hold for every shape; the last four for every aperture. In place of a shape an aperture may have "outlines" and "weights",
+which is what `write_lens` writes. A key that nothing knows is an error.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file_values import Values, read_transmission
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
+
+FORMAT = "mrbokeh-lens"
+VERSION = 1
+
+_OPTIONAL = {"format", "version", "sensor_height_mm", "tilt_deg", "petzval_radius_mm"}
+_REQUIRED = {"focal_length_mm", "f_number", "focus_distance_m", "sensor_width_mm", "aperture"}
+_MODIFIERS = {"cat_eye", "spherical_aberration", "axial_chromatic", "lateral_chromatic"}
+_OF_SHAPES = {"shape", "blades", "curvature", "rotation_deg", "inner", "image", "levels", "points", "path", "squeeze"}
+
+
+def lens_to_json(lens: Lens) -> dict[str, Any]:
+    """The document of a lens; what is neutral among tilt, field curvature and the aperture's modifiers is left out."""
+    opening = lens.aperture
+    aperture: dict[str, Any] = {
+        "outlines": [np.round(outline, 9).tolist() for outline in opening.outlines],
+        "weights": list(opening.weights),
+    }
+    for key in ("cat_eye", "spherical_aberration"):
+        if getattr(opening, key):
+            aperture[key] = getattr(opening, key)
+    for key in ("axial_chromatic", "lateral_chromatic"):
+        if any(getattr(opening, key)):
+            aperture[key] = list(getattr(opening, key))
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "focal_length_mm": lens.focal_length_mm,
+        "f_number": lens.f_number,
+        "focus_distance_m": None if np.isinf(lens.focus_distance_m) else lens.focus_distance_m,
+        "sensor_width_mm": lens.sensor_width_mm,
+    }
+    if lens.sensor_height_mm is not None:
+        document["sensor_height_mm"] = lens.sensor_height_mm
+    if any(lens.tilt_rad):
+        document["tilt_deg"] = np.degrees(lens.tilt_rad).tolist()
+    if np.isfinite(lens.petzval_radius_mm):
+        document["petzval_radius_mm"] = lens.petzval_radius_mm
+    return document | {"aperture": aperture}
+
+
+def lens_from_json(document: dict[str, Any], where: str = "lens", folder: Path | str = ".") -> Lens:
+    """The lens of a document, as in the head of this module; `folder` is where the path of its image starts."""
+    if not isinstance(document, dict) or (document.get("format", FORMAT), document.get("version", VERSION)) != (FORMAT, VERSION):
+        raise InputError(f"{where}: expected a lens with format {FORMAT!r} and version {VERSION}; write one with `mrbokeh lens new`")
+    values = Values(document, where, known=_OPTIONAL | _REQUIRED, required=_REQUIRED)
+    tilt_x_deg, tilt_y_deg = values.numbers("tilt_deg", 2)
+    try:
+        return Lens(
+            values.number("focal_length_mm"),
+            values.number("f_number"),
+            values.number("focus_distance_m", null=np.inf),
+            values.number("sensor_width_mm"),
+            _aperture_from_json(document["aperture"], where, Path(folder)),
+            (float(np.radians(tilt_x_deg)), float(np.radians(tilt_y_deg))),
+            values.number("petzval_radius_mm", default=np.inf, null=np.inf),
+            None if document.get("sensor_height_mm") is None else values.number("sensor_height_mm"),
+        )
+    except InputError as error:
+        raise error if str(error).startswith(where) else InputError(f"{where}: {error}") from None
+
+
+def _aperture_from_json(document: Any, where: str, folder: Path) -> Aperture:
+    place = f"{where}: its aperture"
+    given = {"outlines", "weights"}
+    written = isinstance(document, dict) and "outlines" in document
+    values = Values(document, place, known=_MODIFIERS | (given if written else _OF_SHAPES), required=given if written else {"shape"})
+    if written:
+        weights = values.numbers("weights", None)
+        plain = Aperture(tuple(values.points("outlines", part) for part in values.sequence("outlines")), weights)
+    else:
+        plain = _of_shape(values, folder)
+    return Aperture(
+        plain.outlines,
+        plain.weights,
+        values.number("cat_eye", default=0.0),
+        values.number("spherical_aberration", default=0.0),
+        values.three("axial_chromatic"),
+        values.three("lateral_chromatic"),
+    )
+
+
+def _of_shape(values: Values, folder: Path) -> Aperture:
+    shape = values.document["shape"]
+    rotation_rad = float(np.radians(values.number("rotation_deg", default=0.0)))
+    shapes: dict[str, Callable[[], Aperture]] = {
+        "disc": lambda: Aperture.disc().rotated(rotation_rad),
+        "polygon": lambda: Aperture.blades(values.whole("blades"), rotation_rad, values.number("curvature", default=0.0)),
+        "ring": lambda: Aperture.ring(values.number("inner")).rotated(rotation_rad),
+        "star": lambda: Aperture.star(values.whole("blades"), values.number("inner"), rotation_rad),
+        "heart": lambda: Aperture.heart().rotated(rotation_rad),
+        "image": lambda: Aperture.from_picture(read_transmission(folder / values.text("image")), values.whole("levels", default=1)).rotated(
+            rotation_rad
+        ),
+        "outline": lambda: _from_outline(values).rotated(rotation_rad),
+    }
+    if not isinstance(shape, str) or shape not in shapes:
+        raise InputError(f"{values.where}: expected a shape out of {', '.join(shapes)}, got {shape!r}")
+    return shapes[shape]().squeezed(values.number("squeeze", default=1.0))
+
+
+def _from_outline(values: Values) -> Aperture:
+    if ("points" in values.document) == ("path" in values.document):
+        raise InputError(f"{values.where}: the shape 'outline' needs either points [[x, y], ...] or the path of an SVG")
+    return Aperture.from_outline(values.text("path") if "path" in values.document else values.points("points", values.document["points"]))
+
+
+def read_lens(path: Path | str) -> Lens:
+    return lens_from_json(read_json(path, "a lens file (LENS.json)"), str(path), Path(path).parent)
+
+
+def write_lens(path: Path | str, lens: Lens) -> None:
+    write_json(path, lens_to_json(lens))

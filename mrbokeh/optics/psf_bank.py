@@ -1,0 +1,133 @@
+"""PsfBank: every kernel of a lens that a renderer may need, sampled over a few physical coordinates."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+
+from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.proportional_grid import ProportionalGrid
+from mrbokeh.optics.psf_axis import Axis
+from mrbokeh.system.errors import InputError
+
+Turns = Literal["none", "motion", "field"]
+Kernel = Float32[np.ndarray, "size size channels"]
+Grid = NestedGrid | ProportionalGrid
+
+_MOST_LIGHT = 1.001
+"""What a kernel may sum to: 1, but for the rounding of float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class PsfBank:
+    """Kernels of the cells of a grid over a few coordinates, from a model (mrbokeh.psf_models) or a measured lens.
+
+    model: name of what made it. axes: the coordinates; counts: steps of the grid along each (`NestedGrid`).
+    kernels: one per cell, (K, K, C) float32, K odd and its own for each, C 1 or 3; rows go down, columns right, the source
+    in the middle pixel: what falls from a point into each pixel (renderers see to it that a pixel is no point: see
+    mrbokeh.optics.drawn_diameters). Each stands for the whole of its cell. A channel sums to 1, or to less where light is absorbed
+    (`throughput`); a renderer then darkens the picture by that much.
+    turns: what a kernel is turned by where it is used, from x towards y: "motion", the kernels are those of motion to the
+    right; "field", of a source to the right of the middle of the frame; "none".
+    near_side_turned: kernels are those behind the focus; in front (negative diameter) they are turned by half a turn.
+    nested: False is a regular grid, as for a single axis, signed diameters or samples that were measured on one.
+    knee_px: not None makes it neither, but a `ProportionalGrid` with this knee, over two linear axes in pixels.
+    settings: how it was made, as JSON values.
+    """
+
+    model: str
+    axes: tuple[Axis, ...]
+    counts: tuple[int, ...]
+    kernels: tuple[np.ndarray, ...]
+    turns: str = "none"
+    near_side_turned: bool = False
+    nested: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    knee_px: float | None = None
+
+    def __post_init__(self) -> None:
+        check_space(self.axes, self.counts, self.nested, self.turns)
+        if len(self.kernels) != len(self.grid):
+            raise InputError(f"a bank of {len(self.grid)} cells needs as many kernels, but came with {len(self.kernels)}")
+        channels = {kernel.shape[-1] for kernel in self.kernels}
+        if len(channels) != 1 or not channels <= {1, 3}:
+            raise InputError(f"the kernels of a bank must all have 1 or all have 3 channels, but came with {sorted(channels)}")
+        for index, kernel in enumerate(self.kernels):
+            check_kernel(kernel, f"kernel {index}")
+
+    @cached_property
+    def grid(self) -> Grid:
+        return grid_over(self.axes, self.counts, self.nested, self.knee_px)
+
+    @property
+    def channels(self) -> int:
+        return int(self.kernels[0].shape[-1])
+
+    @property
+    def radius_px(self) -> int:
+        """Whole pixels from the centre to the border of the largest kernel."""
+        return max(kernel.shape[0] for kernel in self.kernels) // 2
+
+    @cached_property
+    def throughput(self) -> Float64[np.ndarray, "cells channels"]:
+        """The sum of each kernel, 1 where no light is absorbed."""
+        return np.stack([kernel.sum(axis=(0, 1), dtype=np.float64) for kernel in self.kernels])
+
+    @cached_property
+    def boxes(self) -> Float64[np.ndarray, "cells axes 2"]:
+        """Low and high end of each cell on each axis, in physical coordinates."""
+        return physical_boxes(self.axes, self.grid)
+
+    @cached_property
+    def centres(self) -> Float64[np.ndarray, "cells axes"]:
+        """The middle of each cell, in physical coordinates."""
+        ends = [[axis.between(low, high, 0.5) for axis, (low, high) in zip(self.axes, box, strict=True)] for box in self.boxes]
+        return np.array(ends, np.float64)
+
+    def nearest(self, coords: Float[np.ndarray, "*batch axes"]) -> Int64[np.ndarray, "*batch"]:
+        """The cells whose kernels stand for these physical coordinates; found in constant time."""
+        unit = np.stack([axis.to_unit(coords[..., index]) for index, axis in enumerate(self.axes)], axis=-1)
+        return self.grid.index_of(unit)
+
+    def kernel_at(self, coords: Float[np.ndarray, " axes"]) -> Kernel:
+        """The kernel for one point, in front of the focus turned where the bank says so; not turned by motion or field."""
+        kernel = self.kernels[int(self.nearest(np.asarray(coords, np.float64)))]
+        in_front = any(axis.name == "diameter_px" and value < 0.0 for axis, value in zip(self.axes, coords, strict=True))
+        return kernel[::-1, ::-1] if in_front and self.near_side_turned else kernel
+
+
+def grid_over(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, knee_px: float | None) -> Grid:
+    """The grid of a bank, in unit coordinates of its axes."""
+    if knee_px is None:
+        return NestedGrid(counts, nested)
+    if any(axis.low != 0.0 or axis.exponent != 1.0 or not axis.name.endswith("_px") for axis in axes):
+        raise InputError("a proportional grid needs linear axes in pixels that begin at 0 (exponent 1): it bends them itself")
+    return ProportionalGrid(counts, tuple(axis.high for axis in axes), knee_px)
+
+
+def check_space(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, turns: str) -> None:
+    """Whether axes, counts and the rest make a space of PSFs."""
+    names = [axis.name for axis in axes]
+    if not axes or len(axes) != len(counts) or len(set(names)) != len(names):
+        raise InputError(f"a bank needs different axes and a count for each, got {names} and {counts}")
+    if nested and any(axis.is_signed for axis in axes):
+        raise InputError("a bank over signed coordinates needs a regular grid (nested=False): a nested one is fine at one end only")
+    if turns not in get_args(Turns):
+        raise InputError(f"a bank turns by one of {', '.join(get_args(Turns))}, got {turns!r}")
+
+
+def check_kernel(kernel: np.ndarray, where: str) -> None:
+    """Whether an array is a kernel: (K, K, C), K odd, finite, no channel brighter than its source or black."""
+    if kernel.ndim != 3 or kernel.shape[0] != kernel.shape[1] or kernel.shape[0] % 2 == 0 or kernel.dtype != np.float32:
+        raise InputError(f"{where}: expected (K, K, C) float32 with an odd K, got {kernel.shape} {kernel.dtype}")
+    light = kernel.sum(axis=(0, 1), dtype=np.float64)
+    if not ((light > 0.0) & (light <= _MOST_LIGHT)).all():
+        raise InputError(f"{where}: each channel of a kernel must sum to 1, or to less where light is absorbed, got {light.tolist()}")
+
+
+def physical_boxes(axes: tuple[Axis, ...], grid: Grid) -> Float64[np.ndarray, "cells axes 2"]:
+    """The cells of a grid in physical coordinates."""
+    return np.stack([axis.from_unit(grid.boxes[:, index]) for index, axis in enumerate(axes)], axis=1)

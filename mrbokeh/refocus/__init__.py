@@ -1,0 +1,1 @@
+"""New slices of a focal stack, and one lens put in place of another."""

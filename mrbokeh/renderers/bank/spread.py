@@ -1,0 +1,147 @@
+"""Light through a bank of kernels: every pixel's light is divided among the kernels around it, and each share is spread by its own.
+
+Places in the frame share in proportion (bilinearly), so that nothing jumps where one cell of the bank ends; the shares of a
+pixel sum to 1, so no light is lost or doubled. Renderers differ in how a side of the focus is spread (`SpreadSide`).
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property, reduce
+from itertools import product
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from mrbokeh.layering.psf_over_field import Channels, Plane
+from mrbokeh.optics.psf import kernel_radius_px
+from mrbokeh.renderers.bank.around import Around
+from mrbokeh.renderers.bank.lattice import BankLattice
+from mrbokeh.renderers.bank.tables import BankTables, Place, turned_kernel
+from mrbokeh.system.errors import InputError
+
+_LARGE_PX = 8.0
+_ALL_LIGHT = 1e-6  # kernels that sum to 1 within the rounding of float32
+
+
+@runtime_checkable
+class SpreadSide(Protocol):
+    """The sum over pixels on one side of the focus (signed diameters coc_px) of value times kernel of a channel of the bank.
+
+    Kernels sum to 1 here. A pixel without any value has no say. Same size out; light that leaves the frame is lost.
+    """
+
+    def __call__(self, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels: ...
+
+
+@dataclass
+class BlendedTables(BankTables):
+    """What mrbokeh.renderers.bank.bank_optics.BankOptics asks of a bank whose kernels are blended with those of the cells beside.
+
+    unit_radius: how far apertures that stand for the kernels reach, 0 if none do.
+    """
+
+    unit_radius: float = 0.0
+
+    @cached_property
+    def lattice(self) -> BankLattice:
+        return BankLattice(self.bank)
+
+    @cached_property
+    def largest_px(self) -> float:
+        return float(np.abs(self.bank.boxes[:, self.diameter_axis]).max())
+
+    @cached_property
+    def reaches_px(self) -> Int64[np.ndarray, " cells"]:
+        """Of each cell's kernel, those of the cells beside it, and the apertures that stand for them."""
+        own, axes = super().reaches_px, range(len(self.bank.axes))
+        reaches, steps = own.copy(), list(product((-1, 0, 1), repeat=len(axes)))
+        for cell, box in enumerate(self.bank.boxes):
+            middle, width = self.bank.centres[cell], 0.75 * (box[:, 1] - box[:, 0])
+            beside = self.bank.nearest(np.array([middle + np.array(step) * width for step in steps]))
+            drawn = kernel_radius_px(float(np.abs(box[self.diameter_axis]).max()), self.unit_radius)
+            reaches[cell] = max(int(own[beside].max()), drawn if self.unit_radius else 0)
+        return reaches
+
+    @cached_property
+    def diameter_axis(self) -> int:
+        return [axis.name for axis in self.bank.axes].index("diameter_px")
+
+
+@dataclass(frozen=True, eq=False)
+class AnchorKernels:
+    """The kernels of a lattice turned to where they are used, kept."""
+
+    lattice: BankLattice
+    _kept: dict[tuple[int, int, int], Float64[np.ndarray, "_ _ channels"]] = field(default_factory=dict, repr=False)
+
+    def kernel(self, side: int, node: int, anchor: int) -> Float64[np.ndarray, "size size channels"]:
+        """As behind the focus, each channel with sum 1."""
+        key = side, node, anchor
+        if key not in self._kept:
+            place, angle_rad = self.lattice.place_and_angle(anchor)
+            kernel = self.lattice.kernel(side, node, place)
+            turned = turned_kernel(kernel.astype(np.float32), angle_rad) if angle_rad else kernel
+            self._kept[key] = _without_border(turned / turned.sum(axis=(0, 1)))
+        return self._kept[key]
+
+    @cached_property
+    def unit_radius(self) -> float:
+        """How far kernels of 8 px or more reach, in radii of their circles of confusion; at least 1."""
+        tables = BlendedTables(self.lattice.bank, None)
+        reaches = 2.0 * BankTables(self.lattice.bank, None).reaches_px + 1.0
+        diameters_px = np.abs(self.lattice.bank.centres[:, tables.diameter_axis])
+        large = diameters_px >= _LARGE_PX
+        return float(np.max(reaches[large] / diameters_px[large], initial=1.0))
+
+
+def _without_border(kernel: Float64[np.ndarray, "_ _ channels"]) -> Float64[np.ndarray, "_ _ channels"]:
+    """Without rows and columns of zeros all around."""
+    middle = len(kernel) // 2
+    reach = int(np.abs(np.argwhere(kernel.any(axis=2)) - middle).max())
+    return np.ascontiguousarray(kernel[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1])
+
+
+def spread_by_bank(tables: BlendedTables, spread_side: SpreadSide, values: Channels, coc_px: Plane, place: Place) -> Channels:
+    """R, G, B, coverage (for a bank of three colours three times), others; as LaplacianSpreadlets.spread_bank has it."""
+    lit = not_black(values)
+    if not np.isfinite(coc_px[lit]).all():
+        raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
+    coc_px = np.where(lit, np.clip(coc_px, -tables.largest_px, tables.largest_px), np.float32(0.0)).astype(np.float32)
+    around = Around.of(tables.lattice, place, coc_px.shape)
+    behind = coc_px > 0
+    sides = {side: here for side, here in ((1, behind), (-1, lit & ~behind)) if here.any()}
+
+    def summed(picked: Channels, colours: int, channel: int) -> Channels:
+        """picked: channels of the picture, the first of which are colours."""
+        total = np.zeros_like(picked) if len(sides) != 1 else None
+        for side, here in sides.items():
+            passed = _passed(tables.lattice, coc_px, side, channel, around)
+            mine = picked if len(sides) == 1 and passed is None else picked * here[..., None]
+            if passed is not None:
+                mine[..., :colours] *= passed[..., None]
+            seen = spread_side(mine, coc_px, side, channel, around)
+            total = seen if total is None else total + seen
+        assert total is not None
+        return total
+
+    if tables.bank.channels == 1:
+        return summed(values, 3, 0)
+    others = list(range(3, values.shape[2]))
+    each = [summed(values[..., [c, *(others if c == 1 else [3])]], 1, c) for c in range(3)]
+    return np.concatenate([*(light[..., :1] for light in each), *(light[..., 1:2] for light in each), each[1][..., 2:]], axis=2)
+
+
+def not_black(values: Channels) -> Bool[np.ndarray, "height width"]:
+    """Which hold anything, faster than `any` along a short axis."""
+    return np.asarray(reduce(np.logical_or, np.moveaxis(values[..., 1:], -1, 0), values[..., 0] != 0.0))
+
+
+def _passed(lattice: BankLattice, coc_px: Plane, side: int, channel: int, around: Around) -> Plane | None:
+    """What the lens lets through of each pixel's light; None is all."""
+    known = lattice.light(side)[..., channel]
+    if np.abs(known - 1.0).max() < _ALL_LIGHT:
+        return None
+    lower, upper = lattice.diameter_shares(side, np.abs(coc_px))
+    places = around.anchors // lattice.directions
+    ends = [(known[np.minimum(lower + i, len(known) - 1)[..., None], places] * around.shares).sum(axis=-1) for i in (0, 1)]
+    return ((1.0 - upper) * ends[0] + upper * ends[1]).astype(np.float32)

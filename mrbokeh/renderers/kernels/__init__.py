@@ -1,0 +1,1 @@
+"""Kernels prepared for a method: fitted polygons, low-rank terms, spreadlets (sparse Laplacians)."""

@@ -1,0 +1,130 @@
+"""Jobs: one partition of one tile each, with how it is reprojected and filtered, in groups that go through a step together."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64
+from torch import Tensor
+
+from mrbokeh.renderers.layered_reconstruction._reprojection_numba import BESIDE_DEPTHS
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._filter import Slopes
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight, block_at
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._merging import Partitions
+
+GUARDS_PX = (1, 3, 7, 15, 31, 47, 79, 111, 175, 239, 367, 495)
+"""Jobs are grouped by their guard bands, up to the next of these: a few sizes of windows, little of them empty,
+and with a tile of 32 px a transform of a power of two or thrice that."""
+
+
+_SHARP_PX = 0.5
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """All partitions. slope: (P, 3) of the reprojection, a, b_x, b_y. guard: (P, 2) how far the filter reads beyond the tile, x and y.
+
+    facts: (P, 10) relative to the corner of a window without a guard band: corner in the picture, first pixel that belongs to
+    the job, the one after the last a sample may come to lie in (x and y each), whether samples keep their pixels, the nearest
+    depth bucket that counts, 2 rank, tile.
+    blocks: (P, 4) blocks of samples to look at, of all that may come into the window: first, x and y, how many along x and in all.
+    """
+
+    partitions: Partitions
+    slopes: Slopes
+    slope: Float32[Tensor, "jobs 3"]
+    guard: Int64[Tensor, "jobs 2"]
+    facts: Int64[Tensor, "jobs 10"]
+    blocks: Int64[Tensor, "jobs 4"]
+    host_guard: Int64[np.ndarray, "jobs 2"]
+    host_blocks: Int64[np.ndarray, " jobs"]
+    host_counts: Int64[np.ndarray, " tiles"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """Jobs whose windows are equally large. job: (G,). facts: (G, 10) of Jobs, of windows with their guard bands. side: of each.
+
+    entry, block: (E,) pairs of a job of the group and a block of samples.
+    """
+
+    job: Int64[Tensor, " group"]
+    facts: Int64[Tensor, "group 10"]
+    side: int
+    entry: Int64[Tensor, " entries"]
+    block: Int64[Tensor, " entries"]
+
+
+def jobs_of(partitions: Partitions, slopes: Slopes, guard: Int64[Tensor, "jobs 2"], light: TileLight, shared_out: bool) -> Jobs:
+    """The host learns here how many jobs each tile has, how wide their windows are and how many blocks of samples they look at.
+
+    shared_out: samples that move are shared out among the four nearest pixels, else all keep the pixel they come into.
+    """
+    slope = torch.stack([slopes.kappa_u * slopes.r, slopes.kappa_t * slopes.m_x, slopes.kappa_t * slopes.m_y], dim=1)
+    reach_px = slope[:, :1].abs() * light.pupil_radius + 0.5 * slope[:, 1:].abs()
+    tile, side = partitions.tile, light.tile_px
+    corner = torch.stack([tile % light.columns, tile // light.columns], dim=1) * side
+    end = torch.stack([(corner[:, 0] + side).clamp(max=light.width_px), (corner[:, 1] + side).clamp(max=light.height_px)], dim=1)
+    is_sharp = ((reach_px < _SHARP_PX).all(dim=1, keepdim=True) | (not shared_out)).long()
+    others = torch.stack([partitions.nearest - BESIDE_DEPTHS, 2 * partitions.rank, tile], dim=1)
+    facts = torch.cat([corner, -guard, end - corner + guard - (1 - is_sharp), is_sharp, others], dim=1)
+    blocks = _blocks(corner, end, guard + reach_px + 1.0, light)
+    known = torch.cat([guard, blocks[:, 3:]], dim=1).cpu().numpy()
+    counts = partitions.counts.cpu().numpy()
+    return Jobs(partitions, slopes, slope.float(), guard, facts, blocks, known[:, :2], known[:, 2], counts)
+
+
+def _blocks(
+    corner: Int64[Tensor, "jobs 2"], end: Int64[Tensor, "jobs 2"], beyond_px: Float64[Tensor, "jobs 2"], light: TileLight
+) -> Int64[Tensor, "jobs 4"]:
+    """First block along x and y, number along x, number in all, of those within some pixels of a tile."""
+    side = light.tile_px // 4
+    low = torch.floor((corner - beyond_px) / side).long().clamp(min=0)
+    high = torch.floor((end + beyond_px) / side).long()
+    count_x = high[:, 0].clamp(max=4 * light.columns - 1) - low[:, 0] + 1
+    count_y = high[:, 1].clamp(max=4 * light.rows - 1) - low[:, 1] + 1
+    return torch.stack([low[:, 0], low[:, 1], count_x, count_x * count_y], dim=1)
+
+
+def task_of(jobs: Jobs, light: TileLight, members: Int64[np.ndarray, " group"], guard: int) -> Task:
+    """Some jobs, with a guard band that is as wide as theirs or wider."""
+    device, entries = jobs.facts.device, int(jobs.host_blocks[members].sum())
+    job = torch.from_numpy(members).to(device)
+    first_x, first_y, across, count = jobs.blocks[job].unbind(dim=1)
+    entry = torch.repeat_interleave(count, output_size=entries)
+    within = torch.arange(entries, device=device) - (torch.cumsum(count, 0) - count)[entry]
+    x, y = first_x[entry] + within % across[entry], first_y[entry] + within // across[entry]
+    block = block_at(x, y, light.columns)
+    moved = torch.tensor([-guard] * 2 + [guard] * 4 + [0] * 4, device=device)
+    return Task(job, jobs.facts[job] + moved, light.tile_px + 2 * guard, entry, block)
+
+
+def batches(jobs: Jobs, jobs_at_once: int) -> Iterator[tuple[int, int]]:
+    """First and end of runs of tiles with at most so many jobs together, or of single tiles."""
+    ends = np.cumsum(jobs.host_counts)
+    begin, before = 0, 0
+    while begin < len(ends):
+        end = max(int(np.searchsorted(ends, before + jobs_at_once, side="right")), begin + 1)
+        yield begin, end
+        begin, before = end, int(ends[end - 1])
+
+
+def jobs_in(jobs: Jobs, tiles: Int64[np.ndarray, " tiles"]) -> Int64[np.ndarray, " jobs"]:
+    """All jobs of these tiles, which must rise."""
+    ends = np.cumsum(jobs.host_counts)
+    return np.concatenate([np.arange(ends[tile] - jobs.host_counts[tile], ends[tile]) for tile in tiles.tolist()])
+
+
+def groups(
+    jobs: Jobs, some: Int64[np.ndarray, " jobs"], tile_px: int, pixels_at_once: int
+) -> Iterator[tuple[Int64[np.ndarray, " group"], int]]:
+    """Of some jobs, those that share a guard band, with it, and no more than so many pixels of windows together."""
+    widest = jobs.host_guard[some].max(axis=1)
+    band = np.searchsorted(GUARDS_PX, widest)
+    for which in np.unique(band).tolist():
+        guard = GUARDS_PX[which] if which < len(GUARDS_PX) else int(widest.max())
+        members = some[band == which]
+        at_once = max(1, pixels_at_once // (tile_px + 2 * guard) ** 2)
+        for begin in range(0, len(members), at_once):
+            yield members[begin : begin + at_once], guard

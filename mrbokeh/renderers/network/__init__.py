@@ -1,0 +1,1 @@
+"""The Neural Bokeh network in an ONNX session."""

@@ -1,0 +1,1 @@
+"""Polygonal directional differences: kernels as polygons, summed along their edges."""

@@ -1,0 +1,159 @@
+"""The working memory of polygon_differences: a ring of rows of several planes, four channels to a cell.
+
+One plane of impulses for each pair of directions that meets in a corner, and, last, one plane of light that needs no sums
+(in focus, small kernels, highlights).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+BLOCK_ROWS = 64
+"""Rows of which the same columns are splatted before the next columns, so that the cells they share stay in the cache."""
+SPARE_PX = 4
+"""What corners of edges that lie between lattice lines, and the profiles of edges, may reach beyond the outline."""
+GUARD = 16
+"""Elements (four cells) before the first of a row of sums, which a step to the side may reach."""
+ALIASED_ROWS = 4
+"""Rows before and after the ring proper that stand for its last and first ones: a corner reaches a few rows beyond its own."""
+APART_PX = 8
+"""Pixels that follow one another when they are splatted are so far apart: neighbours add to overlapping pairs of cells, and
+the second would wait for the first."""
+
+compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False)  # type: ignore[call-overload]
+"""Without counting references, which would be atomic and cost as much as the work: nothing here allocates."""
+
+
+class Corners(NamedTuple):
+    """mrbokeh.renderers.polygon.directional_differences.PolygonCorners laid out for one ring: steps and places count array elements.
+
+    Crossings of a corner that are neighbours in a row are added to together, so corners come in three kinds: up to `level`
+    crossings 0 and 1 are neighbours and so are 2 and 3, up to `steep` 1 and 2 are, and of the rest none. place (corners, 4):
+    where they are from crossing 0 on, in pairs as mrbokeh.renderers.polygon._aim_numba stores their weights. step, turned
+    (corners, 2): of the edge before and the one after, what one line on moves the crossing, and 1 where their two lines count
+    backwards, 0 elsewhere. below: the row under the lowest crossing. extent: farthest reach of an outline at radius 1.
+    """
+
+    slope: np.ndarray
+    shift: np.ndarray
+    origin: np.ndarray
+    curvature: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    step: np.ndarray
+    turned: np.ndarray
+    plane: np.ndarray
+    place: np.ndarray
+    below: np.ndarray
+    weight: np.ndarray
+    level: int
+    steep: int
+    area: float
+    area_offset: float
+    growth: float
+    extent: float
+
+
+class Sums(NamedTuple):
+    """Which planes feed which direction, and what of each sum goes to the picture; index arrays end with the total."""
+
+    step_x: np.ndarray
+    step_y: np.ndarray
+    shift: np.ndarray
+    input_start: np.ndarray
+    input_plane: np.ndarray
+    input_weight: np.ndarray
+    profile_start: np.ndarray
+    profile_x: np.ndarray
+    profile_y: np.ndarray
+    profile_weight: np.ndarray
+    row_start: np.ndarray
+
+
+class Exact(NamedTuple):
+    """Kernels that are splatted whole.
+
+    lower, rise: taps of kernels of small diameters, in groups of neighbours, and what to add to them to reach those of the next
+    level; `per_px` levels to a pixel, from 1 px on, `levels` behind the focus and then as many in front. row, column
+    (groups,): counted from -radius on, and 4 times counted from the pixel. start: with which group each level begins, and the end.
+    from_px, to_px: between these diameters the sums take over. vertices, starts, weights, unit_radius: the aperture itself.
+    """
+
+    lower: np.ndarray
+    rise: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    start: np.ndarray
+    levels: int
+    radius: int
+    per_px: float
+    from_px: float
+    to_px: float
+    vertices: np.ndarray
+    starts: np.ndarray
+    weights: np.ndarray
+    unit_radius: float
+
+
+class Ring(NamedTuple):
+    """planes: flat, light plane last. Row r of the ring proper starts at (ALIASED_ROWS + r) * stride cells.
+
+    Column x of the picture is cell x - left + margin of a row.
+    """
+
+    planes: np.ndarray
+    plane_elements: int
+    light_plane: int
+    rows: int
+    stride: int
+    margin: int
+    left: int
+
+
+class Scratch(NamedTuple):
+    """Work space of one thread.
+
+    sums: (rows of all directions, 4 stride + 2 GUARD). total: (4 stride). small, small_share: the pixels of a chunk with small
+    kernels, and how much of their light these spread. rows: where column 0 of the picture is in the rows
+    that small kernels reach. taps: for a row of a kernel. kernel: 2 times the largest kernel.
+    """
+
+    element: np.ndarray
+    radius: np.ndarray
+    gain: np.ndarray
+    line: np.ndarray
+    share: np.ndarray
+    target: np.ndarray
+    weight: np.ndarray
+    sums: np.ndarray
+    total: np.ndarray
+    carry: np.ndarray
+    small: np.ndarray
+    small_share: np.ndarray
+    rows: np.ndarray
+    taps: np.ndarray
+    kernel: np.ndarray
+
+
+class Picture(NamedTuple):
+    """values (H, W, 4) and coc_px (H, W) float32; share (H, W) of highlights, halved (blocks of 2 x 2) that is spread at half the
+    resolution, each empty if there is none; nonnegative: channels without values below 0; largest_px: of pixels with light, of
+    each tile."""
+
+    values: np.ndarray
+    coc_px: np.ndarray
+    share: np.ndarray
+    halved: np.ndarray
+    nonnegative: np.ndarray
+    largest_px: np.ndarray
+
+
+class Target(NamedTuple):
+    """Where the light of a band of rows top..bottom goes: out (H, 4 W), and above and below (rows, 4 W) what leaves the band."""
+
+    out: np.ndarray
+    above: np.ndarray
+    below: np.ndarray
+    top: int
+    bottom: int

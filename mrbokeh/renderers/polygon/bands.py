@@ -1,0 +1,135 @@
+"""The pieces of work of polygon_differences, and the threads that work through them."""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import pairwise
+from threading import Lock
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from mrbokeh.renderers.polygon._differences_numba import settle, spread_parts
+from mrbokeh.renderers.polygon._ring_numba import Picture, Target
+from mrbokeh.renderers.polygon._survey_numba import TILE_PX
+from mrbokeh.renderers.polygon._tiles_numba import find_parts
+from mrbokeh.renderers.polygon.halves import halves_of
+from mrbokeh.renderers.polygon.light import NO_HIGHLIGHTS, SurveyedLight
+from mrbokeh.renderers.polygon.memory import laid_out, ring_elements, ring_of, scratch_of
+from mrbokeh.renderers.polygon.tables import ApertureTables
+from mrbokeh.system.zeroed_memory import ZeroedMemory
+
+BAND_ROWS = 384
+"""Least height of a band; two margins where these are larger. Bands do not depend on the number of threads."""
+RING_BYTES = 6 << 20
+"""A band is worked through in parts so narrow that the ring fits the cache, but not narrower than four margins."""
+SETTLED_ROWS = 128
+"""Rows that are completed together when all bands are done."""
+FEW_PIXELS = 1 << 18
+"""Pictures below this size are one band."""
+SPARSE, SPARSE_PART_PX = 0.5, 96
+"""Where less than this share of the tiles holds light, parts are narrow, so that they leave out what is dark."""
+_LEAST_ROWS = 64
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows top..bottom of a picture: parts of equal width of it that hold light, each first row, end row, left, right."""
+
+    top: int
+    bottom: int
+    parts: Int64[np.ndarray, "parts 4"]
+
+
+def bands_of(light: SurveyedLight, margin: int, bytes_per_cell: int) -> list[Band]:
+    (height, width), tiles = light.coc_px.shape, light.tiles
+    first, end = tiles.first * TILE_PX, min(tiles.end * TILE_PX, height)
+    least = _LEAST_ROWS if height * width > FEW_PIXELS else height
+    count = max((end - first) // max(BAND_ROWS, 2 * margin), min(2, (end - first) // least), 1)
+    cuts = [first + round(k * (end - first) / TILE_PX / count) * TILE_PX for k in range(count)]
+    sparse = tiles.lit < SPARSE * tiles.occupied.size
+    step = max(SPARSE_PART_PX, 2 * margin) if sparse else _part_width(width, margin, bytes_per_cell)
+    return [Band(top, bottom, parts_of(tiles.occupied, top, bottom, width, step, margin)) for top, bottom in pairwise([*cuts, end])]
+
+
+def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
+    fitting = RING_BYTES // (2 * margin * bytes_per_cell) - 2 * margin
+    return -(-width // max(1, round(width / max(fitting, 4 * margin, 256))))
+
+
+def parts_of(
+    occupied: Bool[np.ndarray, "rows columns"], top: int, bottom: int, width: int, step: int, margin: int
+) -> Int64[np.ndarray, "parts 4"]:
+    """Column by column, `step` px wide, and within one apart where light of one does not reach that of the other."""
+    first, end = top // TILE_PX, -(-bottom // TILE_PX)
+    parts = np.empty((-(-width // step) * (end - first), 4), np.int64)
+    return parts[: find_parts(occupied, (top, bottom), width, step, margin, parts)]
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What all pictures of a call have in common. halve_from_px: see mrbokeh.renderers.polygon.halves; inf for never."""
+
+    tables: ApertureTables
+    dtype: type
+    pool: Executor
+    threads: int
+    memory: ZeroedMemory
+    halve_from_px: float
+
+    def spread_four(self, light: SurveyedLight, highlights: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "height width 4"]:
+        """A picture of four channels, the blurriest parts at half the resolution, and of those the blurriest at half of that."""
+        halves = halves_of(light, highlights, self.halve_from_px, self.pool)
+        half = np.zeros((0, 0), np.float32)
+        if halves.half is not None:
+            half = self.spread_four(halves.half, NO_HIGHLIGHTS)
+            half = half.reshape(len(half), -1)
+        return self._spread(halves.kept, highlights, halves.share, half)
+
+    def _spread(
+        self,
+        light: SurveyedLight,
+        highlights: Float32[np.ndarray, "_ _"],
+        halved: Float32[np.ndarray, "_ _"],
+        half: Float32[np.ndarray, "_ _"],
+    ) -> Float32[np.ndarray, "height width 4"]:
+        """Bands one by one, by as many threads as there are; what light leaves its band is added in the order of the bands."""
+        out = np.zeros(light.values.shape, np.float32)
+        flat, nonnegative = out.reshape(len(out), -1), light.least >= 0.0
+        bands, margin = [], 0
+        if light.tiles.lit:
+            margin = self.tables.margin_px(light.tiles.largest_px)
+            bands = bands_of(light, margin, (len(self.tables.planes) + 1) * 4 * np.dtype(self.dtype).itemsize)
+        edges = [(band.top, band.bottom) for band in bands] if len(bands) > 1 else [(0, len(out))]
+        strays = np.zeros((len(edges), 2, margin if len(bands) > 1 else 0, flat.shape[1]), np.float32)
+        targets = [Target(flat, above, below, *rows) for (above, below), rows in zip(strays, edges, strict=True)]
+        picture = Picture(light.values, light.coc_px, highlights, halved, nonnegative, light.largest_of_tile_px)
+        self._spread_bands(picture, list(zip(bands, targets, strict=False)), margin)
+        starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
+        pieces = strays.reshape(2 * len(edges), *strays.shape[2:])
+
+        def finish(top: int) -> None:
+            target = Target(flat, strays[0, 0], strays[0, 1], top, min(top + SETTLED_ROWS, len(out)))
+            settle(target, pieces, starts, half, np.empty(half.shape[1], np.float32), nonnegative)
+
+        list(self.pool.map(finish, range(0, len(out), SETTLED_ROWS)))
+        return out
+
+    def _spread_bands(self, picture: Picture, bands: list[tuple[Band, Target]], margin: int) -> None:
+        waiting, lock = iter(bands), Lock()
+        width = max((int((band.parts[:, 3] - band.parts[:, 2]).max()) for band, _ in bands), default=0)
+        tables = self.tables
+
+        def work() -> None:
+            planes = self.memory.take(ring_elements(tables, margin, width), self.dtype)
+            ring = ring_of(tables, margin, width, planes)
+            corners, scratch = laid_out(tables, ring), scratch_of(tables, ring)
+            while True:
+                with lock:
+                    piece = next(waiting, None)
+                if piece is None:
+                    break
+                band, target = piece
+                spread_parts(picture, corners, tables.sums, tables.exact, ring, scratch, target, band.parts)
+            self.memory.give_back(planes)
+
+        list(self.pool.map(lambda _: work(), range(min(self.threads, len(bands)))))

@@ -1,0 +1,1 @@
+"""Laplacian spreadlets: sums of sparse Laplacians, integrated once."""

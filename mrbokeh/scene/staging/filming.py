@@ -1,0 +1,127 @@
+"""Filming: how a staged scene becomes the layers of a plate: by which backend, through which distortion, with which shutter and shadow."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.distortion import LensDistortion, distorted, overscan_camera
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.layering.pixel_box import Box
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene import Scene, SceneRenderer
+from mrbokeh.scene.choose import scene_renderer
+from mrbokeh.scene.light_change import GREY, light_change
+from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
+from mrbokeh.scene.moving_layers.moving_shadow import ShadowCatcher
+from mrbokeh.scene.shadow_layer import shadow_layer
+from mrbokeh.scene.staging.assets import Assets
+from mrbokeh.scene.staging.picture_box import shadow_box
+from mrbokeh.scene.staging.scene_description import SceneDescription
+from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.upright import upright_camera
+
+CATCHES = ("shadow", "light")
+
+CameraAt = Callable[[float], Camera]
+
+
+@dataclass(frozen=True)
+class Filming:
+    """backend: a name of `mrbokeh.scene.choose`; samples: paths per pixel of "mitsuba". distortion: of the plate's lens.
+
+    catches: "shadow", of the scene's lights as dark as the scene says, or "light": all that the objects change on the ground
+    (`mrbokeh.scene.light_change`). shutter: blurs by motion; None stands still.
+    """
+
+    backend: str = "auto"
+    samples: int = 64
+    denoise: bool = False
+    catches: str = "shadow"
+    distortion: LensDistortion = field(default_factory=LensDistortion)
+    shutter: ShutterTiming | None = None
+
+    def __post_init__(self) -> None:
+        if self.catches not in CATCHES:
+            raise InputError(f"expected what the ground catches to be {' or '.join(CATCHES)}, got {self.catches!r}")
+        if self.catches == "light" and self.shutter is not None:
+            raise InputError("light on the ground is caught of what stands still: leave the shutter out, or catch the shadow alone")
+
+    def renderer(self, threads: int = 0) -> SceneRenderer:
+        if self.backend == "mitsuba":
+            from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
+
+            return MitsubaTracer(self.samples, threads=threads, denoise=self.denoise)
+        return scene_renderer(self.backend, threads)
+
+
+class FilmedLayers:
+    """A scene before a plate's camera. Backends keep what they prepared, so one of these serves all frames."""
+
+    def __init__(self, filming: Filming, description: SceneDescription, threads: int = 0) -> None:
+        self._filming, self._renderer = filming, filming.renderer(threads)
+        self._staged = StagedScene.load(description, Assets(), moment_s=0.0)
+
+    @property
+    def changes_by_itself(self) -> bool:
+        """Whether the layers can differ between two moments that show the same camera: by animation, or by what the shutter sees."""
+        return self._staged.is_animated or self._filming.shutter is not None
+
+    def at(self, camera_at: CameraAt, time_s: float = 0.0, sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None) -> list[Layer]:
+        """Sharp layers of the plate's size, front first: the objects, and behind them what they change on the ground.
+
+        camera_at: the plate's camera by the time, with its pose in the world of the scene file; time_s: of the scene.
+        sharp_rgb: the plate, all in focus where that is known, for what the ground loses colour by colour; without it, and with
+        distortion, all colours lose alike.
+        """
+        plate, wide_at = camera_at(time_s), self._wide(camera_at)
+        wide = wide_at(time_s)
+        if self._filming.shutter is None:
+            layers = self._still(wide, time_s, sharp_rgb if self._filming.distortion.is_none else None)
+        else:
+            shutter = self._filming.shutter.within(wide, plate)
+            layers = self._moving(FilmedScene(self._staged.scene_at, wide_at, shutter), time_s)
+        return [distorted(layer, wide, plate, self._filming.distortion) for layer in layers]
+
+    def _wide(self, camera_at: CameraAt) -> CameraAt:
+        """The pinhole that sees all that the plate sees, in the upright world."""
+        up, distortion = self._staged.description.up, self._filming.distortion
+        return lambda time_s: overscan_camera(upright_camera(camera_at(time_s), up), distortion)
+
+    def _moving(self, filmed: FilmedScene, time_s: float) -> list[Layer]:
+        layers = [moving_layer(self._renderer, filmed, time_s)]
+        shadow, catcher = self._staged.description.shadow, self._staged.catcher
+        if shadow is not None and catcher is not None:
+            layers.append(moving_shadow_layer(self._renderer, filmed, time_s, ShadowCatcher(catcher, shadow.strength)))
+        return layers
+
+    def _still(self, camera: Camera, time_s: float, sharp_rgb: Float32[np.ndarray, "height width 3"] | None) -> list[Layer]:
+        scene = self._staged.scene_at(time_s)
+        return [self._objects(scene, camera), *self._caught(scene, camera, sharp_rgb)]
+
+    def _objects(self, scene: Scene, camera: Camera) -> Layer:
+        """The objects alone; with light on the ground they also see the ground, where the backend follows light so far."""
+        catcher = self._staged.catcher
+        if self._filming.backend == "mitsuba" and self._filming.catches == "light" and catcher is not None:
+            return self._renderer.render_beside(scene, camera, [replace(catcher, material=GREY, catches_shadow=False)])  # type: ignore[attr-defined]
+        return self._renderer.render(scene, camera)
+
+    def _caught(self, scene: Scene, camera: Camera, sharp_rgb: Float32[np.ndarray, "height width 3"] | None) -> list[Layer]:
+        shadow, catcher = self._staged.description.shadow, self._staged.catcher
+        if shadow is None or catcher is None:
+            return []
+        if self._filming.catches == "shadow":
+            return [self._shadow(scene, camera, ShadowCatcher(catcher, shadow.strength))]
+        change = light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
+        return [change.evenly().as_layer(np.zeros_like(change.ratio)) if sharp_rgb is None else change.as_layer(sharp_rgb)]
+
+    def _shadow(self, scene: Scene, camera: Camera, catcher: ShadowCatcher) -> Layer:
+        """Drawn where hard shadows fall; the path tracer's are soft and may fall anywhere."""
+        frame = Box(0, camera.height_px, 0, camera.width_px)
+        box = frame if self._filming.backend == "mitsuba" else shadow_box(scene, camera, catcher.mesh)
+        if box.is_empty:
+            return clear(camera.height_px, camera.width_px)
+        part = shadow_layer(self._renderer, scene, box.camera_of(camera), catcher.mesh, catcher.strength)
+        return part if box == frame else box.placed(part, frame.size_px)

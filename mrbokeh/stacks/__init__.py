@@ -1,0 +1,1 @@
+"""Focal stacks, captures and layers of other programs, as folders and files."""

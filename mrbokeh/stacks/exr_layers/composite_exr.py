@@ -1,0 +1,102 @@
+"""Our own layered EXR: the finished picture, depth, and what it was put together from, to go on with in another program.
+
+One part, for not all programs read several. The picture is the unnamed R, G, B, A and depth is Z, as EXR says; every layer is
+NAME.R, NAME.G, NAME.B, NAME.A, premultiplied; mattes and maps are layers of their own with one channel.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_primaries import ATTRIBUTE
+from mrbokeh.images.layer import Layer
+from mrbokeh.system.errors import InputError
+
+COMMENTS = (
+    "Scene-linear; alpha premultiplied; unnamed R,G,B,A is the finished picture. Z and *.Z: metres along the optical axis, sharp, not "
+    "antialiased, inf is background. virtual.*: light of the virtual objects as it arrives, blurred and partly hidden, so picture = "
+    "photo left over + virtual. shadow.*: what darkens the photo. matte.A: part of the pupil that sees virtual things. coc.px: diameter "
+    "of the circle of confusion in pixels, + behind the focus, - in front of it. Written by mrbokeh."
+)
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_RESERVED = ("matte", "coc")
+
+
+@dataclass(frozen=True)
+class CompositeLayers:
+    """A finished picture with what it consists of; what is None is not written.
+
+    rgb: (H, W, 3) linear. alpha: of the picture; None is opaque. depth_m: of the picture. layers: by name, such as "virtual" and
+    "shadow", front first, each with its own depth; letters, digits and _ (Nuke changes all else). matte: in [0, 1]. coc_px: signed.
+    """
+
+    rgb: Float32[np.ndarray, "height width 3"]
+    alpha: Float32[np.ndarray, "height width"] | None = None
+    depth_m: Float32[np.ndarray, "height width"] | None = None
+    layers: Mapping[str, Layer] = field(default_factory=dict)
+    matte: Float32[np.ndarray, "height width"] | None = None
+    coc_px: Float32[np.ndarray, "height width"] | None = None
+
+    def __post_init__(self) -> None:
+        size = self.rgb.shape[:2]
+        planes = {"alpha": self.alpha, "depth": self.depth_m, "matte": self.matte, "coc": self.coc_px}
+        planes |= {name: layer.alpha for name, layer in self.layers.items()}
+        for name, plane in planes.items():
+            if plane is not None and plane.shape != size:
+                raise InputError(f"{name} is {plane.shape[1]}x{plane.shape[0]} px but the picture is {size[1]}x{size[0]} px: resize it")
+        for name in self.layers:
+            if not _NAME.fullmatch(name) or name in _RESERVED:
+                raise InputError(f"a layer's name is letters, digits and _, a letter first, and not {' or '.join(_RESERVED)}; got {name!r}")
+
+
+def write_composite_exr(
+    path: Path | str, composite: CompositeLayers, *, half: bool = True, primaries: Sequence[float] | None = None
+) -> None:
+    """Colour in half or float, depth and circles of confusion always in float.
+
+    primaries: CIE x, y of red, green, blue and white that the numbers have, to be stated in the header: exr_primaries.REC709 as all is
+    here, or those of the space that a ColorConversion brought them to. None states nothing, which means Rec.709.
+    """
+    dtype = np.float16 if half else np.float32
+    alpha = np.ones(composite.rgb.shape[:2], np.float32) if composite.alpha is None else composite.alpha
+    channels = _rgba("", composite.rgb, alpha, dtype)
+    for name, layer in composite.layers.items():
+        channels |= _rgba(f"{name}.", layer.rgb, layer.alpha, dtype) | {f"{name}.Z": layer.depth_m}
+    maps = {"Z": composite.depth_m, "coc.px": composite.coc_px}
+    channels |= {name: plane for name, plane in maps.items() if plane is not None}
+    if composite.matte is not None:
+        channels["matte.A"] = composite.matte.astype(dtype)
+    stated = {} if primaries is None else {ATTRIBUTE: tuple(float(each) for each in primaries)}
+    order = ",".join(composite.layers)
+    write_exr(path, ExrPart(channels, attributes={"comments": COMMENTS, "mrbokehLayers": order, **stated}))
+
+
+def read_composite_exr(path: Path | str) -> CompositeLayers:
+    """What `write_composite_exr` wrote, as stored: primaries that are stated are not converted (`image_io.read_image` does)."""
+    part = read_exr(path)[0]
+    if "mrbokehLayers" not in part.attributes:
+        raise InputError(f"{path}: expected a layered EXR of mrbokeh; `FlatRender` reads those of other programs")
+    names = [name for name in str(part.attributes["mrbokehLayers"]).split(",") if name]
+    layers = {name: _layer(part, name) for name in names}
+    maps = {key: part.stacked([name])[..., 0] for key, name in _MAPS.items() if name in part.channels}
+    return CompositeLayers(part.stacked("RGB"), layers=layers, **maps)
+
+
+_MAPS = {"alpha": "A", "depth_m": "Z", "matte": "matte.A", "coc_px": "coc.px"}
+
+
+def _layer(part: ExrPart, name: str) -> Layer:
+    values = part.stacked([f"{name}.{each}" for each in "RGBAZ"])
+    return Layer(values[..., :3], values[..., 3], values[..., 4])
+
+
+def _rgba(prefix: str, rgb: np.ndarray, alpha: np.ndarray, dtype: type) -> dict[str, np.ndarray]:
+    """Half holds up to 65504; brighter light is kept at that, for inf would spoil every blur that follows."""
+    planes = {name: rgb[..., i] for i, name in enumerate("RGB")} | {"A": alpha}
+    limit = np.finfo(dtype).max
+    return {f"{prefix}{name}": np.clip(plane, -limit, limit).astype(dtype) for name, plane in planes.items()}

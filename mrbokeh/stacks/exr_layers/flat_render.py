@@ -1,0 +1,97 @@
+"""A render of another program, RGBA with Z and perhaps motion, as one layer."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.images.exr_primaries import in_rec709
+from mrbokeh.images.layer import Layer
+from mrbokeh.images.sound_values import require_depth_ahead, require_numbers
+from mrbokeh.layering.motion import with_motion
+from mrbokeh.optics.camera import Camera
+from mrbokeh.stacks.exr_layers.channel_names import BACKGROUND_FROM, joined
+from mrbokeh.stacks.exr_layers.nearest_depth import edges_mended
+from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
+from mrbokeh.system.errors import InputError
+
+DepthMeaning = Literal["axis", "inverse", "distance"]
+
+
+@dataclass(frozen=True)
+class FlatRender:
+    """How the channels of a file are to be understood. Nothing of it is guessed from the numbers.
+
+    One thing is mended: pixels at edges whose depth is that of the background behind (nearest_depth).
+
+    layer, depth: names of the colour layer and the depth channel where the known ones (channel_names) do not fit.
+    view: of stereo files.
+    depth_is: "axis" along the optical axis; "inverse" one over that (Nuke); "distance" along the ray, which needs the camera.
+    metres_per_unit: of the depth; 0.01 for a scene in centimetres.
+    premultiplied: False multiplies colour by alpha. Colour above alpha is light of its own (flames) and stays as it is.
+    shutter: which part of a frame the shutter is open, for motion blur from the file's motion; 0 leaves motion unread.
+    """
+
+    layer: str | None = None
+    depth: str | None = None
+    view: str = ""
+    depth_is: DepthMeaning = "axis"
+    metres_per_unit: float = 1.0
+    premultiplied: bool = True
+    shutter: float = 0.0
+    camera: Camera | None = None
+
+    def __post_init__(self) -> None:
+        if self.depth_is not in get_args(DepthMeaning):
+            raise InputError(f"depth can be {', '.join(get_args(DepthMeaning))}, not {self.depth_is!r}")
+        if self.depth_is == "distance" and self.camera is None:
+            raise InputError("depth as a distance along the ray needs the camera that rendered it: give one")
+        if not self.metres_per_unit > 0:
+            raise InputError(f"metres per unit of depth must be above 0, got {self.metres_per_unit}")
+
+    def layers(self, path: Path | str) -> list[Layer]:
+        return [edges_mended(self.layer_of(RenderChannels.read(path, self.view)))]
+
+    def layer_of(self, render: RenderChannels) -> Layer:
+        """The picture of channels that were read already, depth at edges as it is."""
+        name = render.colour_layer(self.layer)
+        rgb = np.stack([render.plane(joined(name, each)) for each in "RGB"], axis=2).astype(np.float32)
+        alpha_name = joined(name, "A")
+        alpha = render.plane(alpha_name).astype(np.float32) if alpha_name in render.channels else np.ones(rgb.shape[:2], np.float32)
+        require_numbers(render.path, {"colour": rgb, "alpha": alpha})
+        rgb = in_rec709(rgb, render.primaries, render.path)
+        rgb = rgb if self.premultiplied else rgb * alpha[..., None]
+        depth_name, is_seen = render.depth_name(name, self.depth), (alpha > 0) | (rgb != 0).any(axis=2)
+        require_depth_ahead(render.path, depth_name, render.plane(depth_name)[is_seen])
+        depth_m = self._depth_m(render, depth_name)
+        layer = Layer(rgb, alpha, np.where(is_seen, depth_m, np.float32(np.inf)))
+        return self._moving(layer, render, name) if self.shutter > 0 else layer
+
+    def _depth_m(self, render: RenderChannels, name: str) -> Float32[np.ndarray, "height width"]:
+        """Metres along the axis; what is not above 0 or farther than any scene is background."""
+        stored = render.plane(name).astype(np.float32)
+        require_numbers(render.path, {name: stored})
+        if self.depth_is == "inverse":
+            stored = np.divide(1.0, stored, out=np.full_like(stored, np.inf), where=stored > 0)
+        is_there = (stored > 0) & (stored < BACKGROUND_FROM)
+        depth_m = np.where(is_there, stored * np.float32(self.metres_per_unit), np.float32(np.inf))
+        return depth_m if self.camera is None or self.depth_is != "distance" else depth_m * _axis_share(self.camera, stored.shape)
+
+    def _moving(self, layer: Layer, render: RenderChannels, name: str) -> Layer:
+        names = render.motion_names(name)
+        right, up = (names.factor * render.plane(each).astype(np.float32) for each in (names.right, names.up))
+        motion_px = np.stack([right, -up], axis=2).astype(np.float32)
+        require_numbers(render.path, {names.right: motion_px[layer.alpha > 0]})
+        return with_motion(layer, motion_px, self.shutter)
+
+
+def _axis_share(camera: Camera, size: tuple[int, ...]) -> Float32[np.ndarray, "height width"]:
+    """Depth along the axis of a point at distance 1 along each pixel's ray."""
+    if size != (camera.height_px, camera.width_px):
+        raise InputError(
+            f"the camera is {camera.width_px}x{camera.height_px} px but the render is {size[1]}x{size[0]} px: give its own camera"
+        )
+    plane = (camera.pixel_centres_px() - camera.principal_px) / np.asarray(camera.focal_px)
+    return (1.0 / np.sqrt(1.0 + (plane**2).sum(axis=2))).astype(np.float32)

@@ -1,0 +1,151 @@
+"""All channels of an EXR file by their full name, whatever parts and views they are spread over."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mrbokeh.images.exr_io import Channels, ExrPart, read_exr
+from mrbokeh.images.exr_primaries import stated_primaries
+from mrbokeh.stacks.exr_layers.channel_names import COLOUR_LAYERS, DEPTH_NAMES, MOTION_NAMES, MotionNames, joined
+from mrbokeh.system.errors import InputError
+
+MULTI_VIEW = "multiView"
+
+
+@dataclass(frozen=True)
+class RenderChannels:
+    """What a file holds for one view (eye).
+
+    channels: full name to (H, W), as stored; a channel of a named part can also be had as PART.CHANNEL. stored: the names as the
+    file has them, for errors. primaries: what R, G and B are, if stated. metadata: all strings and numbers of the headers.
+    """
+
+    path: Path
+    channels: Channels
+    stored: tuple[str, ...]
+    primaries: tuple[float, ...] | None
+    metadata: dict[str, Any]
+
+    @classmethod
+    def read(cls, path: Path | str, view: str = "") -> "RenderChannels":
+        """view: "left", "right" or what else the file names; "" the first that it has."""
+        path = Path(path)
+        parts = read_exr(path)
+        of_parts = _views_of_parts(parts)
+        views = of_parts or _views_of_names(path)
+        if view and view not in views:
+            raise InputError(f"{path}: expected the view {view!r}, but it has {', '.join(views) if views else 'only one, without a name'}")
+        chosen = view or (views[0] if views else "")
+        mine = [part for part in parts if part.attributes.get("view", chosen) == chosen]
+        by_part = [(part.name, part.channels if of_parts else _of_view(part.channels, chosen, views)) for part in mine]
+        metadata = {key: value for part in reversed(parts) for key, value in part.attributes.items()}
+        stored = tuple(sorted({name for part in mine for name in part.channels}))
+        return cls(path, _named(by_part), stored, stated_primaries(mine[0], parts), metadata)
+
+    def colour_layer(self, wanted: str | None = None) -> str:
+        """The layer whose R, G and B are the picture. Raises InputError where none is stated and several or none could be meant."""
+        layers = [layer for layer in self._layers() if all(joined(layer, name) in self.channels for name in "RGB")]
+        if wanted is not None:
+            found = [layer for layer in layers if layer == wanted] or [layer for layer in layers if layer.endswith(f".{wanted}")]
+        else:
+            known = [layer for layer in layers if layer.rpartition(".")[2] in COLOUR_LAYERS]
+            found = [layer for layer in known if layer == ""] or self._distinct(known)
+        if len(found) == 1:
+            return found[0]
+        said = "R, G and B" if wanted is None else f"R, G and B in the layer {wanted!r}"
+        if found:
+            raise InputError(f"{self.path}: {said} could be any of the layers {', '.join(found)}: state the layer by its full name")
+        raise InputError(f"{self.path}: expected {said}, but it has {', '.join(self.stored)}: state the layer that holds the picture")
+
+    def depth_name(self, colour_layer: str, wanted: str | None = None) -> str:
+        """The channel that holds depth. Raises InputError where there is none."""
+        names = (wanted,) if wanted else DEPTH_NAMES
+        found = self._first([(name,) for name in names], colour_layer)
+        if found is None:
+            raise InputError(
+                f"{self.path}: expected depth in a channel {', '.join(names)}, but it has {', '.join(self.stored)}: "
+                f"render with depth, or state the channel that holds it"
+            )
+        return found[0]
+
+    def motion_names(self, colour_layer: str) -> MotionNames:
+        """The channels that hold motion. Raises InputError where there are none."""
+        for names in MOTION_NAMES:
+            found = self._first([(names.right, names.up)], colour_layer)
+            if found is not None:
+                return MotionNames(found[0], found[1], names.factor)
+        wanted = ", ".join(f"{names.right} and {names.up}" for names in MOTION_NAMES)
+        raise InputError(f"{self.path}: expected motion in {wanted}, but it has {', '.join(self.stored)}: render with motion vectors")
+
+    def plane(self, name: str) -> Float[np.ndarray, "height width"]:
+        return self.channels[name]
+
+    def _layers(self) -> list[str]:
+        return sorted({name.rpartition(".")[0] for name in self.channels})
+
+    def _distinct(self, layers: Sequence[str]) -> list[str]:
+        """Layers without those that are another's pixels under a longer name."""
+        kept: dict[int, str] = {}
+        for layer in sorted(layers, key=len):
+            kept.setdefault(id(self.channels[joined(layer, "R")]), layer)
+        return list(kept.values())
+
+    def _first(self, choices: Sequence[tuple[str, ...]], colour_layer: str) -> tuple[str, ...] | None:
+        """The first choice that is there: beside the colour layer, else anywhere at the top."""
+        parents = [colour_layer, colour_layer.rpartition(".")[0], ""]
+        for parent in dict.fromkeys(parents):
+            for choice in choices:
+                names = tuple(joined(parent, name) for name in choice)
+                if all(name in self.channels for name in names):
+                    return names
+        return None
+
+
+def _views_of_parts(parts: Sequence[ExrPart]) -> list[str]:
+    """Names of the eyes where each has parts of its own, the default first."""
+    return list(dict.fromkeys(str(part.attributes["view"]) for part in parts if "view" in part.attributes))
+
+
+def _views_of_names(path: Path) -> list[str]:
+    """Names of the eyes where they stand in the names of channels, the default first."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), header_only=True) as file:
+        return [str(view) for view in file.parts[0].header.get(MULTI_VIEW, [])]
+
+
+def _named(by_part: Sequence[tuple[str, Channels]]) -> Channels:
+    """Channels of all parts. A name that several parts have needs the part's before it, unless one of them is the picture itself."""
+    owners: dict[str, list[str]] = {}
+    for part, of_part in by_part:
+        for name in of_part:
+            owners.setdefault(name, []).append(part)
+    channels: Channels = {}
+    for part, of_part in by_part:
+        for name, pixels in of_part.items():
+            if len(owners[name]) == 1 or part in COLOUR_LAYERS:
+                channels.setdefault(name, pixels)
+            if part and not name.startswith(f"{part}."):
+                channels.setdefault(f"{part}.{name}", pixels)
+    return channels
+
+
+def _of_view(channels: Channels, view: str, views: Sequence[str]) -> Channels:
+    """Channels under the names that they would have if there were one view (Multi-View OpenEXR: LAYER.VIEW.CHANNEL)."""
+    if len(views) < 2:
+        return channels
+    others = {each for each in views if each != view}
+    result: Channels = {}
+    for name, pixels in channels.items():
+        *layer, channel = name.split(".")
+        owner = layer[-1] if layer and layer[-1] in views else None
+        if owner == view:
+            result[".".join([*layer[:-1], channel])] = pixels
+        elif owner not in others and (layer or view == views[0]):
+            # Channels at the top belong to the default view; other layers without a view belong to all.
+            result.setdefault(name, pixels)
+    return result

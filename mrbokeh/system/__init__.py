@@ -1,0 +1,1 @@
+"""Errors, files, progress, threads and memory: what every room stands on."""

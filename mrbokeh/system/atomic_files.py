@@ -1,0 +1,80 @@
+"""Files that are either whole or absent: written under a temporary name, then renamed."""
+
+import json
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from mrbokeh.system.errors import InputError
+
+
+@contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """A temporary path beside `path` with its suffix; renamed to `path` when the block ends well, else removed."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(folder: Path | str) -> Iterator[Path]:
+    """A temporary folder beside `folder`, renamed to it when the block ends well, else removed. Raises InputError where it exists."""
+    folder = Path(folder)
+    refuse_existing(folder, overwrite=False)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    try:
+        yield temporary
+        os.rename(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_json(path: Path | str, document: Any) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path | str, expected: str) -> Any:
+    """A JSON document; `expected` says in the error message what the file should have been."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"expected {expected} at {path}, but there is no such file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"expected {expected} at {path}, but it is not JSON: {error}") from None
+
+
+def refuse_existing(path: Path | str, overwrite: bool) -> None:
+    """Existing results are kept unless the user asked to overwrite them."""
+    if Path(path).exists() and not overwrite:
+        raise InputError(f"{path} exists already: give another name, or --overwrite to replace it")
+
+
+def require_safe_outputs(outputs: Iterable[Path | str | None], inputs: Iterable[Path | str | None], overwrite: bool) -> None:
+    """Every file that will be written is one of its own: no two are the same, none is read (also through links), none is there already.
+
+    None stands for what was not asked for. Raises InputError; `overwrite` allows replacing what exists, but never what is read.
+    """
+    read, written = {_real(path) for path in inputs if path is not None}, set[Path]()
+    for path in (Path(each) for each in outputs if each is not None):
+        if _real(path) in read:
+            raise InputError(f"{path} is read and would be written over: give the result another name")
+        if _real(path) in written:
+            raise InputError(f"{path} is named for two results, of which the second would replace the first: give each its own name")
+        written.add(_real(path))
+        refuse_existing(path, overwrite)
+
+
+def _real(path: Path | str) -> Path:
+    return Path(path).resolve()

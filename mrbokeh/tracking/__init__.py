@@ -1,0 +1,1 @@
+"""Camera tracks, from files and from ChArUco boards."""

@@ -1,0 +1,1 @@
+"""Clips: frames decoded, encoded, joined, with their colour, alpha, sound and times."""

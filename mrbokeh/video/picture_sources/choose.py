@@ -1,0 +1,46 @@
+"""A source of frames by its name on the command line."""
+
+from fractions import Fraction
+from pathlib import Path
+
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.picture_sources.base import PictureSource
+from mrbokeh.video.picture_sources.image_sequence import ImageSequence
+from mrbokeh.video.picture_sources.numbered_files import is_pattern, pattern_of_folder
+from mrbokeh.video.picture_sources.video_source import VideoSource
+
+
+def open_source(clip: Path, rate: str | None = None, space: NamedSpace | None = None) -> PictureSource:
+    """A video, or numbered pictures (a pattern or their folder) with a rate in frames per second ("25", "23.976" or "24000/1001").
+
+    Paths become absolute.
+
+    space: what the numbers of the clip mean, in place of what its files say.
+    """
+    clip = pattern_of_folder(clip) if clip.is_dir() else clip
+    if is_pattern(clip):
+        if rate is None:
+            raise InputError(f"{clip}: numbered pictures have no rate of their own: give --rate, such as 25 or 24000/1001")
+        return ImageSequence.open(clip.resolve(), parse_rate(rate), space)
+    if rate is not None:
+        raise InputError(f"--rate is for numbered pictures (frames.%04d.exr), but {clip} has its own times: leave it out")
+    if space is not None and space.is_linear:
+        raise InputError(
+            f"{clip}: the numbers of a video follow a curve, but {space.name} is linear: name the camera's own space (--input-space)"
+        )
+    return VideoSource.open(clip.resolve(), space)
+
+
+def parse_rate(text: str) -> Fraction:
+    """Frames per second; the usual decimals of NTSC mean the fractions that they stand for."""
+    ntsc = {"23.976": 24, "23.98": 24, "29.97": 30, "47.952": 48, "59.94": 60, "119.88": 120}
+    if text in ntsc:
+        return Fraction(ntsc[text] * 1000, 1001)
+    try:
+        rate = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        rate = Fraction(0)
+    if not 0 < rate <= 1000:
+        raise InputError(f"expected frames per second such as 25, 23.976 or 24000/1001, got {text!r}")
+    return rate
