@@ -20,8 +20,8 @@ from mrbokeh.layering.motion import with_motion
 from mrbokeh.layering.pixel_box import lit_box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, sun, world_from_scene_placing
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.gltf_loader import load_glb
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.gltf.gltf_loader import load_glb
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer
 from tests.machine import machine_line, memory_line
 

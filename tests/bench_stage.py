@@ -19,9 +19,9 @@ from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.scene import Environment, Scene
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment_filter import lighting_maps
-from mrbokeh.scene.gltf_loader import GltfAsset
+from mrbokeh.scene.gltf.gltf_loader import GltfAsset
 from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.scene_description import PlacedObject, SceneDescription, ShadowPlane
 from mrbokeh.scene.staging.staged_scene import StagedObject, StagedScene

@@ -17,7 +17,7 @@ import numpy as np
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
 from viewfinder.lens_book import LensBook

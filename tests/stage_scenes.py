@@ -9,7 +9,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.scene_description import SceneDescription
 from mrbokeh.scene.staging.scene_file import read_scene_file

@@ -27,10 +27,10 @@ LEVELS = (
 RENDERER_LEVELS = (
     {"choose_bank"},
     {"choose"},
-    {"polygon", "low_rank", "spreadlets", "layered_reconstruction", "network", "scatter_reference", "_scatter_reference_numba"},
+    {"polygon", "low_rank", "spreadlets", "layered_reconstruction", "network", "scatter"},
     {"bank"},
     {"kernels"},
-    {"base", "_vectors_numba"},
+    {"base"},
 )
 ALLOWED_ACROSS = {
     "capture": {"mrbokeh"},

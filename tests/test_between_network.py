@@ -15,7 +15,7 @@ from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.renderers.network.onnx_network import OnnxNetwork
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from tests.test_onnx_network import FACTS, LENS, SIZE, depth_for
 from training.export_onnx import export_network
 from training.presets import demo_settings

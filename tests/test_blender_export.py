@@ -205,7 +205,7 @@ os._exit(0)
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="the package bpy (Blender as a module) is not installed")
 def test_in_blender_itself(tmp_path: Path) -> None:
     """GLB, camera and render of one scene agree: the cube's corners, projected from the GLB, frame the cube that Cycles rendered."""
-    from mrbokeh.scene.gltf_loader import load_glb
+    from mrbokeh.scene.gltf.gltf_loader import load_glb
     from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 
     script = tmp_path / "script.py"

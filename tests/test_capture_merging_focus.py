@@ -14,7 +14,7 @@ from capture.merging.lights import no_lights
 from capture.merging.replaced_places import depth_m_of
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 
 SIZE = (96, 128)

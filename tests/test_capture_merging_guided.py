@@ -14,7 +14,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.errors import InputError
 

@@ -22,7 +22,7 @@ from mrbokeh.images.layer import opaque
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack
 from tests.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
 

@@ -16,7 +16,7 @@ from mrbokeh.compositing.pupil_shares import Rays
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 LENS = Lens(100.0, 1.0, 4.0, 36.0)  # 28 px of blur for near things, 13 px for virtual ones

@@ -12,7 +12,7 @@ from capture.merging.semi_global import aggregate_costs
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter.scatter_reference import blur_layer
 
 SLICES = 5
 COC_STEP_PX = 2.5

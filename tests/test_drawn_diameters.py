@@ -11,7 +11,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 
 FINER = 5
 HEIGHT_PX, WIDTH_PX = 64, 96

@@ -8,14 +8,14 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Mesh, Scene, Texture, matte, rectangle, sphere, sun
-from mrbokeh.scene import embree_raycaster as raycaster_module
-from mrbokeh.scene import prepared_scenes as prepared_scenes_module
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.embree_scene import PreparedScene
+from mrbokeh.scene.embree import embree_raycaster as raycaster_module
+from mrbokeh.scene.embree import prepared_scenes as prepared_scenes_module
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.packed_triangles import PreparedScene
+from mrbokeh.scene.embree.pixel_edges import edge_pixels
 from mrbokeh.scene.environment import directions, solid_angles_sr
 from mrbokeh.scene.environment_filter import LightingMaps, _moments, filtered, lighting_maps
 from mrbokeh.scene.packed_scene import packed
-from mrbokeh.scene.pixel_edges import edge_pixels
 from mrbokeh.scene.rigid_motion import rigid_motion
 from mrbokeh.system.errors import InputError
 

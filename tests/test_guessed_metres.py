@@ -15,7 +15,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.lens_measuring.fitting.stack_views import StackSlices
 from mrbokeh.optics.lens_file import lens_to_json, write_lens
 from mrbokeh.refocus.refocusing import leave_one_out
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
 from mrbokeh.stacks.focus_places import Seen, parse_focus, slice_names

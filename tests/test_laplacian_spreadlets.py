@@ -24,7 +24,7 @@ from mrbokeh.renderers.kernels.laplacian_tables import (
     taps_of,
 )
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.lamps import lamps_among, lamps_among_plainly
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.spreadlets.layout import FOUR, Laid, Window, gains_for

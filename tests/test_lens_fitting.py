@@ -29,7 +29,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.optics.psf_bank_file import read_bank
-from mrbokeh.renderers.scatter_reference import ScatterReference, scatter
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference, scatter
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError

@@ -9,9 +9,9 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque, over
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import neutral_environment
-from mrbokeh.scene.light_change import LEAST_CHANGE, LightChange, light_change
+from mrbokeh.scene.light_change.light_change import LEAST_CHANGE, LightChange, light_change
 from mrbokeh.system.errors import InputError
 from tests.test_scene_backends import DARK, rays
 
@@ -28,7 +28,7 @@ def ball(material: Material) -> Scene:
 
 def mitsuba_tracer(samples: int = 64, most_bounces: int = 6) -> SceneRenderer:
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed: pip install 'mrbokeh[mitsuba]'")
-    from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
+    from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
 
     try:
         return MitsubaTracer(samples=samples, most_bounces=most_bounces)

@@ -11,7 +11,7 @@ from capture.merging.restored_lights import restored_lights, with_restored_light
 from capture.photos.clipped_highlights import neutral_where_full
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter.scatter_reference import blur_layer
 
 SIZE = (80, 400)
 LIGHT_AT = (40, 60)

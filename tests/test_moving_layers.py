@@ -13,8 +13,8 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import MOTION, drawn_out, motion_of
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, emitter, rectangle, shadow_catcher, sun, world_from_scene_placing
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.gltf_loader import GltfAsset, load_glb
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.gltf.gltf_loader import GltfAsset, load_glb
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer, moving_shadow_layer
 from mrbokeh.scene.moving_layers.moving_layer import MotionQuality
 from mrbokeh.scene.moving_layers.moving_shadow import ShadowCatcher

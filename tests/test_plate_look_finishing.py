@@ -21,7 +21,7 @@ from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import lit_box
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.test_plate_look_grain import READ, SHOT, smooth_scene, unit_noise
 

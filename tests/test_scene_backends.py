@@ -8,7 +8,7 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions, neutral_environment, solid_angles_sr
 from mrbokeh.system.errors import InputError
 
@@ -16,7 +16,7 @@ from mrbokeh.system.errors import InputError
 def wgpu_rasterizer() -> SceneRenderer:
     """The rasteriser, where there is a graphics device (Mesa's in software counts)."""
     pytest.importorskip("wgpu", reason="wgpu is not installed: pip install 'mrbokeh[viewfinder]'")
-    from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
+    from mrbokeh.scene.wgpu.wgpu_rasterizer import WgpuRasterizer
 
     try:
         return WgpuRasterizer()

@@ -13,8 +13,8 @@ import pytest
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Scene, world_from_scene_placing
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.gltf_loader import GltfAsset, load_glb
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.gltf.gltf_loader import GltfAsset, load_glb
 from mrbokeh.system.errors import InputError
 
 OBJECTS = ("DepthOfFieldExample", "FlightHelmet", "Fox", "GolfBall", "alien", "cakeBirthday")

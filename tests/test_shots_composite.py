@@ -19,7 +19,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.scene.staging.filming import Filming
 from mrbokeh.shots.boxed_insertion import BoxedInsertion
 from mrbokeh.shots.composite_recipe import CompositeRecipe
@@ -190,7 +190,7 @@ class Cameras:
 
 
 def test_a_scene_is_rendered_again_only_where_camera_or_scene_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+    from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 
     calls: list[int] = []
     plain = EmbreeRaycaster.render

@@ -18,7 +18,7 @@ from mrbokeh.layering.slices import Slicing, composited
 from mrbokeh.layering.spreading import Frame, Spread, spread_light
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.system.workers import CallingThread
 from mrbokeh.system.zeroed_memory import ZeroedMemory
 

@@ -9,7 +9,7 @@ import pytest
 
 from mrbokeh.images.image_io import read_linear
 from mrbokeh.scene import split_sun
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import Environment
 from mrbokeh.scene.rigid_motion import rigid_motion
 from mrbokeh.scene.staging.assets import Assets

@@ -16,7 +16,7 @@ import pytest
 from mrbokeh.compositing.overlay import Overlay, code_tables
 from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import code_from_linear, linear_from_code
 from tests.layer_viewfinder import (

@@ -10,7 +10,7 @@ import pytest
 
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
-from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square
 from tests.stage_scenes import LENS as SCENE_LENS

@@ -13,17 +13,17 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Scene, Texture, matte, rectangle, sphere, sun
 from mrbokeh.scene.choose import described_device, has_graphics_card, scene_renderer
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment import directions
 from mrbokeh.system.errors import InputError
 
 pytest.importorskip("wgpu", reason="wgpu is not installed: pip install 'mrbokeh[viewfinder]'")
 
-from mrbokeh.scene import wgpu_textures
-from mrbokeh.scene.wgpu_device import Gpu, gpu
-from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
-from mrbokeh.scene.wgpu_views import light_views
-from mrbokeh.scene.wgpu_visibility import sample_places, tiles
+from mrbokeh.scene.wgpu import textures as wgpu_textures
+from mrbokeh.scene.wgpu.device import Gpu, gpu
+from mrbokeh.scene.wgpu.views import light_views
+from mrbokeh.scene.wgpu.visibility import sample_places, tiles
+from mrbokeh.scene.wgpu.wgpu_rasterizer import WgpuRasterizer
 
 FOX = Path(__file__).resolve().parents[2] / "shared/data/objects/Fox.glb"
 CAMERA = Camera(200, 120, (170.0, 165.0), (96.3, 63.7))
@@ -112,7 +112,7 @@ class TestTwin:
     def test_shadows_follow_the_skinned_pose(self, rasterizer: WgpuRasterizer, raycaster: EmbreeRaycaster) -> None:
         pytest.importorskip("pygltflib")
         from mrbokeh.scene import world_from_scene_placing
-        from mrbokeh.scene.gltf_loader import GltfAsset
+        from mrbokeh.scene.gltf.gltf_loader import GltfAsset
 
         fox = GltfAsset(FOX)
         floor = rectangle((-4, 0.5, 6), (8, 0, 0), (0, 0, -6), Material(), catches_shadow=True)

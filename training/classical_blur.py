@@ -70,7 +70,7 @@ def scatter_reference(
     The picture is continued beyond its border, from where light enters it.
     """
     from mrbokeh.images.layer import opaque
-    from mrbokeh.renderers.scatter_reference import blur_layer
+    from mrbokeh.renderers.scatter.scatter_reference import blur_layer
 
     margin = int(np.ceil(np.abs(coc_px).max(initial=0.0) / 2.0)) + 1
     around = ((margin, margin), (margin, margin))

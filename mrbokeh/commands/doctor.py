@@ -88,7 +88,7 @@ def _graphics_device() -> Finding:
 
 
 def _llvm() -> Finding:
-    from mrbokeh.scene.mitsuba_variant import find_llvm
+    from mrbokeh.scene.mitsuba.variant import find_llvm
 
     found = find_llvm()
     return Finding("LLVM library", None if found is None else str(found), "Mitsuba's compiler", "Debian: apt install libllvm19")

@@ -17,7 +17,7 @@ DEFAULT = "polygon"
 
 
 def _scatter(**settings: Any) -> Renderer:
-    from mrbokeh.renderers.scatter_reference import ScatterReference
+    from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 
     return ScatterReference(**settings)
 

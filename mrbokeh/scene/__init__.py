@@ -1,8 +1,8 @@
 """Virtual objects: GLB scenes with physically based materials, and backends that turn scene and camera into a Layer.
 
     from mrbokeh.scene import Environment, sun, world_from_scene_placing
-    from mrbokeh.scene.gltf_loader import load_glb
-    from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+    from mrbokeh.scene.gltf.gltf_loader import load_glb
+    from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 
     scene = load_glb("cake.glb")
     scene = scene.transformed(world_from_scene_placing(scene, stands_at_m=(0.0, 0.3, 2.0), height_m=0.2))

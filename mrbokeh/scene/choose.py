@@ -1,9 +1,9 @@
 """Which backend renders virtual objects on this machine."""
 
-from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
-from mrbokeh.scene.wgpu_device import gpu
-from mrbokeh.scene.wgpu_rasterizer import WgpuRasterizer
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
+from mrbokeh.scene.wgpu.device import gpu
+from mrbokeh.scene.wgpu.wgpu_rasterizer import WgpuRasterizer
 from mrbokeh.system.errors import InputError
 
 

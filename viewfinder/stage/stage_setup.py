@@ -54,7 +54,7 @@ def live_backend(backend: SceneRenderer) -> SceneRenderer:
     A drawing of tests/bench_stage.py takes 0.54 of the time and is 66 dB near the best one. What the ray
     caster has prepared is shared with `backend`.
     """
-    from mrbokeh.scene.embree_raycaster import EmbreeRaycaster
+    from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 
     return backend.with_quality(_LIVE_EDGE_SAMPLES, _LIVE_SHADOW_STEP_PX) if isinstance(backend, EmbreeRaycaster) else backend
 

@@ -6,7 +6,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from mrbokeh.renderers._vectors_numba import Lowering, data_of, filled, load_vector, shuffled, store_vector
+from mrbokeh.renderers.kernels._vectors_numba import Lowering, data_of, filled, load_vector, shuffled, store_vector
 
 # ruff: noqa: ARG001  (numba reads the arguments of an intrinsic by their names)
 

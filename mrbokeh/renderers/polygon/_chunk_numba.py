@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mrbokeh.renderers._vectors_numba import fetch
+from mrbokeh.renderers.kernels._vectors_numba import fetch
 from mrbokeh.renderers.polygon._ring_numba import Corners, Exact, Picture, Ring, Scratch, compiled
 from mrbokeh.renderers.polygon._splat_numba import splat_corners
 from mrbokeh.renderers.polygon._survey_numba import TILE_PX

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mrbokeh.renderers._vectors_numba import add_to_cell, add_to_two_cells, fetch, one_by_one, scaled
+from mrbokeh.renderers.kernels._vectors_numba import add_to_cell, add_to_two_cells, fetch, one_by_one, scaled
 from mrbokeh.renderers.polygon._aim_numba import AIM_PX, CHUNK_PX, aim_level, aim_steep
 from mrbokeh.renderers.polygon._ring_numba import ALIASED_ROWS, APART_PX, Corners, Ring, Scratch, compiled
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers._vectors_numba import BLENDED_CELLS
+from mrbokeh.renderers.kernels._vectors_numba import BLENDED_CELLS
 from mrbokeh.renderers.polygon._ring_numba import SPARE_PX, Corners, Exact, Sums
 from mrbokeh.renderers.polygon.crossings import CrossedCorners, crossed_corners, pair_of
 from mrbokeh.renderers.polygon.directional_differences import Direction, PolygonCorners, edge_profile, polygon_corners

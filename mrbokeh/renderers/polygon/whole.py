@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt64
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers._vectors_numba import BLENDED_CELLS
+from mrbokeh.renderers.kernels._vectors_numba import BLENDED_CELLS
 from mrbokeh.renderers.polygon._ring_numba import Exact
 
 LEVELS_PER_PX = 8.0

@@ -10,7 +10,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.image_io import read_linear
 from mrbokeh.scene import Environment, Light, split_sun, sun
-from mrbokeh.scene.gltf_loader import GltfAsset
+from mrbokeh.scene.gltf.gltf_loader import GltfAsset
 from mrbokeh.scene.staging.scene_description import Lighting
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.upright import turned

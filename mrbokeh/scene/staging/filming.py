@@ -12,7 +12,7 @@ from mrbokeh.layering.pixel_box import Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, SceneRenderer
 from mrbokeh.scene.choose import scene_renderer
-from mrbokeh.scene.light_change import GREY, light_change
+from mrbokeh.scene.light_change.light_change import GREY, light_change
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
 from mrbokeh.scene.moving_layers.moving_shadow import ShadowCatcher
 from mrbokeh.scene.shadow_layer import shadow_layer
@@ -33,7 +33,7 @@ class Filming:
     """backend: a name of `mrbokeh.scene.choose`; samples: paths per pixel of "mitsuba". distortion: of the plate's lens.
 
     catches: "shadow", of the scene's lights as dark as the scene says, or "light": all that the objects change on the ground
-    (`mrbokeh.scene.light_change`). shutter: blurs by motion; None stands still.
+    (`mrbokeh.scene.light_change.light_change`). shutter: blurs by motion; None stands still.
     """
 
     backend: str = "auto"
@@ -51,7 +51,7 @@ class Filming:
 
     def renderer(self, threads: int = 0) -> SceneRenderer:
         if self.backend == "mitsuba":
-            from mrbokeh.scene.mitsuba_tracer import MitsubaTracer
+            from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
 
             return MitsubaTracer(self.samples, threads=threads, denoise=self.denoise)
         return scene_renderer(self.backend, threads)

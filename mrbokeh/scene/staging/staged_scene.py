@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mrbokeh.scene import Environment, Light, Mesh, Scene, shadow_catcher, world_from_scene_placing
-from mrbokeh.scene.gltf_loader import GltfAsset
+from mrbokeh.scene.gltf.gltf_loader import GltfAsset
 from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.picture_box import drawn_points_m
 from mrbokeh.scene.staging.scene_description import PlacedObject, SceneDescription

@@ -1,0 +1,1 @@
+"""The backend for any CPU: rays cast by Embree."""

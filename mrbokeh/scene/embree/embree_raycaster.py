@@ -1,0 +1,174 @@
+"""EmbreeRaycaster: virtual scenes to Layers on any CPU, by Embree's rays (Wald et al. 2014) and compiled shading."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+
+from mrbokeh.images.layer import Layer, clear
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene.embree.packed_triangles import PreparedScene
+from mrbokeh.scene.embree.pixel_edges import SAMPLE_COUNTS, edge_pixels, sample_offsets_px
+from mrbokeh.scene.embree.prepared_scenes import PlacedScene, PreparedScenes
+from mrbokeh.scene.embree.shading import RaySamples, shaded
+from mrbokeh.scene.embree.shadows import lit_share
+from mrbokeh.scene.embree.silhouettes import silhouette_pixels
+from mrbokeh.scene.embree.views import ROWS_AT_ONCE, cut, ray_directions, row_centres_px, window
+from mrbokeh.scene.light import Light
+from mrbokeh.scene.mesh import Mesh
+from mrbokeh.scene.virtual_scene import Scene
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.workers import cores
+
+_RAYS_AT_ONCE = 1 << 14
+"""So few that the shading points of one part stay in the processor's cache, and that Python's lock is free again after 2 ms."""
+_EDGES_AT_ONCE = 1 << 15
+_Result = TypeVar("_Result")
+
+
+class EmbreeRaycaster:
+    """A SceneRenderer that needs nothing but pip packages: `embreex` and `numba`.
+
+    One ray through each pixel's centre gives colour, exact depth and coverage; only pixels at edges get 4x4 more. Lights cast
+    hard shadows, partly through BLEND surfaces. The environment lights without shadows of its own.
+
+    What a scene and a panorama need before the first picture is kept as long as they live, so a film of one Scene under many
+    cameras is cheap, and so is one Scene moved as a rigid body. Memory is bounded by tracing 16384 rays at a time in each of
+    `threads` threads.
+    """
+
+    def __init__(self, threads: int | None = None, most_layers: int = 16, edge_samples: int = 16, shadow_step_px: int = 1) -> None:
+        """threads: None or 0 takes all cores. most_layers: how many see-through surfaces a ray follows behind each other.
+
+        For pictures that are drawn again and again: edge_samples: rays in a pixel at an edge, 16 or 4; with 4 the coverage of an
+        edge comes in steps of a quarter. shadow_step_px: of shadow masks only every so manieth pixel is traced, and what lies
+        between is interpolated.
+        """
+        if most_layers < 1 or (threads or 0) < 0:
+            raise InputError(f"expected at least one thread and one layer, got {threads} and {most_layers}")
+        self._threads = threads or cores()
+        self._most_layers = most_layers
+        self._offsets, self._shadow_step_px = _checked(edge_samples, shadow_step_px)
+        self._kept = PreparedScenes()
+
+    def with_quality(self, edge_samples: int = 16, shadow_step_px: int = 1) -> "EmbreeRaycaster":
+        """Another ray caster that shares what this one has prepared and will prepare."""
+        other = copy(self)
+        other._offsets, other._shadow_step_px = _checked(edge_samples, shadow_step_px)
+        return other
+
+    def render(self, scene: Scene, camera: Camera) -> Layer:
+        """The scene as the camera sees it, without lens blur; see SceneRenderer."""
+        placed = self._kept.placed(scene)
+        layer = clear(camera.height_px, camera.width_px)
+        if placed is None:
+            return layer
+        rows, columns = window(placed.ready, placed.camera(camera))
+        if rows.start >= rows.stop or columns.start >= columns.stop:
+            return layer
+        part = self._rendered(placed, scene, cut(placed.camera(camera), rows, columns))
+        layer.rgb[rows, columns], layer.alpha[rows, columns], layer.depth_m[rows, columns] = part.rgb, part.alpha, part.depth_m
+        return layer
+
+    def _rendered(self, placed: PlacedScene, scene: Scene, camera: Camera) -> Layer:
+        """The whole picture of a camera in the prepared scene's axes."""
+        height, width = camera.height_px, camera.width_px
+        directions = ray_directions(camera, camera.pixel_centres_px().reshape(-1, 2))
+        centres = self._traced(placed, scene, camera, directions, pixel_share=1.0)
+        rgb, alpha, depth_m = centres.rgb.copy(), centres.alpha.copy(), centres.depth_m.copy()
+
+        edges, count = np.flatnonzero(_edges(placed.ready, camera, directions, centres)), len(self._offsets)
+        for some in np.array_split(edges, max(1, len(edges) // _EDGES_AT_ONCE)):
+            samples = self._traced(placed, scene, camera, ray_directions(camera, self._within(some, width)), pixel_share=count**-0.5)
+            rgb[some] = samples.rgb.reshape(-1, count, 3).mean(1)
+            alpha[some] = samples.alpha.reshape(-1, count).mean(1)
+            nearest_m = samples.depth_m.reshape(-1, count).min(1)
+            depth_m[some] = np.where(np.isfinite(depth_m[some]), depth_m[some], nearest_m)
+        depth_m = np.where(alpha > 0, depth_m, np.inf).astype(np.float32)
+        return Layer(rgb.reshape(height, width, 3), alpha.reshape(height, width), depth_m.reshape(height, width))
+
+    def render_shadow_mask(self, scene: Scene, camera: Camera, catcher: Mesh) -> Float32[np.ndarray, "height width"]:
+        """(H, W) share of the lights' irradiance on the catcher that the scene lets through, 1 is lit; see SceneRenderer."""
+        placed = self._kept.placed(scene)
+        if placed is None or not scene.lighting[0]:
+            return np.ones((camera.height_px, camera.width_px), np.float32)
+        step = self._shadow_step_px
+        if step == 1:
+            return self._shadow_mask(placed, scene.lighting[0], camera, catcher)
+        columns, rows = -(-camera.width_px // step), -(-camera.height_px // step)
+        covering = Camera(columns * step, rows * step, camera.focal_px, camera.principal_px, camera.camera_from_world)
+        mask = self._shadow_mask(placed, scene.lighting[0], covering.resized(columns, rows), catcher)
+        whole = cv2.resize(mask, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
+        return np.ascontiguousarray(whole[: camera.height_px, : camera.width_px])
+
+    def _shadow_mask(
+        self, placed: PlacedScene, lights: Sequence[Light], camera: Camera, catcher: Mesh
+    ) -> Float32[np.ndarray, "height width"]:
+        ground, world_from_ready = self._kept.ground(catcher), placed.world_from_ready
+        height, width, eye_m = camera.height_px, camera.width_px, camera.world_from_camera[:3, 3]
+
+        def lit(xy_px: Float[np.ndarray, "points 2"]) -> Float32[np.ndarray, " points"]:
+            directions = ray_directions(camera, xy_px)
+            parts = self._in_threads(lambda part: lit_share(placed.ready, ground, lights, world_from_ready, eye_m, part), directions)
+            return np.concatenate(parts)
+
+        mask = np.concatenate([lit(row_centres_px(camera, first)) for first in range(0, height, ROWS_AT_ONCE)])
+        edges = np.flatnonzero(_steps(mask.reshape(height, width)))
+        if len(edges):
+            mask[edges] = lit(self._within(edges, width)).reshape(-1, len(self._offsets)).mean(1)
+        return mask.reshape(height, width)
+
+    def _within(self, pixels: Int64[np.ndarray, " pixels"], width_px: int) -> Float64[np.ndarray, "samples 2"]:
+        """The points of pixels (row after row) at which edges are sampled."""
+        corner = np.stack([pixels % width_px, pixels // width_px], axis=-1)
+        return (corner[:, None] + self._offsets).reshape(-1, 2)
+
+    def _traced(
+        self, placed: PlacedScene, scene: Scene, camera: Camera, directions: Float[np.ndarray, "rays 3"], pixel_share: float
+    ) -> RaySamples:
+        """Rays from the camera, shaded. pixel_share: the width of what a ray stands for, in pixels."""
+        maps = placed.maps(self._kept.maps(scene))
+        footprint = pixel_share / float(np.sqrt(camera.focal_px[0] * camera.focal_px[1]))
+        eye_m = camera.world_from_camera[:3, 3]
+        return RaySamples.joined(
+            self._in_threads(lambda part: shaded(placed.ready, eye_m, part, footprint, placed.lights, maps, self._most_layers), directions)
+        )
+
+    def _in_threads(self, work: Callable[[Float[np.ndarray, "some 3"]], _Result], directions: Float[np.ndarray, "rays 3"]) -> list[_Result]:
+        """Embree's binding holds Python's lock, the compiled shading does not: so one part is traced while others are shaded."""
+        parts = np.array_split(directions, max(1, -(-len(directions) // _RAYS_AT_ONCE)))
+        if self._threads == 1 or len(parts) == 1:
+            return [work(part) for part in parts]
+        with ThreadPoolExecutor(self._threads) as pool:
+            return list(pool.map(work, parts))
+
+
+def _checked(edge_samples: int, shadow_step_px: int) -> tuple[Float[np.ndarray, "samples 2"], int]:
+    if edge_samples not in SAMPLE_COUNTS or shadow_step_px < 1:
+        raise InputError(
+            f"expected 4 or 16 rays in a pixel at an edge and a step of whole pixels from 1 on, got {edge_samples} and {shadow_step_px}"
+        )
+    return sample_offsets_px(edge_samples), shadow_step_px
+
+
+def _edges(
+    ready: PreparedScene, camera: Camera, directions: Float64[np.ndarray, "rays 3"], centres: RaySamples
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels whose centre does not speak for all of the pixel."""
+    size = camera.height_px, camera.width_px
+    depth_m = centres.depth_m.reshape(size)
+    mesh, alpha, lit = (values.reshape(size) for values in (centres.mesh, centres.alpha, centres.lit))
+    edges = edge_pixels(mesh, alpha, depth_m, centres.normal.reshape(*size, 3), lit, directions.reshape(*size, 3))
+    outlines_m = ready.edges.seen_from(camera.world_from_camera[:3, 3] - ready.centre_m) + ready.centre_m
+    in_camera_m = outlines_m @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    return edges | silhouette_pixels(in_camera_m, camera.focal_px, camera.principal_px, depth_m)
+
+
+def _steps(mask: Float32[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Pixels that differ from one of their eight neighbours."""
+    around = np.ones((3, 3), np.uint8)
+    return cv2.dilate(mask, around) - cv2.erode(mask, around) > 0.02

@@ -1,0 +1,1 @@
+"""GLB files as scenes."""

@@ -1,0 +1,74 @@
+"""LightChange: what objects change on a real surface, as pictures and as a layer; see `light_change`."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from mrbokeh.images.color import luminance
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.material import Material
+from mrbokeh.scene.mesh import Mesh
+from mrbokeh.scene.virtual_scene import Scene
+from mrbokeh.system.errors import InputError
+
+LEAST_CHANGE = 1.0 / 1024
+"""Changes of less than this share of the surface's light are cut off, so that far from the objects a photograph stays what it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class LightChange:
+    """ratio: (H, W, 3) what remains of the surface's light, 0 to 1; 1 where nothing changes. added: (H, W, 3) radiance that the surface
+    sends besides. alpha: (H, W) how much of the pixel the surface covers. depth_m: (H, W) of the surface, inf where it is not."""
+
+    ratio: Float32[np.ndarray, "height width 3"]
+    added: Float32[np.ndarray, "height width 3"]
+    alpha: Float32[np.ndarray, "height width"]
+    depth_m: Float32[np.ndarray, "height width"]
+
+    def evenly(self) -> "LightChange":
+        """The same with all colours losing what their luminance loses: `as_layer` then asks nothing of the plate."""
+        share = np.where((self.ratio == 1.0).all(-1), 1.0, luminance(self.ratio)).astype(np.float32)
+        return replace(self, ratio=np.repeat(share[..., None], 3, axis=2))
+
+    def as_layer(self, sharp_rgb: Float32[np.ndarray, "height width 3"]) -> Layer:
+        """A layer lying on the surface that turns a plate beneath into plate * ratio + added; the lens blurs it like any other.
+
+        sharp_rgb: the plate, all in focus where there is such a picture. A layer has one alpha, so it takes away what is lost of
+        the colour that loses most and gives the others back from sharp_rgb; nothing in it is negative.
+        """
+        if sharp_rgb.shape != self.ratio.shape:
+            raise InputError(
+                f"expected a plate of the shape {self.ratio.shape} of the light change, got {sharp_rgb.shape}: render both alike"
+            )
+        # Light without any coverage would be lost on renderers that look at covered pixels only.
+        takes = np.maximum(1.0 - self.ratio.min(-1), LEAST_CHANGE * (self.added.max(-1) > 0))
+        gives_back = np.maximum(self.ratio - (1.0 - takes)[..., None], 0.0)
+        rgb = self.added + gives_back * np.maximum(sharp_rgb, 0.0)
+        alpha = (self.alpha * takes).astype(np.float32)
+        depth_m = np.where(alpha > 0, self.depth_m, np.inf).astype(np.float32)
+        return Layer(np.where(alpha[..., None] > 0, self.alpha[..., None] * rgb, 0.0).astype(np.float32), alpha, depth_m)
+
+
+def seen_surface(caster: EmbreeRaycaster, camera: Camera, catcher: Mesh) -> Layer:
+    """Coverage and depth of a catcher by itself, from whichever side it is seen."""
+    shape = replace(catcher, catches_shadow=False, material=Material(base_color=(0.0, 0.0, 0.0, 1.0), unlit=True, double_sided=True))
+    return caster.render(Scene((shape,)), camera)
+
+
+def changed(
+    surface: Layer,
+    pixels: Int64[np.ndarray, " pixels"],
+    light: tuple[Float32[np.ndarray, "pixels 3"], Float32[np.ndarray, "pixels 3"], Float32[np.ndarray, "pixels 3"]],
+) -> LightChange:
+    """From light of some pixels (row after row): (all that there was, what of it is taken away, what is added)."""
+    total, taken, added = light
+    largest = np.maximum(total.max(-1, keepdims=True), 1e-12)
+    lost = np.clip(taken / np.maximum(total, 1e-12), 0.0, 1.0)
+    ratio, more = np.ones_like(surface.rgb).reshape(-1, 3), np.zeros_like(surface.rgb).reshape(-1, 3)
+    ratio[pixels] = np.where(lost.max(-1, keepdims=True) >= LEAST_CHANGE, 1.0 - lost, 1.0)
+    more[pixels] = np.where(added.max(-1, keepdims=True) >= LEAST_CHANGE * largest, added, 0.0)
+    shape = surface.rgb.shape
+    return LightChange(ratio.reshape(shape), more.reshape(shape), surface.alpha, surface.depth_m)

@@ -1,0 +1,1 @@
+"""The backend that traces paths, by Mitsuba."""

@@ -1,0 +1,1 @@
+"""The backend for graphics cards, by WebGPU."""
