@@ -25,7 +25,7 @@ from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from mrbokeh.video.clip import read_display_frames
 from tests.machine import machine_line, memory_line
 from tests.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.detection_thread import Detector, ImmediateDetections

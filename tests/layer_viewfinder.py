@@ -20,11 +20,11 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
-from viewfinder.lens_book import LensBook
-from viewfinder.running import Parts, Viewfinder
-from viewfinder.running import running as parts_running
+from viewfinder.app.lens_book import LensBook
+from viewfinder.app.running import Parts, Viewfinder
+from viewfinder.app.running import running as parts_running
 from viewfinder.server.app import serving_site
-from viewfinder.still_layer import StillLayer
+from viewfinder.stage.still_layer import StillLayer
 
 WIDTH, HEIGHT = 160, 90
 # Half a dioptre out of focus blurs over 13.7 px here: 160 / 6 px per mm, 20 mm aperture, 51.3 mm to the sensor.

@@ -21,10 +21,10 @@ from mrbokeh.video.frames import display_bgr
 from tests.live_clip import LiveClip, board_tracker
 from tests.streaming_viewers import Viewer, watching
 from tests.traced_board_clip import LENS
-from viewfinder.assembly import open_scenery, renderers_of
-from viewfinder.lens_book import LensBook
-from viewfinder.live_compositor import Moment
-from viewfinder.running import Parts, Viewfinder, running
+from viewfinder.app.assembly import open_scenery, renderers_of
+from viewfinder.app.lens_book import LensBook
+from viewfinder.app.live_compositor import Moment
+from viewfinder.app.running import Parts, Viewfinder, running
 from viewfinder.server.app import serving_site
 from viewfinder.sources.base import FrameSource
 from viewfinder.sources.video_file import VideoFileSource

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frame_header import finite
-from viewfinder.frames import FrameStatus, OutputFrame
+from viewfinder.flow.frame_header import finite
+from viewfinder.flow.frames import FrameStatus, OutputFrame
 from viewfinder.server.access import Access
 from viewfinder.server.app import serving_site
 from viewfinder.server.controls import VIEWS, State

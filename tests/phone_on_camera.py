@@ -17,7 +17,7 @@ from mrbokeh.system.atomic_files import write_json
 from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
 from mrbokeh.tracking.charuco.board_file import write_board
 from tests.traced_board_clip import BOARD, clip_of
-from viewfinder.frames import Pose
+from viewfinder.flow.frames import Pose
 from viewfinder.tracking.rigid_motion import rigid_of
 
 CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.06, 0.02]))

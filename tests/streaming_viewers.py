@@ -13,7 +13,7 @@ import numpy as np
 from aiohttp import web
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpReceiver, RTCSessionDescription
 
-from viewfinder.frames import FrameStatus, OutputFrame
+from viewfinder.flow.frames import FrameStatus, OutputFrame
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.encoder import StreamQuality
 from viewfinder.streaming.whep import Whep

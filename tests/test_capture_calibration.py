@@ -10,10 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from capture.commands.scale import scale_command
-from capture.views.focus_calibration import FocusStart, _Fit, calibrate_focus
-from capture.views.focus_calibration_blur import BlurSamples, measure_blur
-from capture.views.focus_calibration_stacks import StackFocus, lens_calibrations, reduced, spread_points
-from capture.views.lens_calibration import (
+from capture.poses.lens_calibration import (
     CalibratedFocus,
     LensCalibration,
     apply_lens_calibration,
@@ -21,7 +18,10 @@ from capture.views.lens_calibration import (
     stated_distances_m,
     write_lens_calibration,
 )
-from capture.views.lens_calibration_stacks import calibrate_scene
+from capture.poses.lens_calibration_stacks import calibrate_scene
+from capture.scale.focus_calibration import FocusStart, _Fit, calibrate_focus
+from capture.scale.focus_calibration_blur import BlurSamples, measure_blur
+from capture.scale.focus_calibration_stacks import StackFocus, lens_calibrations, reduced, spread_points
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture.views.depth_fusion import (
+from capture.dense.depth_fusion import (
     SHARE_OF_FOCUS,
     FocusVote,
     add_focus_votes,

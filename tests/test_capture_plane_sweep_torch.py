@@ -5,16 +5,16 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from capture.views.dense_depth import DenseSettings, dense_depth
-from capture.views.plane_sweep import Matching, plane_sweep
-from capture.views.plane_sweep_view import SweepView
+from capture.dense.dense_depth import DenseSettings, dense_depth
+from capture.dense.plane_sweep import Matching, plane_sweep
+from capture.poses.sweep_view import SweepView
 from mrbokeh.system.errors import InputError
 from tests.plane_sweep_scenes import card, traced, wall
 from tests.test_capture_plane_sweep import turned_view
 
 torch = pytest.importorskip("torch")
 
-from capture.views.torch_plane_sweep import plane_sweep_on  # noqa: E402
+from capture.dense.torch_plane_sweep import plane_sweep_on  # noqa: E402
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU"))]
 

@@ -11,14 +11,14 @@ import typer
 from typer.testing import CliRunner
 
 from capture.commands import poses
-from capture.views import colmap, colmap_process
-from capture.views.colmap import PoseSettings, find_picture_poses, find_scene_poses
-from capture.views.colmap_job import ColmapJob, ColmapPicture, camera_model_for, job_from_json, job_to_json
-from capture.views.colmap_matches import failure_message, median_parallax_deg, weak_model_message
-from capture.views.colmap_pictures import common_exposure_stops, picture_cameras, pictures_in, stack_cameras, write_stack_pictures
-from capture.views.colmap_process import run_colmap
-from capture.views.sparse_model import SparseModel, SparseView
-from capture.views.sparse_model_file import write_sparse_model
+from capture.poses import colmap, colmap_process
+from capture.poses.colmap import PoseSettings, find_picture_poses, find_scene_poses
+from capture.poses.colmap_job import ColmapJob, ColmapPicture, camera_model_for, job_from_json, job_to_json
+from capture.poses.colmap_matches import failure_message, median_parallax_deg, weak_model_message
+from capture.poses.colmap_pictures import common_exposure_stops, picture_cameras, pictures_in, stack_cameras, write_stack_pictures
+from capture.poses.colmap_process import run_colmap
+from capture.poses.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model_file import write_sparse_model
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens

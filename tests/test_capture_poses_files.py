@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.views.distortion import distorted_px, undistorted_px
-from capture.views.sparse_model import SparseModel, SparseView
-from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
+from capture.poses.distortion import distorted_px, undistorted_px
+from capture.poses.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model_file import read_sparse_model, write_sparse_model
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 

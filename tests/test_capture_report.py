@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from capture.poses.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model_file import write_sparse_model
 from capture.report.charts import Axes, chart
 from capture.report.exclusion_masks import REASONS, board_mask, exclusion_masks
 from capture.report.exposure_drift import low_frequency_gain
@@ -24,8 +26,6 @@ from capture.report.scene_gates import Reconstruction, scales_in, scene_gates
 from capture.report.scene_page import SceneReport
 from capture.report.scene_report import report_scene
 from capture.report.stack_gates import stack_gates
-from capture.views.sparse_model import SparseModel, SparseView
-from capture.views.sparse_model_file import write_sparse_model
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.layering.layering import Layering

@@ -12,8 +12,8 @@ if find_spec("pycolmap") is None:
 
 import pycolmap
 
-from capture.views.robust_adjustment import adjusted
-from capture.views.scale_board import umeyama
+from capture.poses.robust_adjustment import adjusted
+from capture.scale.board import umeyama
 from datasets_scripts.lab_scene import LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera
 from datasets_scripts.stack_scenes import STACK_SCENES
 from mrbokeh.optics.camera import Camera

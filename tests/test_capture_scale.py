@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.views.board_options import board_from_options
-from capture.views.board_search import BoardSearch
-from capture.views.scale_answer import ScaleAnswer
-from capture.views.scale_board import (
+from capture.poses.cauchy_loss import squared_under_cauchy, squared_under_cauchy_slope
+from capture.poses.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model_file import read_sparse_model, write_sparse_model
+from capture.scale.answer import ScaleAnswer
+from capture.scale.board import (
     POSES_SIGMA,
     POSES_SIGMA_WITH_DISTORTION,
     BoardDetections,
@@ -21,13 +22,12 @@ from capture.views.scale_board import (
     triangulate,
     umeyama,
 )
-from capture.views.scale_distance import distance_scale, parse_distance
-from capture.views.scale_file import ScaleResult, read_scale, write_scale
-from capture.views.scale_focus import FocusSample, focus_scale, stated_sigma_dioptre
-from capture.views.scale_robust import squared_under_cauchy, squared_under_cauchy_slope
-from capture.views.scale_sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
-from capture.views.sparse_model import SparseModel, SparseView
-from capture.views.sparse_model_file import read_sparse_model, write_sparse_model
+from capture.scale.board_options import board_from_options
+from capture.scale.board_search import BoardSearch
+from capture.scale.distance import distance_scale, parse_distance
+from capture.scale.focus import FocusSample, focus_scale, stated_sigma_dioptre
+from capture.scale.scale_file import ScaleResult, read_scale, write_scale
+from capture.scale.sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.errors import InputError

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.views.board_search import BoardSearch
-from capture.views.colmap import PoseSettings, find_scene_poses
-from capture.views.lens_calibration import read_lens_calibration, stated_distances_m
-from capture.views.metric_scale import ScaledScene, ScaleRequest, scale_scene
-from capture.views.scale_board import Similarity, umeyama
-from capture.views.scale_text import scale_lines
-from capture.views.sparse_model import SparseModel
-from capture.views.sparse_model_file import read_sparse_model
+from capture.poses.colmap import PoseSettings, find_scene_poses
+from capture.poses.lens_calibration import read_lens_calibration, stated_distances_m
+from capture.poses.sparse_model import SparseModel
+from capture.poses.sparse_model_file import read_sparse_model
+from capture.scale.board import Similarity, umeyama
+from capture.scale.board_search import BoardSearch
+from capture.scale.metric_scale import ScaledScene, ScaleRequest, scale_scene
+from capture.scale.text import scale_lines
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError

@@ -12,12 +12,12 @@ from capture.photos.focus_metadata import FocusReading, at_infinity
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.stated_focus import StatedFocus
 from capture.report.focus_spacing import focus_spacing
+from capture.scale.focus import FocusSample, focus_scale, stated_sigma_dioptre
+from capture.scale.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit
+from capture.scale.focus_calibration_stacks import StackFocus, focus_start, lens_calibrations
+from capture.scale.sharpness import sharpness_peaks
 from capture.stacks.ingest import ingest
 from capture.stacks.sentinel_focus import bounded_focus_records, stated_by_sentinel
-from capture.views.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit
-from capture.views.focus_calibration_stacks import StackFocus, focus_start, lens_calibrations
-from capture.views.scale_focus import FocusSample, focus_scale, stated_sigma_dioptre
-from capture.views.scale_sharpness import sharpness_peaks
 from mrbokeh.optics.film_plane import lens_distance_m
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack

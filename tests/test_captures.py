@@ -11,9 +11,9 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.capture_bundle import read_bundle
 from mrbokeh.system.errors import InputError
-from viewfinder.captures import Captures
-from viewfinder.frames import CameraFrame, FrameStatus, OutputFrame
-from viewfinder.live_compositor import LiveCompositor, Moment
+from viewfinder.app.captures import Captures
+from viewfinder.app.live_compositor import LiveCompositor, Moment
+from viewfinder.flow.frames import CameraFrame, FrameStatus, OutputFrame
 from viewfinder.tracking.base import TrackedPose
 
 LENS = Lens(50.0, 2.0, 2.0, 36.0)

@@ -11,12 +11,12 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 from tests.thin_lens_board import DARK, LIGHT, Shot, camera_over, display_bgr, photograph
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus, BlurSettings
 from viewfinder.focus.board_edges import board_edges
 from viewfinder.focus.edge_spread import EdgeBlurs, edge_blurs, edge_rise, sharpest_blur_px
 from viewfinder.focus.focus_from_blur import focus_candidates
 from viewfinder.focus.focus_side import Evidence, settled
-from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 
 BOARD = CharucoBoard((CharucoGrid((6, 4), 30.0, 22.0),))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.merging.preferred_merge import PREFERRED
-from capture.views.lens_calibration_stacks import write_calibrated
+from capture.poses.lens_calibration_stacks import write_calibrated
 from mrbokeh.images.exr_io import read_exr, write_exr
 from mrbokeh.images.image_io import read_image, write_layer
 from mrbokeh.images.layer import Layer

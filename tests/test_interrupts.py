@@ -16,8 +16,8 @@ from mrbokeh.video.clip import VideoWriter
 WORK = {
     "ingest": ("capture.stacks.ingest.ingest", ["{0}", "--out", "{0}/scene"], "finished slices are kept in {0}/scene"),
     "merge": ("capture.merging.merge.merge_scene", ["{0}"], "finished stacks are kept in {0}"),
-    "poses": ("capture.views.colmap.find_scene_poses", ["{0}"], "COLMAP's finished stages are kept in {0}/reconstruction"),
-    "depth": ("capture.views.scene_depth.deepen_scene", ["{0}"], "finished stacks are kept in {0}"),
+    "poses": ("capture.poses.colmap.find_scene_poses", ["{0}"], "COLMAP's finished stages are kept in {0}/reconstruction"),
+    "depth": ("capture.dense.scene_depth.deepen_scene", ["{0}"], "finished stacks are kept in {0}"),
     "report": ("capture.report.scene_report.report_scene", ["{0}"], "what was found of finished stacks is kept in {0}"),
     "dataset": (
         "capture.dataset.writer.write_dataset",

@@ -17,7 +17,7 @@ from capture.matchmove.ground import GroundPicks, Ruler, on_ground, ruler_scale
 from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip
 from capture.matchmove.only_turning import model_residual_px, turning_residual_px
 from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
-from capture.views.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import read_track

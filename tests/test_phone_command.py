@@ -33,12 +33,13 @@ from tests.phone_on_camera import (
 )
 from tests.test_sources_browser import Canvas, Sender
 from tests.traced_board_clip import pose_error
+from viewfinder.app.running import Viewfinder
+from viewfinder.app.tracking_choice import PhoneChoice, TrackingChoice, open_tracker
 from viewfinder.commands.browser_cameras import browser_cameras
 from viewfinder.commands.calibrate_phone import calibrate_phone_command
 from viewfinder.commands.serve import opened
 from viewfinder.commands.serve_options import ServeOptions
-from viewfinder.frames import CameraFrame, Pose
-from viewfinder.running import Viewfinder
+from viewfinder.flow.frames import CameraFrame, Pose
 from viewfinder.server.access import Access, needed_role
 from viewfinder.server.app import serving_site
 from viewfinder.server.sessions import Role
@@ -50,7 +51,6 @@ from viewfinder.tracking.phone_rig import PhoneRig, read_phone_rig, write_phone_
 from viewfinder.tracking.phone_tracker import PhoneTracker
 from viewfinder.tracking.rigid_motion import angle_deg, rigid_of
 from viewfinder.tracking.still_pairs import StillPairs
-from viewfinder.tracking_choice import PhoneChoice, TrackingChoice, open_tracker
 
 app = typer.Typer()
 app.command("calibrate-phone")(calibrate_phone_command)

@@ -20,7 +20,7 @@ import pytest
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
-from viewfinder.frames import LensState
+from viewfinder.flow.frames import LensState
 from viewfinder.sources.newest_of import newest_of
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
 from viewfinder.sources.webcam import WebcamSource

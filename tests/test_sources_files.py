@@ -17,7 +17,7 @@ from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.video.clip import VideoWriter, probe
 from mrbokeh.video.color import linear_from_code
-from viewfinder.frames import CameraFrame, LensState
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.sources.base import FrameSource
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.rhythm import Rhythm

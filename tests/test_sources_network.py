@@ -19,7 +19,7 @@ import pytest
 from aiortc.codecs.h264 import H264Encoder
 from aiortc.rtp import RtpPacket
 
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.sources.network_stream import NetworkStreamSource
 
 WIDTH, HEIGHT, FPS = 160, 112, 25

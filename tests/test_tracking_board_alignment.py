@@ -11,7 +11,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
 from tests.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.detection_thread import ImmediateDetections
 

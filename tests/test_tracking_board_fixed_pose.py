@@ -9,7 +9,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.camera_file import camera_to_json
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.fixed_pose import read_fixed_pose
 
 POSE = np.array([[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 0.9], [0.0, 0.0, 0.0, 1.0]])

@@ -17,7 +17,7 @@ from mrbokeh.tracking.charuco.corner_flow import FrameHistory, flow
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
 from mrbokeh.video.clip import read_display_frames
 from tests.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker
 from viewfinder.tracking.detection_thread import DetectionThread, ImmediateDetections

@@ -14,7 +14,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.between_frames import pose_between
 from mrbokeh.tracking.camera_track.stage_axes import pan_tilt_roll_deg
 from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
-from viewfinder.frames import LensState
+from viewfinder.flow.frames import LensState
 from viewfinder.tracking.encoder_table import read_encoder_table
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, freed_sample, read_freed, write_freed
 from viewfinder.tracking.opentrackio import StageReading, decode_opentrackio, encode_opentrackio, opentrackio_document

@@ -15,7 +15,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
 from tests.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera
-from viewfinder.frames import CameraFrame, Pose
+from viewfinder.flow.frames import CameraFrame, Pose
 from viewfinder.tracking.detection_thread import ImmediateDetections
 from viewfinder.tracking.map_localiser import MapLocaliser, matches
 from viewfinder.tracking.map_pose import pose_in_map, pose_refined

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.world_axes import inverted
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.phone_rig import (
     PhoneRig,

@@ -10,8 +10,8 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.focus.tracked_lens_focus import TrackedLensFocus
-from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, write_freed
 from viewfinder.tracking.opentrackio import encode_opentrackio, opentrackio_document
 from viewfinder.tracking.opentrackio_packets import CBOR, JSON, packets

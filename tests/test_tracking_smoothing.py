@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.one_euro import OneEuroPose
 from viewfinder.tracking.smoothed_tracker import SmoothedTracker

@@ -22,7 +22,7 @@ from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot, pose_from_plane
 from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
 from tests.traced_board_clip import BOARD, camera_frames
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.detection_thread import ImmediateDetections
 

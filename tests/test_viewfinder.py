@@ -32,12 +32,12 @@ from tests.layer_viewfinder import (
     watching,
     write_plate,
 )
-from viewfinder.frames import CameraFrame, FrameStatus, OutputFrame
-from viewfinder.newest import Newest
-from viewfinder.pipeline import Pipeline
+from viewfinder.app.pipeline import Pipeline
+from viewfinder.flow.frames import CameraFrame, FrameStatus, OutputFrame
+from viewfinder.flow.newest import Newest
 from viewfinder.sources.pattern import PatternSource
 from viewfinder.sources.video_file import VideoFileSource
-from viewfinder.still_layer import StillLayer
+from viewfinder.stage.still_layer import StillLayer
 
 
 @pytest.fixture

@@ -38,18 +38,18 @@ from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.tracking.charuco.board_file import read_board, write_board
 from tests.phone_on_camera import PHONE
 from tests.thin_lens_board import Shot, camera_over, display_bgr, photograph
+from viewfinder.app.focus_choice import open_focus
+from viewfinder.app.tracking_choice import TrackingChoice
 from viewfinder.commands.board import board_command
 from viewfinder.commands.listening import Door, ListeningOptions, open_door
 from viewfinder.commands.serve import opened
 from viewfinder.commands.serve_options import ServeOptions
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.focus.frame_focus import FrameFocus
 from viewfinder.focus.manual_focus import ManualFocus
-from viewfinder.focus_choice import open_focus
-from viewfinder.frames import CameraFrame, LensState
 from viewfinder.server.access import Access
 from viewfinder.server.sessions import Role, Sessions
 from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking_choice import TrackingChoice
 
 ROOT = Path(__file__).resolve().parent.parent
 DOC = ROOT / "docs" / "viewfinder.md"
@@ -120,7 +120,7 @@ REFUSED = {
 _INVOKE = """
 import json, sys
 from typer.testing import CliRunner
-import viewfinder.commands.serve as serve, viewfinder.tracking_choice as tracking
+import viewfinder.commands.serve as serve, viewfinder.app.tracking_choice as tracking
 from viewfinder.cli import app
 def opened(*_):
     raise RuntimeError("a camera was opened")

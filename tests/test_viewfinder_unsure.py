@@ -15,16 +15,16 @@ from mrbokeh.system.errors import InputError
 from tests.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square
 from tests.stage_scenes import LENS as SCENE_LENS
 from tests.stage_scenes import ONE_CARD, backend, camera, scene_file
-from viewfinder.captures import Captures
+from viewfinder.app.captures import Captures
+from viewfinder.app.lens_book import LensBook
+from viewfinder.app.live_compositor import LiveCompositor
+from viewfinder.flow.frame_header import frame_header
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.focus.manual_focus import ManualFocus
-from viewfinder.frame_header import frame_header
-from viewfinder.frames import CameraFrame
-from viewfinder.lens_book import LensBook
-from viewfinder.live_compositor import LiveCompositor
 from viewfinder.sources.pattern import PatternSource
 from viewfinder.stage.fade import FADE_S
 from viewfinder.stage.stage import Stage
-from viewfinder.still_layer import StillLayer
+from viewfinder.stage.still_layer import StillLayer
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.smoothed_tracker import SmoothedTracker
 

@@ -12,7 +12,7 @@ from viewfinder.commands.board import board_command
 from viewfinder.commands.calibrate_phone import calibrate_phone_command
 
 if TYPE_CHECKING:
-    from viewfinder.tracking_choice import PhoneChoice
+    from viewfinder.app.tracking_choice import PhoneChoice
 
 app = typer.Typer(add_completion=False)
 app.command("board")(board_command)
@@ -82,10 +82,10 @@ def viewfinder(
     if source is None:
         typer.echo(context.get_help())
         raise typer.Exit(2)
+    from viewfinder.app.tracking_choice import TrackingChoice
     from viewfinder.commands.listening import ListeningOptions
     from viewfinder.commands.serve import serve
     from viewfinder.commands.serve_options import ServeOptions
-    from viewfinder.tracking_choice import TrackingChoice
 
     logging.basicConfig(level=logging.WARNING)
     listening = ListeningOptions(port, lan, interface, tls, tls_key, qr)
@@ -116,7 +116,7 @@ def viewfinder(
 
 def _phone_choice(source: str | None, camera: Path | None, rig: Path | None) -> "PhoneChoice | None":
     """All three of them or none."""
-    from viewfinder.tracking_choice import PhoneChoice
+    from viewfinder.app.tracking_choice import PhoneChoice
 
     for word, given in (("--phone-camera", camera), ("--rig", rig)):
         if source is None and given is not None:

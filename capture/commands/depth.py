@@ -27,9 +27,9 @@ def depth_command(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
 ) -> None:
+    from capture.dense.dense_depth import DenseSettings
+    from capture.dense.scene_depth import SceneDepthSettings, deepen_scene
     from capture.merging.retouch import retouched_stacks, retouches_text, stacks_before
-    from capture.views.dense_depth import DenseSettings
-    from capture.views.scene_depth import SceneDepthSettings, deepen_scene
     from mrbokeh.figures.stack_pictures import SHEET_NAME
     from mrbokeh.system.interrupts import kept_when_interrupted
 

@@ -34,8 +34,8 @@ def poses_command(
     threads: Annotated[int, typer.Option(help="for features and matches; -1 takes all cores")] = -1,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find poses again from the start")] = False,
 ) -> None:
-    from capture.views.colmap import PoseSettings, find_picture_poses, find_scene_poses
-    from capture.views.colmap_matches import median_parallax_deg
+    from capture.poses.colmap import PoseSettings, find_picture_poses, find_scene_poses
+    from capture.poses.colmap_matches import median_parallax_deg
     from mrbokeh.system.interrupts import kept_when_interrupted
 
     settings = PoseSettings(mapper, camera_model, cameras, max_image_size, seed, threads, overwrite)

@@ -46,10 +46,10 @@ def process_command(
     from capture.commands.report import report_command
     from capture.commands.scale import scale_command
     from capture.report.strictness import require_gates
+    from capture.scale.board_options import board_from_options
+    from capture.scale.distance import parse_distance
     from capture.stacks.begun_scene import taken_away_when_refused
     from capture.stacks.session import FILE_NAME as SESSION_NAME
-    from capture.views.board_options import board_from_options
-    from capture.views.scale_distance import parse_distance
     from mrbokeh.stacks.focal_stack import find_focal_stacks
     from mrbokeh.system.errors import InputError
 

@@ -60,10 +60,10 @@ def scale_command(
     calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="calibrate the focus of the stacks")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find the scale again")] = False,
 ) -> None:
-    from capture.views.board_options import board_from_options
-    from capture.views.metric_scale import ScaleRequest, scale_scene
-    from capture.views.scale_distance import parse_distance
-    from capture.views.scale_text import scale_lines
+    from capture.scale.board_options import board_from_options
+    from capture.scale.distance import parse_distance
+    from capture.scale.metric_scale import ScaleRequest, scale_scene
+    from capture.scale.text import scale_lines
 
     if ruler or distance_at or nearest:
         of_scenes = {
@@ -113,8 +113,8 @@ def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | 
 
 
 def _apply(scene: Path, path: Path) -> None:
-    from capture.views.lens_calibration import read_lens_calibration
-    from capture.views.lens_calibration_stacks import calibrate_scene
+    from capture.poses.lens_calibration import read_lens_calibration
+    from capture.poses.lens_calibration_stacks import calibrate_scene
 
     for stack in calibrate_scene(scene, read_lens_calibration(path)):
         typer.echo(f"{stack.folder}: focus distances calibrated by {path}")

@@ -11,11 +11,11 @@ from capture.dataset.coc_maps import FOLDER as COC_FOLDER
 from capture.dataset.coc_maps import largest_coc_px, write_coc_maps
 from capture.dataset.file_placing import place, record_of
 from capture.dataset.radiance_histogram import RadianceHistogram
+from capture.dense.scene_depth import is_depth_stale
 from capture.report.examination import examine
 from capture.report.exclusion_masks import exclusion_masks, has_fresh_exclusions, write_exclusions
 from capture.report.reblur import Reblur
 from capture.report.stack_view import StackView
-from capture.views.scene_depth import is_depth_stale
 from mrbokeh.images.camera_rgb import VALID
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE

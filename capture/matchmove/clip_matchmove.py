@@ -11,11 +11,11 @@ from capture.matchmove.doubts import doubts, require_walking
 from capture.matchmove.frame_poses import FramePose, poses_between
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, ruler_scale
 from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip, view_name, write_keyframes
-from capture.views.colmap import PoseSettings, find_picture_poses
-from capture.views.colmap_matches import median_parallax_deg
-from capture.views.scale_board import board_scale
-from capture.views.scale_distance import distance_scale
-from capture.views.sparse_model import SparseModel, SparseView
+from capture.poses.colmap import PoseSettings, find_picture_poses
+from capture.poses.colmap_matches import median_parallax_deg
+from capture.poses.sparse_model import SparseModel, SparseView
+from capture.scale.board import board_scale
+from capture.scale.distance import distance_scale
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.progress import track as with_progress

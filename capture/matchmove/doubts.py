@@ -6,7 +6,7 @@ import numpy as np
 
 from capture.matchmove.frame_poses import FramePose
 from capture.matchmove.only_turning import model_residual_px, turning_residual_px
-from capture.views.sparse_model import SparseModel
+from capture.poses.sparse_model import SparseModel
 from mrbokeh.system.errors import InputError
 
 _TURNS_AS_WELL = 3.0

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from capture.views.distortion import Distortion, undistorted_px
-from capture.views.sparse_model import SparseModel, SparseView
+from capture.poses.distortion import Distortion, undistorted_px
+from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.camera_track.between_frames import camera_between
 from mrbokeh.tracking.charuco.corner_flow import flow

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from capture.views.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.system.errors import InputError
 
 _FEWEST_POINTS = 12

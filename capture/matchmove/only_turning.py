@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from capture.views.sparse_model import SparseModel
+from capture.poses.sparse_model import SparseModel
 
 _MOST_POINTS = 300
 _FOCAL_STARTS = (0.7, 1.0, 1.4)

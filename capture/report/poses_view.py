@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.views.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model import SparseModel, SparseView
 
 MOST_POINTS = 4000
 _CORNERS = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from capture.poses.sparse_model import SparseModel
+from capture.poses.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
 from capture.report.gates import Gate, Rule
-from capture.views.sparse_model import SparseModel
-from capture.views.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.atomic_files import read_json
 

@@ -12,21 +12,21 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from mrbokeh.tracking.charuco.board_file import read_board
-from viewfinder.assembly import open_scenery, read_lenses, renderers_of
+from viewfinder.app.assembly import open_scenery, read_lenses, renderers_of
+from viewfinder.app.running import Parts, Viewfinder, running
+from viewfinder.app.tracking_choice import open_tracker
 from viewfinder.commands.browser_cameras import CAMERA_PAGE, browser_cameras
 from viewfinder.commands.listening import Door, on_stop, open_door
 from viewfinder.commands.serve_options import ServeOptions, refuse_contradictions
-from viewfinder.running import Parts, Viewfinder, running
 from viewfinder.server.access import Access
 from viewfinder.server.app import serving_site
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.exact_size import ExactSize
-from viewfinder.still_layer import StillLayer
+from viewfinder.stage.still_layer import StillLayer
 from viewfinder.streaming.virtual_webcam import VirtualWebcam
 from viewfinder.tracking.base import Tracker
 from viewfinder.tracking.fixed_pose import FixedPose, read_fixed_pose
 from viewfinder.tracking.phone_tracker import PhoneTracker
-from viewfinder.tracking_choice import open_tracker
 
 
 @contextmanager

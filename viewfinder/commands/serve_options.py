@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mrbokeh.system.errors import InputError
+from viewfinder.app.focus_choice import FOCUS_SOURCES
+from viewfinder.app.tracking_choice import TrackingChoice
 from viewfinder.commands.listening import ListeningOptions
-from viewfinder.focus_choice import FOCUS_SOURCES
-from viewfinder.tracking_choice import TrackingChoice
 
 BACKENDS = ("auto", "wgpu", "embree")
 

@@ -2,7 +2,7 @@
 
 from typing import Protocol, runtime_checkable
 
-from viewfinder.frames import CameraFrame, LensState
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 
 

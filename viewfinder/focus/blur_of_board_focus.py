@@ -14,12 +14,12 @@ from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard
+from viewfinder.flow.frames import CameraFrame, LensState
+from viewfinder.flow.newest import Newest
 from viewfinder.focus.board_edges import board_edges
 from viewfinder.focus.edge_spread import EdgeBlurs, edge_blurs
 from viewfinder.focus.focus_from_blur import FocusCandidate, focus_candidates
 from viewfinder.focus.focus_side import Evidence, settled
-from viewfinder.frames import CameraFrame, LensState
-from viewfinder.newest import Newest
 from viewfinder.tracking.base import TrackedPose
 
 _POLL_S = 0.1

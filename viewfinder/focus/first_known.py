@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.focus.base import FocusSource
-from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 
 

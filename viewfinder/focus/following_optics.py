@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus
-from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 
 

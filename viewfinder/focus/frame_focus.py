@@ -1,6 +1,6 @@
 """FrameFocus: what came with the frame itself: Exif, gphoto2, the browser's focusDistance."""
 
-from viewfinder.frames import CameraFrame, LensState
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 
 

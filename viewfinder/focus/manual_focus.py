@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import CameraFrame, LensState
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 
 

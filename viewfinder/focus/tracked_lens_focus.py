@@ -1,6 +1,6 @@
 """TrackedLensFocus: the lens as an external tracking system tells it (OpenTrackIO; FreeD through a lens table)."""
 
-from viewfinder.frames import CameraFrame, LensState
+from viewfinder.flow.frames import CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.tracking_socket import SocketTracker
 

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frame_header import finite
+from viewfinder.flow.frame_header import finite
 from viewfinder.server.bounded import LARGEST_MESSAGE, json_value
 from viewfinder.server.control_messages import (
     Capture,

@@ -10,9 +10,9 @@ import time
 from threading import Event, Thread
 from typing import Any
 
-from viewfinder.frame_header import frame_header
-from viewfinder.frames import OutputFrame
-from viewfinder.newest import Newest
+from viewfinder.flow.frame_header import frame_header
+from viewfinder.flow.frames import OutputFrame
+from viewfinder.flow.newest import Newest
 from viewfinder.server.waiting_room import WaitingRoom
 
 _POLL_S = 0.1

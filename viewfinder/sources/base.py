@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from threading import Event
 from typing import Protocol, runtime_checkable
 
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 
 
 @runtime_checkable

@@ -15,13 +15,13 @@ from aiohttp import web
 
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import UNSPECIFIED, color_of
-from viewfinder.frames import CameraFrame
-from viewfinder.mdns_candidates import with_address
-from viewfinder.newest import Newest
+from viewfinder.flow.frames import CameraFrame
+from viewfinder.flow.newest import Newest
 from viewfinder.sources.camera_message import CameraKnowledge
 from viewfinder.sources.received_frame import upright_bgr
 from viewfinder.sources.size_limit import SizeLimit
 from viewfinder.sources.whip_session import WhipSession
+from viewfinder.streaming.mdns_candidates import with_address
 
 LONGEST_OFFER_BYTES = 65536
 _SDP = "application/sdp"

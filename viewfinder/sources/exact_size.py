@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import Bgr, CameraFrame
+from viewfinder.flow.frames import Bgr, CameraFrame
 from viewfinder.sources.base import FrameSource
 
 # A camera may differ this much from the aspect ratio before the picture would look stretched.

@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from mrbokeh.system.gphoto2_library import library
-from viewfinder.frames import LensState
+from viewfinder.flow.frames import LensState
 
 _F_NUMBER = ("f-number", "aperture")
 # Properties of PTP itself (PIMA 15740, 13.3.8 and 13.3.9), which libgphoto2 lists by number: 1/100 mm, and mm with all ones beyond.

@@ -11,7 +11,7 @@ import numpy as np
 
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, detected, explanation, library, opened
-from viewfinder.frames import UNKNOWN_LENS, Bgr, CameraFrame
+from viewfinder.flow.frames import UNKNOWN_LENS, Bgr, CameraFrame
 from viewfinder.sources.gphoto2_lens import lens_state
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
 from viewfinder.sources.size_limit import SizeLimit

@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from mrbokeh.video.color import color_of
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.sources.newest_of import newest_of
 from viewfinder.sources.received_frame import upright_bgr
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from threading import Event, Thread
 from typing import TypeVar
 
-from viewfinder.newest import Newest
+from viewfinder.flow.newest import Newest
 
 _POLL_S = 0.05
 

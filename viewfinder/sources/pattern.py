@@ -7,7 +7,7 @@ from threading import Event
 
 import numpy as np
 
-from viewfinder.frames import Bgr, CameraFrame
+from viewfinder.flow.frames import Bgr, CameraFrame
 from viewfinder.sources.rhythm import Rhythm
 
 DEFAULT_FPS = 30.0

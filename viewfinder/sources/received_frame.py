@@ -6,7 +6,7 @@ import numpy as np
 
 from mrbokeh.video.color import VideoColor
 from mrbokeh.video.frames import display_bgr
-from viewfinder.frames import Bgr
+from viewfinder.flow.frames import Bgr
 from viewfinder.sources.size_limit import SizeLimit
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from viewfinder.frames import Bgr
+from viewfinder.flow.frames import Bgr
 
 
 @dataclass(frozen=True)

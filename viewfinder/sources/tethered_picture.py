@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mrbokeh.lens_measuring.matching.photo_facts import read_facts
-from viewfinder.frames import Bgr, LensState
+from viewfinder.flow.frames import Bgr, LensState
 from viewfinder.sources.size_limit import SizeLimit
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")

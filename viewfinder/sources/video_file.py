@@ -7,7 +7,7 @@ from pathlib import Path
 from threading import Event
 
 from mrbokeh.video.clip import probe, read_display_frames
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.sources.rhythm import Rhythm
 from viewfinder.sources.size_limit import SizeLimit
 

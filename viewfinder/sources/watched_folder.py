@@ -7,7 +7,7 @@ from pathlib import Path
 from threading import Event
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.sources.size_limit import SizeLimit
 from viewfinder.sources.tethered_picture import SUFFIXES, NotWholeError, TetheredPicture, read_tethered
 

@@ -9,7 +9,7 @@ from threading import Event
 from typing import Any
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
 from viewfinder.sources.size_limit import SizeLimit
 

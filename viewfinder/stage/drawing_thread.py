@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from threading import Event, Lock, Thread
 
 from mrbokeh.system.errors import InputError
-from viewfinder.newest import Newest
+from viewfinder.flow.newest import Newest
 from viewfinder.stage.drawn_layer import Drawing, DrawRequest, draw
 from viewfinder.stage.redraw import is_outdated
 from viewfinder.stage.resolution import AdaptiveResolution

@@ -15,7 +15,7 @@ from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.staging.scene_description import PlacedObject, Triple
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.upright import upright_camera
-from viewfinder.frames import Bgr
+from viewfinder.flow.frames import Bgr
 from viewfinder.stage.drawing_thread import DrawingThread
 from viewfinder.stage.drawn_layer import DrawRequest, sharp_layers
 from viewfinder.stage.fade import Fade

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from mrbokeh.compositing.overlay import CodeTables, Overlay
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import Bgr
+from viewfinder.flow.frames import Bgr
 from viewfinder.stage.seen import Seen
 
 Plane = Float32[np.ndarray, "height width"]

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from viewfinder.frame_header import frame_header
-from viewfinder.frames import OutputFrame
-from viewfinder.newest import Newest
+from viewfinder.flow.frame_header import frame_header
+from viewfinder.flow.frames import OutputFrame
+from viewfinder.flow.newest import Newest
 from viewfinder.streaming.audience import Audience
 from viewfinder.streaming.encoder import StreamQuality, VideoEncoder
 from viewfinder.streaming.h264 import h264_encoder

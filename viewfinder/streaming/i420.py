@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 
 from mrbokeh.video.color import LIMITED, VideoColor
-from viewfinder.frames import Bgr
+from viewfinder.flow.frames import Bgr
 from viewfinder.streaming._i420_numba import SHIFT, i420_from_bgr
 
 # BT.601 at every size: browsers take VP8 for nothing else, and show H.264 that is tagged so within 2 codes. One conversion serves both.

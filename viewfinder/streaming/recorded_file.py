@@ -12,7 +12,7 @@ from mrbokeh.compositing.overlay import CodeTables
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.frames import encoding_for
-from viewfinder.frames import Bgr, OutputFrame
+from viewfinder.flow.frames import Bgr, OutputFrame
 from viewfinder.streaming.encoder import TIME_BASE
 from viewfinder.streaming.i420 import even_size
 

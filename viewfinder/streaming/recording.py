@@ -13,7 +13,7 @@ from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.system.atomic_files import refuse_existing
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.frames import encoding_for
-from viewfinder.frames import OutputFrame
+from viewfinder.flow.frames import OutputFrame
 from viewfinder.streaming.recorded_file import FileForm, Written, write_recording
 
 _POLL_S = 0.1

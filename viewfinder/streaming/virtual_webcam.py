@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import Bgr, OutputFrame
-from viewfinder.newest import Newest
+from viewfinder.flow.frames import Bgr, OutputFrame
+from viewfinder.flow.newest import Newest
 
 ANY_DEVICE = "auto"
 _FPS = 30.0

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from aiohttp import web
 
 from mrbokeh.system.errors import InputError
-from viewfinder.mdns_candidates import with_address
 from viewfinder.streaming.encoded_stream import EncodedStream
+from viewfinder.streaming.mdns_candidates import with_address
 
 if TYPE_CHECKING:
     from viewfinder.streaming.viewer_connection import ViewerConnection

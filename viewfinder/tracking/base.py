@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from mrbokeh.optics.camera import Camera
-from viewfinder.frames import CameraFrame, Pose
+from viewfinder.flow.frames import CameraFrame, Pose
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from mrbokeh.tracking.charuco.corner_flow import FrameHistory
 from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit
 from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.detection_thread import Detections, DetectionThread
 

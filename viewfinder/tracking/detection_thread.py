@@ -7,7 +7,7 @@ from time import monotonic
 from typing import Protocol, runtime_checkable
 
 from mrbokeh.tracking.charuco.detector import Corners, Grey
-from viewfinder.newest import Newest
+from viewfinder.flow.newest import Newest
 
 _POLL_S = 0.1
 _LEAVE_S = 3.0

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import LensState
+from viewfinder.flow.frames import LensState
 
 AXES = ("focus_m", "zoom_mm", "f_number")
 _COLUMNS = ("axis", "count", "value")

@@ -7,7 +7,7 @@ from mrbokeh.optics.camera_file import camera_from_json
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import is_rigid
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mrbokeh.tracking.camera_track.stage_axes import CAMERA_FROM_STAGE_CAMERA, pan_tilt_roll_deg, stage_rotation
 from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
-from viewfinder.frames import UNKNOWN_LENS, Pose
+from viewfinder.flow.frames import UNKNOWN_LENS, Pose
 from viewfinder.tracking.encoder_table import EncoderTable
 from viewfinder.tracking.tracking_sample import STAGE_FROM_BOARD, MalformedMessageError, TrackingSample
 

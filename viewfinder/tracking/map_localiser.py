@@ -7,7 +7,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners, Grey
-from viewfinder.frames import Pose
+from viewfinder.flow.frames import Pose
 from viewfinder.tracking.map_pose import pose_in_map
 from viewfinder.tracking.sift_features import find_features
 from viewfinder.tracking.sparse_map import SparseMap

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import MissingExtraError
-from viewfinder.frames import Pose
+from viewfinder.flow.frames import Pose
 
 FEWEST_POINTS = 12
 """With fewer, wrong matches agree on a pose now and then."""

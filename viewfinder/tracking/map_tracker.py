@@ -8,7 +8,7 @@ import numpy as np
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.corner_flow import FrameHistory
 from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners
-from viewfinder.frames import CameraFrame, Pose
+from viewfinder.flow.frames import CameraFrame, Pose
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.detection_thread import Detections, DetectionThread
 from viewfinder.tracking.map_localiser import MapLocaliser

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from viewfinder.frames import Pose
+from viewfinder.flow.frames import Pose
 
 SLOWEST_HZ = 0.5
 QUICKENING = 1.0

@@ -21,7 +21,7 @@ from mrbokeh.tracking.camera_track.opentrackio_sample import (
     sampled_s,
 )
 from mrbokeh.tracking.camera_track.world_axes import inverted
-from viewfinder.frames import LensState, Pose
+from viewfinder.flow.frames import LensState, Pose
 from viewfinder.tracking.opentrackio_packets import CBOR, JSON
 from viewfinder.tracking.tracking_sample import STAGE_FROM_BOARD, MalformedMessageError, TrackingSample
 

@@ -6,7 +6,7 @@ from threading import Event
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import Tracker
 from viewfinder.tracking.phone_rig import FEWEST_PAIRS, PhoneRig, calibrate_in_one_world
 from viewfinder.tracking.phone_tracker import PhoneFrames, PhoneTracker

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import CameraFrame, Pose
+from viewfinder.flow.frames import CameraFrame, Pose
 from viewfinder.tracking.base import TrackedPose, Tracker
 from viewfinder.tracking.phone_rig import PhoneRig
 from viewfinder.tracking.pose_history import PoseHistory

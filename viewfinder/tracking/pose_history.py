@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from threading import Lock
 
 from mrbokeh.tracking.camera_track.between_frames import pose_between
-from viewfinder.frames import LensState, Pose
+from viewfinder.flow.frames import LensState, Pose
 from viewfinder.tracking.tracking_sample import TrackingSample, lens_between
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.tracking.camera_track.world_axes import rigid
-from viewfinder.frames import Pose
+from viewfinder.flow.frames import Pose
 
 
 def rigid_of(parameters: Float[np.ndarray, "6"]) -> Pose:

@@ -4,7 +4,7 @@ shown over needs no smoothing, and any smoothing makes the object lag behind the
 from dataclasses import replace
 
 from mrbokeh.optics.camera import Camera
-from viewfinder.frames import CameraFrame
+from viewfinder.flow.frames import CameraFrame
 from viewfinder.tracking.base import TrackedPose, Tracker
 from viewfinder.tracking.one_euro import OneEuroPose
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mrbokeh.tracking.camera_track.between_frames import focus_between_m, stop_between
-from viewfinder.frames import UNKNOWN_LENS, LensState, Pose
+from viewfinder.flow.frames import UNKNOWN_LENS, LensState, Pose
 
 STAGE_FROM_BOARD = np.diag([1.0, -1.0, -1.0, 1.0])
 """Our world (x right, y down the board, z into it) lies on the stage's ground: y along -Y, z along -Z."""

@@ -9,7 +9,7 @@ from threading import Event, Thread
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import UNKNOWN_LENS, CameraFrame, LensState
+from viewfinder.flow.frames import UNKNOWN_LENS, CameraFrame, LensState
 from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.freed import FreeDReading, freed_sample, read_freed
 from viewfinder.tracking.opentrackio import StageReading, decode_opentrackio, require_cbor

@@ -1,0 +1,91 @@
+"""COLMAP's PatchMatch stereo as an optional source of depth: it needs the package pycolmap-cuda12 and an NVIDIA GPU.
+
+The packages pycolmap and pycolmap-cuda12 hold one module of the same name: never install both. `pycolmap.has_cuda` tells how the
+module was built, not whether a GPU is there, and COLMAP ends the whole process where none is: so the driver is asked first.
+Not run in the project's own tests, for want of such a machine; what surrounds the call is.
+"""
+
+import ctypes
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from capture.dense.clues import SparseDepths
+from capture.poses.distortion import Distortion, undistorted_px
+from mrbokeh.optics.camera import Camera
+from mrbokeh.system.errors import InputError
+
+Plane = Float32[np.ndarray, "height width"]
+
+_MAPS = Path("stereo") / "depth_maps"
+
+
+def patch_match_obstacle() -> str | None:
+    """Why PatchMatch cannot run here, as a sentence; None where it can."""
+    try:
+        import pycolmap
+    except ImportError:
+        return "PatchMatch needs the package pycolmap-cuda12, which is not installed: pip install pycolmap-cuda12"
+    if not pycolmap.has_cuda:
+        return (
+            "PatchMatch needs COLMAP built for CUDA, but the package pycolmap is the one without it: "
+            "pip uninstall pycolmap, then pip install pycolmap-cuda12 (never both), or leave out --patch-match"
+        )
+    if nvidia_gpus() == 0:
+        return "PatchMatch needs an NVIDIA GPU, and its driver finds none: leave out --patch-match, the plane sweep runs on the CPU"
+    return None
+
+
+def nvidia_gpus() -> int:
+    """How many the driver sees; 0 without a driver."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return 0
+    count = ctypes.c_int(0)
+    found = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+    return count.value if found else 0
+
+
+def run_patch_match(sparse: Path, pictures: Path, workspace: Path) -> None:
+    """COLMAP's sparse model and its pictures to depth maps in the workspace, in the model's unit; raises InputError where it cannot run."""
+    obstacle = patch_match_obstacle()
+    if obstacle:
+        raise InputError(obstacle)
+    import pycolmap
+
+    pycolmap.undistort_images(workspace, sparse, pictures)
+    pycolmap.patch_match_stereo(workspace)
+
+
+def read_patch_match(workspace: Path, picture: str, camera: Camera, distortion: Distortion) -> Plane:
+    """Depth (H, W) of a picture (its file name) on its own, distorted pixels, in the model's unit; NaN where COLMAP has none."""
+    import pycolmap
+
+    path = workspace / _MAPS / f"{picture}.geometric.bin"
+    if not path.is_file():
+        raise InputError(f"expected a depth map of PatchMatch at {path}, found none: run it again with --overwrite")
+    depths = pycolmap.DepthMap()
+    depths.read(path)
+    model = pycolmap.Reconstruction(workspace / "sparse")
+    pinhole = next(image.camera for image in model.images.values() if image.name == picture)
+    fx, fy, cx, cy = (float(each) for each in pinhole.params)
+    undistorted = Camera(pinhole.width, pinhole.height, (fx, fy), (cx, cy))
+    return on_original_pixels(np.asarray(depths.to_array(), np.float32), undistorted, camera, distortion)
+
+
+def on_original_pixels(depth: Float32[np.ndarray, "rows columns"], undistorted: Camera, camera: Camera, distortion: Distortion) -> Plane:
+    """An undistorted picture's depth (0: none) seen at the pixels of the real one, the nearest for each; NaN where there is none."""
+    rays = (undistorted_px(camera, distortion, camera.pixel_centres_px()) - camera.principal_px) / np.asarray(camera.focal_px)
+    samples = (rays * undistorted.focal_px + undistorted.principal_px - 0.5).astype(np.float32)
+    x, y = np.moveaxis(np.nan_to_num(samples, nan=-10.0), -1, 0)
+    found = cv2.remap(depth, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_NEAREST, borderValue=0.0)
+    return np.where(found > 0, found, np.nan).astype(np.float32)
+
+
+def patch_match_clue(depth_m: Plane) -> SparseDepths:
+    """All known pixels as depths known at single places, for `Clues.sparse`: the sweep then looks only near them."""
+    row, column = np.nonzero(np.isfinite(depth_m))
+    return SparseDepths(np.stack([column + 0.5, row + 0.5], axis=-1), depth_m[row, column].astype(np.float64))

@@ -1,0 +1,1 @@
+"""Camera poses of several viewpoints, by COLMAP."""

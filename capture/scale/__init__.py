@@ -1,0 +1,1 @@
+"""Metres: the scale of a reconstruction and the focus of its stacks."""

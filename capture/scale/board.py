@@ -1,0 +1,176 @@
+"""The scale from a ChArUco board: its corners triangulated with the poses, then a similarity that fits the board to its pictures."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from capture.poses.distortion import undistorted_px
+from capture.poses.sparse_model import SparseModel, SparseView
+from capture.scale.answer import ScaleAnswer
+from capture.scale.board_search import BoardSearch
+from mrbokeh.optics.lens import MM_PER_M
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard
+
+FEWEST_CORNERS = 6
+POSES_SIGMA, POSES_SIGMA_WITH_DISTORTION = 5e-4, 1e-3
+"""What errors of poses and lens leave, which the corners do not show: 0.00 to 0.04 % on traced scenes where the lens has no
+distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too. That is noise of the matches: 0.1 px on 500
+points of the lab's seven views leave 0.09 % root mean square beside a term of distortion that is there, and 0.06 % without one.
+"""
+
+_MEDIAN_OF_RAYLEIGH = 1.1774  # of the length of an error whose two parts are normal with a deviation of 1
+_WRONG_SIGMAS = 5.0
+_LEAST_WRONG_PX = 0.1
+
+Points = Float[np.ndarray, "points 3"]
+
+
+@dataclass(frozen=True)
+class BoardDetections:
+    """Where the views see corners of the board: index of the view, id of the corner, position in the picture."""
+
+    views: Int[np.ndarray, " seen"]
+    corners: Int[np.ndarray, " seen"]
+    xy_px: Float[np.ndarray, "seen 2"]
+
+    def only(self, keep: np.ndarray) -> "BoardDetections":
+        return BoardDetections(self.views[keep], self.corners[keep], self.xy_px[keep])
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """y = scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    def __call__(self, points: Points) -> Points:
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def board_scale(model: SparseModel, board: CharucoBoard, pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> ScaleAnswer:
+    """pictures: 8-bit RGB, one for each view of the model, in its order and with its intrinsics."""
+    return scale_of_detections(model, board, detect_board(board, pictures))
+
+
+def detect_board(board: CharucoBoard, pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> BoardDetections:
+    search = BoardSearch(board)
+    found = [search.corners(picture) for picture in pictures]
+    views = np.concatenate([np.full(len(each), index, np.int64) for index, each in enumerate(found)])
+    return BoardDetections(views, np.concatenate([each.ids for each in found]), np.concatenate([each.xy_px for each in found]))
+
+
+def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> ScaleAnswer:
+    """Similarity of Umeyama (1991) from the triangulated corners, then refined on the pixels, where the errors are alike."""
+    seen = seen.only(_seen_twice(seen))
+    corners = np.unique(seen.corners)
+    if len(corners) < FEWEST_CORNERS:
+        raise InputError(
+            f"looked for a ChArUco board of {board.squares_text} squares ({board.dictionary}) in {len(model.views)} views "
+            f"and found {len(corners)} corners seen by two or more, but {FEWEST_CORNERS} are needed: check --board, --dictionary and "
+            f"that the board is sharp in the all-in-focus pictures"
+        )
+    start, _ = _from_triangulated(model, board, seen)
+    fit, sigma = _fit_to_pixels(model, board, seen, start)
+    wrong = _wrong(_residuals_px(model, board, seen, fit))
+    right = seen.only(~wrong)
+    right = right.only(_seen_twice(right))
+    if wrong.any() and len(np.unique(right.corners)) >= FEWEST_CORNERS:
+        seen = right
+        fit, sigma = _fit_to_pixels(model, board, seen, fit)
+    start, residual_mm = _from_triangulated(model, board, seen)
+    facts = {
+        "corners": len(np.unique(seen.corners)),
+        "detections": len(seen.corners),
+        "views": len(np.unique(seen.views)),
+        "residual_px": float(np.sqrt(np.mean(np.sum(_residuals_px(model, board, seen, fit) ** 2, axis=1)))),
+        "residual_mm": residual_mm,
+        "uncertainty_of_corners": sigma,
+        "metres_per_unit_of_triangulated_corners": 1.0 / start.scale,
+    }
+    of_poses = POSES_SIGMA_WITH_DISTORTION if any(any(view.distortion) for view in model.views) else POSES_SIGMA
+    return ScaleAnswer("board", 1.0 / fit.scale, float(np.hypot(sigma, of_poses)), facts, board_outlines(model, board, seen, fit))
+
+
+def board_outlines(model: SparseModel, board: CharucoBoard, seen: BoardDetections, fit: Similarity) -> dict[str, list[list[float]]]:
+    """The four corners of the board in the picture of every view that saw it; beyond the frame where the board is."""
+    width_m, height_m = (side / MM_PER_M for side in board.size_mm)
+    corners_m = np.array([(0.0, 0.0, 0.0), (width_m, 0.0, 0.0), (width_m, height_m, 0.0), (0.0, height_m, 0.0)])
+    views = [model.views[index] for index in np.unique(seen.views)]
+    return {view.name: view.project(fit(corners_m))[0].tolist() for view in views}
+
+
+def _wrong(residuals_px: Float[np.ndarray, "seen 2"]) -> np.ndarray:
+    """Beyond five standard deviations of what is usual here: corners that something half covers lie a pixel or so off."""
+    off_px = np.linalg.norm(residuals_px, axis=1)
+    return off_px > max(_WRONG_SIGMAS * float(np.median(off_px)) / _MEDIAN_OF_RAYLEIGH, _LEAST_WRONG_PX)
+
+
+def _from_triangulated(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> tuple[Similarity, float]:
+    """From the board to the model by points in space, and how far these lie off, root mean square, in mm."""
+    corners = np.unique(seen.corners)
+    points = np.array(
+        [triangulate([model.views[v] for v in seen.views[seen.corners == c]], seen.xy_px[seen.corners == c]) for c in corners]
+    )
+    found = umeyama(board.corners_m[corners], points)
+    off_m = (points - found(board.corners_m[corners])) / found.scale
+    return found, float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))) * MM_PER_M)
+
+
+def _seen_twice(seen: BoardDetections) -> np.ndarray:
+    return np.bincount(seen.corners)[seen.corners] >= 2 if len(seen.corners) else np.zeros(0, bool)
+
+
+def triangulate(views: Sequence[SparseView], xy_px: Float[np.ndarray, "seen 2"]) -> Float[np.ndarray, "3"]:
+    """The point nearest to the rays of all views, in least squares."""
+    matrix, right = np.zeros((3, 3)), np.zeros(3)
+    for view, place in zip(views, xy_px, strict=True):
+        pinhole = undistorted_px(view.camera, view.distortion, place)
+        ray = view.camera.unproject(pinhole, np.asarray(1.0)) - view.centre
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        matrix += across
+        right += across @ view.centre
+    return np.linalg.solve(matrix, right)
+
+
+def umeyama(source: Points, target: Points) -> Similarity:
+    """The similarity with the least squared distance from source to target (Umeyama 1991, eqs. 40-42)."""
+    mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
+    centred_s, centred_t = source - mean_s, target - mean_t
+    u, singular, vt = np.linalg.svd(centred_t.T @ centred_s)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u * sign @ vt
+    scale = float((singular * sign).sum() / (centred_s**2).sum())
+    return Similarity(scale, rotation, mean_t - scale * rotation @ mean_s)
+
+
+def _fit_to_pixels(model: SparseModel, board: CharucoBoard, seen: BoardDetections, start: Similarity) -> tuple[Similarity, float]:
+    """(the similarity of least squared reprojection errors, robust; the relative standard deviation of its scale)."""
+
+    def similarity(parameters: np.ndarray) -> Similarity:
+        turn = Rotation.from_rotvec(parameters[1:4]).as_matrix()
+        return Similarity(start.scale * float(np.exp(parameters[0])), turn @ start.rotation, start.translation + length * parameters[4:])
+
+    def residuals(parameters: np.ndarray) -> np.ndarray:
+        return _residuals_px(model, board, seen, similarity(parameters)).ravel()
+
+    length = start.scale * board.grids[0].square_mm / MM_PER_M
+    result = least_squares(residuals, np.zeros(7), loss="soft_l1", f_scale=0.5, x_scale="jac")
+    freedom = max(result.fun.size - 7, 1)
+    covariance = np.linalg.inv(result.jac.T @ result.jac) * float(result.fun @ result.fun) / freedom
+    return similarity(result.x), float(np.sqrt(covariance[0, 0]))
+
+
+def _residuals_px(model: SparseModel, board: CharucoBoard, seen: BoardDetections, fit: Similarity) -> Float[np.ndarray, "seen 2"]:
+    points = fit(board.corners_m)[seen.corners]
+    residuals = np.empty((len(points), 2))
+    for index in np.unique(seen.views):
+        of_view = seen.views == index
+        residuals[of_view] = model.views[index].project(points[of_view])[0] - seen.xy_px[of_view]
+    return residuals

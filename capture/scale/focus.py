@@ -1,0 +1,183 @@
+"""The scale from the stacks' own focus distances: where points are sharpest against where the model puts them.
+
+A point at depth z (model units, from the entrance pupil) is sharp in the slice whose stated focus distance D, less one offset e
+for the lens, is its depth in metres: 1 / (D - e) = 1 / (s z). EXIF counts from the film plane, the thin lens from its principal
+plane, COLMAP from the entrance pupil; e is what is left between them, a few centimetres at most.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from capture.poses.cauchy_loss import CAUCHY_95, deviation
+from capture.poses.lens_calibration import stated_distances_m
+from capture.poses.sparse_model import SparseModel
+from capture.scale.answer import ScaleAnswer
+from capture.scale.sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
+from capture.stacks.sentinel_focus import stated_by_sentinel
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.progress import track
+
+FEWEST_POINTS = 50
+OFFSET_SIGMA_M = 0.03
+"""How far the entrance pupil of a photographic lens may well lie from where its focus distances count."""
+SIGNIFICANT = 3.0
+"""Standard deviations from 0 at which an offset counts."""
+
+_NO_OFFSET_M = 1e-6
+_STEPS = 25
+_LEAST_STATED_SIGMA = 0.001
+
+
+@dataclass(frozen=True)
+class FocusSample:
+    """Peaks of one stack. depth: of its peaks, in model units. focus_dioptres: as stated, NaN where unknown.
+
+    stated_sigma: one standard deviation of these, by the intervals that the cameras' codes stand for; 0 where nothing is known of it,
+    inf where a sentinel stands for the distance: such a slice has no say.
+    """
+
+    view: str
+    peaks: SharpnessPeaks
+    xy_px: Float[np.ndarray, "peaks 2"]
+    depth: Float[np.ndarray, " peaks"]
+    focus_dioptres: Float[np.ndarray, " slices"]
+    stated_sigma: Float[np.ndarray, " slices"]
+
+
+def focus_sample(model: SparseModel, view: str, stack: FocalStack) -> FocusSample:
+    """Sharpness of the stack's registered slices at the points that the view observes."""
+    if not stack.registered:
+        raise InputError(f"{stack.folder} is not registered: run `mrbokeh capture merge` on it")
+    xy_px, depth = model.depths_in(view)
+    curves = sharpness_curves(track(stack.iter_rgb(), f"{view}: sharpness", len(stack)), xy_px)
+    peaks = sharpness_peaks(curves)
+    stated = np.array([np.nan if distance is None else 1.0 / distance for distance in stated_distances_m(stack)])
+    return FocusSample(view, peaks, xy_px[peaks.points], depth[peaks.points], stated, stated_sigma_dioptre(stack))
+
+
+def stated_sigma_dioptre(stack: FocalStack) -> Float[np.ndarray, " slices"]:
+    """Of a distance that may lie anywhere in its interval: the width over the square root of 12; inf where it is stated by a sentinel.
+
+    A sentinel's interval has a width too, but is one-sided about its infinity: that would pull all one way, however little it weighs.
+    """
+    intervals = [(each.metadata.get("focus") or {}).get("lens_interval_dioptre") or (0.0, 0.0) for each in stack.slices]
+    widths = np.array([abs(float(upper) - float(lower)) for lower, upper in intervals])
+    return np.where(stated_by_sentinel(stack), np.inf, widths / np.sqrt(12.0))
+
+
+@dataclass(frozen=True)
+class _Peaks:
+    """Peaks of all stacks in one: dioptre by the stated distances, depth in units, group: the stated distance it is sharpest at."""
+
+    dioptre: Float[np.ndarray, " peaks"]
+    depth: Float[np.ndarray, " peaks"]
+    group: Int[np.ndarray, " peaks"]
+    stated_sigma: Float[np.ndarray, " peaks"]
+
+
+def focus_scale(samples: Sequence[FocusSample]) -> ScaleAnswer:
+    """Robust fit of the scale and one offset; each stated distance may be off by an error that its points share.
+
+    Scale and offset pull on each other, so an offset that is not told apart from 0 is set to 0; what that would change in the
+    scale counts as uncertainty.
+    """
+    peaks = _joined(samples, 0.0)
+    if len(peaks.depth) < FEWEST_POINTS:
+        raise InputError(
+            f"looked for points whose sharpness peaks between slices of known focus distance and found {len(peaks.depth)} in "
+            f"{len(samples)} stacks, but {FEWEST_POINTS} are needed: give focus distances (lens.toml), more slices or more texture"
+        )
+    peaks = _joined(samples, _fit(peaks, OFFSET_SIGMA_M).offset_m)
+    with_offset, without = _fit(peaks, OFFSET_SIGMA_M), _fit(peaks, _NO_OFFSET_M)
+    told_apart = abs(with_offset.offset_m) > SIGNIFICANT * with_offset.offset_sigma_m
+    used = with_offset if told_apart else without
+    between = abs(with_offset.scale / without.scale - 1.0)
+    facts = {
+        "points": len(peaks.depth),
+        "stacks": len(samples),
+        "offset_m": with_offset.offset_m if told_apart else 0.0,
+        "fitted_offset_m": with_offset.offset_m,
+        "offset_uncertainty_m": with_offset.offset_sigma_m,
+        "residual_dioptre": used.residual_dioptre,
+        "stated_error_dioptre": used.stated_sigma_dioptre,
+        "metres_per_unit_with_offset": with_offset.scale,
+        "metres_per_unit_without_offset": without.scale,
+    }
+    return ScaleAnswer("focus", used.scale, used.scale_sigma if told_apart else float(np.hypot(used.scale_sigma, between)), facts)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """scale_sigma is relative. residual_dioptre: of one peak. stated_sigma_dioptre: of the stated distances, beyond their peaks' noise."""
+
+    scale: float
+    scale_sigma: float
+    offset_m: float
+    offset_sigma_m: float
+    residual_dioptre: float
+    stated_sigma_dioptre: float
+
+
+def _fit(peaks: _Peaks, offset_sigma_m: float) -> _Fit:
+    """Gauss-Newton on the means of the groups, Cauchy-weighted within each.
+
+    Groups count by their points, for noise is even over the picture; but how sure the result is depends on how far whole groups
+    are off, as they show it and as the stated intervals allow: a sandwich covariance (Huber 1967).
+    """
+    scale, offset_m = float(np.median(1.0 / (peaks.dioptre * peaks.depth))), 0.0
+    members = [np.flatnonzero(peaks.group == group) for group in np.unique(peaks.group)]
+    prior = np.diag([0.0, offset_sigma_m**-2.0])
+    for _ in range(_STEPS):
+        from_pupil = 1.0 / np.maximum(1.0 / peaks.dioptre - offset_m, 1e-3)
+        by_model = 1.0 / (scale * peaks.depth)
+        off = from_pupil - by_model
+        means, noise, directions = _group_means(off, np.stack([by_model, from_pupil**2], axis=1), members)
+        weighted = directions / noise[:, None]
+        normal = weighted.T @ directions + prior
+        step = np.linalg.solve(normal, weighted.T @ means + prior @ [0.0, offset_m])
+        scale, offset_m = scale * float(np.exp(-step[0])), offset_m - float(step[1])
+    shown = float(np.sum(np.maximum(means**2 - noise, 0.0))) / max(len(members) - 2, 1)
+    stated = np.array([np.mean(peaks.stated_sigma[mine] ** 2) for mine in members])
+    between = np.maximum(np.maximum(shown, stated), _LEAST_STATED_SIGMA**2)
+    inverse = np.linalg.inv(normal)
+    meat = (weighted * (noise + between)[:, None]).T @ weighted + prior
+    sigma = np.sqrt(np.diag(inverse @ meat @ inverse))
+    return _Fit(scale, float(sigma[0]), offset_m, float(sigma[1]), deviation(off), float(np.sqrt(np.mean(between))))
+
+
+def _group_means(off: np.ndarray, slopes: np.ndarray, members: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(robust mean of each group, its variance from noise, its derivatives by log scale and offset)."""
+    means, noise, directions = [], [], []
+    for mine in members:
+        middle = np.median(off[mine])
+        spread = deviation(off[mine] - middle)
+        weight = 1.0 / (1.0 + ((off[mine] - middle) / (CAUCHY_95 * spread)) ** 2)
+        means.append(np.average(off[mine], weights=weight))
+        noise.append(spread**2 / weight.sum())
+        directions.append(np.average(slopes[mine], axis=0, weights=weight))
+    return np.array(means), np.array(noise), np.array(directions)
+
+
+def _joined(samples: Sequence[FocusSample], offset_m: float) -> _Peaks:
+    """Peaks by the distances as stated; their parabolas lie where the blur is even: in dioptres from the pupil, by this offset."""
+    dioptres, depths, groups, sigmas = [np.zeros(0)], [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros(0)]
+    stated: dict[float, int] = {}
+    for sample in samples:
+        known = np.isfinite(sample.focus_dioptres)
+        if not known.all():
+            continue
+        names = [stated.setdefault(round(float(each), 6), len(stated)) for each in sample.focus_dioptres]
+        told = np.where(np.isfinite(sample.stated_sigma), sample.focus_dioptres, np.nan)
+        with np.errstate(divide="ignore"):
+            from_pupil = sample.peaks.dioptres(1.0 / (1.0 / told - offset_m))
+            dioptre = 1.0 / (1.0 / from_pupil + offset_m)
+        good = np.isfinite(dioptre) & (dioptre > 0) & (sample.depth > 0)
+        dioptres.append(dioptre[good])
+        depths.append(sample.depth[good])
+        groups.append(np.array(names, np.int64)[sample.peaks.highest[good]])
+        sigmas.append(sample.stated_sigma[sample.peaks.highest[good]])
+    return _Peaks(np.concatenate(dioptres), np.concatenate(depths), np.concatenate(groups), np.concatenate(sigmas))

@@ -1,0 +1,150 @@
+"""Where each slice of a stack is really focused and how fast its blur grows, found against depth from several views.
+
+Blur around points of known depth is c = k_i |F_i - 1 / z| in slice i: both flanks of a V over the dioptres, whose tip is the focus
+F_i (from the entrance pupil) and whose slope is k_i. A thin lens has k_i = Lens.coc_px_per_dioptre, but lenses that focus by
+moving glass inside change focal length and pupil, and f-numbers are nominal; EXIF's focus is coarse and counts from elsewhere.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import least_squares
+
+from capture.poses.cauchy_loss import CAUCHY_95, squared_under_cauchy, squared_under_cauchy_slope
+from capture.scale.focus_calibration_blur import MOST_BLUR_PX, BlurSamples
+from mrbokeh.system.errors import InputError
+
+FEWEST_SAMPLES = 60
+LEAST_BLUR_PX = 2.0
+FOCUS_SIGMA_DIOPTRE = 0.05
+"""How far a first idea of the focus may well be off: half a step of Nikon's 8-bit code is 0.03 to 0.06 dioptres at 0.5 to 1 m."""
+
+GROWTH_SIGMA = 0.01
+"""How far the growth in one slice, over that of a thin lens, may well differ from the growth in the others."""
+
+_DIAMETER_SIGMA_PX = 0.1
+_COMMON_ERROR_PX = 0.06  # of all diameters of a slice alike: what the foci of a traced lab of 12 slices were off, times their growth
+_PASSES = 4
+_TRIED = 101
+_ROUGH_PX = 0.5
+
+
+@dataclass(frozen=True)
+class FocusStart:
+    """First ideas: focus dioptres of the slices, and how their growth of blur compares (a thin lens's px per dioptre, or all 1).
+
+    sigma_dioptre: how far the dioptres may well be off, of all slices or of each. beyond: slices of which nothing else is known than that
+    they are focused beyond all others, so that their focus is looked for there: from too far a start the fit finds a wrong one.
+    """
+
+    dioptres: Float[np.ndarray, " slices"]
+    growth: Float[np.ndarray, " slices"]
+    sigma_dioptre: float | Float[np.ndarray, " slices"] = FOCUS_SIGMA_DIOPTRE
+    beyond: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class FocusFit:
+    """dioptres: focus of each slice, 1 / metres from the entrance pupil. px_per_dioptre: of the registered slices measured.
+
+    sigma_dioptre: one standard deviation of each focus. samples: how many measured diameters tell of each slice.
+    """
+
+    dioptres: Float[np.ndarray, " slices"]
+    px_per_dioptre: Float[np.ndarray, " slices"]
+    sigma_dioptre: Float[np.ndarray, " slices"]
+    samples: Int[np.ndarray, " slices"]
+
+
+def calibrate_focus(blur: BlurSamples, point_dioptres: Float[np.ndarray, " points"], start: FocusStart) -> FocusFit:
+    """Robust fit (Cauchy's loss) of all V's of a stack; where nothing tells, the start stays.
+
+    point_dioptres: 1 / metres of the points by the scaled model.
+    """
+    fit = _Fit(blur.slices, point_dioptres[blur.points], blur.diameter_px, start)
+    if len(blur.slices) < FEWEST_SAMPLES:
+        raise InputError(
+            f"looked for blur between {LEAST_BLUR_PX:g} and {MOST_BLUR_PX:g} px around points of known depth and found it "
+            f"{len(blur.slices)} times, but {FEWEST_SAMPLES} are needed to calibrate the focus: more texture or more slices"
+        )
+    values = fit.first_values()
+    for _ in range(_PASSES):
+        within = fit.measurable(values)
+        result = least_squares(fit.residuals, values, fit.jacobian, args=(within,), loss="cauchy")
+        values = result.x
+    covariance = np.linalg.pinv(result.jac.T @ result.jac) / CAUCHY_95**2
+    count = len(start.dioptres)
+    dioptres, growth = fit.meaning(values)
+    told = np.bincount(blur.slices[within], minlength=count)
+    variances = np.diag(covariance)[-count:]
+    if (variances < 0.0).any() or (growth <= 0.0).any():
+        raise InputError("no focus distances explain how the blur of the slices grows with depth: is the scale of the poses right?")
+    sigma = np.hypot(np.sqrt(variances), _COMMON_ERROR_PX / growth)
+    return FocusFit(dioptres, growth, sigma, told)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Parameters: log of the common growth, the deviations of the slices from it, their focus dioptres."""
+
+    slices: np.ndarray
+    point_dioptre: np.ndarray
+    diameter_px: np.ndarray
+    start: FocusStart
+
+    def first_values(self) -> np.ndarray:
+        off = np.abs(self.start.dioptres[self.slices] - self.point_dioptre) * self.start.growth[self.slices]
+        told = ~np.isin(self.slices, self.start.beyond)
+        common = float(np.median((self.diameter_px / np.maximum(off, 1e-6))[told if told.any() else slice(None)]))
+        dioptres = self.start.dioptres.copy()
+        for index in self.start.beyond:
+            dioptres[index] = self._looked_for(index, common)
+        return np.concatenate([[np.log(common)], np.zeros(len(dioptres)), dioptres])
+
+    def _looked_for(self, index: int, common: float) -> float:
+        """The focus between infinity and the others' that explains most samples of a slice; where it has none, that of the start."""
+        mine, others = self.slices == index, np.delete(self.start.dioptres, self.start.beyond)
+        if not mine.any() or not others.size:
+            return float(self.start.dioptres[index])
+        tried = np.linspace(0.0, others.min(), _TRIED)
+        predicted = common * self.start.growth[index] * np.abs(tried[:, None] - self.point_dioptre[mine])
+        return float(tried[np.log1p(((predicted - self.diameter_px[mine]) / _ROUGH_PX) ** 2).sum(axis=1).argmin()])
+
+    def meaning(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        count = len(self.start.dioptres)
+        return values[1 + count :], np.exp(values[0]) * (1.0 + values[1 : 1 + count]) * self.start.growth
+
+    def predicted_px(self, values: np.ndarray) -> np.ndarray:
+        dioptres, growth = self.meaning(values)
+        return np.asarray(growth[self.slices] * np.abs(dioptres[self.slices] - self.point_dioptre))
+
+    def measurable(self, values: np.ndarray) -> np.ndarray:
+        """By prediction and not by measurement, which would prefer those that noise has pushed inside."""
+        predicted = self.predicted_px(values)
+        return (predicted > LEAST_BLUR_PX) & (predicted < MOST_BLUR_PX)
+
+    def residuals(self, values: np.ndarray, within: np.ndarray) -> np.ndarray:
+        off_px = (self.predicted_px(values) - self.diameter_px)[within] / _DIAMETER_SIGMA_PX
+        return np.concatenate([off_px / CAUCHY_95, squared_under_cauchy(self._off_priors(values))])
+
+    def _off_priors(self, values: np.ndarray) -> np.ndarray:
+        count = len(self.start.dioptres)
+        uneven = values[1 : 1 + count] / GROWTH_SIGMA
+        moved = (values[1 + count :] - self.start.dioptres) / self.start.sigma_dioptre
+        return np.concatenate([uneven, moved]) / CAUCHY_95
+
+    def jacobian(self, values: np.ndarray, within: np.ndarray) -> np.ndarray:
+        """Derivatives of the residuals: (samples within + two priors for each slice, parameters)."""
+        count, slices = len(self.start.dioptres), self.slices[within]
+        dioptres, growth = self.meaning(values)
+        off = dioptres[slices] - self.point_dioptre[within]
+        rows, predicted = np.arange(len(slices)), growth[slices] * np.abs(off)
+        matrix = np.zeros((len(slices) + 2 * count, 1 + 2 * count))
+        matrix[rows, 0] = predicted
+        matrix[rows, 1 + slices] = predicted / (1.0 + values[1 + slices])
+        matrix[rows, 1 + count + slices] = growth[slices] * np.sign(off)
+        matrix[rows] /= _DIAMETER_SIGMA_PX * CAUCHY_95
+        widths = np.concatenate([np.full(count, GROWTH_SIGMA), np.broadcast_to(self.start.sigma_dioptre, count)]) * CAUCHY_95
+        matrix[len(slices) :, 1:] = np.diag(squared_under_cauchy_slope(self._off_priors(values)) / widths)
+        return matrix

@@ -1,0 +1,169 @@
+"""The scale of a scene's camera poses in metres by every means at hand, and what follows from it: calibrated focus, metric cameras."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.poses.colmap_job import job_from_json
+from capture.poses.lens_calibration import FILE_NAME as CALIBRATION_NAME
+from capture.poses.lens_calibration import LensCalibration, write_lens_calibration
+from capture.poses.lens_calibration_stacks import write_calibrated
+from capture.poses.sparse_model import SparseModel
+from capture.poses.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
+from capture.scale.answer import ScaleAnswer
+from capture.scale.board import board_scale
+from capture.scale.distance import distance_scale
+from capture.scale.focus import FocusSample, focus_sample, focus_scale
+from capture.scale.focus_calibration_stacks import StackFocus, calibrated_stack, focus_start, lens_calibrations, stack_focus, with_view
+from capture.scale.scale_file import ScaleResult, read_scale, write_scale
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_NAME
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
+from mrbokeh.stacks.guessed_metres import metres_facts
+from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard
+
+RECONSTRUCTION_FOLDER = "reconstruction"
+JOB_NAME = "colmap_job.json"
+
+Picture = UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True)
+class ScaleRequest:
+    """board: that lies in the scene. distance: (view, view, metres) between two camera centres. calibrate: also the focus."""
+
+    board: CharucoBoard | None = None
+    distance: tuple[str, str, float] | None = None
+    calibrate: bool = True
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class ScaledScene:
+    """calibrated: the fit of each stack. uncalibrated: why others have none. written: lens calibrations, the scene's own first."""
+
+    result: ScaleResult
+    calibrated: Mapping[str, StackFocus] = field(default_factory=dict)
+    uncalibrated: Mapping[str, str] = field(default_factory=dict)
+    calibrations: tuple[LensCalibration, ...] = ()
+
+
+def scale_scene(scene: Path | str, request: ScaleRequest) -> ScaledScene:
+    """Write scale.json; for stacks also lens_calibration.json, and into stack.json the calibrated focus and the metric camera.
+
+    A scale that is there already is kept. Raises InputError where no method answers, or one that was asked for does not.
+    """
+    scene = Path(scene)
+    folder = reconstruction_folder(scene)
+    if (folder / SCALE_NAME).exists() and not request.overwrite:
+        return ScaledScene(_kept(folder, request))
+    model = replace(read_sparse_model(folder), metres_per_unit=None)
+    stacks = merged_stacks(scene, model)
+    samples = {view: focus_sample(model, view, stack) for view, stack in stacks.items()}
+    result = _answers(model, folder, samples, request)
+    scaled = _calibrated(scene, model, stacks, samples, result) if request.calibrate and stacks else ScaledScene(result)
+    # Last, as the sign that all is done: a run that was interrupted before starts anew.
+    write_scale(folder, result)
+    return scaled
+
+
+def _kept(folder: Path, request: ScaleRequest) -> ScaleResult:
+    """The scale that is there. Raises InputError where something is asked for that it does not rest on."""
+    kept = read_scale(folder)
+    facts = {each.method: each.facts for each in kept.answers}
+    if request.board is not None and "board" not in facts:
+        raise InputError(f"{folder / SCALE_NAME} was found without a board: --overwrite finds the scale again with it")
+    if request.distance is not None:
+        *views, metres = request.distance
+        if facts.get("distance") != {"views": views, "metres": metres}:
+            raise InputError(f"{folder / SCALE_NAME} was found without this --distance: --overwrite finds the scale again with it")
+    return kept
+
+
+def reconstruction_folder(scene: Path) -> Path:
+    """SCENE/reconstruction, or the folder itself where plain pictures were reconstructed into it."""
+    return scene if (scene / POSES_NAME).exists() else scene / RECONSTRUCTION_FOLDER
+
+
+def merged_stacks(scene: Path, model: SparseModel) -> dict[str, FocalStack]:
+    """The stacks of the model's views, so far as there are any and they are merged."""
+    folders = {view.name: scene / view.name for view in model.views}
+    stacks = {name: read_focal_stack(folder) for name, folder in folders.items() if (folder / STACK_NAME).is_file()}
+    return {name: stack for name, stack in stacks.items() if stack.registered and stack.merged}
+
+
+def _answers(model: SparseModel, folder: Path, samples: Mapping[str, FocusSample], request: ScaleRequest) -> ScaleResult:
+    """What was asked for must answer; the focus distances are tried in any case."""
+    answers: list[ScaleAnswer] = []
+    missing = {"board": "none was given (--board)", "distance": "none was given (--distance)"}
+    if request.board is not None:
+        answers.append(board_scale(model, request.board, view_pictures(model, folder)))
+    if request.distance is not None:
+        answers.append(distance_scale(model, *request.distance))
+    try:
+        answers.append(_focus_answer(samples))
+    except InputError as error:
+        missing["focus"] = str(error)
+    found = {each.method for each in answers}
+    return ScaleResult.of(answers, {method: why for method, why in missing.items() if method not in found})
+
+
+def _focus_answer(samples: Mapping[str, FocusSample]) -> ScaleAnswer:
+    if not samples:
+        raise InputError("the scene has no merged stacks whose focus distances could tell")
+    if not any(np.isfinite(sample.focus_dioptres).all() for sample in samples.values()):
+        raise InputError("the focus distances of the stacks are unknown")
+    return focus_scale(list(samples.values()))
+
+
+def view_pictures(model: SparseModel, folder: Path) -> Iterator[Picture]:
+    """The 8-bit pictures that the poses were found with, in the order of the views."""
+    job = job_from_json(read_json(folder / JOB_NAME, "what COLMAP was asked to do (run `mrbokeh capture poses --overwrite`)"))
+    for view in model.views:
+        path = folder / job.pictures_folder / job.file_of(view.name)
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if picture is None:
+            raise InputError(f"cannot read {path}: run `mrbokeh capture poses --overwrite`")
+        yield np.ascontiguousarray(picture[..., ::-1])
+
+
+def _calibrated(
+    scene: Path, model: SparseModel, stacks: Mapping[str, FocalStack], samples: Mapping[str, FocusSample], result: ScaleResult
+) -> ScaledScene:
+    """stack.json of every stack gets its camera; a stack whose focus cannot be calibrated keeps its stated distances."""
+    metric = model.times(result.used.metres_per_unit)
+    offset_m = offset_of(result)
+    calibrated, uncalibrated = {}, {}
+    for name, stack in stacks.items():
+        width_px = metric.view(name).camera.width_px
+        try:
+            start = focus_start(stack, samples[name], result.used.metres_per_unit, offset_m, width_px)
+            calibrated[name] = stack_focus(metric, name, stack, start)
+        except InputError as error:
+            uncalibrated[name] = str(error)
+    calibrations = tuple(lens_calibrations(calibrated, offset_m))
+    for number, calibration in enumerate(calibrations):
+        write_lens_calibration(scene / numbered(CALIBRATION_NAME, number), calibration)
+    for name, stack in stacks.items():
+        view = metric.view(name)
+        changed = calibrated_stack(calibrated[name], view) if name in calibrated else with_view(stack, view)
+        if name in calibrated and metres_facts(changed):
+            write_calibrated(stack, changed)
+        else:
+            write_focal_stack(changed)
+    return ScaledScene(result, calibrated, uncalibrated, calibrations)
+
+
+def numbered(name: str, number: int) -> str:
+    """name.json for the first, name_2.json for the second."""
+    return name if number == 0 else name.replace(".json", f"_{number + 1}.json")
+
+
+def offset_of(result: ScaleResult) -> float:
+    """The offset of the lens that came with the focus distances; 0 where they have no answer."""
+    return next((float(each.facts["offset_m"]) for each in result.answers if each.method == "focus"), 0.0)

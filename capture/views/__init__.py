@@ -1,1 +1,0 @@
-"""Many viewpoints of one scene: camera poses, metric scale, calibration of focus, dense depth."""
