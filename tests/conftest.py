@@ -23,23 +23,21 @@ def _modules() -> list[str]:
 
 
 class _ChecksOfFirstCalls:
-    """Check each function on its calls 1, 2, 4, 8, ... in every test; checking all calls, as jaxtyping does, takes 40 % of the time."""
+    """Check each function on its calls 1, 2, 4, 8, ... of the whole run; checking all calls, as jaxtyping does, takes 40 % of the time."""
 
     def __init__(self) -> None:
-        self.test, self._always = 0, jaxtyping.jaxtyped
+        self._always = jaxtyping.jaxtyped
 
     def __call__(self, *, typechecker: Any) -> Callable[[Any], Any]:
         check = self._always(typechecker=typechecker)
         return lambda decorated: self._checked_at_first(decorated, check) if inspect.isfunction(decorated) else check(decorated)
 
     def _checked_at_first(self, plain: Callable[..., Any], check: Callable[..., Any]) -> Callable[..., Any]:
-        test, calls, checked = -1, 0, None
+        calls, checked = 0, None
 
         @functools.wraps(plain)
         def either(*args: Any, **kwargs: Any) -> Any:
-            nonlocal test, calls, checked
-            if test != self.test:
-                test, calls = self.test, 0
+            nonlocal calls, checked
             calls += 1
             if calls & (calls - 1):
                 return plain(*args, **kwargs)
@@ -49,14 +47,8 @@ class _ChecksOfFirstCalls:
         return either
 
 
-_checks = _ChecksOfFirstCalls()
-jaxtyping.jaxtyped = _checks
+jaxtyping.jaxtyped = _ChecksOfFirstCalls()
 jaxtyping.install_import_hook(_modules(), "beartype.beartype")
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
-    _checks.test += 1
 
 
 # Tests send Ctrl-C to themselves and to programs they start; what runs in the background of a shell is deaf to it, and so are its children.

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from mrbokeh.commands.blender_addon import app
 from mrbokeh.optics.camera_file import camera_from_json
 from mrbokeh.optics.lens import Lens
+from mrbokeh.scene.blender import mrbokeh_export
 from mrbokeh.scene.blender.mrbokeh_export import Film, camera_from_world, check_scene, intrinsics, track_frame
 from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF
 from mrbokeh.system.errors import InputError
@@ -24,7 +25,7 @@ from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD
 
 DATA = Path(__file__).parent / "data" / "blender"
-ADDON = Path(__file__).parent.parent / "mrbokeh" / "blender" / "mrbokeh_export.py"
+ADDON = Path(mrbokeh_export.__file__)
 
 
 def test_a_full_frame_camera() -> None:
