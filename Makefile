@@ -32,7 +32,7 @@ check: $(READY)
 	$(MAKE) test
 
 bench: $(READY)
-	for bench in tests/bench_*.py; do $(RUN)/python -m tests.$$(basename $$bench .py) || exit 1; done
+	for bench in tests/bench/bench_*.py; do $(RUN)/python -m tests.bench.$$(basename $$bench .py) || exit 1; done
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

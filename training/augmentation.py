@@ -2,7 +2,7 @@
 
 Training pairs have the depth of many photographs taken for the purpose; what the network is used on has a depth of its own, with other
 mistakes. The strength 1 is what focus and multi-view stereo together got wrong on traced stacks with known truth (README, "Capture";
-`python -m tests.bench_capture`): a median relative error of 0.13 to 0.19 %, 2.1 to 6.3 % of the pixels off by more than 0.05 dioptres, and
+`python -m tests.bench.bench_capture`): a median relative error of 0.13 to 0.19 %, 2.1 to 6.3 % of the pixels off by more than 0.05 dioptres, and
 silhouettes off by about a pixel. Pictures stay as they are; only circles of confusion change.
 """
 

@@ -1,6 +1,6 @@
 """What the gates of one stack ask, and their limits.
 
-Limits were set between what right stacks reach and what faulty ones show (tests/test_capture_reblur.py): on traced stacks with truth the
+Limits were set between what right stacks reach and what faulty ones show (tests/views/test_reblur.py): on traced stacks with truth the
 fit of a right one finds focus within 0.1 px, blur within 1 %, place within 0.03 px and exposure within 0.1 %. A tenth of f-number too
 much reads as 9.6 % of blur. The merged stacks of the demo's desk, which are right, read focus within 0.3 px and -1.4 to +0.8 % of blur with
 calibrated focus, but -3.3 to -3.5 % before calibration and second pass: blur that merging leaves in the all-in-focus picture, and depth

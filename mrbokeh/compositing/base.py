@@ -1,6 +1,6 @@
 """What every way of putting virtual layers into a photograph is: a plate, layers and a renderer in, a picture in two parts out.
 
-Every insertion owes these (tests/test_compositing.py asks all of them):
+Every insertion owes these (tests/compositing/test_compositing.py asks all of them):
 - identity: where no light of a layer arrives and none of the photograph is hidden, the picture is the plate bit for bit;
 - no layers give the plate;
 - an opaque layer in focus before everything replaces the plate where it covers the pixel;

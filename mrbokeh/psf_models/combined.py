@@ -1,6 +1,6 @@
 """COMBINED: defocus and motion, a disc swept along a line during the shutter (Leimkuehler 2018, Section 5.1).
 
-What a bank is worth (`python -m tests.bench_combined_bank`): the overlap (sum of the smaller of both) of a cell's
+What a bank is worth (`python -m tests.bench.bench_combined_bank`): the overlap (sum of the smaller of both) of a cell's
 kernel with the exact one at 1,000 random places, mean and worst of 20. The L1 distance is twice what it lacks to 1.
 
                                        even over 256 x 256 px     even over octaves from 0.5 px

@@ -1,7 +1,7 @@
 """Glass: refractive index by wavelength, and an estimate of its dispersion where a prescription has one index only.
 
 Where the numbers come from. Indices n_d and Abbe numbers of catalogue glasses: Schott's catalogue, checked against its indices
-at the C and F lines (tests/test_lens_prescription.py). Cauchy's two terms through n_d and V meet those to 1e-4 for V above 40
+at the C and F lines (tests/psf_models/test_lens_prescription.py). Cauchy's two terms through n_d and V meet those to 1e-4 for V above 40
 and to 5e-4 for the densest flints. Indices of a lens: its table. Abbe numbers of a lens: its table, where it has them.
 
 Where it has none, which is so of the published double Gauss, wide-angle and fisheye: an estimate. Of the double Gauss

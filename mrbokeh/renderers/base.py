@@ -1,6 +1,6 @@
 """What every renderer is: layers and a lens in, one blurred layer out.
 
-Every renderer conserves these (tests/test_renderers.py):
+Every renderer conserves these (tests/renderers/test_renderers.py):
 - energy: the light of a layer of one depth, far from the border, is as much after as before, colour and coverage alike;
 - identity: what is in focus (a circle of confusion below one pixel) stays as it was;
 - support: a point spreads no farther than its circle of confusion;

@@ -13,7 +13,7 @@ _KEPT_BYTES = 1 << 30
 def keep_few_arenas() -> None:
     """Keep to two arenas: codecs come with threads, and glibc gives each new thread an arena, which keeps what was in it.
 
-    Ten minutes with a recording every 15 s grew by 65 MB between the medians of their thirds (tests/test_viewfinder_soak.py); with two
+    Ten minutes with a recording every 15 s grew by 65 MB between the medians of their thirds (tests/live/test_viewfinder_soak.py); with two
     arenas the same memory is used again.
     """
     _set(_M_ARENA_MAX, _MOST_ARENAS)

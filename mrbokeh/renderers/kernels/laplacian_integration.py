@@ -8,7 +8,7 @@ on both. Pictures are zero on a border and beyond, which makes the answer unique
 tridiagonal system with two sweeps. Nothing is approximated; a picture that is zero within one pixel of the border comes
 back to rounding. `integrate_by_pyramid` is the convolution pyramid of Farbman et al. 2011, kept for comparison.
 
-Measured (tests/bench_laplacian_spreadlets.py, 1024 x 1024, 4 channels): the exact way is off by 2e-11 at most in double and
+Measured (tests/bench/bench_laplacian_spreadlets.py, 1024 x 1024, 4 channels): the exact way is off by 2e-11 at most in double and
 1e-5 in single precision, the pyramid by 3 % on average and 10 % at most for discs and textures (as Moroto found) and by 10 and
 16 % where an area of 800 px is lit, a bias that scales the whole picture. They take the same time in single precision (96 and
 106 ms); in double the exact way takes half the pyramid's. So it is the default.

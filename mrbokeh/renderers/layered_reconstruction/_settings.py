@@ -15,7 +15,7 @@ _MOST_PARTS = 16
 
 @dataclass(frozen=True)
 class Settings:
-    """The defaults are the paper's where it names one, else what measured best (tests/bench_layered_reconstruction.py).
+    """The defaults are the paper's where it names one, else what measured best (tests/bench/bench_layered_reconstruction.py).
 
     tile_px: side of a tile, a power of two from 4 to 256.
     coc_step_px, near_coc_px: depth buckets take equal steps of the circle of confusion up to near_coc_px on both sides of the focus.

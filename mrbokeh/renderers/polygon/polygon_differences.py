@@ -24,7 +24,7 @@ How near to exact kernels of the true aperture: a texture of noise in [0, 1] und
 pixel. In single precision pixels in focus that share a picture with blurred ones are off by up to 1e-7. Halving costs little
 beside that: under 0 to 400 px both ways agree to 68 dB.
 
-What it costs (tests/bench_polygon_differences.py): per corner and pixel four splats of four channels, neighbouring ones together,
+What it costs (tests/bench/bench_polygon_differences.py): per corner and pixel four splats of four channels, neighbouring ones together,
 then the sums. Larger kernels cost no more: what they need at the halved resolutions, and what is kept of the rest, is less work.
 """
 

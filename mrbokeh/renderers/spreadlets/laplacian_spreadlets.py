@@ -4,7 +4,7 @@ What is exact: the Laplacian that makes the points and the integration that undo
 of whole Laplacians (`sparsification=None`) give what splatting all taps gives. Sparse points are off by about a tenth of a
 kernel's norm along its outline, which averages out over the pixels of a picture, but not for a lamp or a lone pixel: those
 get whole Laplacians. Light and centroid of every kernel are exact. Circles of confusion are rounded: to 1/32 px on the
-fast track, to 1.1 % (64 steps per octave) beyond it. Measured (tests/bench_laplacian_spreadlets.py) at a mean circle
+fast track, to 1.1 % (64 steps per octave) beyond it. Measured (tests/bench/bench_laplacian_spreadlets.py) at a mean circle
 of 40 px: SSIM 0.998 and 55 dB to dense splatting of the same kernels, 56 dB to exact ones.
 
 A rounding error of one pixel shows, integrated, all over the picture, and those of an even area all go the same way. So Laplacians

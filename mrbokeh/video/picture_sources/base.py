@@ -13,7 +13,7 @@ from mrbokeh.video.clip import Frame, VideoInfo
 
 @runtime_checkable
 class PictureSource(Protocol):
-    """What every source owes (tests/test_picture_sources.py asks all of them).
+    """What every source owes (tests/video/test_picture_sources.py asks all of them).
 
     It can be pickled and opened again by another process or machine that sees the same files. `frames(i, j)` are the frames that
     reading all of them gives from the i-th on, picture and time, wherever a decoder has to begin for that.

@@ -1,0 +1,150 @@
+"""`mrbokeh composite` as a user meets it: a layer or an object into a photograph or a slice, and what it refuses."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrbokeh.compositing.plate import open_plate
+from mrbokeh.demo.plan import DATA
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from tests.house.test_user_mistakes import said
+
+HEIGHT, WIDTH = 96, 144
+LENS = Lens(35.0, 2.0, 1.0, 23.5)
+CAKE = DATA / "objects" / "cakeBirthday.glb"
+
+
+Composite = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def composite(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Composite:
+    """`mrbokeh composite` with these arguments: (exit code, what was said)."""
+    return lambda *arguments: said(capsys, monkeypatch, "composite", *arguments)
+
+
+def plate_rgb() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 0.5, (HEIGHT, WIDTH, 3)).astype(np.float32)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A photograph of a wall 2 m away with a post at 0.8 m in its left third, its depth, a lens and a card at 1.3 m."""
+    write_image(tmp_path / "photo.exr", plate_rgb(), half=False)
+    depth_m = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    depth_m[:, : WIDTH // 3] = 0.8
+    write_layer(tmp_path / "depth.exr", Layer(plate_rgb(), np.ones_like(depth_m), depth_m))
+    write_lens(tmp_path / "lens.json", LENS)
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[30:70, 30:90] = 1.0
+    card = Layer(alpha[..., None] * np.float32([0.9, 0.2, 0.1]), alpha, np.where(alpha > 0, 1.3, np.inf).astype(np.float32))
+    write_layer(tmp_path / "card.exr", card, half=False)
+    return tmp_path
+
+
+def test_a_layer_goes_behind_the_post_and_before_the_wall(files: Path, composite: Composite) -> None:
+    out, layer = files / "out.exr", files / "blurred.exr"
+    arguments = ("--layer", files / "card.exr", "--lens", files / "lens.json", "--depth", files / "depth.exr")
+    code, told = composite(files / "photo.exr", *arguments, "--out", out, "--save-layer", layer)
+    assert code == 0, told
+    picture, blurred = read_image(out), read_layer(layer)
+    # The blur reaches half a circle of confusion beyond the visible part of the card, which begins at the post's edge.
+    reach_px = int(np.ceil(float(LENS.coc_px(1.3, WIDTH)) / 2)) + 1
+    assert blurred.alpha[:, : WIDTH // 3 - reach_px].max() == 0.0
+    np.testing.assert_allclose(picture[50, 70], [0.9, 0.2, 0.1], rtol=2e-3)  # half float
+    untouched = blurred.alpha == 0
+    np.testing.assert_allclose(picture[untouched], plate_rgb()[untouched], rtol=2**-11)
+
+
+def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path, composite: Composite) -> None:
+    out, layer = files / "out.png", files / "cake.exr"
+    arguments = ("--object", CAKE, "--at-pixel", "100,70", "--height", 0.1, "--shadow", 0.6)
+    code, told = composite(
+        *(files / "photo.exr", "--lens", files / "lens.json", "--focus", 2.0, "--depth", files / "depth.exr"),
+        *(*arguments, "--out", out, "--save-layer", layer),
+    )
+    assert code == 0, told
+    rows, columns = np.nonzero(read_layer(layer).alpha > 0.5)
+    # 0.1 m at 2 m through 35 mm on 23.5 mm is 10.9 px of 144; it stands on row 70 and is wider than high.
+    assert 68 <= rows.max() <= 76 and 8 <= 70 - rows.min() <= 16
+    assert abs(columns.mean() - 100) < 4
+    assert read_image(out).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path, composite: Composite) -> None:
+    stack_folder = files / "stack"
+    for i in range(3):
+        write_image(stack_folder / f"{i}.exr", plate_rgb())
+    camera = Camera(WIDTH, HEIGHT, (LENS.focal_px(WIDTH),) * 2, (WIDTH / 2, HEIGHT / 2))
+    stack = FocalStack(stack_folder, tuple(Slice(f"{i}.exr", d) for i, d in enumerate((0.6, 1.3, 3.0))), LENS, camera, registered=True)
+    plane = np.ones((HEIGHT, WIDTH), np.float32)
+    write_merged(stack_folder, plate_rgb(), plane, plane, 2 * plane)
+    write_focal_stack(replace(stack, merged=True))
+    spread = []
+    for index in range(3):
+        layer = files / f"layer_{index}.exr"
+        words = stack_folder, "--slice", index, "--layer", files / "card.exr", "--out", files / f"{index}.png", "--save-layer", layer
+        code, told = composite(*words)
+        assert code == 0, told
+        spread.append(int((read_layer(layer).alpha > 0).sum()))
+    assert spread[1] == 40 * 60, "slice 1 is focused on the card"
+    assert spread[0] > spread[1] < spread[2]
+
+
+def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: Path) -> None:
+    """Depth 2 m under the middle of the picture is (0, 0, 2), also for a camera that stands 5 m to the side."""
+    write_image(tmp_path / "0.exr", plate_rgb())
+    pose = np.eye(4)
+    pose[0, 3] = -5.0
+    camera = Camera(WIDTH, HEIGHT, (LENS.focal_px(WIDTH),) * 2, (WIDTH / 2, HEIGHT / 2), pose)
+    plane = np.ones((HEIGHT, WIDTH), np.float32)
+    write_merged(tmp_path, plate_rgb(), plane, plane, 2 * plane)
+    write_focal_stack(FocalStack(tmp_path, (Slice("0.exr", 1.3),), LENS, camera, registered=True, merged=True))
+    plate = open_plate(tmp_path, 0)
+    assert plate.point_under_pixel_m(WIDTH / 2, HEIGHT / 2) == pytest.approx((0.0, 0.0, 2.0), abs=1e-9)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({}, "nothing to put into the photograph"),
+    ({"--layer": "card.exr", "--lens": None}, "does not tell its lens"),
+    ({"--layer": "none.exr"}, "none.exr"),
+    ({"--object": "cake"}, "where does the object stand"),
+    ({"--object": "cake", "--at-pixel": "10,10"}, "needs depth"),
+    ({"--object": "cake", "--at": "1,2"}, "--at expects 3 numbers"),
+    ({"--layer": "card.exr", "--renderer": "magic"}, "expected a renderer"),
+    ({"--layer": "card.exr", "--out": "photo.exr"}, "is read and would be written over"),
+    ({"--layer": "card.exr", "--out": "depth.exr"}, "exists already: give another name, or --overwrite"),
+    ({"--layer": "card.exr", "--slice": "1"}, "not a folder"),
+    ({"--layer": "card.exr", "--out": "out.gif"}, "expected a name that ends in .exr or .png"),
+])  # fmt: skip
+def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change: dict[str, str | None], message: str) -> None:
+    options = {"--lens": "lens.json", "--out": "out.exr"} | change
+    words: list[object] = []
+    for option, value in options.items():
+        if value is not None:
+            path = CAKE if value == "cake" else files / value if "." in value and "," not in value else value
+            words += [option, path]
+    code, told = composite(files / "photo.exr", *words)
+    assert code == 2
+    assert message in told and "Traceback" not in told
+    assert not (files / "out.exr").exists() and not (files / "out.gif").exists()
+
+
+def test_a_shell_gets_the_code_and_the_sentence(files: Path) -> None:
+    """A process of its own, as a user starts it."""
+    command = [sys.executable, "-m", "mrbokeh.cli", "composite", files / "photo.exr"]
+    command += ["--lens", files / "lens.json", "--out", files / "out.exr"]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True)
+    assert done.returncode == 2 and not done.stdout
+    assert "nothing to put into the photograph" in " ".join(done.stderr.split()) and "Traceback" not in done.stderr
+    assert not (files / "out.exr").exists()

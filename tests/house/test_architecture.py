@@ -1,0 +1,155 @@
+"""Who may import whom (ARCHITECTURE.md), read from the syntax tree; imports inside functions count like any other."""
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
+
+# The levels of mrbokeh/, top first: a room imports from lower levels only; inside a room anything without a cycle.
+LEVELS = (
+    {"cli"},
+    {"commands"},
+    {"shots"},
+    {"compositing", "refocus", "demo"},
+    {"scene", "depth", "checks", "figures", "lens_measuring"},
+    {"renderers", "stacks", "distortion"},
+    {"layering", "psf_models", "tracking"},
+    {"optics", "video"},
+    {"images"},
+    {"system"},
+)
+# Those of mrbokeh/renderers: what chooses one; the methods, which never import one another; kernels of banks; fitted kernels; the protocol.
+RENDERER_LEVELS = (
+    {"choose_bank"},
+    {"choose"},
+    {"polygon", "low_rank", "spreadlets", "layered_reconstruction", "network", "scatter"},
+    {"bank"},
+    {"kernels"},
+    {"base"},
+)
+ALLOWED_ACROSS = {
+    "capture": {"mrbokeh"},
+    "training": {"mrbokeh"},
+    "viewfinder": {"mrbokeh"},
+    "datasets_scripts": {"mrbokeh"},
+    "mrbokeh": set(),
+}
+
+
+def modules() -> dict[str, Path]:
+    files = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+    return {name.removesuffix(".__init__"): path for name, path in names.items()}
+
+
+MODULES = modules()
+
+
+@cache
+def imports_of(path: Path) -> list[ast.Import | ast.ImportFrom]:
+    """Every import statement of a file, also those within functions."""
+    return [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, (ast.Import, ast.ImportFrom))]
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Dotted names of our own modules that a file imports."""
+    for node in imports_of(path):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            assert node.level == 0, f"{path}: relative import"
+            names = [
+                f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in MODULES else str(node.module) for alias in node.names
+            ]
+        yield from (name for name in names if name.split(".")[0] in PACKAGES)
+
+
+def level_of(module: str, levels: tuple[set[str], ...], folder: str) -> tuple[int, str]:
+    """Return (level, room) of a module below a folder."""
+    room = module.removeprefix(folder + ".").split(".")[0]
+    for level, rooms in enumerate(levels):
+        if room in rooms:
+            return level, room
+    raise AssertionError(f"{module} lies in no room of {folder}: say where in the house {room!r} belongs")
+
+
+def arrows() -> list[tuple[str, str]]:
+    return sorted({(module, target) for module, path in MODULES.items() for target in imported(path) if target != module})
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_meet_in_files_only(package: str) -> None:
+    allowed = ALLOWED_ACROSS[package] | {package}
+    wrong = [f"{a} -> {b}" for a, b in arrows() if a.split(".")[0] == package and b.split(".")[0] not in allowed]
+    assert not wrong
+
+
+@pytest.mark.parametrize(("folder", "levels"), [("mrbokeh", LEVELS), ("mrbokeh.renderers", RENDERER_LEVELS)])
+def test_rooms_import_from_lower_levels_only(folder: str, levels: tuple[set[str], ...]) -> None:
+    inside = [(a, b) for a, b in arrows() if a.startswith(folder + ".") and b.startswith(folder + ".")]
+    places = [(level_of(a, levels, folder), level_of(b, levels, folder), f"{a} -> {b}") for a, b in inside]
+    wrong = [arrow for (above, room), (below, target), arrow in places if room != target and above >= below]
+    assert not wrong
+
+
+def test_no_cycles() -> None:
+    graph: dict[str, set[str]] = {}
+    for source, target in arrows():
+        graph.setdefault(source, set()).add(target)
+    done: set[str] = set()
+
+    def visit(module: str, trail: tuple[str, ...]) -> None:
+        assert module not in trail, " -> ".join((*trail, module))
+        if module not in done:
+            for target in graph.get(module, ()):
+                visit(target, (*trail, module))
+            done.add(module)
+
+    for module in list(graph):
+        visit(module, ())
+
+
+@pytest.mark.parametrize(
+    ("library", "homes"),
+    [("torch", {"training"})]
+    + [("aiohttp", {"viewfinder", "datasets_scripts"})]  # the gallery looks at pages through a browser
+    + [(name, {"viewfinder"}) for name in ("aiortc", "segno", "reportlab")]
+    + [(name, {"capture"}) for name in ("rawpy", "pyexiv2", "exifread", "lensfunpy")]
+    + [("pycolmap", {"capture", "viewfinder"}), ("gphoto2", set())],
+)
+def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -> None:
+    """commands/doctor.py may ask torch for a GPU; two renderers have twins on devices; data sets may write metadata.
+
+    COLMAP's maps are made by capture and localised in by the viewfinder; tethered cameras shoot for one and look for the other,
+    both through mrbokeh.system.gphoto2_library.
+    """
+    asking = {
+        "mrbokeh.commands.doctor",
+        "mrbokeh.compositing.plate_look.lensfun_falloff",
+        "mrbokeh.distortion.lensfun_database",
+        "datasets_scripts.dng_writer",
+        "mrbokeh.system.gphoto2_library",
+    }
+    users = {
+        module
+        for module, path in MODULES.items()
+        for node in imports_of(path)
+        if library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
+    }
+    twins = (
+        "mrbokeh.renderers.spreadlets.torch_spreadlets",
+        "mrbokeh.renderers.layered_reconstruction.torch_reconstruction",
+        "mrbokeh.system.torch_device",
+        "mrbokeh.psf_models.torch_tracing",
+        "capture.dense.torch_plane_sweep",
+    )
+    assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= homes
+
+
+def test_no_drawers_for_anything() -> None:
+    assert not {Path(path).stem for path in MODULES.values()} & {"utils", "util", "helpers", "common", "misc"}

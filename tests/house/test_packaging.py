@@ -1,0 +1,91 @@
+"""The wheel: what is in it, and that its commands run outside the checkout."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMANDS = ("capture", "train", "lens", "render", "composite", "video", "viewfinder", "demo", "doctor")
+
+HELP_OF_ALL = """
+import sys
+
+site, *commands = sys.argv[1:]
+codes = []
+for command in commands:
+    for name in [each for each in sys.modules if each.partition(".")[0] in ("mrbokeh", "capture", "training", "viewfinder")]:
+        del sys.modules[name]
+    from mrbokeh.cli import main
+    assert sys.modules["mrbokeh"].__file__.startswith(site)
+    sys.argv = ["mrbokeh", command, "--help"]
+    try:
+        main()
+    except SystemExit as stop:
+        codes.append(stop.code)
+print(*codes, end=" \\n")
+"""
+"""Each imports all modules of the wheel that it needs anew, so that none lives on what another imported."""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("wheel")
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--wheel-dir",
+        str(out),
+        str(_copy(out)),
+    ]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    return next(out.glob("mrbokeh-*.whl"))
+
+
+def _copy(out: Path) -> Path:
+    """The files under version control only, so that neither build folders nor local rests get into the wheel."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
+    source = out / "source"
+    for name in filter(None, listed):
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+    return source
+
+
+def test_top_level_names(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    top = {name.split("/")[0] for name in names if ".dist-info/" not in name}
+    assert top == {"mrbokeh", "capture", "training", "viewfinder"}
+
+
+def test_data_travels_with_its_licences(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert "mrbokeh/py.typed" in names
+    for folder in ("raw_stack", "pcb_oblique", "objects"):
+        assert f"mrbokeh/demo_data/{folder}/LICENSE.txt" in names
+    assert {f"mrbokeh/demo_data/raw_stack/view_{v}/slice_{i:02d}.dng" for v in range(3) for i in range(9)} <= names
+    assert any(name.startswith("viewfinder/page/") for name in names)
+    assert wheel.stat().st_size < 20e6
+
+
+def test_every_command_runs_from_the_installed_wheel(wheel: Path, tmp_path: Path) -> None:
+    """Unpacked as pip does it, in another folder, with the libraries of this environment but not the checkout."""
+    site = tmp_path / "site"
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(site), str(wheel)]
+    subprocess.run(install, check=True, capture_output=True)
+    environment = os.environ | {"PYTHONPATH": str(site), "PYTHONSAFEPATH": "1", "NO_COLOR": "1"}
+    command = [sys.executable, "-c", HELP_OF_ALL, str(site), *COMMANDS]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split("\n")[-2] == "0 " * len(COMMANDS), done.stderr
+    assert all(f"Usage: mrbokeh {name} " in done.stdout for name in COMMANDS)
+    assert (site / "bin" / "mrbokeh").is_file()

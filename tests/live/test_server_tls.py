@@ -1,0 +1,116 @@
+"""TLS with certificates made here, and what is said of those that cannot be used."""
+
+import ssl
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+import aiohttp
+import pytest
+
+from mrbokeh.system.errors import InputError
+from tests.scenes.made_viewfinder import in_time, made_viewfinder
+from viewfinder.server.access import Access
+from viewfinder.server.origins import LOOPBACK_NAMES
+from viewfinder.server.sessions import Role, Sessions
+from viewfinder.server.tls import load_tls
+
+x509 = pytest.importorskip("cryptography.x509")
+
+Make = Callable[..., tuple[Path, Path]]
+
+
+@pytest.fixture
+def make_certificate(tmp_path: Path) -> Make:
+    """(certificate, key) as PEM files, signed by themselves."""
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    def make(name: str = "one", days: int = 1, passphrase: bytes | None = None, *, named: bool = True) -> tuple[Path, Path]:
+        key = ec.generate_private_key(ec.SECP256R1())
+        subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+        now = datetime.now(UTC)
+        builder = x509.CertificateBuilder().subject_name(subject).issuer_name(subject).public_key(key.public_key())
+        builder = builder.serial_number(x509.random_serial_number()).not_valid_before(now - timedelta(days=9))
+        builder = builder.not_valid_after(now + timedelta(days=days))
+        if named:
+            names = [x509.DNSName("Box.local"), x509.DNSName("*.example"), x509.IPAddress(ip_address("127.0.0.1"))]
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        encryption = serialization.BestAvailableEncryption(passphrase) if passphrase else serialization.NoEncryption()
+        key_pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
+        paths = tmp_path / f"{name}.pem", tmp_path / f"{name}-key.pem"
+        paths[0].write_bytes(builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+        paths[1].write_bytes(key_pem)
+        return paths
+
+    return make
+
+
+def test_the_page_the_stream_and_the_cookie_travel_encrypted(make_certificate: Make) -> None:
+    certificate, key = make_certificate()
+    tls = load_tls(certificate, key)
+    assert tls.names == ("box.local", "127.0.0.1")
+    sessions = Sessions()
+
+    async def work() -> None:
+        trusting = ssl.create_default_context(cafile=str(certificate))
+        access = Access(names=LOOPBACK_NAMES | set(tls.names), sessions=sessions, secure=True)
+        async with (
+            made_viewfinder(access, tls) as made,
+            aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True), connector=aiohttp.TCPConnector(ssl=trusting)) as client,
+        ):
+            assert made.url.startswith("https://127.0.0.1:")
+            async with client.post(made.url + "enter", json={"token": sessions.invitation(Role.CONTROL)}) as answer:
+                assert answer.status == 200
+                assert "Secure" in answer.headers["Set-Cookie"]
+            async with client.ws_connect(made.url + "stream") as stream:
+                assert (await stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY
+            async with client.get(made.url) as page:
+                assert "wss://127.0.0.1" in page.headers["Content-Security-Policy"]
+            async with client.get(made.url + "state", headers={"Host": "box.local"}) as answer:
+                assert answer.status == 401  # known name, other cookie
+            with pytest.raises(aiohttp.ClientError):
+                await client.get(made.url.replace("https", "http"))
+
+    in_time(work)
+
+
+def test_the_address_has_a_name_of_the_certificate(make_certificate: Make) -> None:
+    certificate, key = make_certificate()
+    tls = load_tls(certificate, key)
+
+    async def work() -> None:
+        async with made_viewfinder(tls=tls) as made:
+            assert made.url.startswith("https://127.0.0.1:")
+        async with made_viewfinder(tls=tls, host="127.0.0.2") as made:
+            assert made.url.startswith("https://box.local:")
+
+    in_time(work)
+
+
+def test_certificate_and_key_may_share_a_file(make_certificate: Make, tmp_path: Path) -> None:
+    certificate, key = make_certificate()
+    both = tmp_path / "both.pem"
+    both.write_bytes(key.read_bytes() + certificate.read_bytes())
+    assert load_tls(both).names == ("box.local", "127.0.0.1")
+
+
+def test_what_cannot_be_used_is_named(make_certificate: Make, tmp_path: Path) -> None:
+    certificate, key = make_certificate()
+    rubbish = tmp_path / "rubbish.pem"
+    rubbish.write_bytes(b"\x30\x82 no PEM")
+    cases = [
+        ((tmp_path / "absent.pem", key), "no certificate file .*absent.pem.*mkcert"),
+        ((certificate, tmp_path / "absent.pem"), "no key file .*absent.pem"),
+        ((rubbish, key), "rubbish.pem holds no certificate in PEM"),
+        ((certificate, rubbish), "cannot be used"),
+        ((certificate, None), "cannot be used"),
+        ((certificate, make_certificate("two")[1]), "two-key.pem does not belong to the certificate"),
+        (make_certificate("old", days=-1), "old.pem expired on"),
+        (make_certificate("locked", passphrase=b"secret"), "locked-key.pem has a pass phrase"),
+        (make_certificate("nameless", named=False), "names no host"),
+    ]
+    for files, expected in cases:
+        with pytest.raises(InputError, match=expected):
+            load_tls(*files)

@@ -1,0 +1,272 @@
+"""Cameras on a cable that are pulled out and plugged in: a real OpenCV capture of a file in a webcam's place, libgphoto2's virtual
+camera as far as it goes (it has no live view), a stand-in for its live view, and the pauses between attempts."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator
+from fractions import Fraction
+from pathlib import Path
+from threading import Event, Thread
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.color import linear_from_code
+from viewfinder.flow.frames import LensState
+from viewfinder.sources.newest_of import newest_of
+from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
+from viewfinder.sources.webcam import WebcamSource
+
+WIDTH, HEIGHT = 160, 112
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    """Three frames."""
+    path = tmp_path / "clip.mkv"
+    with VideoWriter(path, WIDTH, HEIGHT, Fraction(25)) as writer:
+        for index in range(3):
+            writer.write(linear_from_code(np.full((HEIGHT, WIDTH, 3), 0.2 + 0.2 * index), "bt709"), index / 25)
+    return path
+
+
+# --- webcam ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_webcam_is_pulled_out_and_plugged_in_again(clip: Path) -> None:
+    """The file ends after 3 frames as a camera does that is pulled out; twice there is nothing; then it is there again."""
+    opened: list[Any] = []
+
+    def plug(_index: int) -> Any:
+        opened.append(cv2.VideoCapture(str(clip)) if len(opened) not in (1, 2) else None)
+        return opened[-1]
+
+    source, stopping = WebcamSource(3, max_width_px=80, open_camera=plug), Event()
+    assert source.status is None
+    frames = source.frames(stopping)
+    before = [next(frames) for _ in range(3)]
+    sentences: list[str | None] = []
+    waiting = Thread(target=lambda: [sentences.append(source.status) or time.sleep(0.01) for _ in range(60)])
+    waiting.start()
+    after = next(frames)
+    waiting.join()
+    assert [each.sequence for each in [*before, after]] == [0, 1, 2, 3]
+    assert all(each.bgr.shape == (56, 80, 3) for each in [*before, after])
+    assert {"camera 3 stopped giving pictures: plug it in again", "camera 3 is unplugged or in use: waiting for it"} <= set(sentences)
+    assert source.status is None and len(opened) == 4
+    np.testing.assert_array_equal(after.bgr, before[0].bgr)
+    frames.close()  # type: ignore[attr-defined]
+    assert not opened[0].isOpened() and not opened[3].isOpened()
+
+
+def test_a_webcam_that_is_not_there_at_the_start_is_refused() -> None:
+    with pytest.raises(InputError, match="camera 987 cannot be opened"):
+        WebcamSource(987)
+
+
+# --- pauses and threads ---------------------------------------------------------------------------------------------
+
+
+def test_pauses_grow_and_start_again_after_success() -> None:
+    waits: list[float] = []
+    sessions = iter(["away", "away", "away", "there", "away", "away"])
+    told: list[str | None] = []
+
+    class Stopping(Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            waits.append(timeout or 0.0)
+            return False
+
+    def session() -> Generator[int, None, None]:
+        what = next(sessions, None)
+        if what is None:
+            stopping.set()
+        elif what == "there":
+            yield 1
+        raise CameraAwayError("away")
+
+    stopping = Stopping()
+    assert list(reconnecting(session, stopping, told.append, first_pause_s=1.0)) == [1]
+    # 1, 2, 4 s; the camera gives something, after which it is 1 s again.
+    assert waits == [1.0, 2.0, 4.0, 1.0, 2.0, 4.0, 4.0][: len(waits)] and len(waits) == 7
+    assert told == ["away"] * 3 + [None] + ["away"] * 4
+
+
+def test_a_thread_hands_over_the_newest_and_its_failure() -> None:
+    went_on = Event()
+
+    def produce(_leaving: Event) -> Generator[int, None, None]:
+        yield from range(100)
+        went_on.set()
+        time.sleep(0.2)
+        yield 100
+        raise InputError("broken")
+
+    items = newest_of(produce, Event(), name="test drain")
+    first = next(items)
+    assert went_on.wait(5)
+    got = [first]
+
+    def take_all() -> None:
+        for item in items:
+            got.append(item)
+
+    with pytest.raises(InputError, match="broken"):
+        take_all()
+    # The last of the hundred comes, few of those before it do.
+    assert got[-2:] == [99, 100] and got == sorted(got) and len(got) < 20
+
+
+def test_the_thread_ends_when_nobody_asks_any_more() -> None:
+    ended = Event()
+
+    def produce(leaving: Event) -> Generator[int, None, None]:
+        try:
+            while not leaving.wait(0.01):
+                yield 1
+        finally:
+            ended.set()
+
+    items = newest_of(produce, Event(), name="test drain")
+    assert next(items) == 1
+    items.close()  # type: ignore[attr-defined]
+    assert ended.wait(5)
+
+
+# --- gphoto2 --------------------------------------------------------------------------------------------------------
+
+SCRIPT = """
+import json, sys, threading, warnings
+warnings.simplefilter("error")
+from mrbokeh.system.errors import InputError
+from viewfinder.sources.choose import open_source
+from viewfinder.sources.gphoto2_lens import lens_state
+
+def sentence(what):
+    try:
+        what()
+    except InputError as error:
+        return str(error)
+
+source = open_source("gphoto2")
+lens = lens_state(source._opened)
+print(json.dumps({
+    "lens": [lens.focus_distance_m, lens.f_number, lens.focal_length_mm],
+    "preview": sentence(lambda: next(source.frames(threading.Event()))),
+    "again": sentence(lambda: next(open_source("gphoto2:usb:001,001").frames(threading.Event()))),
+    "port": sentence(lambda: open_source("gphoto2:usb:009,009")),
+}))
+"""
+
+
+def in_own_interpreter(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """libgphoto2 looks for VCAMERADIR when it is loaded."""
+    root = str(Path(__file__).resolve().parents[2])
+    search = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": search} | environment
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=120)
+
+
+def test_the_virtual_camera_is_opened_and_tells_its_f_number(tmp_path: Path) -> None:
+    """It sets out at some f-number above 1, has no focus distance, and refuses a live view, which is no reason to wait."""
+    pytest.importorskip("gphoto2", reason="the extra 'tether' is not installed")
+    cv2.imwrite(str(tmp_path / "GPH_0001.JPG"), np.zeros((48, 64, 3), np.uint8))
+    done = in_own_interpreter(SCRIPT, VCAMERADIR=str(tmp_path))
+    if "no camera found" in done.stderr:
+        pytest.skip("this build of libgphoto2 has no virtual camera (vusb)")
+    assert done.returncode == 0, done.stderr
+    answers = json.loads(done.stdout)
+    assert answers["lens"][0] is None and answers["lens"][1] > 1 and answers["lens"][2] is None
+    # The second time shows that the first one let go of the camera.
+    assert "gives no live view" in answers["preview"] and "gives no live view" in answers["again"]
+    assert "no camera at usb:009,009, only at Nikon DSC D750 at usb:001,001" in answers["port"]
+
+
+class LiveCamera:
+    """Speaks as gphoto2.Camera does with a camera that has live view; `script` says what each look at it brings."""
+
+    def __init__(self, script: list[Any], settings: dict[str, Any]) -> None:
+        self.script, self.settings, self.calls = script, settings, list[str]()
+
+    def capture_preview(self) -> Any:
+        import gphoto2 as gp
+
+        step = self.script.pop(0)
+        if isinstance(step, int):
+            raise gp.GPhoto2Error(step)
+        return SimpleNamespace(get_data_and_size=lambda: step)
+
+    def get_single_config(self, name: str) -> Any:
+        import gphoto2 as gp
+
+        if name not in self.settings:
+            raise gp.GPhoto2Error(gp.GP_ERROR_BAD_PARAMETERS)
+        return SimpleNamespace(get_value=lambda: self.settings[name], set_value=lambda value: self.settings.update({name: value}))
+
+    def set_single_config(self, name: str, _widget: Any) -> None:
+        self.calls.append(f"{name}={self.settings[name]}")
+
+    def exit(self) -> None:
+        self.calls.append("exit")
+
+
+def jpeg(level: int) -> bytes:
+    return cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), level, np.uint8))[1].tobytes()
+
+
+@pytest.fixture
+def preview_source() -> Callable[..., Any]:
+    pytest.importorskip("gphoto2", reason="the extra 'tether' is not installed")
+    from viewfinder.sources.gphoto2_preview import Gphoto2PreviewSource
+
+    return Gphoto2PreviewSource
+
+
+def test_live_view_brings_pictures_and_the_lens(preview_source: Callable[..., Any]) -> None:
+    """Property 5009 of PTP is in mm, 5008 in 1/100 mm; busy (-110) and an empty picture are passed over; the mirror goes down again."""
+    settings = {"viewfinder": 0, "f-number": "f/5.6", "5008": "3500", "5009": "1250"}
+    camera = LiveCamera([-110, b"", jpeg(40), jpeg(90)], settings)
+    source, stopping = preview_source(max_width_px=80, open_camera=lambda _port: camera), Event()
+    frames = source.frames(stopping)
+    first, second = next(frames), next(frames)
+    assert first.lens == second.lens == LensState(1.25, 5.6, 35.0)
+    assert first.bgr.shape == (56, 80, 3) and abs(int(first.bgr[5, 5, 0]) - 40) < 3 and abs(int(second.bgr[5, 5, 0]) - 90) < 3
+    frames.close()
+    assert camera.calls == ["viewfinder=1", "viewfinder=0", "exit"]
+
+
+def test_a_tethered_camera_is_switched_off_and_on_again(preview_source: Callable[..., Any]) -> None:
+    """-52: the USB device is gone. While it is away opening fails; then it is there, focused at infinity."""
+    away = CameraAwayError("no camera is found")
+    cameras = [LiveCamera([jpeg(40), -52], {"5009": "65535"}), away, LiveCamera([jpeg(90), jpeg(90)], {"5009": "65535"})]
+
+    def open_next(_port: str | None) -> Any:
+        camera = cameras.pop(0)
+        if isinstance(camera, CameraAwayError):
+            raise camera
+        return camera
+
+    source, stopping = preview_source(open_camera=open_next), Event()
+    frames = source.frames(stopping)
+    assert next(frames).lens == LensState(focus_distance_m=float("inf"))
+    seen: list[str | None] = []
+    watcher = Thread(target=lambda: [seen.append(source.status) or time.sleep(0.01) for _ in range(60)])
+    watcher.start()
+    after = next(frames)
+    watcher.join()
+    assert abs(int(after.bgr[5, 5, 0]) - 90) < 3 and after.sequence == 1 and source.status is None
+    assert any("is away" in str(each) and "check the cable" in str(each) for each in seen) and "no camera is found" in seen
+    frames.close()
+
+
+def test_no_camera_at_the_start_is_refused(preview_source: Callable[..., Any]) -> None:
+    with pytest.raises(InputError, match=r"no camera found.*switch it on"):
+        preview_source()

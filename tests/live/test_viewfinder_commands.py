@@ -1,0 +1,432 @@
+"""`mrbokeh viewfinder` and `mrbokeh viewfinder board` as their user meets them: refusals, starting, ending, and what they leave behind."""
+
+import asyncio
+import json
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from threading import enumerate as threads
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+import typer
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from mrbokeh.cli import SUB_COMMANDS
+from mrbokeh.images.image_io import write_layer
+from mrbokeh.images.layer import clear
+from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board_file import read_board, write_board
+from tests.scenes.phone_on_camera import PHONE
+from tests.scenes.thin_lens_board import Shot, camera_over, display_bgr, photograph
+from viewfinder.app.focus_choice import open_focus
+from viewfinder.app.tracking_choice import TrackingChoice
+from viewfinder.commands.board import board_command
+from viewfinder.commands.listening import Door, ListeningOptions, open_door
+from viewfinder.commands.serve import opened
+from viewfinder.commands.serve_options import ServeOptions
+from viewfinder.flow.frames import CameraFrame, LensState
+from viewfinder.focus.frame_focus import FrameFocus
+from viewfinder.focus.manual_focus import ManualFocus
+from viewfinder.server.access import Access
+from viewfinder.server.sessions import Role, Sessions
+from viewfinder.tracking.base import TrackedPose
+
+ROOT = Path(__file__).resolve().parents[2]
+DOC = ROOT / "docs" / "viewfinder.md"
+BOARD = CharucoBoard((CharucoGrid((6, 4), 30.0, 22.0),))
+LENS = Lens(35.0, 2.8, 1.0, 23.5)
+WIDTH_PX, HEIGHT_PX = 480, 270
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With layer.exr, lens.json, board.json, pose.json, and bad.json, which is none of them; bad.toml is no scene."""
+    write_layer(tmp_path / "layer.exr", clear(HEIGHT_PX, WIDTH_PX))
+    write_lens(tmp_path / "lens.json", LENS)
+    write_board(tmp_path / "board.json", BOARD)
+    write_json(tmp_path / "pose.json", camera_to_json(PHONE))
+    write_json(tmp_path / "bad.json", {"what": 1})
+    (tmp_path / "bad.toml").write_text('[[object]]\nname = "lamp"\nglb = "none.glb"\n')
+    (tmp_path / "rig.json").write_text("{}")
+    return tmp_path
+
+
+# What the command line says (after --source test) and what the refusal must say. The camera must not be opened before.
+REFUSED = {
+    "": "either --scene SCENE.toml or --layer",
+    "--layer layer.exr --scene bad.toml --lens lens.json": "either --scene SCENE.toml or --layer",
+    "--layer layer.exr": "expected a lens, got none",
+    "--layer layer.exr --lens none.json": "none.json",
+    "--layer layer.exr --lens bad.json": "bad.json",
+    "--layer none.exr --lens lens.json": "none.exr",
+    "--scene bad.toml --lens lens.json": "none.glb",
+    "--layer layer.exr --lens lens.json --backend vulkan": "--backend: expected one of auto, wgpu, embree",
+    "--layer layer.exr --lens lens.json --backend embree": "leave --backend out",
+    "--layer layer.exr --lens lens.json --fps -1": "--fps: expected a positive number",
+    "--layer layer.exr --lens lens.json --renderer magic": "--renderer: expected one of polygon",
+    "--layer layer.exr --lens lens.json --renderer polygon --renderer none.onnx": "no such file",
+    "--layer layer.exr --lens lens.json --renderer lrdm --psf bank.exr": "leave --psf out",
+    "--layer layer.exr --lens lens.json --board bad.json": "bad.json",
+    "--layer layer.exr --lens lens.json --pose bad.json": "expected width_px",
+    "--layer layer.exr --lens lens.json --camera none.json": "none.json",
+    "--layer layer.exr --lens lens.json --board board.json --pose pose.json": "got --board and --pose: give one",
+    "--layer layer.exr --lens lens.json --opentrackio 5000 --freed 5001": "got --opentrackio and --freed: give one",
+    "--layer layer.exr --lens lens.json --lens-table a.csv": "--lens-table is for the encoders of --freed",
+    "--layer layer.exr --lens lens.json --lens-table a.csv --opentrackio 5000": "--lens-table is for the encoders of --freed",
+    "--layer layer.exr --lens lens.json --metres-per-unit 2": "--metres-per-unit is the scale of a --map",
+    "--layer layer.exr --lens lens.json --map here --metres-per-unit -2": "--metres-per-unit: expected a number above 0",
+    "--layer layer.exr --lens lens.json --rig rig.json": "--rig is for --phone",
+    "--layer layer.exr --lens lens.json --phone-camera pose.json": "--phone-camera is for --phone",
+    "--layer layer.exr --lens lens.json --phone 0 --phone-camera pose.json": "--phone needs --rig RIG.json",
+    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json": "--phone needs --phone-camera CAMERA.json",
+    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json --phone-camera pose.json": "--phone needs --board",
+    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json --phone-camera pose.json --board board.json": "not a phone rig",
+    "--layer layer.exr --lens lens.json --phone test --rig rig.json --phone-camera pose.json --board board.json": "are both test",
+    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json --phone-camera pose.json --freed 5000": "--freed and --phone",
+    "--layer layer.exr --lens lens.json --delay-ms 20": "--delay-ms is for poses that come from elsewhere",
+    "--layer layer.exr --lens lens.json --board board.json --delay-ms 20": "--delay-ms is for poses that come from elsewhere",
+    "--layer layer.exr --lens lens.json --smoothing": "--smoothing needs a track",
+    "--layer layer.exr --lens lens.json --smoothing --pose pose.json": "--smoothing needs a track",
+    "--layer layer.exr --lens lens.json --focus-from luck": "--focus-from: expected one of hand, tracking, source, board",
+    "--layer layer.exr --lens lens.json --focus-from board": "--focus-from board needs --board",
+    "--layer layer.exr --lens lens.json --focus-from tracking": "--focus-from tracking needs a tracking system",
+    "--layer layer.exr --lens lens.json --focus-from tracking --freed 5000": "needs --lens-table",
+    "--layer layer.exr --lens lens.json --interface eth0": "--interface eth0 is for --lan",
+    "--layer layer.exr --lens lens.json --tls-key key.pem": "--tls-key is for --tls",
+    "--layer layer.exr --lens lens.json --tls none.pem": "there is no certificate file none.pem",
+    "--layer layer.exr --lens lens.json --lan --interface nowhere0": "there is no interface 'nowhere0'",
+}
+
+_INVOKE = """
+import json, sys
+from typer.testing import CliRunner
+import viewfinder.commands.serve as serve, viewfinder.app.tracking_choice as tracking
+from viewfinder.cli import app
+def opened(*_):
+    raise RuntimeError("a camera was opened")
+serve.open_source = tracking.open_source = opened
+done = [CliRunner().invoke(app, ["--source", "test", *words]) for words in json.loads(sys.argv[1])]
+print(json.dumps([[type(each.exception).__name__, str(each.exception)] for each in done]))
+"""
+
+
+def test_what_cannot_be_is_refused_before_a_camera_is_opened(folder: Path) -> None:
+    """All in one process of their own, as the hooks of the tests do not know typer's Context. The last one is in order."""
+    good = "--layer layer.exr --lens lens.json --board board.json --focus-from board --smoothing"
+    lines = json.dumps([shlex.split(line) for line in (*REFUSED, good)])
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", _INVOKE, lines], cwd=folder, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    results = json.loads(done.stdout.splitlines()[-1])
+    for line, (kind, sentence) in zip(REFUSED, results, strict=False):
+        assert kind == "InputError" and REFUSED[line] in sentence, (line, kind, sentence)
+        assert "\n" not in sentence, line
+    assert results[-1] == ["RuntimeError", "a camera was opened"]
+
+
+def test_a_refusal_is_one_sentence_and_code_2(folder: Path) -> None:
+    with command(folder, "--renderer", "magic") as process:
+        output, errors = process.communicate(timeout=60)
+    assert (process.returncode, output) == (2, "")
+    assert errors.startswith("error: --renderer: expected one of polygon") and "Traceback" not in errors
+
+
+@contextmanager
+def command(folder: Path, *words: str, before: str = "") -> Iterator["subprocess.Popen[str]"]:
+    """`mrbokeh viewfinder` with the layer and the lens of the folder, run in it; before: Python that runs first."""
+    arguments = ["viewfinder", "--source", "test", "--layer", "layer.exr", "--lens", "lens.json", "--port", "0", *words]
+    program = f"import sys; sys.argv = ['mrbokeh', *{arguments!r}]\n{before}\nfrom mrbokeh.cli import main; main()"
+    with subprocess.Popen(
+        [sys.executable, "-u", "-c", program],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+_SLOW_CAMERA = """
+import time, viewfinder.commands.serve as serve
+def slowly(*_):
+    print("opening", flush=True)
+    time.sleep(60)
+serve.open_source = slowly
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
+def test_ctrl_c_while_it_starts_ends_it_cleanly(folder: Path) -> None:
+    """While the camera is being opened; the tracker's and the layer's threads run by then."""
+    with command(folder, "--board", "board.json", before=_SLOW_CAMERA) as process:
+        assert process.stdout is not None and process.stdout.readline() == "opening\n"
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=30)
+    assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM for another process")
+def test_all_that_is_written_goes_to_the_captures(folder: Path) -> None:
+    """A capture and a recording, and nothing else is new in the folder where it ran."""
+    before = {path.name for path in folder.iterdir()}
+
+    async def work(url: str) -> None:
+        async with aiohttp.ClientSession() as session, session.ws_connect(url + "stream") as stream:
+            await stream.receive(timeout=20)
+            for message in ({"record": True}, {"capture": {}}, {"record": False}):
+                async with session.post(url + "control", json=message) as answer:
+                    assert answer.status == 200, await answer.text()
+
+    with command(folder, "--captures", "shots/today") as process:
+        assert process.stdout is not None
+        url = next(word for word in process.stdout.readline().split() if word.startswith("http://"))
+        asyncio.run(asyncio.wait_for(work(url), 60.0))
+        process.send_signal(signal.SIGTERM)
+        output, errors = process.communicate(timeout=30)
+    assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
+    assert {path.name for path in folder.iterdir()} == before | {"shots"}
+    assert [path.name for path in (folder / "shots").iterdir()] == ["today"]
+    kept = sorted(path.suffix for path in (folder / "shots" / "today").iterdir())
+    assert "" in kept, "the bundle is a folder"
+
+
+def test_a_part_that_fails_closes_those_before_it(folder: Path) -> None:
+    """The layer's and the board's threads run when the camera turns out not to be there; the scenery when the tracker fails."""
+    before = set(threads())
+    good = ServeOptions("none.mkv", layer=folder / "layer.exr", lenses=(folder / "lens.json",), captures=folder)
+    by_board = replace(good, tracking=TrackingChoice(board=folder / "board.json"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        by_freed = replace(good, tracking=TrackingChoice(freed=taken.getsockname()[1]))
+        in_board = replace(good, tracking=TrackingChoice(board=folder / "bad.json"))
+        for options, sentence in ((by_board, "none of them"), (by_freed, "cannot listen"), (in_board, "bad.json")):
+            with pytest.raises(InputError, match=sentence), opened(options, Access()):
+                pass
+            assert set(threads()) <= before
+    with opened(replace(by_board, source="test"), Access()):
+        assert {"board detection", "still layer", "capture", "composite"} <= {each.name for each in threads()}
+    assert set(threads()) <= before
+
+
+def test_a_browser_camera_behind_a_layer_can_be_sent(folder: Path) -> None:
+    options = ServeOptions("whip", layer=folder / "layer.exr", lenses=(folder / "lens.json",), captures=folder)
+    with opened(options, Access()) as running:
+        assert "whip" in running.site.parts
+
+
+def test_what_is_printed_for_a_network(capsys: pytest.CaptureFixture[str]) -> None:
+    """The QR code is drawn with half blocks, as long as nobody asks for none. A token that was used is followed by the next."""
+    sessions = Sessions()
+    door = Door("10.0.0.1", 8080, None, sessions, Access(sessions=sessions))
+    url = "https://10.0.0.1:8080/"
+    for qr in (True, False):
+        replace(door, qr=qr).announce("viewfinder of x", url)
+        replace(door, qr=qr).announce_camera(url, "camera")
+        shown = capsys.readouterr().out
+        assert ("\u2588" in shown or "\u2584" in shown) == qr
+        assert f"to control, for one device: {url}#token={sessions.invitation(Role.CONTROL)}" in shown
+        assert f"to send a camera from a browser: {url}camera#token={sessions.standing_token(Role.CONTROL)}" in shown
+        assert f"{url}whip with the bearer token {sessions.standing_token(Role.CONTROL)}" in shown
+    used = sessions.invitation(Role.CONTROL)
+    assert sessions.enter(used) is not None
+    assert f"#token={sessions.invitation(Role.CONTROL)}" in capsys.readouterr().out != used
+    alone = open_door(ListeningOptions())
+    alone.announce("viewfinder of x", "http://127.0.0.1:8080/")
+    assert capsys.readouterr().out == "viewfinder of x: http://127.0.0.1:8080/ (Ctrl-C stops it)\n"
+
+
+boards = typer.Typer()
+boards.command()(board_command)
+
+
+def test_a_board_to_print(tmp_path: Path) -> None:
+    """The markers span six blurs: at f/2.8 and half a dioptre from the focus the blur of this lens is 17 px of 1280."""
+    write_lens(tmp_path / "lens.json", LENS)
+    out = tmp_path / "board.pdf"
+    words = ["--lens", str(tmp_path / "lens.json"), "--distance-m", "0.8,1.2", "--out", str(out)]
+    done = CliRunner().invoke(boards, words)
+    assert done.exit_code == 0, done.exception
+    assert "print it at 100 %" in done.output and "blurs" in done.output
+    assert out.read_bytes().startswith(b"%PDF")
+    marker_px = LENS.focused_at(1.2).focal_px(1280) * read_board(tmp_path / "board.json").grids[0].marker_mm / 1000 / 0.8
+    assert marker_px >= 6.0 * abs(float(LENS.coc_px(0.8, 1280)))
+    again = CliRunner().invoke(boards, words)
+    assert isinstance(again.exception, InputError) and "--overwrite" in str(again.exception)
+    assert CliRunner().invoke(boards, [*words, "--overwrite"]).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--out", "board.png"], "ends in .pdf"),
+        (["--out", "board.pdf", "--distance-m", "near"], "--distance-m: expected NEAREST,FARTHEST"),
+        (["--out", "board.pdf", "--distance-m", "2,1"], "2"),
+        (["--out", "board.pdf", "--paper", "napkin"], "napkin"),
+        (["--out", "board.pdf", "--lens", "lens.json", "--distance-m", "0.2,30"], "no paper holds a board"),
+    ],
+)
+def test_boards_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], sentence: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_lens(tmp_path / "lens.json", replace(LENS, f_number=1.0))
+    done = CliRunner().invoke(boards, words)
+    assert isinstance(done.exception, InputError) and sentence in str(done.exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["lens.json"]
+
+
+class Told:
+    """Knows one focus."""
+
+    name = "blur of the board"
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:  # noqa: ARG002
+        return LensState(0.9)
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+def test_who_is_asked_first_for_the_focus() -> None:
+    """By hand 3 m, the frame says 2 m; the board's 0.9 m counts only where it is named."""
+    frame = CameraFrame(np.zeros((4, 6, 3), np.uint8), 1.0, 0, LensState(2.0, 4.0))
+    manual = ManualFocus(LensState(3.0))
+    expected: dict[tuple[str, ...], tuple[float, str]] = {
+        (): (3.0, manual.name),
+        ("source",): (2.0, FrameFocus.name),
+        ("source", "hand"): (2.0, FrameFocus.name),
+        ("hand", "source"): (3.0, manual.name),
+        ("board",): (0.9, Told.name),
+        ("hand", "board"): (3.0, manual.name),
+    }
+    for first, (metres, name) in expected.items():
+        focus = open_focus(manual, None, first, Told() if "board" in first else None)
+        assert (focus.state(frame, None), focus.focus_from) == (LensState(metres, 4.0), name), first
+    manual.focus(None)
+    focus = open_focus(manual, None, ("hand", "board"), Told())
+    assert focus.state(frame, None).focus_distance_m == 0.9, "what nobody set by hand comes from the next"
+
+
+@cache
+def board_picture(f_number: float) -> np.ndarray:
+    lens = replace(LENS.focused_at(FOCUS_M), f_number=f_number)
+    camera = camera_over(BOARD, lens, WIDTH_PX, HEIGHT_PX, 0.45, 35.0)
+    return display_bgr(photograph(BOARD, Shot(lens, camera), 48))
+
+
+FOCUS_M = 1 / 1.5
+"""The board lies at 2.0 to 2.4 dioptres."""
+
+
+def test_focus_from_the_blur_of_the_board_follows_the_page(folder: Path) -> None:
+    """Two photographs with the same focus, the second stopped down by two stops, which the page is told, by f-number or by lens.
+
+    Told wrongly, half the blur would mean half the way: about 1.85 in place of 1.5 dioptres. (What is left is 0.01 at f/2.8 and 0.09
+    at f/5.6, for these pictures are sharper than the camera that the solver expects.) The lens's files have the focus, as it breathes.
+    """
+    write_lens(folder / "lens.json", LENS.focused_at(FOCUS_M))
+    write_lens(folder / "stopped.json", replace(LENS.focused_at(FOCUS_M), f_number=5.6))
+    options = ServeOptions(
+        "test",
+        layer=folder / "layer.exr",
+        lenses=(folder / "lens.json", folder / "stopped.json"),
+        tracking=TrackingChoice(board=folder / "board.json"),
+        focus_from=("board",),
+        captures=folder,
+    )
+    with opened(options, Access()) as running:
+        controls = running.site.controls
+        assert controls.state()["focus_from"] is None, "before the first picture"
+        steps: list[tuple[float, Callable[[], None]]] = [
+            (2.8, lambda: None),
+            (5.6, lambda: controls.set_f_number(5.6)),
+            (2.8, lambda: controls.set_f_number(2.8)),
+            (5.6, lambda: controls.set_lens("stopped")),
+        ]
+        for f_number, tell in steps:
+            tell()
+            state = solved(running, board_picture(f_number))
+            assert state["focus_from"] == "blur of the board" and state["f_number"] == f_number
+            assert 1 / state["focus_distance_m"] == pytest.approx(1 / FOCUS_M, abs=0.12)
+        controls.focus_at_distance(3.0)
+        assert solved(running, board_picture(5.6))["focus_distance_m"] != 3.0, "the board was named first"
+
+
+def solved(running: Any, bgr: np.ndarray) -> dict[str, Any]:
+    """The state once the focus came from the board, but not from an answer of an earlier picture."""
+    blur = running.compositor.focus._sources[0].blur
+    deadline_s = time.monotonic() + 20.0
+    sequence, old = 0, blur.answer
+    for forgotten in (True, False):
+        # The change of the lens arrives with a picture; then the answer is a new one.
+        while time.monotonic() < deadline_s:
+            sequence += 1
+            running.compositor(CameraFrame(bgr, time.monotonic(), sequence), 0)
+            if forgotten or (blur.answer is not None and blur.answer is not old):
+                break
+            time.sleep(0.02)
+    running.compositor(CameraFrame(bgr, time.monotonic(), sequence + 1), 0)
+    return running.site.controls.state()
+
+
+def shell_lines() -> Iterator[str]:
+    """The commands of the guide, those that go on over several lines joined."""
+    inside, joined = False, ""
+    for line in DOC.read_text(encoding="utf-8").splitlines():
+        if line.startswith("```"):
+            inside = line == "```sh"
+        elif inside:
+            joined += line.removesuffix("\\")
+            if not line.endswith("\\") and joined.split("#")[0].strip():
+                yield joined.split(" # ")[0].strip()
+            joined = joined if line.endswith("\\") else ""
+
+
+def test_every_command_of_the_guide_is_one() -> None:
+    """Parsed as the command line would be: unknown options, missing ones and values of a wrong kind are refused. Nothing is run."""
+    lines = [line for line in shell_lines() if line.startswith("mrbokeh ")]
+    assert len(lines) >= 15
+    for line in lines:
+        words = shlex.split(line)[1:]
+        name = words.pop(0)
+        parsed = get_command(import_module(SUB_COMMANDS[name].module).app)
+        while words and words[0] in getattr(parsed, "commands", {}):
+            name = words.pop(0)
+            parsed = parsed.commands[name]  # type: ignore[attr-defined]
+        parsed.make_context(name, words)
+
+
+def test_the_guide_names_every_option_and_only_files_that_exist() -> None:
+    text = DOC.read_text(encoding="utf-8")
+    group = get_command(import_module("viewfinder.cli").app)
+    options = {option for parameter in group.params for option in parameter.opts if option.startswith("--")}
+    missing = {option for option in options - {"--help", "--method"} if option not in text}
+    assert not missing, missing
+    for target in _links(text):
+        assert (DOC.parent / target).exists(), target
+
+
+def _links(text: str) -> list[str]:
+    return [target for target in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in target]

@@ -1,0 +1,405 @@
+"""Layered reconstruction by torch agrees with the compiled one, step by step and in its pictures."""
+
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
+from mrbokeh.renderers.layered_reconstruction._filter_numba import extents as extents_compiled
+from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_axes as sheared_axes_compiled
+from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_slopes as sheared_slopes_compiled
+from mrbokeh.renderers.layered_reconstruction._filter_numba import slope_distance as slope_distance_compiled
+from mrbokeh.renderers.layered_reconstruction._samples_numba import morton as morton_compiled
+from mrbokeh.renderers.layered_reconstruction._statistics_numba import seeded, xorshift
+from mrbokeh.stacks.light_field_samples_file import read_samples
+from mrbokeh.system.errors import InputError
+from tests.scenes.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth
+
+torch = pytest.importorskip("torch")
+
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction, _picture  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._filter import (  # noqa: E402
+    Slopes,
+    extents,
+    features,
+    sheared_axes,
+    sheared_slopes,
+    slope_distance,
+)
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight, morton, tile_light  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._screen import transform_size  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import chance, chosen_samples, tile_rows  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._windows import PupilTables, line_kernels, pupil_kernels  # noqa: E402
+
+CPU = torch.device("cpu")
+SIZE_PX = 45
+WINDOW = (0.25, 0.02, 0.21, 1.0 / 12.0)
+SHIPPED = Path(__file__).parents[1] / "data" / "samples"
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Small pictures gain nothing from threads, which wait for one another where tests run side by side."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@cache
+def fence_samples(per_pixel: int = 4) -> LightFieldSamples:
+    """No multiple of a tile: the last tiles are cut."""
+    return sample_planes(fence_scene(SIZE_PX), SIZE_PX, per_pixel)
+
+
+def device_samples(samples: LightFieldSamples) -> DeviceSamples:
+    return DeviceSamples.of(samples, samples.rgb, samples.coc_px(LENS), CPU)
+
+
+def by_torch(samples: LightFieldSamples, settings: Settings | None = None, seed: int = 0) -> np.ndarray:
+    return TorchReconstruction(settings or Settings(), seed=seed).reconstruct(samples, LENS).rgb
+
+
+# Agreement with the compiled renderer. Both do the same in single precision, but for the order of sums and for the screen-space
+# filter (running sums there, transforms in double precision here). A sample whose place rounds to the other side of a pixel
+# could show; none does by more than 100 dB here, and 60 dB is what is promised.
+
+
+@pytest.mark.parametrize("screen_filter", ["windows", "sheared", "direct"])
+@pytest.mark.parametrize("name", ["fence_1", "whirl_1"])
+def test_shipped_samples_give_the_picture_of_the_compiled_renderer(name: str, screen_filter: str) -> None:
+    samples, lens = read_samples(SHIPPED / name / "samples.npz"), read_lens(SHIPPED / name / "lens.json")
+    settings = Settings(screen_filter=screen_filter)  # type: ignore[arg-type]
+    known, known_counts = LayeredReconstruction(settings).reconstruct_counted(samples, lens)
+    found, counts = TorchReconstruction(settings).reconstruct_values(samples, samples.rgb, samples.coc_px(lens), lens.aperture)
+    assert counts == pytest.approx((known_counts.before, known_counts.after), abs=1e-9), "the same partitions"
+    assert psnr(found, known) > 90.0
+    assert np.abs(found - known).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"merge": False},
+        {"sparse_statistics": False},
+        {"merge": False, "sparse_statistics": False, "screen_filter": "sheared", "recursive_passes": 1, "enough": np.inf},
+        {"motion": False},
+        {"tile_px": 16},
+        {"tile_px": 64},
+        {"sigma_x_px": 1.0},
+        {"sigma_x_px": 0.8, "screen_filter": "sheared", "recursive_passes": 3},
+        {"bandwidth": 0.0},
+        {"part_tolerance": 0.0},
+        {"part_tolerance": 0.1, "faint": 0.1},
+        {"faint": 0.0, "merge_tolerance": 0.1},
+        {"pupil_parts": 1, "shutter_parts": 1},
+        {"pupil_parts": 2, "shutter_parts": 4},
+    ],
+)
+def test_every_setting_means_the_same(changed: dict) -> None:
+    settings = replace(Settings(), **changed)
+    known = LayeredReconstruction(settings, seed=5).reconstruct(fence_samples(), LENS).rgb
+    found = by_torch(fence_samples(), settings, seed=5)
+    assert psnr(found, known) > 90.0
+    assert np.abs(found - known).max() < 1e-3
+
+
+def test_lamps_and_pixels_without_samples_are_the_same() -> None:
+    """A lamp of 1e4, and a corner that nothing was sampled in; relative to the lamp single precision is good for 1e-6."""
+    whole = fence_samples()
+    kept = (whole.xy_px[:, 0] > 9.0) | (whole.xy_px[:, 1] > 9.0)
+    arrays = {name: getattr(whole, name)[kept] for name in ("xy_px", "lens_uv", "time", "rgb", "depth_m", "motion_px")}
+    arrays["rgb"] = arrays["rgb"] + 1e4 * (np.abs(arrays["xy_px"] - 30.5) < 0.5).all(axis=1)[:, None].astype(np.float32)
+    samples = LightFieldSamples(SIZE_PX, SIZE_PX, **arrays)
+    known = LayeredReconstruction().reconstruct(samples, LENS)
+    found = TorchReconstruction().reconstruct(samples, LENS)
+    assert known.rgb.max() > 100.0
+    assert np.abs(found.rgb - known.rgb).max() < 1e-6 * 1e4
+    np.testing.assert_array_equal(found.depth_m, known.depth_m)
+
+
+@pytest.mark.parametrize(
+    ("size_px", "count", "nearest_m", "farthest_m"),
+    [
+        ((1, 1), 1, 2.0, 2.0),
+        ((20, 33), 700, np.inf, np.inf),
+        ((40, 35), 120, 0.3, 3.0),
+        pytest.param((70, 40), 500, 0.3, 3.0, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.slow
+def test_few_samples_and_bare_background_are_the_same(size_px: tuple[int, int], count: int, nearest_m: float, farthest_m: float) -> None:
+    """One sample, nothing but background, and less than a sample a pixel with depth and motion all by chance."""
+    rng = np.random.default_rng(4)
+    radius, angle = np.sqrt(rng.uniform(size=count)), rng.uniform(0.0, 2.0 * np.pi, count)
+    depth_m = rng.uniform(nearest_m, farthest_m, count) if np.isfinite(farthest_m) else np.full(count, np.inf)
+    xy_px, uv = rng.uniform(size=(count, 2)) * size_px, np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+    arrays = xy_px, uv, rng.uniform(size=count), rng.uniform(size=(count, 3)), depth_m, rng.normal(0.0, 20.0, (count, 2))
+    samples = LightFieldSamples(*size_px, *(each.astype(np.float32) for each in arrays))
+    known, found = LayeredReconstruction().reconstruct(samples, LENS), TorchReconstruction().reconstruct(samples, LENS)
+    np.testing.assert_allclose(found.rgb, known.rgb, atol=2e-5)
+    np.testing.assert_array_equal(found.depth_m, known.depth_m)
+
+
+def test_samples_that_keep_their_pixels_are_the_same() -> None:
+    """As `render` takes those of layers."""
+    samples = fence_samples()
+    task = samples, samples.rgb, samples.coc_px(LENS), LENS.aperture
+    known, _ = LayeredReconstruction()._reconstructed(*task, shared_out=False)
+    found, _ = TorchReconstruction().reconstruct_values(*task, shared_out=False)
+    assert psnr(found, known) > 90.0 > psnr(by_torch(samples), known)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no NVIDIA GPU")
+@pytest.mark.parametrize("screen_filter", ["windows", "sheared", "direct"])
+def test_a_gpu_gives_the_same_picture(screen_filter: str) -> None:
+    settings = Settings(screen_filter=screen_filter)  # type: ignore[arg-type]
+    found = TorchReconstruction(settings, "cuda").reconstruct(fence_samples(), LENS)
+    known = LayeredReconstruction(settings).reconstruct(fence_samples(), LENS)
+    assert psnr(found.rgb, known.rgb) > 60.0
+    np.testing.assert_array_equal(found.depth_m, known.depth_m)
+
+
+def test_how_much_is_done_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = by_torch(fence_samples())
+    monkeypatch.setitem(_picture.AT_ONCE, "cpu", (3000, 6000, 2000))
+    np.testing.assert_allclose(by_torch(fence_samples()), whole, atol=2e-6)
+
+
+# Pictures.
+
+
+@pytest.mark.parametrize("screen_filter", ["windows", "sheared", "direct"])
+def test_an_even_light_field_stays_even(screen_filter: str) -> None:
+    """Whatever lies at whichever depth and moves however: weights are shares."""
+    samples = sample_planes([replace(plane, colour=even(0.37)) for plane in fence_scene(SIZE_PX)], SIZE_PX, 4)
+    found = by_torch(samples, Settings(screen_filter=screen_filter))  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, 0.37, rtol=1e-4)
+
+
+def test_a_sharp_still_plane_is_the_mean_of_its_samples() -> None:
+    samples = sample_planes([Plane(checker(5.3))], SIZE_PX, 8)
+    np.testing.assert_allclose(by_torch(samples, replace(Settings(), enough=np.inf)), samples.raw_picture(), atol=1e-5)
+
+
+def test_a_lamp_out_of_focus_keeps_its_light() -> None:
+    """One pixel of 100 at its own depth, spread over a disc of 6 px; the truth holds chance in how many samples see it."""
+    lamp = Plane(even(100.0), -6.0, covers=lambda x, y: (np.abs(x - 30.5) < 0.5) & (np.abs(y - 12.5) < 0.5))
+    planes = [lamp, Plane(even(0.0), 0.0)]
+    light = truth(planes, SIZE_PX, 256).sum()
+    found = by_torch(sample_planes(planes, SIZE_PX, 8))
+    assert found.sum() == pytest.approx(light, rel=0.25)
+    assert (found[..., 0] > 0.5).sum() == pytest.approx(np.pi * 9.0, rel=0.5), "a disc of 28 px, its rim uneven"
+
+
+def test_a_blurred_front_over_a_sharp_back_is_nearer_to_the_truth_than_its_samples() -> None:
+    """The 6 dB that are asked of the compiled renderer; where the bar covers everything or nothing its picture is known."""
+    bar = Plane(even(0.9), -12.0, covers=lambda x, _: np.abs(x - 22.0) < 9.0)
+    planes = [bar, Plane(checker(8.0), 0.0)]
+    exact, samples = truth(planes, SIZE_PX, 512), sample_planes(planes, SIZE_PX, 8)
+    found = by_torch(samples)
+    assert psnr(found, exact) > psnr(samples.raw_picture(), exact) + 6.0
+    np.testing.assert_allclose(found[:, 21:23], exact[:, 21:23], atol=0.01)
+    np.testing.assert_allclose(found[:, :5], samples.raw_picture()[:, :5], atol=0.02)
+
+
+# Steps.
+
+
+def test_the_order_of_pixels_and_chance_are_those_of_the_compiled_renderer() -> None:
+    y, x = np.indices((256, 256))
+    some = np.random.default_rng(0).integers(0, 256, (200, 2))
+    codes = morton(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+    assert sorted(codes.ravel().tolist()) == list(range(256 * 256))
+    assert all(codes[b, a] == morton_compiled(a, b) for a, b in some.tolist())
+    numbers = chance(7, 3, 5, CPU)
+    for tile in range(3):
+        state = seeded(7, tile)
+        for k in range(5):
+            state = xorshift(state)
+            assert numbers[tile, k] == state
+
+
+def random_sums(count: int) -> np.ndarray:
+    """Sums over 40 samples each: slopes of both signs, some all alike, some still."""
+    rng = np.random.default_rng(2)
+    slopes = rng.normal(rng.normal(0.0, 6.0, (count, 1, 3)), rng.choice([0.0, 0.3, 4.0], (count, 1, 3)), (count, 40, 3))
+    slopes[:3] = 0.0
+    slopes[3:6, :, 1:] = 0.0
+    return features(torch.from_numpy(slopes)).sum(dim=1).numpy()
+
+
+def test_filters_of_partitions_are_those_of_the_compiled_renderer() -> None:
+    sums, window = random_sums(60), np.array(WINDOW)
+    for bandwidth in (0.0, 1.0):
+        arguments = torch.from_numpy(sums), torch.from_numpy(window), 0.33, bandwidth
+        expected = np.array([sheared_slopes_compiled(row, window, 0.33, bandwidth) for row in sums])
+        np.testing.assert_allclose(torch.stack(sheared_slopes(*arguments), dim=1).numpy(), expected, rtol=1e-9, atol=1e-12)
+        expected = np.array([extents_compiled(row, window, 0.33, bandwidth) for row in sums])
+        np.testing.assert_allclose(torch.stack(extents(*arguments), dim=1).numpy(), expected, rtol=1e-9)
+    found = slope_distance(torch.from_numpy(sums), torch.from_numpy(sums[::-1].copy()), torch.from_numpy(window), 0.33)
+    expected = np.array([slope_distance_compiled(a, b, window, 0.33) for a, b in zip(sums, sums[::-1], strict=True)])
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9)
+    shapes = np.array([(3.0, 1.0, 0.4), (2.0, 2.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.0, 0.0), (4.0, 0.5, -1.5)])
+    found = torch.stack(sheared_axes(*torch.from_numpy(shapes).unbind(dim=1)), dim=1).numpy()
+    np.testing.assert_allclose(found, [sheared_axes_compiled(*each) for each in shapes], rtol=1e-12, atol=1e-12)
+
+
+def plain_rows(light: TileLight) -> dict[tuple[int, int], np.ndarray]:
+    """Sums of what each tile holds, and of what only the ring of blocks around it holds, one sample after the other."""
+    sums: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(8))
+    around: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(8))
+    block_px = light.tile_px // 4
+    for (x, y, *_), (r, m_x, m_y), bucket in zip(light.geometry.tolist(), light.slopes.tolist(), light.bucket.tolist(), strict=True):
+        row = np.array([1.0, r, r * r, m_x, m_y, m_x * m_x, m_x * m_y, m_y * m_y])
+        for tile in range(light.rows * light.columns):
+            left, top = tile % light.columns * light.tile_px, tile // light.columns * light.tile_px
+            in_x, in_y = (low <= at < low + light.tile_px for at, low in ((x, left), (y, top)))
+            by_x, by_y = (low - block_px <= at < low + light.tile_px + block_px for at, low in ((x, left), (y, top)))
+            if in_x and in_y:
+                sums[tile, bucket] += row
+            elif by_x and by_y:
+                around[tile, bucket] += row
+    return {**around, **sums}
+
+
+def test_statistics_are_plain_sums_over_a_tile_and_of_what_only_its_surroundings_hold() -> None:
+    light = tile_light(device_samples(fence_samples(2)), replace(Settings(), tile_px=16))
+    rows, expected = tile_rows(light, 1, 0), plain_rows(light)
+    keys = list(zip(rows.tile.tolist(), rows.bucket.tolist(), strict=True))
+    assert keys == sorted(expected)
+    np.testing.assert_allclose(rows.sums.numpy(), [expected[key] for key in keys], rtol=1e-9, atol=1e-9)
+
+
+def test_sparse_statistics_take_one_of_every_so_many_and_miss_nothing() -> None:
+    light = tile_light(device_samples(fence_samples(8)), Settings())
+    every = 24
+    whole, sparse = tile_rows(light, 1, 0), tile_rows(light, every, 0)
+    assert torch.equal(whole.place >= 0, sparse.place >= 0), "a bucket that holds anything is there"
+    chosen = chosen_samples(light, every, 0)
+    tile_of = light.block // 16
+    within = chosen - light.starts[:-1:16][tile_of[chosen]]
+    for tile, held in enumerate(torch.bincount(tile_of).tolist()):
+        own = within[tile_of[chosen] == tile] // every
+        assert own.tolist() == list(range(-(-held // every))), "stratified: one from each run of so many"
+
+
+def test_kernels_of_pupil_and_shutter_keep_light_and_have_their_variance() -> None:
+    """Sum 1. A disc of radius R has R^2 / 4 along an axis, and shared out among pixels by area 1/12 more (in strips, 2 %). A segment
+    of odd length m is m pixels of 1 / m each, which have (m^2 - 1) / 12."""
+    size = transform_size(67)
+    offset = torch.arange(size)
+    offset = torch.where(offset > size // 2, offset - size, offset)
+    radius, across, down = torch.tensor([[-9.3, 3.7, 20.0], [9.0, -15.0, 1.0], [0.0, 5.0, -7.0]], dtype=torch.float64)
+    slopes = Slopes(radius, across, down, torch.ones_like(radius), torch.ones_like(radius))
+    tables = PupilTables.of(Aperture.disc(), CPU)
+    for kernels, variances in (
+        (pupil_kernels(slopes, tables, offset), radius**2 / 4.0 + 1.0 / 12.0),
+        (line_kernels(slopes, offset), (across**2 - 1.0) / 12.0),
+    ):
+        assert (kernels >= 0.0).all()
+        np.testing.assert_allclose(kernels.sum(dim=(1, 2)), 1.0, atol=1e-9)
+        np.testing.assert_allclose((kernels.sum(dim=1) * offset**2).sum(dim=1), variances, rtol=0.02)
+
+
+# Mistakes, and what is not there.
+
+
+@pytest.mark.parametrize("device", ["tpu", "cuda:99", "mps"])
+def test_devices_that_are_not_there_are_refused(device: str) -> None:
+    with pytest.raises(InputError, match="device"):
+        TorchReconstruction(device=device)
+
+
+def test_filters_that_are_not_there_are_refused() -> None:
+    with pytest.raises(InputError, match="windows, sheared, direct"):
+        by_torch(fence_samples(), Settings(screen_filter="texture"))
+
+
+def test_without_torch_it_says_what_to_install() -> None:
+    code = """
+import sys
+sys.modules["torch"] = None
+from mrbokeh.system.errors import MissingExtraError
+try:
+    import mrbokeh.renderers.layered_reconstruction.torch_reconstruction
+except MissingExtraError as error:
+    assert "mrbokeh[train]" in str(error)
+    print("said so")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "said so"
+
+
+# Kernels for GPUs, interpreted, which has to be said before they are imported, and compiled for one that is not there.
+
+
+def test_the_kernels_for_gpus_do_what_torch_does() -> None:
+    pytest.importorskip("triton")
+    code = """
+import torch
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _merging, _reprojection
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._reprojection_triton import splat_by_kernel
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._sweep_triton import sweep_by_kernel
+from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
+
+torch.set_num_threads(1)
+plain_sweep, plain_splat = _merging.sweep_row_by_row, _reprojection.splat_in_chunks
+
+def sweep(*task):
+    print(all(torch.equal(a, b) for a, b in zip(sweep_by_kernel(*task), plain_sweep(*task))), "merged" if len(task[0].tile) > 20 else "few")
+    return plain_sweep(*task)
+
+def splat(planes, light, slope, facts, place, entry, block, side, pairs):
+    some = torch.arange(0, len(entry), 7)
+    found, known = torch.zeros_like(planes), torch.zeros_like(planes)
+    splat_by_kernel(found, light, slope, facts, place, entry[some], block[some], side)
+    plain_splat(known, light, slope, facts, place, entry[some], block[some], side, pairs)
+    print(torch.allclose(found, known, atol=1e-4), "light" if float(known.sum()) > 100 else "dark")
+    plain_splat(planes, light, slope, facts, place, entry, block, side, pairs)
+
+_merging.sweep_row_by_row, _reprojection.splat_in_chunks = sweep, splat
+TorchReconstruction().reconstruct(sample_planes(fence_scene(32), 32, 4), LENS)
+"""
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    words = done.stdout.split()
+    assert words[:2] == ["True", "merged"]
+    assert len(words) >= 4 and set(words[2::2]) == {"True"} and "light" in words
+
+
+def test_the_kernels_compile_for_gpus() -> None:
+    """For Hopper, without one. Products are not fused with sums, so that a sample falls on the same side of a pixel's border."""
+    pytest.importorskip("triton")
+    code = """
+from triton import compile
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._reprojection_triton import _splat
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._sweep_triton import _sweep
+
+def ptx(kernel, types, sizes, **options):
+    signature = {name: "constexpr" if name in sizes else types.get(name, "*i64") for name in kernel.arg_names}
+    constants = {(kernel.arg_names.index(name),): size for name, size in sizes.items()}
+    source = ASTSource(fn=kernel, signature=signature, constexprs=constants)
+    return compile(source, target=GPUTarget("cuda", 90, 32), options={"enable_fp_fusion": False, **options}).asm["ptx"]
+
+singles = dict.fromkeys(("planes", "geometry", "values", "slope"), "*fp32")
+print(ptx(_splat, {**singles, "buckets": "i32", "side": "i32"}, {"CHANNELS": 3, "WIDE": 8, "SAMPLES": 64}))
+print(ptx(_sweep, dict.fromkeys(("sums", "widths", "limits", "window", "chosen"), "*fp64"), {"BACK": 8}, num_warps=1))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "red.global.gpu.relaxed.add.f32" in done.stdout
+    assert "fma." not in done.stdout
