@@ -1,4 +1,6 @@
-"""How long layered reconstruction takes by torch: `python -m tests.bench.bench_torch_reconstruction [--device cuda] [--size 1280x720] [--spp 8]`.
+"""How long layered reconstruction takes by torch.
+
+`python -m tests.bench.bench_torch_reconstruction [--device cuda] [--size 1280x720] [--spp 8]`
 
 The scene after Hasselgren 2015, Fig. 8, with all samples on the device; the compiled renderer reconstructs the same samples in the
 same run, and both pictures are compared.
