@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from mrbokeh.optics._outline_geometry_numba import cross
+from mrbokeh.renderers.polygon._outline_geometry_numba import cross
 
 THROUGH, ARRIVING, LEAVING = 0, 1, 2
 """Kinds of line: touching on both sides of the vertex; ending or starting at a vertex that points inwards."""

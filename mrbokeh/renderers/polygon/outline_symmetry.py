@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrbokeh.optics.outline_geometry import EXACT, Outline
+from mrbokeh.renderers.polygon.outline_geometry import EXACT, Outline
 
 ALIKE = 1e-3
 """An outline counts as symmetric if its mirror image stays this close to it, in its half extents."""
@@ -59,7 +59,7 @@ class Sector:
 
 def sectors(shape: Outline, steps: Outline) -> Iterator[Sector]:
     """The outline unfolded from one sector of every symmetry that it shares with the directions, the largest first."""
-    from mrbokeh.optics._outline_geometry_numba import farthest_from_outline
+    from mrbokeh.renderers.polygon._outline_geometry_numba import farthest_from_outline
 
     def holds(element: np.ndarray) -> bool:
         if not all(np.abs(steps - step).max(axis=1).min() < EXACT for step in steps @ element.T):

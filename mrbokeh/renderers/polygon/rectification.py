@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.outline_geometry import EXACT, Outline, area, centroid, without_flat_vertices
+from mrbokeh.renderers.polygon.outline_geometry import EXACT, Outline, area, centroid, without_flat_vertices
 from mrbokeh.renderers.polygon.rectification_walks import smallest_polygon
 from mrbokeh.system.errors import InputError
 
@@ -105,7 +105,7 @@ def _unit_steps(directions: Sequence[tuple[int, int]], max_edges: int) -> Float6
 
 
 def _check(outline: Outline) -> None:
-    from mrbokeh.optics._outline_geometry_numba import crosses_itself
+    from mrbokeh.renderers.polygon._outline_geometry_numba import crosses_itself
 
     if outline.ndim != 2 or outline.shape[0] < 3 or outline.shape[1] != 2 or not np.isfinite(outline).all():
         raise InputError("an outline must be (V, 2) with at least 3 vertices and finite numbers")

@@ -5,7 +5,7 @@ Shapes here are centred, turn with positive area and reach 1 from their middle.
 
 import numpy as np
 
-from mrbokeh.optics.outline_geometry import EXACT, Outline, area, corner_points, swept_areas, without_flat_vertices
+from mrbokeh.renderers.polygon.outline_geometry import EXACT, Outline, area, corner_points, swept_areas, without_flat_vertices
 from mrbokeh.renderers.polygon.outline_symmetry import NO_SYMMETRY, Sector, sectors
 
 
@@ -40,7 +40,7 @@ def _simple_walk(sector: Sector, shape: Outline, steps: Outline, max_edges: int)
 
 def _overlaps_itself(polygon: Outline) -> bool:
     """Whether a polygon crosses itself. Made a little smaller first: then one that touches itself in a point does not."""
-    from mrbokeh.optics._outline_geometry_numba import crosses_itself
+    from mrbokeh.renderers.polygon._outline_geometry_numba import crosses_itself
 
     edges = np.roll(polygon, -1, axis=0) - polygon
     return bool(crosses_itself(corner_points(np.column_stack([polygon, edges / np.hypot(*edges.T)[:, None]]), -1e3 * EXACT)))
@@ -48,7 +48,7 @@ def _overlaps_itself(polygon: Outline) -> bool:
 
 def _enclosing(lines: np.ndarray, shape: Outline) -> Outline:
     """The polygon of lines in their order, all moved outwards by as much as the shape differs from its symmetric twin."""
-    from mrbokeh.optics._outline_geometry_numba import farthest_from_outline
+    from mrbokeh.renderers.polygon._outline_geometry_numba import farthest_from_outline
 
     outwards, polygon = 0.0, without_flat_vertices(corner_points(lines, 0.0))
     for _ in range(8):
