@@ -32,8 +32,8 @@ from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, write_focal
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME as MANIFEST
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
 from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 PLAN_NAME = "plan.json"
 _TEST_SHARE = 0.2

@@ -24,8 +24,8 @@ from datasets_scripts.file_job import claim_folder
 from datasets_scripts.truth_mitsuba import SCALAR, best_variant, load
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, write_focal_stack_dataset
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 PLAN_NAME = "plan.json"
 

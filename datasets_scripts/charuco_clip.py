@@ -18,12 +18,11 @@ from jaxtyping import Float32
 
 from datasets_scripts.hand_held import HandHeld
 from datasets_scripts.sheet_tracer import Sheet, pack_table, trace_sheet, with_noise
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from mrbokeh.video.clip import VideoWriter
 
 _FOCAL_LENGTH_MM, _SENSOR_WIDTH_MM = 22.0, 24.0

@@ -22,9 +22,9 @@ import typer
 from datasets_scripts.gallery_entries import Entry, read_entries
 from datasets_scripts.gallery_pictures import page_jpeg, result_jpeg
 from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.html_page import inline_figure, write_page
-from mrbokeh.system.progress import track
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
-from mrbokeh.images.image_io import read_image, read_layer
+from mrbokeh.images.image_io import SheetRow, read_image, read_layer, write_contact_sheet
 from mrbokeh.system.atomic_files import read_json
 
 

@@ -9,8 +9,8 @@ from jaxtyping import Float, Float64
 
 from datasets_scripts.psf_quad_tree import QuadTree
 from mrbokeh.images.image_metrics import ssim
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import physical_boxes
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.renderers.kernels.laplacian_integration import integrate
 from mrbokeh.renderers.kernels.spreadlets import Spreadlet

@@ -17,8 +17,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 # JPEG rounds and rings: what was full may be stored a little lower.
 _CLIPPED_CODE = 250.0 / 255.0

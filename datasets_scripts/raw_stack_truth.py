@@ -9,8 +9,7 @@ from jaxtyping import Float
 from datasets_scripts.dng_writer import film_plane_distance_m
 from datasets_scripts.sensor_model import SensorModel
 from datasets_scripts.stack_scenes import STACK_SCENES, StackScene
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_to_json
 from mrbokeh.system.errors import InputError

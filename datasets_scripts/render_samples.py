@@ -15,8 +15,8 @@ import typer
 
 from datasets_scripts.samples_plan import SamplesPlan, SamplesSet
 from datasets_scripts.samples_scenes import SCENES
+from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import progress_bars
 
 
 def render_samples(out: Path, plan: SamplesPlan, *, measure: bool = False, overwrite: bool = False, threads: int = 0) -> int:

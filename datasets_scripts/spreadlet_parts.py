@@ -9,13 +9,13 @@ import numpy as np
 
 from datasets_scripts.psf_corpus import Corpus, Kernel, Likeness, Window, alike, around, clean, is_line, likeness_of, mean_of, picture_of
 from datasets_scripts.psf_quad_tree import QuadTree, quad_tree, quad_tree_points
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import physical_boxes
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.renderers.kernels.laplacian_integration import laplacian
 from mrbokeh.renderers.kernels.spreadlet_values import fitted_values, moments, potential_of, table_for
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 OPERATIONAL_POINTS = (0.5, 1.0, 2.0)
 SAMPLE_STEPS = (12, 25, 50, 75, 110, 150)

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 
 from datasets_scripts.blur_rows import Row
-from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
-from mrbokeh.images.image_io import read_image
+from mrbokeh.images.image_io import SheetRow, read_image, write_contact_sheet
 
 DETAIL_SHARE = (0.22, 0.22)
 """Height and width of a detail over those of the picture."""

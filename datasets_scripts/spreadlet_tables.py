@@ -17,8 +17,8 @@ from datasets_scripts.blur_rows import ROWS, Measurement, Methods, Row
 from datasets_scripts.samples_plan import SamplesPlan
 from datasets_scripts.spreadlet_sheet import write_details
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import progress_bars
 
 _SPP = 4
 _NOT_THERE = "-"

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.aperture_modifiers import joined
-from mrbokeh.optics.aperture_shapes import net_area, outlines_of, unit_disc
+from mrbokeh.optics.aperture_shapes import joined, net_area, outlines_of, unit_disc
 from mrbokeh.system.errors import InputError
 
 _LINES = 512

@@ -11,8 +11,8 @@ from datasets_scripts.file_job import Job, claim_folder
 from datasets_scripts.truth_mitsuba import SCALAR, VARIANTS, best_variant, load
 from datasets_scripts.truth_plan import TruthPlan
 from datasets_scripts.truth_shapes import SHAPE_NAMES
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 
 class ViewFiles(ABC):

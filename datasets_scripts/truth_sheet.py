@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from datasets_scripts.truth_tracer import Picture
-from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
 from mrbokeh.images.exr_io import read_exr
-from mrbokeh.images.image_io import read_image, read_layer
+from mrbokeh.images.image_io import SheetRow, read_image, read_layer, write_contact_sheet
 from mrbokeh.system.atomic_files import read_json
 
 

@@ -13,8 +13,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from mrbokeh.system.errors import InputError, MissingExtraError
-from mrbokeh.system.interrupts import INTERRUPTED
+from mrbokeh.system.errors import INTERRUPTED, InputError, MissingExtraError
 
 # OpenCV's threads otherwise spin while they wait for work: a tenth of the CPU time of a merge. It is read when OpenCV is imported.
 os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")

@@ -8,8 +8,8 @@ import numpy as np
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from training.dataset import PairSet
 from training.stacks import stack_name
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.renderers.network.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
 from mrbokeh.system.atomic_files import atomic_path, write_json
 from mrbokeh.system.errors import InputError

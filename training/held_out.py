@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from mrbokeh.images.contact_sheet import SheetRow
+from mrbokeh.images.image_io import SheetRow
 from mrbokeh.stacks.focal_stack import FocalStack
 from training.batches import Batch, stack_pairs
 from training.dataset import Pair, PairSet

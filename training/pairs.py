@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.stacks.focal_stack import FocalStack
 from training.slice_rows import StackRows, read_slice_rows, slice_size_px
 from training.weights import Counting, pixel_weight

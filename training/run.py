@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from rich.progress import Progress as Bars
 
+from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import progress_bars
 from training.batches import Batch, draw_share
 from training.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.checkpoint import Progress, read_checkpoint, restore_checkpoint

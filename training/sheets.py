@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.contact_sheet import WIDEST_PX, SheetRow, write_contact_sheet
+from mrbokeh.images.image_io import WIDEST_PX, SheetRow, write_contact_sheet
 
 FOLDER_NAME = "sheets"
 MOST_KEPT = 16

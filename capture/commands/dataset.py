@@ -45,7 +45,7 @@ def dataset_command(
     from capture.dataset.writer import DatasetPlan, write_dataset
     from capture.report.reblur import reblur_by
     from mrbokeh.stacks.guessed_metres import metres_notes
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     if not scenes:
         raise InputError("expected the folders of scenes, got none: mrbokeh capture dataset SCENE... --out DATASET --licence TEXT")

@@ -31,7 +31,7 @@ def depth_command(
     from capture.dense.scene_depth import SceneDepthSettings, deepen_scene
     from capture.merging.retouch import retouched_stacks, retouches_text, stacks_before
     from mrbokeh.figures.stack_pictures import SHEET_NAME
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     retouched = retouched_stacks(stacks_before(scene))
     settings = SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device))

@@ -45,8 +45,8 @@ def ingest_command(
     from capture.stacks.ingest import IngestSettings, ingest
     from capture.stacks.ingest_table import print_report
     from capture.stacks.stack_ingest import Development
-    from mrbokeh.system.interrupts import kept_when_interrupted
-    from mrbokeh.system.malloc_settings import keep_freed_pictures
+    from mrbokeh.system.console import kept_when_interrupted
+    from mrbokeh.system.memory import keep_freed_pictures
 
     if group not in list(Grouping):
         raise InputError(f"--group must be one of {', '.join(Grouping)}, got {group!r}")

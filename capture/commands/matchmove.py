@@ -37,7 +37,7 @@ def matchmove_command(
 ) -> None:
     from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
     from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
     from mrbokeh.tracking.camera_track.formats import format_of_name, write_track
     from mrbokeh.tracking.charuco.board_file import read_board
 

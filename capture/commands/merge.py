@@ -54,8 +54,8 @@ def merge_command(
     from capture.merging.relative_stack import ORDER
     from capture.merging.retouch import retouched_stacks, stacks_before
     from mrbokeh.stacks.guessed_metres import metres_facts, metres_note
-    from mrbokeh.system.interrupts import kept_when_interrupted
-    from mrbokeh.system.malloc_settings import keep_freed_pictures
+    from mrbokeh.system.console import kept_when_interrupted
+    from mrbokeh.system.memory import keep_freed_pictures
 
     if from_slice or mask:
         if overwrite or registration is not None or prefer is not None:

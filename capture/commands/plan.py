@@ -106,7 +106,7 @@ def range_from(origin: str, near_m: float, far_m: float, lens: "Lens") -> "Focus
 def rounded_to(plan: "FocusPlan", text: str) -> "FocusPlan":
     """--scale: marks count from the film plane, as they are engraved."""
     from capture.tether.focus_plan import on_scale
-    from mrbokeh.optics.film_plane import lens_distance_m
+    from mrbokeh.optics.lens import lens_distance_m
 
     try:
         marks_m = [float(each) for each in text.split(",")]

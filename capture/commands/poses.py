@@ -36,7 +36,7 @@ def poses_command(
 ) -> None:
     from capture.poses.colmap import PoseSettings, find_picture_poses, find_scene_poses
     from capture.poses.colmap_matches import median_parallax_deg
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     settings = PoseSettings(mapper, camera_model, cameras, max_image_size, seed, threads, overwrite)
     if scene is not None and images is None and out is None:

@@ -40,7 +40,7 @@ def report_command(
     from capture.report.scene_report import report_scene
     from capture.report.stack_rules import picture_verdict
     from capture.report.strictness import require_gates, unmet
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     allowed = require_gates(allow_absent or [], strict)
     if not scene.is_dir():

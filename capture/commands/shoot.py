@@ -73,7 +73,7 @@ def shoot_command(
     from capture.tether.shoot import shoot
     from capture.tether.shoot_arguments import parse_seconds, parse_spot, parse_target, steps_between
     from capture.tether.shoot_options import ShootOptions, Surroundings
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     planned = read_plan(plan)
     given = read_focus_steps(focus_steps) if focus_steps is not None else steps_between(planned, near_steps, far_steps, home)
@@ -109,7 +109,7 @@ def measured(
     from capture.tether.focus_steps import read_focus_steps, write_focus_steps
     from capture.tether.focus_sweep import measure_focus_steps
     from capture.tether.shoot_arguments import parse_stop
-    from mrbokeh.system.progress import working
+    from mrbokeh.system.console import working
 
     path = out / "focus_steps.json"
     if path.exists() and not again:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from capture.dataset.file_placing import record_of
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, file_troubles
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 
 def verify(dataset: FocalStackDataset) -> list[str]:

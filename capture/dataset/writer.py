@@ -11,8 +11,8 @@ from mrbokeh import __version__
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, StackRecord, write_focal_stack_dataset
 from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 UNFINISHED_NAME = "unfinished.json"
 MAXIMUM = "maximum"

@@ -26,8 +26,8 @@ from capture.poses.sparse_model_file import read_sparse_model
 from capture.poses.sweep_view import SweepView
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

@@ -17,8 +17,8 @@ from capture.poses.sparse_model import SparseModel, SparseView
 from capture.scale.board import board_scale
 from capture.scale.distance import distance_scale
 from mrbokeh.optics.camera import Camera
+from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track as with_progress
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
 from mrbokeh.tracking.charuco.board import CharucoBoard

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 from mrbokeh.tracking.charuco.corner_flow import flow
 from mrbokeh.tracking.charuco.detector import Grey
 from mrbokeh.video.clip import VideoInfo, read_display_frames

@@ -31,8 +31,8 @@ from capture.merging.registration import Registration
 from capture.merging.slice_structure import SliceStructure, structure_of
 from capture.merging.track_fit import distances_px
 from capture.merging.warping import warp, warped_validity
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 __all__ = ["Registration", "register_stack", "warp", "warped_validity"]
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32
 
 from capture.merging.focus_volume import Blocks, FocusVolume, block_detail
 from capture.stacks.block_detail import BLOCK_PX
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

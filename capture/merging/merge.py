@@ -33,8 +33,8 @@ from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 FEWEST_SLICES = 2
 HIGHLIGHTS = "highlights"

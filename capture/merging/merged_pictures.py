@@ -14,7 +14,7 @@ from capture.merging.tiff_writer import BYTE, LONG, RATIONAL, SHORT, UNDEFINED, 
 from mrbokeh.figures.stack_pictures import depth_codes, orientation_of, write_upright_png
 from mrbokeh.images.camera_rgb import Matrix3x3
 from mrbokeh.images.color import rec709_from_XYZ
-from mrbokeh.images.exif_orientation import upright
+from mrbokeh.images.exif import upright
 from mrbokeh.images.picture_codec import codes_of, even_codes, write_stored
 from mrbokeh.stacks.focal_stack import FocalStack
 

@@ -19,8 +19,7 @@ from capture.merging.registered_slices import IngestedSlices, RegisteredSlices, 
 from capture.merging.relative_focus import RelativeFocus, solve_relative_focus
 from mrbokeh.images.camera_rgb import half_of
 from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH, METRES, FocalStack, Slice

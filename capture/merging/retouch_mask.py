@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.exif_orientation import as_stored, stored_orientation, upright
+from mrbokeh.images.exif import as_stored, stored_orientation, upright
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import require_suffix
 from mrbokeh.images.picture_codec import stored_pixels

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mrbokeh.optics.film_plane import lens_distance_m
-from mrbokeh.optics.lens import MM_PER_M
+from mrbokeh.optics.lens import MM_PER_M, lens_distance_m
 
 Tags = Mapping[str, str]
 

@@ -8,8 +8,7 @@ from capture.photos.developing import develop, is_raw
 from capture.photos.metadata import read_metadata
 from capture.photos.photo_metadata import PhotoMetadata
 from mrbokeh.images.color import convert
-from mrbokeh.images.cut_out import cut_from_px
-from mrbokeh.images.exif_orientation import known_orientation, quarter_turns, stored_orientation, upright
+from mrbokeh.images.exif import cut_from_px, known_orientation, quarter_turns, stored_orientation, upright
 from mrbokeh.stacks.photograph import Photograph
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mrbokeh.images.cut_out import as_it_lies, is_same_shape
+from mrbokeh.images.exif import as_it_lies, is_same_shape
 
 # A RAW shows a few pixels more than the JPEG of its camera; a picture that differs by more was resized or cut.
 _MARGIN = 0.05

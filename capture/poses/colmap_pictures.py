@@ -12,8 +12,8 @@ from capture.poses.lens_calibration import stated_distances_m
 from mrbokeh.images.color import luminance
 from mrbokeh.images.image_io import write_preview
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 CAMERA_CHOICES = ("auto", "shared", "separate")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

@@ -16,8 +16,8 @@ from typing import IO, Any
 from rich.progress import Progress
 
 import capture
+from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError, MissingExtraError
-from mrbokeh.system.progress import progress_bars
 
 LOG_NAME = "colmap.log"
 DATABASE_NAME = "database.db"

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from capture.poses.sparse_model import SparseModel, SparseView
-from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.optics.camera import camera_from_json, camera_to_json
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.system.errors import InputError
 

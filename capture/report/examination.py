@@ -21,7 +21,7 @@ from capture.report.stack_rules import DEPTH_OFF_PX
 from capture.report.stack_view import StackView
 from mrbokeh.images.color import luminance
 from mrbokeh.images.image_metrics import psnr
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

@@ -18,8 +18,8 @@ from capture.scale.answer import ScaleAnswer
 from capture.scale.sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
 from capture.stacks.sentinel_focus import stated_by_sentinel
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 FEWEST_POINTS = 50
 OFFSET_SIGMA_M = 0.03

@@ -23,8 +23,8 @@ from capture.stacks.sentinel_focus import stated_by_sentinel
 from mrbokeh.images.color import luminance
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import METRES, FocalStack
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 _WIDEST_PX = 1600
 _UNKNOWN_SIGMA_DIOPTRE = 0.5

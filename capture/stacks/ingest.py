@@ -21,8 +21,8 @@ from capture.stacks.session import CameraChoice, Session, open_session
 from capture.stacks.stack_description import StackReport, finish_stack, finished_before, ingest_digest
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
 from capture.stacks.stack_remarks import FEWEST_TO_MERGE
+from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import progress_bars
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from mrbokeh.optics.film_plane import lens_distance_m
-from mrbokeh.optics.lens import MM_PER_M, Lens
+from mrbokeh.optics.lens import MM_PER_M, Lens, lens_distance_m
 from mrbokeh.system.errors import InputError
 
 MOST_SLICES = 999

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.tether.focus_plan import FocusPlan, FocusRange
-from mrbokeh.optics.film_plane import film_plane_m
+from mrbokeh.optics.lens import film_plane_m
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.system.errors import InputError

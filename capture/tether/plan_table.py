@@ -4,7 +4,7 @@ from rich.console import Console
 from rich.table import Table
 
 from capture.tether.focus_plan import FocusPlan
-from mrbokeh.optics.film_plane import film_plane_m
+from mrbokeh.optics.lens import film_plane_m
 
 _ROUNDING_PX = 1e-6
 

@@ -15,8 +15,8 @@ from capture.tether.focus_steps import steps_to_json
 from capture.tether.shoot_focus import ByHand, ByMotor, Focusing
 from capture.tether.shoot_log import ShootLog, open_log
 from capture.tether.shoot_options import ShootOptions, Surroundings
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 
 def shoot(plan: FocusPlan, camera: CameraDriver, out: Path, options: ShootOptions, world: Surroundings) -> ShootLog:

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 from capture.tether.focus_axis import FocusAxis
 from capture.tether.focus_plan import FocusPlan
 from capture.tether.focus_steps import FocusSteps
-from mrbokeh.optics.film_plane import film_plane_m
+from mrbokeh.optics.lens import film_plane_m
 
 
 @runtime_checkable

@@ -15,8 +15,7 @@ from jaxtyping import Float32
 
 from capture.tether.camera_driver import CameraError
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.optics.film_plane import film_plane_m
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens import Lens, film_plane_m
 from mrbokeh.system.errors import MissingExtraError
 
 Rgb = Float32[np.ndarray, "height width 3"]

@@ -14,8 +14,8 @@ from mrbokeh.checks.shots import Shot
 from mrbokeh.images.image_io import read_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 
 @dataclass(frozen=True)

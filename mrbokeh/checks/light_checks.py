@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float32
 from mrbokeh.checks.checked_picture import SHARP, VIRTUAL, CheckedPicture
 from mrbokeh.checks.findings import CheckReport, Finding
 from mrbokeh.images.color import convert
-from mrbokeh.images.exr_primaries import BT2020_from_rec709
+from mrbokeh.images.exr_io import BT2020_from_rec709
 from mrbokeh.images.layer import Layer
 
 Rgb = Float32[np.ndarray, "height width 3"]

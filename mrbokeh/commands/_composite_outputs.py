@@ -9,9 +9,9 @@ from mrbokeh.commands._composite_options import ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
 from mrbokeh.images.layer import Layer, flatten
-from mrbokeh.images.plate_alpha import HOLDING_ALPHA, alpha_with
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.errors import InputError
@@ -71,7 +71,7 @@ def write_results(
 
 def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions) -> None:
     """With an output space the picture alone; else linear Rec.709 with its layers, or sRGB."""
-    from mrbokeh.images.finished_picture import write_finished
+    from mrbokeh.images.alpha_io import write_finished
 
     if out.suffix.lower() == ".exr" and colour.of_result is None:
         _write_layers(out, inserted, plate, flatten(sharp))

@@ -5,13 +5,13 @@ from typing import Any
 
 from typer.core import TyperCommand
 
-from mrbokeh.system.option_names import flag, spelled_out
+from mrbokeh.system.console import flag, spelled_out
 
 
 def formerly(*parameters: str, **now_by_former: str) -> type[TyperCommand]:
     """The class for a command some of whose options had other names: `@app.command(cls=formerly("frame_rate", width="--image-width"))`.
 
-    parameters: those whose options were their names spelled out; `mrbokeh.system.option_names` says what they are called now.
+    parameters: those whose options were their names spelled out; `mrbokeh.system.console` says what they are called now.
     """
     renamings = {name: flag(name) for name in parameters} | now_by_former
     names = {spelled_out(former): now for former, now in renamings.items()}

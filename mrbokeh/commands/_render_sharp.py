@@ -50,8 +50,7 @@ def _read(sources: Sources) -> dict[str, Layer]:
 
 
 def _whole_layer(path: Path) -> Layer:
-    from mrbokeh.images.image_io import read_layer
-    from mrbokeh.images.sound_values import require_numbers
+    from mrbokeh.images.image_io import read_layer, require_numbers
 
     layer = read_layer(path, extra=True)
     require_numbers(path, {"colour": layer.rgb, "alpha": layer.alpha})

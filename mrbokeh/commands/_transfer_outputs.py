@@ -11,8 +11,8 @@ from jaxtyping import Float32
 from mrbokeh.optics.lens import Lens
 from mrbokeh.refocus.transferring import SharpPhotograph
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Blurred = Callable[[float], Rgb]
@@ -79,7 +79,7 @@ def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tup
 
 
 def write_sheet(path: Path, distances_m: Sequence[float], blurred: Blurred, sharp_rgb: Rgb) -> None:
-    from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+    from mrbokeh.images.image_io import SheetRow, write_contact_sheet
 
     pictures = {"all in focus": sharp_rgb} | {f"{each:.4g} m": blurred(each) for each in distances_m}
     write_contact_sheet(path, [SheetRow("focus", pictures)])

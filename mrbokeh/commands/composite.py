@@ -51,7 +51,7 @@ def composite(
     from mrbokeh.compositing.plate_look.look_options import finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
-    from mrbokeh.system.progress import working
+    from mrbokeh.system.console import working
 
     read = (photo, taken.depth, taken.matte, *virtual.files, standing.object_, standing.environment, rendering.distortion, optics.lens)
     check_outputs(out, result, read, all_slices=taken.all_slices)

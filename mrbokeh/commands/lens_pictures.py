@@ -21,7 +21,7 @@ def show(
     Example: mrbokeh lens show lens.json --out lens.png
     """
     from mrbokeh.system.atomic_files import atomic_path, refuse_existing
-    from mrbokeh.system.progress import working
+    from mrbokeh.system.console import working
 
     if lens.suffix.lower() == ".onnx":
         raise InputError(f"expected a lens file or a bank of PSFs to draw, got the network {lens}: `mrbokeh train evaluate` shows it")

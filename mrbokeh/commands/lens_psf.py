@@ -62,7 +62,7 @@ def psf(
     """
     from mrbokeh.psf_models.build import build_bank
     from mrbokeh.psf_models.choose import ModelOptions, choose_model
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     options = ModelOptions(
         lens=lens,
@@ -119,7 +119,7 @@ def spreadlets(
     from mrbokeh.optics.psf_bank_file import SPREADLETS
     from mrbokeh.renderers.kernels.spreadlets import Sparsification
     from mrbokeh.renderers.kernels.spreadlets_build import build_spreadlets
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     settings = Sparsification(points_per_px=points_per_px, lloyd_steps=lloyd_steps, annealing_steps=annealing_steps, seed=seed)
     with kept_when_interrupted(f"finished kernels are kept in {bank}", overwrite):

@@ -55,7 +55,7 @@ def refocus(
     from mrbokeh.stacks.focus_places import Seen, parse_focus
     from mrbokeh.stacks.guessed_metres import inherited_facts, metres_note, unit_of
     from mrbokeh.system.atomic_files import require_safe_outputs
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
 
     if out.resolve() == stack.resolve():
         raise InputError("--out must be another folder than the stack's own")
@@ -127,7 +127,7 @@ def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, se
     from mrbokeh.images.image_io import write_image
     from mrbokeh.stacks.focus_places import slice_names
     from mrbokeh.system.atomic_files import read_json, write_json
-    from mrbokeh.system.progress import track
+    from mrbokeh.system.console import track
 
     kept = not overwrite and (out / _SETTINGS).is_file() and read_json(out / _SETTINGS, "settings of refocus") == settings
     write_json(out / _SETTINGS, settings)
@@ -160,7 +160,7 @@ def _times_as_fast(way: Refocusing) -> float:
 
 
 def _write_sheet(path: Path, made: FocalStack) -> None:
-    from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+    from mrbokeh.images.image_io import SheetRow, write_contact_sheet
     from mrbokeh.stacks.guessed_metres import unit_of
 
     pictures = {f"{each.focus_distance_m:.5g} {unit_of(made)}": made.slice_rgb(index) for index, each in enumerate(made.slices)}

@@ -62,7 +62,7 @@ def render(
     from mrbokeh.optics.lens_file import read_lens
     from mrbokeh.renderers.choose_bank import chosen_renderer
     from mrbokeh.system.atomic_files import require_safe_outputs
-    from mrbokeh.system.progress import working
+    from mrbokeh.system.console import working
 
     require_suffix(out, (".exr", *INTEGER_SUFFIXES), "--out")
     require_safe_outputs((out,), (lens, rgb, depth, motion, samples, *(layer or ()), *(behind or ())), overwrite)

@@ -8,8 +8,8 @@ from jaxtyping import Float32
 
 from mrbokeh.depth.depth_settings import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
+from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
-from mrbokeh.images.plate_alpha import is_straight, read_alpha
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.capture_bundle import CaptureBundle

@@ -18,8 +18,8 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.focal_stack import FocalStack, write_focal_stack, write_merged
 from mrbokeh.stacks.guessed_metres import POSITION, POSITION_ERROR, metres_facts
 from mrbokeh.system.atomic_files import atomic_folder
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]

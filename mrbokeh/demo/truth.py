@@ -8,8 +8,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.camera import Camera, camera_from_json
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.atomic_files import read_json
 

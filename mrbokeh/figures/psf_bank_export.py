@@ -9,8 +9,8 @@ import numpy as np
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 
 def export_bank(bank: PsfBank, folder: Path | str, suffix: Literal["exr", "png"], overwrite: bool = False) -> int:

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float32, Shaped, UInt8
 
 from mrbokeh.images.color import srgb_to_linear
-from mrbokeh.images.contact_sheet import WIDEST_PX, SheetRow, write_contact_sheet
-from mrbokeh.images.exif_orientation import known_orientation, upright
-from mrbokeh.images.image_io import write_preview
+from mrbokeh.images.exif import known_orientation, upright
+from mrbokeh.images.image_io import WIDEST_PX, SheetRow, write_contact_sheet, write_preview
 from mrbokeh.images.picture_codec import codes_of, write_stored
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.guessed_metres import unit_of

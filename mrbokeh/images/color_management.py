@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.exr_primaries import known_primaries
+from mrbokeh.images.exr_io import known_primaries
 from mrbokeh.system.errors import InputError, MissingExtraError
 
 REC709_LINEAR = "Linear Rec.709 (sRGB)"
@@ -112,7 +112,7 @@ class NamedSpace:
     def primaries(self) -> tuple[float, ...] | None:
         """CIE x, y of red, green, blue and white, to be stated in an EXR header.
 
-        None of a space that is not linear, or whose primaries are none of those in `mrbokeh.images.exr_primaries`.
+        None of a space that is not linear, or whose primaries are none of those in `mrbokeh.images.exr_io`.
         """
         if not self.is_linear:
             return None

@@ -1,19 +1,137 @@
-"""PNG, TIFF, JPEG, WebP and HDR files to and from the numbers that they store, and these to and from scene-linear light."""
+"""PNG, TIFF, JPEG, WebP and HDR files to and from the numbers that they store, and these to and from scene-linear light.
 
+Pixels of a TIFF as its file stores them.
+
+OpenCV turns a TIFF as its tag Orientation says, unlike pictures of other formats, and multiplies straight colour of 8 bits by alpha, as
+libtiff's reader of RGBA does; neither is wanted where files of all formats are to be treated alike. What it writes does not say what the
+fourth channel is.
+
+PNG files without what libpng would talk about: it writes its complaints to standard error itself, beside our one sentence.
+
+OpenCV without its own lines on standard error, while a file is decoded that may be damaged: what is wrong, we say.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float, Float32, Shaped, UInt8
 
-from mrbokeh.images.color import srgb_to_linear
-from mrbokeh.images.png_chunks import without_chatter
-from mrbokeh.images.quiet_opencv import quiet_opencv
-from mrbokeh.images.srgb_codes import srgb_codes
-from mrbokeh.images.tiff_pixels import tiff_as_stored, with_straight_alpha
-from mrbokeh.images.tiff_tags import TIFF_SUFFIXES
+from mrbokeh.images.color import srgb_codes, srgb_to_linear
+from mrbokeh.images.exif import TIFF_SUFFIXES, as_stored, known_orientation, tiff_tags
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
+
+_ORIENTATION, _EXTRA_SAMPLES = 274, 338
+_ASSOCIATED, _STRAIGHT = 1, 2
+_SHORT, _ENTRY_BYTES = 3, 12
+
+
+def tiff_as_stored(path: Path, decoded: np.ndarray) -> np.ndarray:
+    """decoded: by OpenCV, (H, W) or (H, W, 3 or 4) with blue first. Colour that is multiplied by alpha is divided by it, code by code."""
+    tags = tiff_tags(path)
+    extra = tags.get(_EXTRA_SAMPLES, ())
+    has_alpha = decoded.ndim == 3 and decoded.shape[2] == 4 and len(extra) == 1
+    upright = _by_pillow(path) if has_alpha and extra[0] == _STRAIGHT and decoded.dtype == np.uint8 else decoded
+    stored = as_stored(upright, known_orientation(tags.get(_ORIENTATION)))
+    return _divided(stored) if has_alpha and extra[0] == _ASSOCIATED else stored
+
+
+def with_straight_alpha(encoded: bytes) -> bytes:
+    """A TIFF of four channels as OpenCV encodes it, whose header then says that the fourth is alpha, not multiplied into colour.
+
+    The tags are written anew behind all else, for they stand in rising order. Other TIFFs come back as they are.
+    """
+    if encoded[:4] != b"II*\x00":
+        return encoded
+    (first,) = struct.unpack_from("<I", encoded, 4)
+    (count,) = struct.unpack_from("<H", encoded, first)
+    entries = [encoded[at : at + _ENTRY_BYTES] for at in range(first + 2, first + 2 + _ENTRY_BYTES * count, _ENTRY_BYTES)]
+    if any(entry[:2] == struct.pack("<H", _EXTRA_SAMPLES) for entry in entries):
+        return encoded
+    entries.append(struct.pack("<HHIHH", _EXTRA_SAMPLES, _SHORT, 1, _STRAIGHT, 0))
+    entries.sort(key=lambda entry: struct.unpack_from("<H", entry))
+    following = encoded[first + 2 + _ENTRY_BYTES * count :][:4]
+    body = encoded + b"\x00" * (len(encoded) % 2)
+    tags = struct.pack("<H", len(entries)) + b"".join(entries) + following
+    return body[:4] + struct.pack("<I", len(body)) + body[8:] + tags
+
+
+def _by_pillow(path: Path) -> np.ndarray:
+    """Turned as well, but not multiplied. From memory: Pillow 13 confuses rows and columns of a file that it maps and turns."""
+    from PIL import Image
+
+    with Image.open(BytesIO(path.read_bytes())) as picture:
+        return np.ascontiguousarray(np.asarray(picture.convert("RGBA"))[..., [2, 1, 0, 3]])
+
+
+def _divided(multiplied: np.ndarray) -> np.ndarray:
+    """Straight colour; what nothing covers is black."""
+    top = 1.0 if multiplied.dtype.kind == "f" else float(np.iinfo(multiplied.dtype).max)
+    alpha = multiplied[..., 3:].astype(np.float64)
+    colour = np.divide(multiplied[..., :3] * top, alpha, out=np.zeros(multiplied[..., :3].shape), where=alpha > 0)
+    if multiplied.dtype.kind != "f":
+        colour = np.round(np.minimum(colour, top))
+    return np.concatenate([colour.astype(multiplied.dtype), multiplied[..., 3:]], axis=2)
+
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_BEFORE_DATA, _CRC = 8, 4
+_LAST = b"IEND"
+_OF_PIXELS = {b"IHDR", b"PLTE", b"tRNS", b"IDAT", _LAST}
+
+
+def without_chatter(data: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, " fewer"] | None:
+    """The chunks that say what the pixels are (PNG specification, third edition, section 5), or None where one is missing or damaged.
+
+    Profiles, comments and the like are left out: their numbers are not asked for here, and many are written wrongly. What is no PNG, or has
+    none of them, is returned as it is.
+    """
+    if data[: len(SIGNATURE)].tobytes() != SIGNATURE:
+        return data
+    whole, at, kind = data.data, len(SIGNATURE), b""
+    kept: list[bytes | memoryview] = [SIGNATURE]
+    while kind != _LAST:
+        after = at + _BEFORE_DATA + int.from_bytes(whole[at : at + 4], "big") + _CRC
+        if after > len(whole) or at + _BEFORE_DATA > len(whole):
+            return None
+        kind = bytes(whole[at + 4 : at + _BEFORE_DATA])
+        if kind in _OF_PIXELS:
+            if zlib.crc32(whole[at + 4 : after - _CRC]) != int.from_bytes(whole[after - _CRC : after], "big"):
+                return None
+            kept.append(whole[at:after])
+        at = after
+    return data if sum(map(len, kept)) == len(data) else np.frombuffer(b"".join(kept), np.uint8)
+
+
+_lock = Lock()
+_state = {"inside": 0, "before": 0}
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """The level of OpenCV's log is one for all threads: the first in silences it, the last out restores it."""
+    from cv2.utils import logging
+
+    with _lock:
+        if not _state["inside"]:
+            _state["before"] = logging.getLogLevel()
+            logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+        _state["inside"] += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _state["inside"] -= 1
+            if not _state["inside"]:
+                logging.setLogLevel(_state["before"])
+
 
 Encoding = Literal["srgb", "linear"]
 

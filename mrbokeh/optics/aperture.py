@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from mrbokeh.optics import aperture_shapes
-from mrbokeh.optics.aperture_modifiers import clipped, clipped_by_rim, joined, radially_weighted, shifted
-from mrbokeh.optics.aperture_shapes import CIRCLE_SIDES, net_area, unit_disc
+from mrbokeh.optics.aperture_shapes import CIRCLE_SIDES, clipped, clipped_by_rim, joined, net_area, radially_weighted, shifted, unit_disc
 from mrbokeh.optics.psf import Psf, identity_psf, kernel_radius_px
 from mrbokeh.system.errors import InputError
 
@@ -199,7 +198,7 @@ class Aperture:
         `mrbokeh.optics.psf.shown_diameter_px`) grow out of it a little faster, so that nothing jumps. An aperture that is not
         plain is shown as in the middle of the frame, without colour.
         """
-        from mrbokeh.optics._polygon_coverage_numba import fill_psf
+        from mrbokeh.optics._aperture_numba import fill_psf
 
         if not np.isfinite(diameter_px):
             raise InputError(f"a PSF needs a finite diameter in pixels, got {diameter_px}")

@@ -1,11 +1,37 @@
-"""Camera: an undistorted pinhole with a pose; where world points land in the picture and back."""
+"""Camera: an undistorted pinhole with a pose; where world points land in the picture and back.
+
+Where pixels lie in the frame: x right, y down from its middle, in half diagonals (CONVENTIONS, "Field position").
+
+A Camera as JSON.
+
+A level plane, such as the ground or a table, as a camera sees it. Up is -y.
+"""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from mrbokeh.system.errors import InputError
+
+
+def field_positions(
+    size_px: tuple[int, int], frame_px: tuple[int, int] | None = None, origin_px: tuple[int, int] = (0, 0)
+) -> Float32[np.ndarray, "height width 2"]:
+    """(H, W, 2): (x, y) of the centre of every pixel; length 1 is reached in the corner of a corner pixel.
+
+    size_px: (height, width) of the part wanted, whose top left pixel is origin_px (row, column) of a frame of frame_px (height, width);
+    None: the part is the whole frame.
+    """
+    frame_px = frame_px or size_px
+    half_diagonal_px = 0.5 * float(np.hypot(*frame_px))
+    down, right = (
+        (origin + 0.5 + np.arange(length) - 0.5 * whole) / half_diagonal_px
+        for length, whole, origin in zip(size_px, frame_px, origin_px, strict=True)
+    )
+    return np.stack(np.meshgrid(right, down), axis=2).astype(np.float32)
+
 
 _SAME_SHAPE = 0.01
 
@@ -70,3 +96,38 @@ def depth_m_from_zbuffer(zbuffer: Float[np.ndarray, "*batch"], near_m: float, fa
     """An OpenGL depth buffer in [0, 1] to metres along the optical axis; 1 (nothing drawn) becomes inf."""
     depth_m = near_m * far_m / (far_m - zbuffer * (far_m - near_m))
     return np.where(zbuffer >= 1.0, np.inf, depth_m)
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    return {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "focal_px": list(camera.focal_px),
+        "principal_px": list(camera.principal_px),
+        "camera_from_world": camera.camera_from_world.tolist(),
+    }
+
+
+def camera_from_json(document: dict[str, Any], where: str = "camera") -> Camera:
+    try:
+        (fx, fy), (cx, cy) = document["focal_px"], document["principal_px"]
+        pose = np.asarray(document["camera_from_world"], np.float64)
+        return Camera(int(document["width_px"]), int(document["height_px"]), (float(fx), float(fy)), (float(cx), float(cy)), pose)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: expected width_px, height_px, focal_px, principal_px and camera_from_world ({error!r})") from None
+
+
+def level_plane_dioptres(camera: Camera, y_m: float = 0.0) -> Float32[np.ndarray, "height width"]:
+    """(H, W): 1 / depth along the optical axis of the plane y = y_m of the world at every pixel; 0 where it is not seen.
+
+    On a plane it is linear in the pixel's position, so that it is finite up to the horizon and beyond. The pose turns as it likes.
+    """
+    turn, eye_y_m = camera.world_from_camera[1, :3], float(camera.world_from_camera[1, 3])
+    below_m = y_m - eye_y_m
+    if below_m == 0.0:
+        return np.zeros((camera.height_px, camera.width_px), np.float32)
+    # How far down a ray goes that is 1 long along the axis: of its column, and of its row.
+    x = (np.arange(camera.width_px) + 0.5 - camera.principal_px[0]) / camera.focal_px[0] * turn[0]
+    y = (np.arange(camera.height_px) + 0.5 - camera.principal_px[1]) / camera.focal_px[1] * turn[1] + turn[2]
+    dioptres = (y / below_m).astype(np.float32)[:, None] + (x / below_m).astype(np.float32)
+    return np.maximum(dioptres, 0.0, out=dioptres)

@@ -38,7 +38,7 @@ def drawn_diameters_px(coc_px: Plane, aperture: Aperture) -> Plane:
     An aperture that changes over the frame, with the side of the focus or with the colour is taken as in the middle of the frame, behind
     the focus, without colour.
     """
-    from mrbokeh.optics._drawn_diameters_numba import look_up
+    from mrbokeh.optics._aperture_numba import look_up
 
     drawn = np.empty(coc_px.shape, np.float32)
     look_up(drawn.reshape(-1), np.ascontiguousarray(coc_px).reshape(-1), _table(aperture), STEPS_PER_PX)

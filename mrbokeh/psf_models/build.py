@@ -20,8 +20,8 @@ from mrbokeh.optics.psf_bank_file import (
     write_head,
 )
 from mrbokeh.psf_models.base import PsfModel
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from mrbokeh.system.workers import cores
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from mrbokeh.psf_models.base import PsfModel
+from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.option_names import flag
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.optics.proportional_grid import ProportionalGrid
 from mrbokeh.optics.psf import kernel_radius_px
 from mrbokeh.optics.psf_bank import Axis, Turns
+from mrbokeh.optics.psf_grid import ProportionalGrid
 from mrbokeh.psf_models.base import Kernel, check_positive, nodes
 from mrbokeh.psf_models.quasi_random import sobol_blocks
 

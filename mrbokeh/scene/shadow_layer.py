@@ -3,8 +3,7 @@
 import numpy as np
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.level_plane import level_plane_dioptres
+from mrbokeh.optics.camera import Camera, level_plane_dioptres
 from mrbokeh.scene.base import SceneRenderer
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.virtual_scene import Scene

@@ -16,8 +16,8 @@ from mrbokeh.compositing.occlusion import covered_by, occlusion_matte
 from mrbokeh.compositing.over import OverPhotograph, behind
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.touched_box import InTouchedBox, touched_box
+from mrbokeh.images.alpha_io import coverage_with
 from mrbokeh.images.layer import Layer, clear, flatten
-from mrbokeh.images.plate_alpha import coverage_with
 from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer

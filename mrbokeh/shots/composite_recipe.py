@@ -9,8 +9,8 @@ from jaxtyping import Float32
 
 from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
 from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.images.alpha_io import coverage_with
 from mrbokeh.images.layer import Layer
-from mrbokeh.images.plate_alpha import coverage_with
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
+from mrbokeh.images.alpha_io import in_named_space
 from mrbokeh.images.color_management import NamedSpace
-from mrbokeh.images.finished_picture import in_named_space
 from mrbokeh.images.layer import Layer
 from mrbokeh.shots.frame_maker import Picture, Rgba
 

@@ -5,12 +5,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mrbokeh.images.alpha_io import HOLDING_ALPHA, exr_part, in_named_space, write_finished
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exr_io import write_exr
-from mrbokeh.images.finished_picture import exr_part, in_named_space, write_finished
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.images.plate_alpha import HOLDING_ALPHA
 from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.segment import Segment
 from mrbokeh.shots.shot import PartSink, Shot

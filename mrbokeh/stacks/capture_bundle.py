@@ -17,8 +17,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.image_io import read_image, read_layer, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens, write_lens
 from mrbokeh.system.atomic_files import atomic_folder, read_json, write_json

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, Float32
 from mrbokeh.images.camera_rgb import Matrix3x3, SliceMasks, matrix3x3, read_camera_rgb, read_masks, read_slice_masks, write_camera_rgb
 from mrbokeh.images.color import convert
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.system.atomic_files import read_json, write_json

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.images.exr_primaries import in_rec709, stated_primaries
+from mrbokeh.images.exr_io import ExrPart, in_rec709, read_exr, stated_primaries, write_exr
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError

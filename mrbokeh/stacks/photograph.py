@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.exif_orientation import AS_STORED, quarter_turns
+from mrbokeh.images.exif import AS_STORED, quarter_turns
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 

@@ -1,4 +1,7 @@
-"""The one exception that means "the user can mend this": the command line prints it as a sentence, without a traceback."""
+"""Errors that the user can mend: the command line prints them as one sentence, without a traceback."""
+
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C stopped, as shells have it."""
 
 
 class InputError(ValueError):

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from mrbokeh.commands import composite, track, video
 from mrbokeh.images.image_io import read_layer, write_image
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.scene_camera import scene_track

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import pytest
 from rich.console import Console
 
-from mrbokeh.system import progress
-from mrbokeh.system.progress import PlainLines, track
+from mrbokeh.system import console
+from mrbokeh.system.console import PlainLines, track
 
 
 class Clock:
@@ -27,8 +27,8 @@ def clock() -> Clock:
 def said(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     """What progress tells a file, with the time of the clock."""
     log = io.StringIO()
-    monkeypatch.setattr(progress, "PlainLines", lambda console: PlainLines(console, get_time=clock))
-    monkeypatch.setattr(progress, "Console", lambda **_: Console(file=log, force_terminal=False, width=40))
+    monkeypatch.setattr(console, "PlainLines", lambda console: PlainLines(console, get_time=clock))
+    monkeypatch.setattr(console, "Console", lambda **_: Console(file=log, force_terminal=False, width=40))
     return log
 
 
@@ -51,7 +51,7 @@ def test_lines_come_every_ten_seconds_and_at_the_end(clock: Clock, said: io.Stri
 
 def test_work_that_is_gone_on_with_is_timed_from_there(clock: Clock, said: io.StringIO) -> None:
     """80 of 100 were done before; 10 more in 20 s leave as many for another 20 s."""
-    with progress.progress_bars() as bars:
+    with console.progress_bars() as bars:
         task = bars.add_task("train", total=100, completed=80)
         for _ in slow(clock, 10, 2.0):
             bars.advance(task)
@@ -88,7 +88,7 @@ def test_what_is_broken_off_says_how_far_it_was(clock: Clock, said: io.StringIO)
 
 def test_counts_that_are_set_and_totals_that_come_later(clock: Clock, said: io.StringIO) -> None:
     """As COLMAP's stages are shown; and a number that nobody knows the end of."""
-    with progress.progress_bars() as bars:
+    with console.progress_bars() as bars:
         features, frames = bars.add_task("features", total=None), bars.add_task("frames", total=None)
         clock.now_s += 11.0
         bars.update(features, completed=4, total=8)

@@ -8,7 +8,7 @@ import pytest
 
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.color_management import REC709_LINEAR, ColorConversion, open_config, rec709_name
-from mrbokeh.images.exr_primaries import AP1, rec709_from_chromaticities
+from mrbokeh.images.exr_io import AP1, rec709_from_chromaticities
 from mrbokeh.system.errors import InputError, MissingExtraError
 
 ocio = pytest.importorskip("PyOpenColorIO")

@@ -11,8 +11,7 @@ from mrbokeh.commands.render import app as render
 from mrbokeh.compositing.plate import open_plate
 from mrbokeh.images.camera_rgb import chromaticities, matrix3x3, read_camera_rgb, write_camera_rgb
 from mrbokeh.images.color import convert
-from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.images.exr_primaries import rec709_from_chromaticities
+from mrbokeh.images.exr_io import ExrPart, read_exr, rec709_from_chromaticities, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, read_linear, write_image
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.optics.lens import Lens

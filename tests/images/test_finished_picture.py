@@ -8,14 +8,23 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.commands.composite import app
+from mrbokeh.images.alpha_io import alpha_with, read_alpha, write_finished
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.color_management import NamedSpace
-from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.images.exr_primaries import AP0, AP1, BT2020, P3_D65, REC709, known_primaries, rec709_from_chromaticities
-from mrbokeh.images.finished_picture import write_finished
+from mrbokeh.images.exr_io import (
+    AP0,
+    AP1,
+    BT2020,
+    P3_D65,
+    REC709,
+    ExrPart,
+    known_primaries,
+    read_exr,
+    rec709_from_chromaticities,
+    write_exr,
+)
 from mrbokeh.images.image_io import read_image, read_layer, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.images.plate_alpha import alpha_with, read_alpha
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 

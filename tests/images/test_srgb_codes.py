@@ -1,9 +1,9 @@
-"""mrbokeh.images.srgb_codes: the table gives the codes of the plain formula, value by value."""
+"""mrbokeh.images.color: the table gives the codes of the plain formula, value by value."""
 
 import numpy as np
 import pytest
 
-from mrbokeh.images.srgb_codes import _table, plain_srgb_codes, srgb_codes
+from mrbokeh.images.color import _table, plain_srgb_codes, srgb_codes
 
 both = pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 

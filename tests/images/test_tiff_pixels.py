@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from mrbokeh.images.exif_orientation import stored_orientation
+from mrbokeh.images.exif import stored_orientation, tiff_tags
 from mrbokeh.images.picture_codec import stored_pixels, stored_rgb, write_stored
-from mrbokeh.images.tiff_tags import tiff_tags
 
 SHADES = (np.uint8, np.uint16, np.float32)
 

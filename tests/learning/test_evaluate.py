@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_metrics import psnr
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
 from mrbokeh.optics.psf_bank_file import write_bank
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.stacks.focal_stack import write_focal_stack
 from mrbokeh.system.errors import InputError
 from tests.scenes.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_stack

@@ -11,7 +11,7 @@ import torch
 from typer.testing import CliRunner
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.network import onnx_network
 from mrbokeh.renderers.network.onnx_network import METADATA_KEY, OnnxNetwork

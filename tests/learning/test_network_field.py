@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.system.errors import InputError
 from training.gated_kernels import disc_kernel, fresh_kernels
 from training.network import BlurNetwork

@@ -12,7 +12,7 @@ import torch
 
 from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError

@@ -10,8 +10,7 @@ import pytest
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.layer import Layer
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene.staging.picture_box import box_around
 from mrbokeh.scene.staging.scene_description import RealThings

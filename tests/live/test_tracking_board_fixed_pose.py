@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from viewfinder.flow.frames import CameraFrame

@@ -29,7 +29,7 @@ from typer.testing import CliRunner
 from mrbokeh.cli import SUB_COMMANDS
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.images.layer import clear
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import write_json

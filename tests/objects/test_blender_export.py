@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.commands.blender_addon import app
-from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.camera import camera_from_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.scene.blender import mrbokeh_export
 from mrbokeh.scene.blender.mrbokeh_export import Film, camera_from_world, check_scene, intrinsics, track_frame

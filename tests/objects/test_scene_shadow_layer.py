@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.level_plane import level_plane_dioptres
+from mrbokeh.optics.camera import Camera, level_plane_dioptres
 from mrbokeh.scene import Mesh, Scene, SceneRenderer, shadow_catcher
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.shadow_layer import shadow_layer

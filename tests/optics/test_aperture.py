@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from shapely import Polygon, box
 
-from mrbokeh.optics._polygon_coverage_numba import _shown_diameter_px
+from mrbokeh.optics._aperture_numba import _shown_diameter_px
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf import shown_diameter_px
 from mrbokeh.system.errors import InputError

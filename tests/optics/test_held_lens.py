@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.plate import open_plate
-from mrbokeh.images.cut_out import cut_from_px
+from mrbokeh.images.exif import cut_from_px
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.lens_measuring.matching.photo_facts import read_facts

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.level_plane import level_plane_dioptres
+from mrbokeh.optics.camera import Camera, level_plane_dioptres
 
 
 def tilted(tilt_rad: float, eye_m: tuple[float, float, float]) -> Camera:

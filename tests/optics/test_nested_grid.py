@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrbokeh.optics.nested_grid import NestedGrid, triangular, triangular_root
+from mrbokeh.optics.psf_grid import NestedGrid, triangular, triangular_root
 from mrbokeh.system.errors import InputError
 
 SHAPES = [(1,), (7,), (9, 9), (5, 12), (13, 4), (1, 6), (8, 9, 10)]

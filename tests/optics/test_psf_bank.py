@@ -11,9 +11,9 @@ import pytest
 from mrbokeh.figures.psf_bank_drawing import draw_bank
 from mrbokeh.figures.psf_bank_export import export_bank
 from mrbokeh.images.image_io import read_image
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.optics.psf_bank_file import cell_path, read_bank, write_bank
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.system.errors import InputError
 
 DIAMETER = Axis("diameter_px", 0.0, 32.0, 2.0)

@@ -6,8 +6,7 @@ import pytest
 
 from capture.photos.focus_metadata import FocusReading
 from capture.photos.focus_tags import read_focus
-from mrbokeh.optics.film_plane import lens_distance_m
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens import Lens, lens_distance_m
 
 
 @pytest.mark.parametrize(

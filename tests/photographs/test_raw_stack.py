@@ -20,7 +20,7 @@ from datasets_scripts.thin_lens_tracer import trace, trace_pinhole
 from datasets_scripts.traced_scene import Scene, emissive_quad
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image
-from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.camera import camera_from_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 

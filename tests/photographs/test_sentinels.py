@@ -18,8 +18,7 @@ from capture.scale.focus_calibration_stacks import StackFocus, focus_start, lens
 from capture.scale.sharpness import sharpness_peaks
 from capture.stacks.ingest import ingest
 from capture.stacks.sentinel_focus import bounded_focus_records, stated_by_sentinel
-from mrbokeh.optics.film_plane import lens_distance_m
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens import Lens, lens_distance_m
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack
 from tests.scenes.made_photographs import LENS, make_shoot, only_stack, sources
 

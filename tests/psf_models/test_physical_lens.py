@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.nested_grid import NestedGrid
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import BANDS_UM, GREEN_UM
 from mrbokeh.psf_models._ray_tracing_numba import trace_ray

@@ -13,9 +13,9 @@ from datasets_scripts.bank_pairs_scenes import FARTHEST_M, NEAREST_M, random_lay
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens_file import read_lens
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
 from mrbokeh.optics.psf_bank_file import write_bank
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset

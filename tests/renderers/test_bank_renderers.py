@@ -11,8 +11,8 @@ import pytest
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.renderers.bank.apertures import fit_apertures
 from mrbokeh.renderers.bank.lattice import ANGLES, BankLattice
 from mrbokeh.renderers.bank.tables import Place

@@ -8,7 +8,7 @@ import onnxruntime
 import torch
 from onnx import ModelProto
 
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from training.fast_export.fewer_bins import thinned
 from training.fast_export.gated_graph import gated_model
 from training.fast_export.gated_weights import weights_of

@@ -9,8 +9,7 @@ import numpy as np
 
 from datasets_scripts.sheet_tracer import pack_table, trace_sheet
 from mrbokeh.images.color import display_rgb8
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import write_json

@@ -10,8 +10,8 @@ from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.renderers.bank.apertures import BankApertures, fit_apertures
 from mrbokeh.renderers.bank.lattice import BankLattice
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter

@@ -11,8 +11,7 @@ from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_layer, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import MOTION, motion_of
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.camera import Camera, camera_from_json
 from mrbokeh.stacks.exr_layers.flat_render import FlatRender
 from mrbokeh.stacks.exr_layers.object_split import ObjectSplit
 from mrbokeh.stacks.exr_layers.reader import LayerReader

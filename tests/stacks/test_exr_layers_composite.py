@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.images.exr_io import read_exr
-from mrbokeh.images.exr_primaries import REC709
+from mrbokeh.images.exr_io import REC709, read_exr
 from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, read_composite_exr, write_composite_exr

@@ -8,7 +8,7 @@ from PIL import Image, ImageOps
 
 from mrbokeh.compositing.plate import open_plate
 from mrbokeh.images.color import srgb_to_linear
-from mrbokeh.images.exif_orientation import as_stored, upright
+from mrbokeh.images.exif import as_stored, upright
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.errors import InputError
 

@@ -16,8 +16,7 @@ from capture.tether.simulated import SimulatedCamera
 from capture.tether.simulated_picture import nikon_code, to_centimetre, unstated
 from capture.tether.simulated_scene import Card, SimulatedScene
 from mrbokeh.images.image_io import read_image
-from mrbokeh.optics.film_plane import film_plane_m
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens import Lens, film_plane_m
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 Picture = Float32[np.ndarray, "height width 3"]

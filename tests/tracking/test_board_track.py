@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from datasets_scripts.hand_held import HandHeld
 from mrbokeh.commands.track import app
 from mrbokeh.images.color import display_rgb8
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import calibrated
 from mrbokeh.tracking.camera_track.board_corners import RollingCorners, Undistorting

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import FORMATS, read_track, write_track
 from mrbokeh.tracking.camera_track.options import ROTATION_ORDERS, TrackOptions

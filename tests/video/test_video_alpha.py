@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 import mrbokeh.video.picture_sources.image_sequence as image_sequence
 import mrbokeh.video.picture_sources.video_source as video_source
 from mrbokeh.commands.video import app
+from mrbokeh.images.alpha_io import write_finished
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exr_io import read_exr
-from mrbokeh.images.finished_picture import write_finished
 from mrbokeh.images.image_io import read_image, read_layer, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens

@@ -17,7 +17,7 @@ from mrbokeh.compositing.plate import plate_of
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.optics.camera_file import camera_to_json
+from mrbokeh.optics.camera import camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter.scatter_reference import ScatterReference

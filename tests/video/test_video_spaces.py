@@ -9,8 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.commands.video import app
-from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.images.exr_primaries import AP1
+from mrbokeh.images.exr_io import AP1, ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens

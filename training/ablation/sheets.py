@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+from mrbokeh.images.image_io import SheetRow, write_contact_sheet
 from mrbokeh.images.image_metrics import psnr
 from training.ablation.plan import DataSet, run_folder
 from training.ablation.rows import FILE_NAMES, Row, TableName

@@ -75,7 +75,7 @@ def ablate_command(
 
 
 def _run(planned: "Sequence[PlannedRun]", out: Path, tables: "tuple[TableName, ...]", shared: "Ablation", lpips: object) -> None:
-    from mrbokeh.system.interrupts import kept_when_interrupted
+    from mrbokeh.system.console import kept_when_interrupted
     from training.ablation.report import Report
     from training.ablation.runs import result_of
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from training.dataset import PairSet
 from training.evaluation.cost import peak_memory_mib, timed
 from training.evaluation.focus_pull import FRAMES, flickers, focus_pull

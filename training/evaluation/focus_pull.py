@@ -13,7 +13,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.image_metrics import flicker
 from mrbokeh.stacks.focal_stack import FocalStack
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 from training.dataset import PairSet
 from training.evaluation.methods import Method, renderer_method
 from training.evaluation.unseen_slice import UnseenSlice, unseen_slice

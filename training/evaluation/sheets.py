@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.contact_sheet import SheetRow, write_contact_sheet
+from mrbokeh.images.image_io import SheetRow, write_contact_sheet
 from mrbokeh.images.image_metrics import psnr
 from training.evaluation.methods import NO_BLUR, Method
 from training.evaluation.places import light_discs

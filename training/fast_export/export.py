@@ -14,8 +14,8 @@ import onnxruntime
 from mrbokeh.renderers.network.onnx_network import METADATA_KEY, NetworkFacts, OnnxNetwork
 from mrbokeh.renderers.network.onnx_sessions import open_session
 from mrbokeh.system.atomic_files import atomic_path, write_json
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from training.export_onnx import export_network, largest_difference, network_facts_of, record_path
 from training.fast_export.measured_loss import Look, looks_at, loss_db, made_up_look
 from training.fast_export.plans import Plan, model_of, plans

@@ -10,7 +10,7 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.renderers.network.onnx_network import NetworkFacts
 from training.batches import stack_pairs
 from training.dataset import PairSet

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.malloc_settings import keep_few_arenas
+from mrbokeh.system.memory import keep_few_arenas
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from viewfinder.app.assembly import MakeRenderer
 from viewfinder.app.captures import Captures

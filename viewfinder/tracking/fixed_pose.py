@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.camera_file import camera_from_json
+from mrbokeh.optics.camera import Camera, camera_from_json
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import is_rigid
@@ -27,7 +26,7 @@ class FixedPose:
 
 
 def read_fixed_pose(path: Path | str) -> FixedPose:
-    """From the JSON of `mrbokeh.optics.camera_file`."""
+    """From the JSON of `mrbokeh.optics.camera`."""
     document = read_json(path, "a camera with its pose")
     camera = camera_from_json(document if isinstance(document, dict) else {}, str(path))
     if not is_rigid(camera.camera_from_world):

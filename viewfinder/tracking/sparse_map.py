@@ -18,8 +18,8 @@ from jaxtyping import Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
 from mrbokeh.system.atomic_files import atomic_path, read_json
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from viewfinder.tracking.map_pose import require_pycolmap
 from viewfinder.tracking.sift_features import find_features
 

@@ -15,7 +15,7 @@ from mrbokeh.compositing.plate_look.colour_match import Triple, triple_of
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.system.errors import InputError
 
 Gain = Float32[np.ndarray, "height width channels"]

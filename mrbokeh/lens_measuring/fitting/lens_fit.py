@@ -16,8 +16,8 @@ from mrbokeh.lens_measuring.fitting.stack_equations import LEAST_DIAMETER_PX, Sl
 from mrbokeh.lens_measuring.fitting.stack_views import StackSlices, largest_diameter_px
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 _ROUNDS = 2
 _LEAST_PIXELS = 1000

@@ -7,10 +7,10 @@ from jaxtyping import Float32, Float64
 
 from mrbokeh.lens_measuring.fitting.lens_fit import LensFit
 from mrbokeh.lens_measuring.fitting.pupil_picture import kernel_of
-from mrbokeh.optics.nested_grid import NestedGrid
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
+from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models.base import centred
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 EXPONENT = 1.5  # steps are fine in focus, where a pixel's step changes a kernel most
 _STEP_PX, _STEP_SHARE = 0.5, 0.03

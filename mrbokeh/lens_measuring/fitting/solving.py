@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from mrbokeh.lens_measuring.fitting.evidence import Evidence
 from mrbokeh.lens_measuring.fitting.knots import Knots
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 _SOFT = 0.02  # e: steps of brightness smaller than this are smoothed as squares would
 _POWER_STEPS = 12

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.images.cut_out import cut_from_px
-from mrbokeh.optics.film_plane import lens_distance_m
+from mrbokeh.images.exif import cut_from_px
+from mrbokeh.optics.lens import lens_distance_m
+from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.option_names import flag
 
 _EXIF_IFD = 0x8769
 _F_NUMBER, _SUBJECT_DISTANCE, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x829D, 0x9206, 0x920A, 0xA405

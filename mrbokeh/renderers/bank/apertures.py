@@ -10,8 +10,8 @@ from jaxtyping import Float, Float64, Int64
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.bank.lattice import SIDES, BankLattice, between
 from mrbokeh.renderers.kernels.polygon_fit import LEVELS, PolygonFit, fit_polygons, grown, relative_error
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 LEAST_FITTED_PX = 8.0
 """Smaller kernels say too little about their shape: they take that of the smallest one from here on."""

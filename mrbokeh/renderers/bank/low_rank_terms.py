@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from mrbokeh.renderers.bank.lattice import SIDES, BankLattice
 from mrbokeh.renderers.kernels.low_rank_kernel import LowRankKernel
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 BankTerms = Mapping[tuple[int, int, int, int], LowRankKernel]
 """By side of the focus, node, place and channel (see BankLattice); each states what it misses of its kernel."""

@@ -12,8 +12,8 @@ from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.kernels.laplacian_tables import Points, by_rows, joined_points, taps_of
 from mrbokeh.renderers.kernels.spreadlet_values import turned
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify, whole_laplacian
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 
 _LEAST_ANGLES, _MOST_ANGLES = 16, 256
 _DENSE_TAPS = 452  # those of a disc of 24 px: fewer are splatted as they are

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify, whole_laplacian
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from mrbokeh.system.workers import cores, in_bands, workers
 
 DENSE, SPARSE, WHOLE = 0, 1, 2

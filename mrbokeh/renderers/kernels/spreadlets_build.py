@@ -8,8 +8,8 @@ import numpy as np
 from mrbokeh.optics.psf_bank_file import SPREADLETS, SPREADLETS_PART, read_bank
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify
 from mrbokeh.renderers.kernels.spreadlets_file import fingerprint, read_spreadlets, write_spreadlets
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track
 from mrbokeh.system.workers import cores
 
 

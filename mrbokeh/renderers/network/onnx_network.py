@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.images.layer import Layer, clear, flatten
-from mrbokeh.optics.field_position import field_positions
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.network.facts import FORMAT, METADATA_KEY, NetworkFacts, facts_from_json
 from mrbokeh.renderers.network.layers import depth_around, grown, window_around

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mrbokeh.optics._polygon_coverage_numba import fill_psf
+from mrbokeh.optics._aperture_numba import fill_psf
 from mrbokeh.renderers.kernels._vectors_numba import BLENDED_CELLS, add_to_cell, add_to_two_cells, blend_onto_cells, scaled
 from mrbokeh.renderers.polygon._ring_numba import ALIASED_ROWS, APART_PX, Exact, Ring, Scratch, compiled
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from mrbokeh.optics._polygon_coverage_numba import fill_psf
+from mrbokeh.optics._aperture_numba import fill_psf
 
 
 @njit(cache=True, nogil=True)

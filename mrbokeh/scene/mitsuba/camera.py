@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.mitsuba.paths import Seen
-from mrbokeh.system.progress import track
+from mrbokeh.system.console import track
 
 _RAYS_AT_ONCE = 1 << 20
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.images.exr_primaries import ATTRIBUTE
+from mrbokeh.images.exr_io import ATTRIBUTE, ExrPart, read_exr, write_exr
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.errors import InputError
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from mrbokeh.images.exr_primaries import ATTRIBUTE, in_rec709
+from mrbokeh.images.exr_io import ATTRIBUTE, in_rec709
 from mrbokeh.system.errors import InputError
 
 _COLOURS = ("R", "G", "B")

@@ -7,9 +7,9 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.exr_primaries import in_rec709
+from mrbokeh.images.exr_io import in_rec709
+from mrbokeh.images.image_io import require_depth_ahead, require_numbers
 from mrbokeh.images.layer import Layer
-from mrbokeh.images.sound_values import require_depth_ahead, require_numbers
 from mrbokeh.layering.motion import with_motion
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.exr_layers.channel_names import BACKGROUND_FROM, joined

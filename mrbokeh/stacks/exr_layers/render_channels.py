@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.images.exr_io import Channels, ExrPart, read_exr
-from mrbokeh.images.exr_primaries import stated_primaries
+from mrbokeh.images.exr_io import Channels, ExrPart, read_exr, stated_primaries
 from mrbokeh.stacks.exr_layers.channel_names import COLOUR_LAYERS, DEPTH_NAMES, MOTION_NAMES, MotionNames, joined
 from mrbokeh.system.errors import InputError
 

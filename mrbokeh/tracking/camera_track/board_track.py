@@ -6,8 +6,8 @@ from itertools import islice
 from pathlib import Path
 
 from mrbokeh.optics.camera import Camera
+from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.progress import track as with_progress
 from mrbokeh.tracking.camera_track.board_calibration import Calibration, calibrated
 from mrbokeh.tracking.camera_track.board_corners import RollingCorners, Undistorting, read_greys
 from mrbokeh.tracking.camera_track.board_smoothing import Observation, residual_px, steadied

@@ -3,7 +3,7 @@
     {"format": "mrbokeh-camera-track", "version": 1, "up": "-z", "metric": true, "fixed": false,
      "frames": [{"frame": 0, "time_s": 0.0, "camera": {...}, "focus_distance_m": 1.2, "f_number": 2.8, "distortion": {"k1": -0.1}}]}
 
-camera is that of `mrbokeh.optics.camera_file`. What is not known is left out; focus_distance_m null is infinity. A file with one camera
+camera is that of `mrbokeh.optics.camera`. What is not known is left out; focus_distance_m null is infinity. A file with one camera
 and nothing else is a camera on a tripod.
 """
 
@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.optics.camera_file import camera_from_json, camera_to_json
+from mrbokeh.optics.camera import camera_from_json, camera_to_json
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.options import TrackOptions

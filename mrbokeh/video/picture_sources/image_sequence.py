@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from mrbokeh.images.alpha_io import is_straight, read_alpha, stores_alpha, straight
 from mrbokeh.images.color_management import NamedSpace
-from mrbokeh.images.exif_orientation import AS_STORED, quarter_turns, stored_orientation, upright
-from mrbokeh.images.finished_picture import straight
+from mrbokeh.images.exif import AS_STORED, quarter_turns, stored_orientation, upright
 from mrbokeh.images.image_io import LINEAR_SUFFIXES, read_image
-from mrbokeh.images.plate_alpha import is_straight, read_alpha, stores_alpha
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import Frame, VideoInfo
 from mrbokeh.video.color import FULL, VideoColor

@@ -1,12 +1,20 @@
-"""Progress with the time left, the same everywhere: bars on a terminal, else a plain line now and then, as it suits a log."""
+"""Progress with the time left, the same everywhere: bars on a terminal, else a plain line now and then, as it suits a log.
+
+Ctrl-C in a command whose work is kept: what there is, and how to go on, in one line; exit code 130, as shells have it.
+
+What the command line calls what the library names with its unit: for messages, and for options that once had the longer name.
+"""
 
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
 from typing import Any, TypeVar
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from mrbokeh.system.errors import INTERRUPTED
 
 Item = TypeVar("Item")
 
@@ -99,3 +107,38 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
 def working(description: str) -> AbstractContextManager[object]:
     """A spinner on the terminal while something runs whose length nobody knows."""
     return Console(stderr=True).status(description)
+
+
+@contextmanager
+def kept_when_interrupted(kept: str, overwrite: bool = False) -> Iterator[None]:
+    """kept: what is there to go on with and where, such as "finished slices are kept in scene/". overwrite: begins anew all the same."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        again = "with --overwrite it begins again" if overwrite else "the same command goes on from there"
+        typer.echo(f"stopped: {kept}; {again}", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+FLAGS = {
+    "focus_distance_m": "--focus",
+    "focal_length_mm": "--focal-length",
+    "sensor_width_mm": "--sensor-width",
+    "sensor_height_mm": "--sensor-height",
+    "image_width_px": "--image-width",
+    "nearest_m": "--near",
+    "farthest_m": "--far",
+    "diameter_px": "--diameter",
+    "motion_px": "--motion",
+    "frame_rate": "--rate",
+}
+
+
+def flag(name: str) -> str:
+    """The option that sets a parameter: `focus_distance_m` is --focus, and what FLAGS does not hold goes by its own name."""
+    return FLAGS.get(name, spelled_out(name))
+
+
+def spelled_out(name: str) -> str:
+    """--focus-distance-m for `focus_distance_m`."""
+    return "--" + name.replace("_", "-")

@@ -1,0 +1,112 @@
+"""The tags in the header of a TIFF, whatever its pixels are.
+
+Which way up a picture is stored, as EXIF tells, and how it is brought upright.
+
+Whether a photograph was cut out of what its camera took: then it has another shape than its EXIF tells.
+"""
+
+import struct
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+TIFF_SUFFIXES = (".tif", ".tiff")
+_HEADER_BYTES, _BIG_HEADER_BYTES, _BIG = 8, 16, 43
+
+
+def tiff_tags(path: Path) -> Mapping[int, Any]:
+    """By their numbers, of the first picture; none where the file is no TIFF or its header is damaged."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    try:
+        with path.open("rb") as file, warnings.catch_warnings(action="ignore"):
+            header = file.read(_HEADER_BYTES)
+            header += file.read(_BIG_HEADER_BYTES - _HEADER_BYTES) if header[2:3] == bytes([_BIG]) else b""
+            tags = ImageFileDirectory_v2(header)
+            file.seek(tags.next)
+            tags.load(file)
+            return dict(tags)
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error):
+        return {}
+
+
+AS_STORED = 1
+_TAG = 0x0112
+_TELLING = (".png", ".jpg", ".jpeg", ".webp")
+# EXIF 2.3: quarter turns counter-clockwise that bring the stored picture upright, and whether it is mirrored left to right first.
+_UPRIGHT = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False), 7: (3, True), 8: (1, False)}
+
+Picture = TypeVar("Picture", bound=np.ndarray)
+
+
+def stored_orientation(path: Path) -> int:
+    """EXIF's number, 1 to 8; AS_STORED where the file tells none."""
+    from PIL import Image, UnidentifiedImageError
+
+    suffix = path.suffix.lower()
+    if suffix in TIFF_SUFFIXES:
+        return known_orientation(tiff_tags(path).get(_TAG))
+    if suffix not in _TELLING:
+        return AS_STORED
+    try:
+        with Image.open(path) as picture:
+            # Not picture.getexif(), which decodes the whole of a PNG to look for the tag behind its pixels.
+            return known_orientation(Image.Image.getexif(picture).get(_TAG))
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+        return AS_STORED
+
+
+def known_orientation(told: object) -> int:
+    """AS_STORED where it is none of EXIF's numbers."""
+    return told if isinstance(told, int) and told in _UPRIGHT else AS_STORED
+
+
+def quarter_turns(orientation: int) -> int:
+    """Counter-clockwise, that bring the stored picture upright."""
+    return _UPRIGHT[orientation][0]
+
+
+def upright(picture: Picture, orientation: int) -> Picture:
+    """A picture as it is stored, (H, W) or (H, W, channels): mirrored left to right where asked, then turned by quarters."""
+    turns, mirrored = _UPRIGHT[orientation]
+    return np.ascontiguousarray(np.rot90(picture[:, ::-1] if mirrored else picture, turns))  # type: ignore[return-value]
+
+
+def as_stored(picture: Picture, orientation: int) -> Picture:
+    """The other way round."""
+    turns, mirrored = _UPRIGHT[orientation]
+    turned = np.rot90(picture, -turns)
+    return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)  # type: ignore[return-value]
+
+
+SizePx = tuple[int, int]
+"""Width, height."""
+
+_SAME_ASPECT = 0.01
+
+
+def as_it_lies(full_px: SizePx, size_px: SizePx) -> SizePx:
+    """The size of the whole, with its sides exchanged where the picture was turned by a quarter since."""
+    turned = (size_px[0] < size_px[1]) != (full_px[0] < full_px[1])
+    return full_px[::-1] if turned else full_px
+
+
+def is_same_shape(size_px: SizePx, full_px: SizePx) -> bool:
+    """To 1 %: sizes are rounded to pixels, and RAW shows a few more than the JPEG of its camera."""
+    return abs(size_px[0] / size_px[1] * full_px[1] / full_px[0] - 1.0) < _SAME_ASPECT
+
+
+def cut_from_px(size_px: SizePx, full_px: SizePx | None) -> SizePx | None:
+    """The size of the whole, or None where it is not known or the picture shows all of it.
+
+    What does not fit into the whole as it was taken was turned by a quarter since.
+    """
+    if full_px is None or min(*full_px, *size_px) < 1:
+        return None
+    whole_px = as_it_lies(full_px, size_px)
+    if is_same_shape(size_px, whole_px):
+        return None
+    return full_px if size_px[0] <= full_px[0] and size_px[1] <= full_px[1] else whole_px
