@@ -20,6 +20,8 @@ Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 Patches = Float32[np.ndarray, "slices height width 3"]
 Flux = Float[np.ndarray, "3"]
+Matrix = Float[np.ndarray, "2 2"]
+Kernel = Float32[np.ndarray, "rows columns"]
 
 # Slices that tell one light's flux may differ by this share; what differs more is no single light.
 LARGEST_SPREAD = 0.25
@@ -51,6 +53,9 @@ USUAL_RADIUS_PX = 1.0
 USUAL_WEIGHT = 10.0
 SUBPIXELS = 8
 MARGIN_PX = 3
+# A light or the disc of a lens (a cat-eye) is an ellipse where its axes differ at least by this factor, and at most by the larger.
+ELONGATIONS = (1.2, 4.0)
+PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 
 
 @dataclass(frozen=True)
@@ -122,15 +127,29 @@ def with_restored_lights(merged: Rgb, restored: Sequence[RestoredLight]) -> Rgb:
 
 @dataclass(frozen=True)
 class Discs:
-    """A light in its slices: flux (slices, 3) above the surroundings, xy_px (slices, 2) its centroid in the patch, variance_px2 (slices,)
-    mean of both axes, peak (slices,), whole (slices,) whether the disc lies within the light's zone and the picture.
+    """A light in its slices: flux (slices, 3) above the surroundings, xy_px (slices, 2) its centroid in the patch, covariance_px2 (slices,
+    2, 2) about it, peak (slices,), whole (slices,) whether the disc lies within the light's zone and the picture.
     """
 
     flux: Float[np.ndarray, "slices 3"]
     xy_px: Float[np.ndarray, "slices 2"]
-    variance_px2: Float[np.ndarray, " slices"]
+    covariance_px2: Float[np.ndarray, "slices 2 2"]
     peak: Float[np.ndarray, " slices"]
     whole: Bool[np.ndarray, " slices"]
+
+    @property
+    def variance_px2(self) -> Float[np.ndarray, " slices"]:
+        """Return the mean of both axes."""
+        return np.trace(self.covariance_px2, axis1=1, axis2=2) / 2.0
+
+    def blur_shape(self, sharpest: int) -> Matrix:
+        """Return the shape of the lens's disc here (see `ellipse_of`): what slices in which it is whole have beyond the light itself."""
+        wide = np.flatnonzero(self.believable & (np.arange(len(self.peak)) != sharpest))
+        if len(wide) == 0:
+            return np.eye(2)
+        beyond = self.covariance_px2[wide] - self.covariance_px2[sharpest]
+        weight = np.maximum(np.trace(beyond, axis1=1, axis2=2), 0.0)
+        return ellipse_of((weight[:, None, None] * beyond).sum(axis=0))
 
     @property
     def believable(self) -> Bool[np.ndarray, " slices"]:
@@ -146,11 +165,27 @@ def measured_discs(patches: Patches, zone: Mask, centre_px: Float[np.ndarray, "2
     """Measure one light in all slices. zone: what is this light's; centre_px: (x, y) of its core, in the patch."""
     rows = [_measured(patch, zone, centre_px, _radius_px(area)) for patch, area in zip(patches, areas_px, strict=True)]
     table = np.array(rows, np.float64)
-    return Discs(table[:, 0:3], table[:, 3:5], table[:, 5], table[:, 6], table[:, 7] > 0)
+    return Discs(
+        flux=table[:, 0:3],
+        xy_px=table[:, 3:5],
+        covariance_px2=table[:, [5, 6, 6, 7]].reshape(-1, 2, 2),
+        peak=table[:, 8],
+        whole=table[:, 9] > 0,
+    )
+
+
+def ellipse_of(covariance_px2: Matrix) -> Matrix:
+    """Return the symmetric matrix that turns a disc into the ellipse of this shape and the same area; the identity if it is about round."""
+    variances, axes = np.linalg.eigh(covariance_px2)
+    ratio = float(np.sqrt(variances[1] / variances[0])) if variances[0] > 0 else np.inf
+    if ratio < ELONGATIONS[0] or variances[1] <= 0:
+        return np.eye(2)
+    stretch = np.sqrt(min(ratio, ELONGATIONS[1]))
+    return np.asarray(axes @ np.diag([1.0 / stretch, stretch]) @ axes.T)
 
 
 def _measured(patch: Rgb, zone: Mask, centre_px: Float[np.ndarray, "2"], radius_px: float) -> tuple[float, ...]:
-    """Return (flux r, g, b, x, y, variance, peak, whole) of one light in one slice."""
+    """Return (flux r, g, b, x, y, covariance xx, xy, yy, peak, whole) of one light in one slice."""
     y, x = np.mgrid[: patch.shape[0], : patch.shape[1]] + 0.5
     distance = np.hypot(x - centre_px[0], y - centre_px[1])
     inside = distance < radius_px
@@ -159,10 +194,17 @@ def _measured(patch: Rgb, zone: Mask, centre_px: Float[np.ndarray, "2"], radius_
     excess = (patch - level) * inside[..., None]
     whole = bool(zone[inside].all()) and inside.sum() > 0.97 * np.pi * radius_px**2
     weight = np.maximum(excess.sum(axis=2), 0.0)
+    centre, covariance = _moments(weight, x, y)
+    peak = float(patch[inside].max(initial=0.0))
+    return (*excess.sum(axis=(0, 1)).tolist(), *centre, covariance[0, 0], covariance[0, 1], covariance[1, 1], peak, float(whole))
+
+
+def _moments(weight: Float[np.ndarray, "height width"], x: np.ndarray, y: np.ndarray) -> tuple[tuple[float, float], Matrix]:
+    """Return the centroid (x, y) and the covariance of a plane of weights."""
     total = max(float(weight.sum()), 1e-9)
     mean_x, mean_y = float((weight * x).sum() / total), float((weight * y).sum() / total)
-    variance = 0.5 * float((weight * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum() / total)
-    return (*excess.sum(axis=(0, 1)).tolist(), mean_x, mean_y, variance, float(patch[inside].max(initial=0.0)), float(whole))
+    xx, xy, yy = (float((weight * a * b).sum() / total) for a, b in (((x - mean_x),) * 2, (x - mean_x, y - mean_y), ((y - mean_y),) * 2))
+    return (mean_x, mean_y), np.array([[xx, xy], [xy, yy]])
 
 
 def _radius_px(area_px: float) -> float:
@@ -218,11 +260,11 @@ def _mostly_lost(discs: Discs, areas_px: Float[np.ndarray, " slices"], sharpest:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """The slices around a light, against which proposals are held. blurs: (luminance of the slice, radius of its blur)."""
+    """The slices around a light, against which proposals are held. blurs: (luminance of the slice, kernel of its blur)."""
 
     zone: Mask
     full: float
-    blurs: tuple[tuple[Plane, float], ...]
+    blurs: tuple[tuple[Plane, Float32[np.ndarray, "_ _"]], ...]
     light: float
 
     @classmethod
@@ -231,15 +273,16 @@ class _Comparison:
         whole = np.flatnonzero(discs.whole)
         by_area = whole[np.argsort(areas_px[whole])]
         chosen = by_area[np.unique(np.linspace(0, len(by_area) - 1, COMPARED_SLICES).round().astype(int))]
-        blurs = [(_grey(patches[i]), float(np.sqrt(max(areas_px[i] - areas_px[sharpest], 0.0) / np.pi))) for i in chosen]
+        radii_px, shape = np.sqrt(np.maximum(areas_px - areas_px[sharpest], 0.0) / np.pi), discs.blur_shape(sharpest)
+        blurs = [(_grey(patches[i]), _disc_kernel(float(radii_px[i]), shape)) for i in chosen]
         light = sum(float(((grey - np.median(grey[~zone] if (~zone).any() else grey)) ** 2)[zone].sum()) for grey, _ in blurs)
         return cls(zone, float(discs.peak.max()), tuple(blurs), light)
 
     def error(self, picture: Rgb) -> float:
         """Return the squared difference, in the light's zone, between the slices and a picture blurred as they are; full is full."""
         total = 0.0
-        for grey, radius_px in self.blurs:
-            blurred = cv2.merge([cv2.filter2D(each, -1, _disc_kernel(radius_px)) for each in cv2.split(picture)])
+        for grey, kernel in self.blurs:
+            blurred = cv2.merge([cv2.filter2D(each, -1, kernel) for each in cv2.split(picture)])
             total += float(((_grey(np.minimum(blurred, self.full)) - grey)[self.zone] ** 2).sum())
         return total
 
@@ -248,12 +291,18 @@ def _grey(rgb: Rgb) -> Plane:
     return rgb.mean(axis=2)
 
 
-def _disc_kernel(radius_px: float) -> Plane:
-    """Return a disc of sum 1 with soft pixels at its rim."""
-    reach = int(np.ceil(radius_px + 0.5))
+def _disc_kernel(radius_px: float, shape: Matrix) -> Kernel:
+    """Return a disc or ellipse of sum 1 with soft pixels at its rim."""
+    reach = int(np.ceil(radius_px * float(np.linalg.norm(shape, 2)) + 0.5))
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    kernel = np.clip(radius_px + 0.5 - np.hypot(x, y), 0.0, 1.0).astype(np.float32)
+    kernel = np.clip(radius_px + 0.5 - _distance(x, y, shape), 0.0, 1.0).astype(np.float32)
     return kernel / kernel.sum()
+
+
+def _distance(x: np.ndarray, y: np.ndarray, shape: Matrix) -> Float[np.ndarray, "..."]:
+    """Return the distance from the middle in a frame in which the ellipse is a disc."""
+    inverse = np.linalg.inv(shape)
+    return np.hypot(inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y)
 
 
 def _drawn(blank: Rgb, discs: Discs, sharp_area_px: float) -> Rgb:
@@ -269,7 +318,7 @@ def _drawn(blank: Rgb, discs: Discs, sharp_area_px: float) -> Rgb:
     if not around.any():
         return picture
     surroundings = np.median(picture[around], axis=0)
-    drawn = disc_picture(xy_px, _fitting_radius_px(blank, xy_px, distance, clear_px, surroundings, flux), blank.shape[:2])
+    drawn = _fitting_disc(blank, xy_px, distance, clear_px, surroundings, flux)
     lowest, highest = picture[around].min(axis=0), picture[around].max(axis=0)
     stray = (distance <= clear_px) & ((picture > highest) | (picture < lowest)).any(axis=2)
     picture[stray] = surroundings
@@ -277,31 +326,46 @@ def _drawn(blank: Rgb, discs: Discs, sharp_area_px: float) -> Rgb:
     return ((1.0 - cover) * picture + drawn[..., None] * flux).astype(np.float32)
 
 
-def disc_picture(xy_px: Float[np.ndarray, "2"], radius_px: float, shape: tuple[int, ...]) -> Float[np.ndarray, "height width"]:
-    """Return the share of a disc's light in each pixel; a disc below the grid of subpixels is a point."""
-    left, top = (max(int(each - radius_px) - 1, 0) for each in xy_px)
-    right, bottom = min(int(xy_px[0] + radius_px) + 2, shape[1]), min(int(xy_px[1] + radius_px) + 2, shape[0])
+def disc_picture(
+    xy_px: Float[np.ndarray, "2"], radius_px: float, size: tuple[int, ...], shape: Matrix | None = None
+) -> Float[np.ndarray, "height width"]:
+    """Return the share of a light in each pixel of a picture (h, w); shape: of an ellipse. Below the grid of subpixels it is a point."""
+    reach_px = radius_px * (1.0 if shape is None else float(np.linalg.norm(shape, 2)))
+    left, top = (max(int(each - reach_px) - 1, 0) for each in xy_px)
+    right, bottom = min(int(xy_px[0] + reach_px) + 2, size[1]), min(int(xy_px[1] + reach_px) + 2, size[0])
     y, x = (np.mgrid[: (bottom - top) * SUBPIXELS, : (right - left) * SUBPIXELS] + 0.5) / SUBPIXELS
-    squared = (x + left - xy_px[0]) ** 2 + (y + top - xy_px[1]) ** 2
+    squared = _distance(x + left - xy_px[0], y + top - xy_px[1], np.eye(2) if shape is None else shape) ** 2
     inside = squared <= max(radius_px**2, float(squared.min()))
     shares = inside.reshape(bottom - top, SUBPIXELS, right - left, SUBPIXELS).sum(axis=(1, 3)) / inside.sum()
-    result = np.zeros(shape)
+    result = np.zeros(size)
     result[top:bottom, left:right] = shares
     return result
 
 
-def _fitting_radius_px(
+def _fitting_disc(
     seen: Rgb, xy_px: Float[np.ndarray, "2"], distance: Float[np.ndarray, "height width"], reach_px: float, surroundings: Flux, flux: Flux
-) -> float:
-    """Return the radius of the disc that explains what is seen of a light where nothing is full."""
+) -> Float[np.ndarray, "height width"]:
+    """Return the disc that explains what is seen of a light where nothing is full; an ellipse where that does it clearly better."""
     near = distance <= reach_px + MARGIN_PX
-    unsaturated = np.minimum(seen[near], OVER_RANGE)
+    unsaturated = np.minimum(seen, OVER_RANGE)
+    light = np.where(near, np.maximum(unsaturated - surroundings, 0.0).sum(axis=2), 0.0)
+    y, x = np.mgrid[: seen.shape[0], : seen.shape[1]] + 0.5
+    _, covariance = _moments(np.where(light > 0.5 * light.max(), light, 0.0), x, y)
+    elongated = ellipse_of(covariance - PIXEL_VARIANCE_PX2 * np.eye(2))
 
-    def miss(radius_px: float) -> float:
-        expected = np.minimum(surroundings + disc_picture(xy_px, radius_px, seen.shape[:2])[near][:, None] * flux, OVER_RANGE)
-        return float(((expected - unsaturated) ** 2).sum() + USUAL_WEIGHT * (radius_px - USUAL_RADIUS_PX) ** 2)
+    def miss(drawn: Float[np.ndarray, "height width"], radius_px: float) -> float:
+        expected = np.minimum(surroundings + drawn[near][:, None] * flux, OVER_RANGE)
+        return float(((expected - unsaturated[near]) ** 2).sum() + USUAL_WEIGHT * (radius_px - USUAL_RADIUS_PX) ** 2)
 
-    return float(min(RADII_PX, key=miss))
+    def best(shape: Matrix) -> tuple[float, Float[np.ndarray, "height width"]]:
+        discs = [(radius_px, disc_picture(xy_px, float(radius_px), seen.shape[:2], shape)) for radius_px in RADII_PX]
+        return min(((miss(drawn, float(radius_px)), drawn) for radius_px, drawn in discs), key=lambda pair: pair[0])
+
+    round_miss, round_disc = best(np.eye(2))
+    if np.array_equal(elongated, np.eye(2)):
+        return round_disc
+    ellipse_miss, ellipse = best(elongated)
+    return ellipse if ellipse_miss * CLEARLY < round_miss else round_disc
 
 
 def _raised(blank: Rgb, core: Mask, discs: Discs, sharpest: int) -> Rgb:

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.alignment import register_stack, warp
 from capture.merging.all_in_focus import all_in_focus
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
-from capture.merging.guided_all_in_focus import all_in_focus_from_depth
 from capture.merging.lights import Extremes, Lights, find_lights, no_lights
+from capture.merging.registration.alignment import register_stack
+from capture.merging.registration.plane_transforms import warp
 from capture.merging.restored_lights import Discs, measured_discs, restored_lights, with_restored_lights
-from capture.merging.slice_optics import SliceOptics
+from capture.merging.second_pass import SliceOptics, all_in_focus_from_depth
 from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
 from datasets_scripts.traced_scene import DiscLight, Quad, Scene, emissive_quad
 from mrbokeh.images.image_metrics import psnr
@@ -90,6 +90,37 @@ def test_a_light_that_lost_its_flux_is_drawn_anew(photographs: list[np.ndarray])
     assert restored.max() < found[0].supported
     far = np.hypot(*(np.mgrid[: SIZE[0], : SIZE[1]] + 0.5 - AT_PX[::-1, None, None])) > 8
     np.testing.assert_array_equal(restored[far], merged[far])
+
+
+@pytest.mark.parametrize("cat_eye", [1.0, 0.6])
+def test_an_elongated_light_keeps_its_shape_also_behind_a_lens_of_cat_eyes(cat_eye: float) -> None:
+    """Half axes of 2 and 1.2 px along 115 degrees; discs whose short half axis is `cat_eye` of the long one, along another direction."""
+    light, flux = _filled_ellipse(2.0, 1.2, 2.0), 2.4 * FLUX
+    slices = []
+    for index in range(12):
+        radius_px = abs(index - 5.0)
+        disc = _filled_ellipse(radius_px, cat_eye * radius_px, 1.2) if radius_px else None
+        spread = light if disc is None else cv2.filter2D(light, -1, disc[1:, 1:], borderType=cv2.BORDER_CONSTANT)
+        slices.append(np.minimum(0.05 + _on_pixels(spread)[..., None] * flux, FULL).astype(np.float32))
+    _, found = restored_lights(lambda: slices, slices[5])
+    drawn = (with_restored_lights(slices[5], found) - 0.05).sum(axis=2)
+    assert drawn.sum() == pytest.approx(flux.sum(), rel=0.03)
+    # A filled ellipse has a quarter of its squared half axes as variances, and pixels add 1 / 12.
+    variances = np.linalg.eigvalsh(np.cov(np.indices(drawn.shape).reshape(2, -1), aweights=np.maximum(drawn, 0.0).ravel()))
+    np.testing.assert_allclose(np.sqrt(variances - 1 / 12), [0.6, 1.0], atol=0.1, err_msg="a round dot of this area has 0.77 twice")
+
+
+def _filled_ellipse(long_px: float, short_px: float, angle_rad: float) -> np.ndarray:
+    """An ellipse of flux 1 about the middle of 64 x 64 pixels, by 8 x 8 points each."""
+    y, x = (np.mgrid[: 64 * 8, : 64 * 8] + 0.5) / 8 - 32
+    along, across = np.cos(angle_rad) * x + np.sin(angle_rad) * y, np.cos(angle_rad) * y - np.sin(angle_rad) * x
+    inside = ((along / long_px) ** 2 + (across / short_px) ** 2 <= 1).astype(np.float32)
+    return inside / inside.sum()
+
+
+def _on_pixels(points: np.ndarray) -> np.ndarray:
+    """The same on pixels, in a wider picture: a light's reach is a share of the width."""
+    return np.pad(points.reshape(64, 8, 64, 8).sum(axis=(1, 3)), ((0, 0), (96, 96)))
 
 
 def test_discs_that_contradict_each_other_are_not_believed(photographs: list[np.ndarray], discs: Discs) -> None:
