@@ -1,9 +1,10 @@
 """Compiled visibility rays for baked lighting."""
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from datasets_scripts._traced_bodies_numba import FAST, PackedScene, nearest_hit
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, fastmath=FAST, parallel=True)

@@ -7,7 +7,8 @@ position q is `c = a + bx x + by y`, and lens point u sees q at the film point `
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 FAST = {"nsz", "arcp", "contract"}
 OUT, SOME, ALL = 0, 1, 2

@@ -1,7 +1,8 @@
 """The loop of datasets_scripts.gathering_filter, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})

@@ -9,7 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 NOTHING = -1
 QUAD, ROUND, SPHERE, LAMP = 0, 1, 2, 3

@@ -7,11 +7,11 @@ much blurred is gathered by every pixel that it reaches, one near the focus is f
 import math
 
 import numpy as np
-from numba import njit
 
 from datasets_scripts._samples_bodies_numba import CENTRE, RADIANCE, RADIUS, VELOCITY, PackedBodies, first_hit
 from datasets_scripts._samples_numba import TILE_PX, Pinhole, members_of_tile
 from datasets_scripts._samples_random_numba import DIMENSIONS, PER_BIT, LensTable, fill_seeds, lens_point, place, scrambled
+from mrbokeh.system.kernels import njit
 
 OWN_LAMP = 1.0 - 1e-9
 

@@ -7,10 +7,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from datasets_scripts._samples_bodies_numba import LAMP, PackedBodies, first_hit, motion_of, radiance_of
 from datasets_scripts._samples_random_numba import DIMENSIONS, PER_BIT, LensTable, fill_seeds, lens_point, place, scrambled
+from mrbokeh.system.kernels import njit
 
 TILE_PX = 8
 

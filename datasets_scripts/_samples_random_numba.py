@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 DIMENSIONS = 5
 PLACES = 4096

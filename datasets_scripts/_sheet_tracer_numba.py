@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 TABLE_TILE_M = 0.5
 

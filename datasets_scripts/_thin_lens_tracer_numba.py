@@ -4,9 +4,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from datasets_scripts._traced_bodies_numba import FAST, PackedScene, nearest_hit, radiance
+from mrbokeh.system.kernels import njit
 
 TILE_PX = 8
 

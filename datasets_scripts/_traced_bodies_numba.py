@@ -4,7 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 NOTHING = -1
 # Without "ninf" and "nnan": a missed body is at infinity.

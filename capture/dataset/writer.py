@@ -1,18 +1,64 @@
-"""`mrbokeh capture dataset`: the stacks of some scenes as one data set. Stacks are written one by one, pictures read one by one."""
+"""`mrbokeh capture dataset`: the stacks of some scenes as one data set. Stacks are written one by one, pictures read one by one.
 
-from collections.abc import Sequence
+Which stacks are for training and which for testing: whole viewpoints, the same ones on every machine; of a single one some slices.
+
+Whether a data set is what its manifest says.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from capture.dataset.split import slices_of_a_single_stack, split_by_viewpoint
-from capture.dataset.stack_writer import StackWriting, require_usable, write_stack
+from capture.dataset.stack_writer import StackWriting, record_of, require_usable, write_stack
 from mrbokeh import __version__
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
-from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, StackRecord, write_focal_stack_dataset
+from mrbokeh.stacks.focal_stack_dataset import (
+    FILE_NAME,
+    FocalStackDataset,
+    Part,
+    StackRecord,
+    file_troubles,
+    slices_to_hold_out,
+    write_focal_stack_dataset,
+)
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
+
+
+def split_by_viewpoint(names: Sequence[str], test: Sequence[str] = (), test_share: float = 0.2, seed: int = 0) -> dict[str, Part]:
+    """The part of each stack. names: SCENE/VIEW.
+
+    test: names (or VIEW alone) to test on; without any, those whose hash with the seed is smallest, test_share of all and at least one
+    where there are two. Raises InputError where a name is unknown or nothing is left to train on.
+    """
+    unknown = [name for name in test if not any(_is_called(full, name) for full in names)]
+    if unknown:
+        raise InputError(f"cannot test on {', '.join(unknown)}: expected viewpoints among {', '.join(sorted(names))}")
+    if test:
+        apart = {full for full in names if any(_is_called(full, name) for name in test)}
+    else:
+        if not 0.0 <= test_share < 1.0:
+            raise InputError(f"the share of test viewpoints must lie in [0, 1), got {test_share:g}")
+        count = max(1, round(test_share * len(names))) if len(names) > 1 and test_share > 0 else 0
+        apart = set(sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).hexdigest())[:count])
+    if len(apart) == len(names):
+        raise InputError(f"all {len(names)} viewpoints are for testing, none is left to train on: test on fewer or give more scenes")
+    return {name: "test" if name in apart else "train" for name in names}
+
+
+def slices_of_a_single_stack(stacks: Mapping[str, FocalStack], test_share: float = 0.2) -> dict[str, tuple[int, ...]]:
+    """Slices held out inside the stack where it is the only one and something is to be tested on; {} where viewpoints are split."""
+    if len(stacks) > 1 or test_share == 0.0:
+        return {}
+    return {name: slices_to_hold_out(stack) for name, stack in stacks.items()}
+
+
+def _is_called(full: str, name: str) -> bool:
+    return name in (full, full.rsplit("/", 1)[-1])
+
 
 UNFINISHED_NAME = "unfinished.json"
 MAXIMUM = "maximum"
@@ -108,3 +154,12 @@ def _claim(out: Path, overwrite: bool) -> None:
     elif out.exists() and any(out.iterdir()) and not (out / UNFINISHED_NAME).exists():
         raise InputError(f"{out} holds something else than a data set: give the name of a new folder")
     write_json(out / UNFINISHED_NAME, {"what": f"a data set being written; {FILE_NAME} comes last"})
+
+
+def verify(dataset: FocalStackDataset) -> list[str]:
+    """What is wrong, one sentence each; [] where every file is there with its size and hash."""
+    return [trouble for record in track(dataset.stacks, "verify") for trouble in file_troubles(dataset, record, _sha256)]
+
+
+def _sha256(path: Path) -> str:
+    return record_of(path).sha256

@@ -1,7 +1,8 @@
 """Weighted median around the edges of a depth map, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

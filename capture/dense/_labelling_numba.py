@@ -1,7 +1,8 @@
 """Semi-global aggregation of costs in 0..255 along eight directions with penalties that bend to a guide picture, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _FAR = np.float32(1e9)
 

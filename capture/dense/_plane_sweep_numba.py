@@ -1,7 +1,8 @@
 """Matching scores of a plane sweep, compiled: warp a band of rows of a neighbour's picture, correlate it in windows, keep the best."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _UNSEEN = -2.0  # as plane_sweep.UNSEEN
 

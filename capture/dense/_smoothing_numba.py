@@ -1,7 +1,8 @@
 """Tridiagonal solves of the fast global smoother along rows and columns, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -3,11 +3,13 @@
 There the focus energy has two clear peaks along the slices. The focus map takes what fits its surroundings; who merges may prefer the near
 or the far one. The window of the energy sees a thread from several pixels away, where there is nothing but what lies behind it: a pixel
 takes the preferred slice only if that shows detail in the pixel itself, else the other one on the same condition, else nothing changes.
+
+The side that was preferred, put into a merged stack: picture, depth.exr and what is remembered of it.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,6 +18,11 @@ from jaxtyping import Bool, Float32, Int
 from capture.merging.all_in_focus import painted
 from capture.merging.depth_from_focus import SURFACE_STEP
 from capture.merging.focus_volume import FocusVolume, focus_energy
+from capture.merging.merged_pictures import replaced_depth
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.exr_io import read_exr, write_exr
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import is_near_first, metres_facts
 
 Side = Literal["near", "far"]
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -101,3 +108,61 @@ def _has_the_detail(rgb: Rgb) -> Mask:
     """Return where detail lies in the pixel itself and not only beside it; small gaps within are filled."""
     own = focus_energy(rgb, _OWN_WINDOW_PX) >= _OWN_SHARE * focus_energy(rgb, _WINDOW_PX)
     return cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_GAP_PX, _GAP_PX), np.uint8)) > 0
+
+
+PREFERRED = "preferred"
+"""Key in a stack's metadata: the side that was asked for, the share of the picture that changed, and whether near is known."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What merging has seen: the energies, the focus index that it took (H, W), and where energy is that of rims of lights."""
+
+    volume: FocusVolume
+    focus_index: Float32[np.ndarray, "height width"]
+    rims: Bool[np.ndarray, "height width"]
+
+
+def with_preferred(merged: FocalStack, picture: Rgb, slices: Callable[[], Iterable[Rgb]], seen: Seen, side: Side) -> tuple[FocalStack, Rgb]:
+    """Return the stack and its picture with the preferred side in places where two things are sharp; all_in_focus.exr and depth.exr too.
+
+    merged: with a focus distance for every slice, by which the near side is told. slices: gives a fresh pass over the registered ones.
+    """
+    first_is_near, sure = nearest_end(merged)
+    preferred = preferred_places(slices(), seen.volume, seen.focus_index, first_is_near == (side == "near"), seen.rims)
+    record = {"side": side, "share": float(preferred.where.mean()), "first_is_near": first_is_near, "sure": sure}
+    merged = replace(merged, metadata=merged.metadata | {PREFERRED: record})
+    if not preferred.where.any():
+        return merged, picture
+    picture, part = blended(picture, slices(), preferred), read_exr(merged.depth_path)[0]
+    confidence = part.channels["confidence"].astype(np.float32)
+    channels = replaced_depth(merged, part.channels, preferred.index, confidence, preferred.where)
+    write_camera_rgb(merged.all_in_focus_path, picture, merged.rec709_from_camera, half=False)
+    write_exr(merged.depth_path, replace(part, channels=channels), compress=False)
+    return merged, picture
+
+
+def nearest_end(merged: FocalStack) -> tuple[bool, bool]:
+    """Whether the first slice is focused nearer than the last, and whether that is known and not guessed."""
+    return is_near_first(merged), bool((metres_facts(merged).get("gauge") or {}).get("near_first_sure", True))
+
+
+def preferred_side(stack: FocalStack) -> Side | None:
+    """Which side a merge was asked to prefer; None where it was not asked."""
+    record: dict[str, Any] = stack.metadata.get(PREFERRED) or {}
+    return record.get("side")
+
+
+def preferred_lines(stack: FocalStack) -> list[str]:
+    """What to tell people of the side that a merge preferred; nothing where none was asked for."""
+    record: dict[str, Any] | None = stack.metadata.get(PREFERRED)
+    if record is None:
+        return []
+    taken = f"{record['share']:.2%} of the picture changed, around things that cross" if record["share"] else ""
+    lines = [f"--prefer {record['side']}: {taken or 'nothing changed, no place shows the other of two things in focus'}"]
+    if record["share"] and not record["sure"]:
+        end, other = "first" if record["first_is_near"] else "last", "far" if record["side"] == "near" else "near"
+        lines.append(
+            f"--prefer {record['side']}: that the {end} slice is the nearest is a guess; if it is the farthest, use --prefer {other}"
+        )
+    return lines

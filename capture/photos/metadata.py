@@ -1,15 +1,17 @@
-"""What a photograph tells about how it was taken: through pyexiv2, then for what is still open exiftool and exifread."""
+"""What a photograph tells about how it was taken: through pyexiv2, then for what is still open exiftool and exifread.
+
+Files cut short in copying: decoders notice most of them, but lossy tiles of a DNG can go missing without a word.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 
-from capture.photos.exifread_metadata import read_tags_with_exifread
-from capture.photos.exiftool_metadata import read_with_exiftool
-from capture.photos.focus_metadata import Tags, number
-from capture.photos.focus_tags import read_focus
+from capture.photos.focus_metadata import Tags, number, read_focus
+from capture.photos.metadata_readers import read_tags_with_exifread, read_with_exiftool
 from capture.photos.photo_metadata import PhotoMetadata, parse_time
 from capture.photos.sensor_metadata import read_sensor, stated_size_px
+from mrbokeh.system.errors import InputError
 
 _NO_MESSAGES = 4
 
@@ -118,3 +120,25 @@ def _microseconds(digits: str | None) -> int:
 
 def _text(tags: Mapping[str, str], *names: str) -> str | None:
     return next((tags[name].strip() for name in names if tags.get(name, "").strip()), None)
+
+
+_BLOCKS = (("TileOffsets", "TileByteCounts"), ("StripOffsets", "StripByteCounts"))
+
+
+def require_whole_tiff(path: Path) -> None:
+    """Raise InputError where a TIFF-like file (DNG and most RAW) speaks of pixels that lie behind its end."""
+    if not path.is_file():
+        raise InputError(f"expected a photograph at {path}, but there is no such file")
+    size, tags = path.stat().st_size, read_tags(path)
+    for offsets_name, counts_name in _BLOCKS:
+        for key, offsets in tags.items():
+            group, _, name = key.rpartition(".")
+            if name == offsets_name and (end := _end(offsets, tags.get(f"{group}.{counts_name}", ""))) > size:
+                raise InputError(f"{path} is cut short: it has {size} bytes, its pixels reach to {end}. Copy it again")
+
+
+def _end(offsets: str, counts: str) -> int:
+    try:
+        return max((int(offset) + int(count) for offset, count in zip(offsets.split(), counts.split(), strict=True)), default=0)
+    except ValueError:
+        return 0

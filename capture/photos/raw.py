@@ -1,6 +1,21 @@
-"""Camera RAW to linear white-balanced camera RGB, unclipped, on one exposure scale: 1.0 is where the raw green channel saturates."""
+"""Camera RAW to linear white-balanced camera RGB, unclipped, on one exposure scale: 1.0 is where the raw green channel saturates.
 
+DecodedPhoto: one photograph in linear light.
+
+X-Trans files decoded by a Python of their own with one thread: LibRaw's parallel decoding of them is not reproducible.
+
+LibRaw issue 845: between 0.03 and 0.16 % of the samples of a compressed RAF differ from run to run, and its demosaicing of
+X-Trans does too (1033 of 972 000 samples of an uncompressed DNG on two cores), unless OMP_NUM_THREADS=1 was set before
+LibRaw was loaded, which only a new process can still do. It is spawned, never forked: OpenMP deadlocks in a forked child.
+"""
+
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,15 +23,91 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.photos.clipped_highlights import neutral_where_full
-from capture.photos.decoded_photo import DecodedPhoto, Photosites
-from capture.photos.libraw import MAX_16_BIT, WhiteBalance, matrix_used_by_libraw, opened_raw, processed, rec709_from_balanced_camera
+from capture.photos.libraw import (
+    MAX_16_BIT,
+    WhiteBalance,
+    full_photosites,
+    matrix_used_by_libraw,
+    neutral_where_full,
+    opened_raw,
+    processed,
+    rec709_from_balanced_camera,
+    saturated_share,
+)
+from capture.photos.metadata import require_whole_tiff
 from capture.photos.photo_metadata import PhotoMetadata
-from capture.photos.saturation import full_photosites, saturated_share
-from capture.photos.whole_file import require_whole_tiff
-from capture.photos.x_trans import X_TRANS_SIZE, decode_in_one_thread, decodes_reproducibly
-from mrbokeh.images.camera_rgb import matrix3x3
+from mrbokeh.images.camera_rgb import Matrix3x3, matrix3x3
 from mrbokeh.system.errors import InputError
+
+
+@dataclass(frozen=True)
+class Photosites:
+    """The sensor's own grid before any reduction, and how many of its photosites gave no more than "full"."""
+
+    width: int
+    height: int
+    full: int = 0
+
+    @property
+    def full_fraction(self) -> float:
+        return self.full / (self.width * self.height)
+
+
+@dataclass(frozen=True)
+class DecodedPhoto:
+    """One photograph in linear light.
+
+    rgb: (H, W, 3) white-balanced camera RGB; Rec.709 where rec709_from_camera is None (JPEG, EXR).
+    saturated: (H, W) how much of each pixel comes from full photosites or their neighbours in demosaicing, 0 to 1.
+    white_balance: multipliers of red, green, blue, green being 1; None where it was applied before (JPEG, EXR).
+    saturation_level: the linear value of a saturated green or grey; None where there is no such thing (EXR).
+    remarks: what a reader of the result should know.
+    half_suffices: the file holds 8 bits a channel. Their steps are 0.9 % near white and more below, those of half 0.1 % at most; 14-bit RAW
+    and 16-bit files have finer ones near white (0.006 %) than half (0.05 %).
+    """
+
+    rgb: Float32[np.ndarray, "height width 3"]
+    rec709_from_camera: Matrix3x3 | None
+    saturated: Float32[np.ndarray, "height width"]
+    photosites: Photosites
+    white_balance: WhiteBalance | None = None
+    saturation_level: float | None = 1.0
+    remarks: tuple[str, ...] = ()
+    half_suffices: bool = False
+
+
+X_TRANS_SIZE = (6, 6)
+_VARIABLE = "OMP_NUM_THREADS"
+_WORKER = "from capture.photos.raw import serve_one_order; serve_one_order()"
+# OpenMP reads it once: what is set later does not count.
+_AT_START = os.environ.get(_VARIABLE)
+
+
+def decodes_reproducibly() -> bool:
+    """Whether this process was started with one OpenMP thread."""
+    return _AT_START == "1"
+
+
+def decode_in_one_thread(path: Path, white_balance: WhiteBalance | None, half_size: bool) -> DecodedPhoto:
+    """`decode_raw` in a process of its own with one thread; errors come back as they were."""
+    with tempfile.TemporaryDirectory(prefix="mrbokeh_") as folder:
+        result = Path(folder) / "decoded.pickle"
+        order = pickle.dumps((Path(path), white_balance, half_size, result))
+        search = os.pathsep.join(each for each in sys.path if each)
+        environment = os.environ | {_VARIABLE: "1", "PYTHONPATH": search}
+        done = subprocess.run([sys.executable, "-c", _WORKER], input=order, env=environment, capture_output=True)
+        if done.returncode != 0 or not result.is_file():
+            last_line = (done.stderr.decode(errors="replace").strip().splitlines() or ["no message"])[-1]
+            raise InputError(
+                f"{path} cannot be decoded as RAW: the process that decodes X-Trans ended with {done.returncode} ({last_line})"
+            )
+        with result.open("rb") as file:
+            answer = pickle.load(file)
+    if isinstance(answer, InputError):
+        raise answer
+    assert isinstance(answer, DecodedPhoto)
+    return answer
+
 
 if TYPE_CHECKING:
     import rawpy
@@ -32,7 +123,7 @@ def decode_raw(path: Path, white_balance: WhiteBalance | None = None, *, half_si
     """A RAW file in linear camera RGB. white_balance: multipliers of red, green, blue, or None for the camera's own.
 
     half_size: one pixel per 2x2 photosites, without demosaicing: fast, for a quick look. X-Trans is decoded in a process
-    of its own (capture.photos.x_trans), so that it comes out the same every time.
+    of its own (capture.photos.raw), so that it comes out the same every time.
     Raises InputError where LibRaw cannot decode the file, the file is cut short, or the sensor does not see RGB.
     """
     require_whole_tiff(path)
@@ -60,6 +151,17 @@ def _decoded(raw: "rawpy.RawPy", white_balance: WhiteBalance | None, half_size: 
 
 def _count(full: Bool[np.ndarray, "sensor_height sensor_width"]) -> Photosites:
     return Photosites(full.shape[1], full.shape[0], int(np.count_nonzero(full)))
+
+
+def serve_one_order() -> None:
+    """Decode the photograph that an order on standard input names, into a file: the process that `decode_in_one_thread` starts."""
+    path, white_balance, half_size, result = pickle.load(sys.stdin.buffer)
+    try:
+        answer: DecodedPhoto | InputError = decode_raw(path, white_balance, half_size=half_size)
+    except InputError as error:
+        answer = error
+    with open(result, "wb") as file:
+        pickle.dump(answer, file, protocol=pickle.HIGHEST_PROTOCOL)
 
 
 def camera_white_balance(path: Path) -> WhiteBalance:

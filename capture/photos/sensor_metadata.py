@@ -1,11 +1,74 @@
-"""The width of the sensor from what a photograph states: pixel pitch, size of the picture it belongs to, model, 35 mm equivalent."""
+"""The width of the sensor from what a photograph states: pixel pitch, size of the picture it belongs to, model, 35 mm equivalent.
+
+SensorReading: how large the pixels of a sensor are, and what part of it a picture shows.
+
+Sensor sizes by camera model from lensfun's database (CC-BY-SA 3.0, in the lensfunpy wheel), for cameras whose files do not tell.
+"""
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
 
 from capture.photos.focus_metadata import Tags, number, rational
-from capture.photos.sensor_reading import SensorReading
-from capture.photos.sensor_table import FULL_FRAME_DIAGONAL_MM, sensor_of_model
+from mrbokeh.images.exif import as_it_lies, is_same_shape
+
+# A RAW shows a few pixels more than the JPEG of its camera; a picture that differs by more was resized or cut.
+_MARGIN = 0.05
+
+
+@dataclass(frozen=True)
+class SensorReading:
+    """Millimetres per pixel in a picture of full_size_px (width, height), if that size is known; source: the tag it came from."""
+
+    pitch_mm: float
+    full_size_px: tuple[int, int] | None
+    source: str
+
+    def width_mm(self, width_px: int, height_px: int) -> float:
+        """Width on the sensor of a picture as it is stored.
+
+        The full size, or nearly (RAW margins): pitch times width. Another size but the same shape: the picture was
+        resized and shows the full width. Another shape: it was cut out, at full resolution as far as anyone can tell.
+        """
+        if self.full_size_px is None:
+            return self.pitch_mm * width_px
+        full_width, full_height = as_it_lies(self.full_size_px, (width_px, height_px))
+        resized = abs(width_px / full_width - 1.0) > _MARGIN
+        same_shape = is_same_shape((width_px, height_px), (full_width, full_height))
+        return self.pitch_mm * (full_width if resized and same_shape else width_px)
+
+
+if TYPE_CHECKING:
+    import lensfunpy
+
+FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+
+
+def sensor_of_model(make: str | None, model: str | None, size_px: tuple[int, int] | None) -> SensorReading | None:
+    """The sensor of a camera whose full pictures have size_px (width, height); None where lensfun is not installed or knows it not.
+
+    The crop factor compares diagonals, rounded to about 0.5 % (Nikon D3300: 23.64 mm by it, 23.5 by the data sheet).
+    """
+    database = _database() if make and model and size_px else None
+    if database is None or size_px is None:
+        return None
+    found = next(iter(database.find_cameras(make, model)), None)
+    if found is None or found.crop_factor <= 0:
+        return None
+    diagonal_mm = FULL_FRAME_DIAGONAL_MM / found.crop_factor
+    return SensorReading(diagonal_mm / math.hypot(*size_px), size_px, f"lensfun's crop factor {found.crop_factor:.4g} of {found.model}")
+
+
+@cache
+def _database() -> "lensfunpy.Database | None":
+    try:
+        import lensfunpy
+    except ImportError:
+        return None
+    return lensfunpy.Database()
+
 
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH_MM = 25.4

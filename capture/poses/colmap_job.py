@@ -1,9 +1,24 @@
-"""What COLMAP is asked to do, as a document: it crosses to the process that runs COLMAP and tells whether old results still fit."""
+"""What COLMAP is asked to do, as a document: it crosses to the process that runs COLMAP and tells whether old results still fit.
 
+The all-in-focus pictures of a scene, or the pictures of a folder, as COLMAP wants them: 8 bits, files, cameras.
+"""
+
+import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from capture.merging.metres.relative_stack import as_stated
+from capture.poses.lens_calibration import stated_distances_m
+from mrbokeh.images.color import luminance
+from mrbokeh.images.image_io import write_preview
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.console import track
+from mrbokeh.system.errors import InputError
 
 CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL")
 FEWEST_FOR_TWO_TERMS = 5
@@ -72,3 +87,105 @@ def camera_model_for(cameras: Sequence[int], choice: str) -> str:
         return choice
     fewest = min(Counter(cameras).values())
     return "RADIAL" if fewest >= FEWEST_FOR_TWO_TERMS else "SIMPLE_RADIAL"
+
+
+CAMERA_CHOICES = ("auto", "shared", "separate")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+Prior = tuple[float, float, float] | None
+
+_MID_GREY = 0.18
+_BRIGHT_QUANTILE = 0.95
+_EVERY_NTH_PIXEL = 7
+
+
+def view_name(stack: FocalStack, scene: Path) -> str:
+    """The folder of a stack below the scene, with slashes."""
+    return stack.folder.relative_to(scene).as_posix()
+
+
+def write_stack_pictures(scene: Path, stacks: Sequence[FocalStack], images: Path) -> list[str]:
+    """VIEW.png of every stack, all at one exposure; returns the file names below `images`."""
+    stops = common_exposure_stops(stacks)
+    files = [f"{view_name(stack, scene)}.png" for stack in stacks]
+    for stack, file in zip(track(stacks, "pictures for COLMAP"), files, strict=True):
+        write_preview(images / file, stack.all_in_focus(), stops)
+    return files
+
+
+def common_exposure_stops(stacks: Sequence[FocalStack]) -> float:
+    """Brings the median luminance of all views to mid grey, but no more than a twentieth of the pixels above white."""
+    values = [luminance(stack.all_in_focus())[::_EVERY_NTH_PIXEL, ::_EVERY_NTH_PIXEL].ravel() for stack in stacks]
+    pooled = np.concatenate(values)
+    middle, bright = float(np.median(pooled)), float(np.quantile(pooled, _BRIGHT_QUANTILE))
+    gain = min(_MID_GREY / max(middle, 1e-6), 1.0 / max(bright, 1e-6))
+    return float(np.log2(gain))
+
+
+def stack_cameras(stacks: Sequence[FocalStack], choice: str) -> tuple[list[int], list[Prior]]:
+    """(number of the camera of each stack, prior of each camera): one for each size, lens and focus of the reference slice.
+
+    The focal length in pixels breathes with the focus, so only pictures registered to the same focus share a camera.
+    Where nobody knows the focus, stacks of one size are taken to have been focused alike; what merging guessed is no prior.
+    """
+    stacks = [as_stated(stack) for stack in stacks]
+    keys = [_camera_key(stack) for stack in stacks]
+    priors = [None if each.camera is None else (each.camera.focal_px[0], *each.camera.principal_px) for each in stacks]
+    return _numbered(keys, priors, choice)
+
+
+def _camera_key(stack: FocalStack) -> tuple[object, ...]:
+    if stack.camera is None or stack.lens is None:
+        height_px, width_px = stack.all_in_focus().shape[:2]
+        return width_px, height_px
+    lens, stated_m = stack.lens, stated_distances_m(stack)[stack.reference]
+    dioptres = round(1.0 / (stated_m or lens.focus_distance_m), 4)
+    return stack.camera.width_px, stack.camera.height_px, round(lens.focal_length_mm, 3), dioptres
+
+
+def picture_cameras(files: Sequence[Path], choice: str) -> tuple[list[int], list[Prior]]:
+    """One camera for all where all pictures have one size, else one for each; the focal length is what Exif tells."""
+    sizes = [_size_px(file) for file in files]
+    if choice == "auto":
+        choice = "shared" if len(set(sizes)) == 1 else "separate"
+    return _numbered(sizes, [None] * len(files), choice)
+
+
+def _numbered(keys: Sequence[object], priors: Sequence[Prior], choice: str) -> tuple[list[int], list[Prior]]:
+    if choice == "separate":
+        return list(range(len(keys))), list(priors)
+    if choice == "shared" and len({_size_of(key) for key in keys}) > 1:
+        raise InputError("--cameras shared needs pictures of one size, but they differ: leave it at auto, or give separate")
+    grouped: list[object] = ["all"] * len(keys) if choice == "shared" else list(keys)
+    order = list(dict.fromkeys(grouped))
+    return [order.index(key) for key in grouped], [priors[grouped.index(key)] for key in order]
+
+
+def _size_of(key: object) -> object:
+    return key[:2] if isinstance(key, tuple) else key
+
+
+def _size_px(file: Path) -> tuple[int, int]:
+    import cv2
+
+    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise InputError(f"cannot read the picture {file}: expected one of {', '.join(PICTURE_SUFFIXES)}; take it out of the folder")
+    return picture.shape[1], picture.shape[0]
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures of a folder by name. Raises InputError where there are fewer than two."""
+    if not folder.is_dir():
+        raise InputError(f"expected a folder of pictures at {folder}, but there is none")
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    if len(files) < 2:
+        raise InputError(f"expected at least 2 pictures ({', '.join(PICTURE_SUFFIXES)}) in {folder}, found {len(files)}")
+    return files
+
+
+def described(names: Sequence[str], files: Sequence[str], cameras: Sequence[int], folder: Path) -> tuple[ColmapPicture, ...]:
+    """With the hash of each file, by which a changed picture is known."""
+    hashes = [hashlib.sha256((folder / file).read_bytes()).hexdigest() for file in files]
+    rows = zip(names, files, hashes, cameras, strict=True)
+    return tuple(ColmapPicture(name, file, sha256, camera) for name, file, sha256, camera in rows)

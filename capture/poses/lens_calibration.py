@@ -3,6 +3,8 @@
 lens_calibration.json: {"format": "mrbokeh-lens-calibration", "version": 1, "lens_model", "focal_length_mm", "f_number", "width_px",
 "offset_m", "rows": [{"stated_dioptre", "dioptre", "px_per_dioptre", "breathing_scale", "sigma_dioptre", "stacks"}]}, rows from far
 to near. stated_dioptre is null where the camera did not tell; such rows say something of their own stack only.
+
+A lens calibration put to use on stacks without camera poses: their focus distances, and the depth from focus that rests on them.
 """
 
 from collections.abc import Sequence
@@ -11,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH, FocalStack, Slice
-from mrbokeh.stacks.guessed_metres import STATED_DISTANCE
+from capture.merging.merged_pictures import depth_m_of
+from capture.merging.metres.known_metres import with_known_nearest, write_changed_metres
+from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH, FocalStack, Slice, find_focal_stacks, write_focal_stack
+from mrbokeh.stacks.guessed_metres import STATED_DISTANCE, is_near_first
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 
@@ -147,3 +151,24 @@ def read_lens_calibration(path: Path | str) -> LensCalibration:
         return LensCalibration(**values, rows=tuple(CalibratedFocus(**row) for row in document["rows"]))
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} is incomplete ({error!r}): run `mrbokeh capture scale` on the calibration scene again") from None
+
+
+def calibrate_scene(scene: Path, calibration: LensCalibration) -> list[FocalStack]:
+    """Apply to every stack of a scene and write; all lenses are checked before anything is changed."""
+    stacks = find_focal_stacks(scene)
+    for stack in stacks:
+        check_lens(stack, calibration)
+    changed = [apply_lens_calibration(stack, calibration) for stack in stacks]
+    for before, after in zip(stacks, changed, strict=True):
+        if after.merged:
+            write_calibrated(before, after)
+        else:
+            write_focal_stack(after)
+    return changed
+
+
+def write_calibrated(before: FocalStack, after: FocalStack) -> None:
+    """Write a merged stack with other focus distances, and its depth in metres anew from the focus index."""
+    depth_m, turned = depth_m_of(after, after.focus_index()), is_near_first(before) != is_near_first(after)
+    assert depth_m is not None, f"{after.folder}: calibrated stacks are metric"
+    write_changed_metres(with_known_nearest(after, turned), depth_m, turned)

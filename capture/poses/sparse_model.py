@@ -1,13 +1,86 @@
-"""SparseModel: cameras of many viewpoints and the points they saw in common, as structure from motion finds them."""
+"""SparseModel: cameras of many viewpoints and the points they saw in common, as structure from motion finds them.
+
+Radial lens distortion: where a pinhole's pixel lies in the picture of a real lens, and back. Pictures are never resampled.
+
+Brown-Conrady with two radial terms, as COLMAP's RADIAL model (SIMPLE_RADIAL has k2 = 0): with (u, v) the position over the
+focal length from the principal point and r^2 = u^2 + v^2, the picture has (u, v) (1 + k1 r^2 + k2 r^4).
+
+A SparseModel on disk: poses.json (views), points.npz (points and observations) and scale.json (metres, see `scale_file`).
+
+poses.json: {"format": "mrbokeh-poses", "version": 1, "views": [{"name", "camera": {...}, "distortion": [k1, k2]}], "left_out": [names]}
+camera_from_world of a view is in the model's own unit; scale.json, where it is there, says how many metres that is.
+"""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from capture.poses.distortion import Distortion, distorted_px, undistorted_px
-from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
+from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.system.errors import InputError
+
+Distortion = tuple[float, float]
+Positions = Float[np.ndarray, "*batch 2"]
+
+_NEWTON_STEPS = 12
+_LARGEST_RADIUS = 4.0  # tan of 76 degrees: beyond what a pinhole with distortion can describe
+
+
+def distorted_px(camera: Camera, distortion: Distortion, xy_px: Positions) -> Positions:
+    """Pixel positions of the undistorted pinhole to positions in the picture."""
+    plane = _plane(camera, xy_px)
+    k1, k2 = distortion
+    r2 = np.sum(plane**2, axis=-1, keepdims=True)
+    return _pixels(camera, plane * (1.0 + r2 * (k1 + r2 * k2)))
+
+
+def undistorted_px(camera: Camera, distortion: Distortion, xy_px: Positions) -> Positions:
+    """Positions in the picture to pixel positions of the undistorted pinhole: the inverse of `distorted_px`.
+
+    NaN beyond the radius at which barrel distortion folds the picture back, for no point is seen there.
+    """
+    plane = _plane(camera, xy_px)
+    if not any(distortion):
+        return np.array(xy_px, np.float64)
+    radius = np.linalg.norm(plane, axis=-1, keepdims=True)
+    true_radius = _undistorted_radius(radius, distortion)
+    stretch = np.divide(true_radius, radius, out=np.ones_like(radius), where=radius > 0)
+    return _pixels(camera, plane * stretch)
+
+
+def _undistorted_radius(radius: Float[np.ndarray, "*batch 1"], distortion: Distortion) -> Float[np.ndarray, "*batch 1"]:
+    """Newton's method kept between 0 and the fold, where r (1 + k1 r^2 + k2 r^4) grows."""
+    k1, k2 = distortion
+    fold = _fold_radius(distortion)
+    true_radius = np.minimum(radius, 0.99 * fold)
+    for _ in range(_NEWTON_STEPS):
+        r2 = true_radius**2
+        value = true_radius * (1.0 + r2 * (k1 + r2 * k2)) - radius
+        slope = 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2)
+        true_radius = np.clip(true_radius - value / np.maximum(slope, 1e-3), 0.0, fold)
+    r2 = true_radius**2
+    solved = np.abs(true_radius * (1.0 + r2 * (k1 + r2 * k2)) - radius) < 1e-9 * (1.0 + radius)
+    return np.where(solved, true_radius, np.nan)
+
+
+def _fold_radius(distortion: Distortion) -> float:
+    """The least radius at which d/dr of r (1 + k1 r^2 + k2 r^4) is 0."""
+    k1, k2 = distortion
+    roots = np.roots([5.0 * k2, 3.0 * k1, 1.0]) if k2 else np.array([-1.0 / (3.0 * k1)])
+    squares = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
+    return min(np.sqrt(min(squares)) if squares else _LARGEST_RADIUS, _LARGEST_RADIUS)
+
+
+def _plane(camera: Camera, xy_px: Positions) -> Positions:
+    return (np.asarray(xy_px, np.float64) - camera.principal_px) / camera.focal_px
+
+
+def _pixels(camera: Camera, plane: Positions) -> Positions:
+    return plane * np.asarray(camera.focal_px) + camera.principal_px
 
 
 @dataclass(frozen=True)
@@ -113,3 +186,75 @@ class SparseModel:
     def _of_view(self, view: SparseView | str) -> Int[np.ndarray, " seen"]:
         name = view if isinstance(view, str) else view.name
         return np.flatnonzero(self.observations[:, 0] == self.index_of(name))
+
+
+FORMAT = "mrbokeh-poses"
+VERSION = 1
+POSES_NAME = "poses.json"
+POINTS_NAME = "points.npz"
+SCALE_NAME = "scale.json"
+
+_ARRAYS = ("points", "errors_px", "observations", "observed_xy_px")
+
+
+def write_sparse_model(folder: Path | str, model: SparseModel) -> None:
+    """poses.json is written last and is the sign that the model is whole; the scale of an earlier model goes with that model."""
+    folder = Path(folder)
+    for stale in (POSES_NAME, SCALE_NAME):
+        (folder / stale).unlink(missing_ok=True)
+    with atomic_path(folder / POINTS_NAME) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **{name: getattr(model, name) for name in _ARRAYS})
+    write_json(folder / POSES_NAME, _document(model))
+
+
+def read_sparse_model(folder: Path | str) -> SparseModel:
+    """The model of SCENE/reconstruction; metres_per_unit is that of scale.json, None where there is none yet."""
+    folder = Path(folder)
+    document = read_json(folder / POSES_NAME, "camera poses (run `mrbokeh capture poses` on the scene)")
+    if document.get("format") != FORMAT or document.get("version") != VERSION:
+        raise InputError(
+            f"{folder / POSES_NAME}: expected format {FORMAT!r} version {VERSION}, got {document.get('format')!r} version "
+            f"{document.get('version')!r}; run `mrbokeh capture poses --overwrite` on the scene"
+        )
+    try:
+        views = tuple(_view(each, str(folder / POSES_NAME)) for each in document["views"])
+        return SparseModel(views, **_arrays(folder / POINTS_NAME), metres_per_unit=_scale(folder), left_out=tuple(document["left_out"]))
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        message = f"{folder / POSES_NAME} is incomplete ({error!r}): run `mrbokeh capture poses --overwrite` on the scene"
+        raise InputError(message) from None
+
+
+def _document(model: SparseModel) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "views": [{"name": each.name, "camera": camera_to_json(each.camera), "distortion": list(each.distortion)} for each in model.views],
+        "left_out": list(model.left_out),
+    }
+
+
+def _view(document: dict[str, Any], where: str) -> SparseView:
+    k1, k2 = document["distortion"]
+    return SparseView(str(document["name"]), camera_from_json(document["camera"], where), (float(k1), float(k2)))
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return {name: file[name] for name in _ARRAYS}
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise InputError(
+            f"expected the points of a sparse model at {path}, but cannot read them ({error}): run `mrbokeh capture poses --overwrite`"
+        ) from None
+
+
+def _scale(folder: Path) -> float | None:
+    path = folder / SCALE_NAME
+    if not path.exists():
+        return None
+    scale = read_json(path, "the metric scale").get("metres_per_unit")
+    if not (isinstance(scale, int | float) and 0 < scale < float("inf")):
+        raise InputError(f"{path}: expected a positive metres_per_unit, got {scale!r}; run `mrbokeh capture scale --overwrite`")
+    return float(scale)

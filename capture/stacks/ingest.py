@@ -3,24 +3,29 @@
 SCENE/NAME/stack.json and slices/00.exr, 01.exr, ...: linear camera RGB, ordered by focus distance, nearest first, where
 all distances are known, else by file name. Nothing is rotated or cropped; the slices are not registered yet.
 SCENE/session.json: the white balance and the exposure that all stacks share.
+
+What ingest did, for people: a table of stacks, remarks below it, and the files that were left out.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
 
 from capture.photos.developing import is_raw
 from capture.photos.metadata import read_metadata_of
 from capture.photos.photo_files import PhotoFolder, SkippedFile, find_photos, no_photographs
 from capture.photos.raw import read_raw_metadata
 from capture.photos.sidecar import sidecar_of
-from capture.stacks.begun_scene import taken_away_when_refused
-from capture.stacks.disk_space import told_when_full
 from capture.stacks.grouping import Grouping, Photo, PhotoGroup, group_photos, in_focus_order, why_aside
-from capture.stacks.session import CameraChoice, Session, open_session
-from capture.stacks.stack_description import StackReport, finish_stack, finished_before, ingest_digest
+from capture.stacks.session import CameraChoice, Session, open_session, taken_away_when_refused
+from capture.stacks.slice_files import told_when_full
+from capture.stacks.stack_description import FEWEST_TO_MERGE, StackReport, finish_stack, finished_before, ingest_digest, lens_text
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
-from capture.stacks.stack_remarks import FEWEST_TO_MERGE
+from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
 
@@ -143,3 +148,48 @@ def _nothing_usable(given: Sequence[Path], skipped: Sequence[SkippedFile]) -> st
         return f"expected photographs (RAW, JPEG, PNG, TIFF, WebP, EXR) in {where}, but found none"
     reasons = "; ".join(f"{each.path.name}: {each.reason}" for each in skipped[:5])
     return f"none of the {len(skipped)} files in {where} could be used: {reasons}{' ...' if len(skipped) > 5 else ''}"
+
+
+_MOST_NAMED = 5
+
+
+def print_report(report: IngestReport, console: Console) -> None:
+    """One line for each stack, then remarks and skipped files with their reasons."""
+    table = Table("stack", "slices", "size", "focus (from the lens)", "lens", "skipped")
+    for each in report.stacks:
+        table.add_row(*_cells(each))
+    console.print(table)
+    for each in report.stacks:
+        for remark in each.remarks:
+            console.print(f"{each.name}: {remark}", highlight=False, markup=False, soft_wrap=True)
+        if each.problem:
+            console.print(f"no stack {each.name}: {each.problem}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+    for skipped in (*report.skipped, *(one for each in report.stacks for one in each.skipped)):
+        console.print(f"skipped {skipped.path.name}: {skipped.reason}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+    if report.no_photographs:
+        console.print(f"not photographs, left out: {_some_names(report.no_photographs)}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _some_names(paths: Sequence[Path]) -> str:
+    """Name the first few, and say how many there are."""
+    more = f" ... ({len(paths)} files)" if len(paths) > _MOST_NAMED else ""
+    return ", ".join(each.name for each in paths[:_MOST_NAMED]) + more
+
+
+def focus_text(stack: FocalStack) -> str:
+    """The range of focus distances: "0.4 .. 2.1 m", "... inf", "unknown"."""
+    known = [distance for distance in stack.focus_distances_m if distance is not None]
+    if not known:
+        return "unknown"
+    ends = [f"{distance:.4g}" if math.isfinite(distance) else "inf" for distance in (min(known), max(known))]
+    partly = "" if len(known) == len(stack) else f" ({len(known)} of {len(stack)} known)"
+    return f"{' .. '.join(dict.fromkeys(ends))} m{partly}"
+
+
+def _cells(report: StackReport) -> tuple[str, ...]:
+    skipped = str(len(report.skipped) or "")
+    if report.stack is None or report.size_px is None:
+        return report.name, "none", "", "", "", skipped
+    kept = f" ({report.kept} from before)" if report.kept else ""
+    size = f"{report.size_px[0]}x{report.size_px[1]}"
+    return report.name, f"{len(report.stack)}{kept}", size, focus_text(report.stack), lens_text(report.stack.lens), skipped

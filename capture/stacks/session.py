@@ -2,10 +2,14 @@
 
 A network learns one lens from many stacks, so equal light must be equal numbers in all of them. The choice is made once,
 by the first call of ingest, and later calls into the same scene reuse it.
+
+A scene that a refused command has begun: it is taken away, so that a run with other photographs finds nothing of it.
 """
 
+import shutil
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +19,9 @@ from capture.photos.libraw import WhiteBalance
 from capture.photos.photo_metadata import StatedExposure
 from capture.photos.raw import camera_white_balance
 from capture.stacks.grouping import Photo, PhotoGroup, in_focus_order
+from capture.stacks.slice_files import DiskFullError
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE_NAME
+from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 
@@ -138,3 +144,33 @@ def _require_same(scene: Path, choice: CameraChoice, wanted: WhiteBalance | None
             f"all stacks of {scene} share the white balance {has} (from {choice.white_balance_source}), but {asked} was asked for: leave "
             f"--white-balance out, give another --out, or ingest all photographs of the scene with --overwrite"
         )
+
+
+@contextmanager
+def taken_away_when_refused(scene: Path, is_kept: Callable[[Sequence[FocalStack]], bool]) -> Iterator[None]:
+    """Take away what a block that raises InputError has put into a scene.
+
+    All stays where the scene was begun before, where its new stacks (by name) are to be kept, and where a full disk stopped the work: that
+    can go on.
+    """
+    before = set(scene.iterdir()) if scene.is_dir() else None
+    try:
+        yield
+    except DiskFullError:
+        raise
+    except InputError:
+        made = set(scene.iterdir()) - (before or set()) if scene.is_dir() else set()
+        stacks = [read_focal_stack(each) for each in sorted(made) if (each / STACK_FILE_NAME).is_file()]
+        if scene / FILE_NAME in made and not is_kept(stacks):
+            _take_away(scene, made, with_folder=before is None)
+        raise
+
+
+def _take_away(scene: Path, made: set[Path], *, with_folder: bool) -> None:
+    for path in made:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    if with_folder:
+        scene.rmdir()

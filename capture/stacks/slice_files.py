@@ -1,16 +1,76 @@
-"""Slices on disk: EXR files that carry a record of what they were made from, so that an interrupted ingest goes on where it was."""
+"""Slices on disk: EXR files that carry a record of what they were made from, so that an interrupted ingest goes on where it was.
 
+A full disk in one clear line: no half file, and what is finished stays.
+
+What stack.json keeps of each photograph: shooting data, focus as stated, exposure and white balance as applied.
+
+Slices whose camera stated infinity by a sentinel: taken as infinity to start from, but not known.
+
+How far they may be off follows from the stack alone: such a slice comes after all those that state real distances, since a camera
+writes the sentinel for what lies beyond its last code. So its distance lies anywhere from the farthest real one to infinity. The
+hyperfocal distance would be a narrower bound, but depends on what blur one calls sharp and on nothing that the camera has said.
+A distance of a lens.toml or focus.csv is no sentinel, `inf` included.
+"""
+
+import errno
 import json
+import math
 import os
-from collections.abc import Iterable, Sequence
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
-from capture.stacks.disk_space import told_when_full
+from capture.photos.photo_metadata import PhotoMetadata
+from capture.photos.raw import DecodedPhoto
+from capture.stacks.exposure import ExposureGain
+from capture.stacks.grouping import Photo
 from mrbokeh.images.camera_rgb import Matrix3x3, write_camera_rgb
+from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_MIB = 2**20
+
+
+class DiskFullError(InputError):
+    """Nothing can be written any more; going on with the next file would not help."""
+
+
+@contextmanager
+def told_when_full(path: Path, needed_bytes: int = 0) -> Iterator[None]:
+    """Turn a write that fails for want of space into DiskFullError.
+
+    Libraries in C++ say so in words at best: otherwise it is the disk if it has less left than needed_bytes.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        raise DiskFullError(_message(path)) from None
+    except RuntimeError as error:
+        said = any(os.strerror(code) in str(error) for code in _FULL)
+        if not said and shutil.disk_usage(_existing(path)).free >= needed_bytes:
+            raise
+        raise DiskFullError(_message(path)) from None
+
+
+def _existing(path: Path) -> Path:
+    return next(each for each in (path, *path.parents) if each.exists())
+
+
+def _message(path: Path) -> str:
+    free_mib = shutil.disk_usage(_existing(path)).free / _MIB
+    return (
+        f"the disk of {path.parent} is full ({free_mib:.0f} MiB left): make room or give another --out, then run the same command again; "
+        f"finished slices are kept"
+    )
+
 
 FOLDER = "slices"
 _ATTRIBUTE = "mrbokehIngest"
@@ -73,3 +133,74 @@ def arrange_slices(stack_folder: Path, chosen: Sequence[Path]) -> list[Path]:
 def _delete(paths: Iterable[Path]) -> None:
     for path in list(paths):
         path.unlink(missing_ok=True)
+
+
+def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> dict[str, Any]:
+    """JSON-ready metadata of a slice. Distances that may be infinite are given in dioptres (1/m), for which JSON has numbers.
+
+    saturated_fraction: share of the photosites that were full. saturation_level: the value of a full grey in the slice.
+    """
+    metadata = photo.metadata
+    level = decoded.saturation_level
+    return {
+        "exposure_time_s": metadata.exposure_time_s,
+        "iso": metadata.iso,
+        "f_number": metadata.f_number,
+        "focal_length_mm": metadata.focal_length_mm,
+        "taken_at": metadata.taken_at.isoformat() if metadata.taken_at else None,
+        "camera_model": metadata.camera_model,
+        "lens_model": metadata.lens_model,
+        "orientation": metadata.orientation,
+        "lens_position": metadata.lens_position,
+        "focus": focus_record(metadata),
+        "white_balance": None if decoded.white_balance is None else list(decoded.white_balance),
+        "exposure_gain": gain.total,
+        "exposure_gain_session": gain.session,
+        "exposure_gain_session_from": gain.session_from,
+        "exposure_gain_stated": gain.stated,
+        "exposure_gain_measured": None if gain.measured is None else gain.stated * gain.measured,
+        "saturated_fraction": decoded.photosites.full_fraction if level is not None else None,
+        "saturation_level": None if level is None else level * gain.total,
+    }
+
+
+def focus_record(metadata: PhotoMetadata) -> dict[str, Any] | None:
+    """The focus distance as the file stated it, and counted from the lens; intervals are what the statement may stand for.
+
+    The lens's are None where its focal length is unknown or no lens of that length focuses so near. sentinel: nothing is known of this
+    distance but what the rest of the stack tells (`capture.stacks.slice_files`).
+    """
+    focus = metadata.focus
+    if focus is None:
+        return None
+    distance_m, interval_m = metadata.focus_distance_m, metadata.focus_interval_m
+    return {
+        "source": focus.source,
+        "origin": focus.origin,
+        "sentinel": focus.is_sentinel,
+        "stated_dioptre": 1.0 / focus.distance_m,
+        "interval_dioptre": [1.0 / focus.farthest_m, 1.0 / focus.nearest_m],
+        "hiatus_mm": metadata.hiatus_mm,
+        "lens_dioptre": None if distance_m is None else 1.0 / distance_m,
+        "lens_interval_dioptre": None if interval_m is None else [1.0 / interval_m[1], 1.0 / interval_m[0]],
+    }
+
+
+def bounded_focus_records(metadata: Sequence[PhotoMetadata]) -> list[dict[str, Any] | None]:
+    """`focus_record` of the photographs of a stack; intervals of sentinels reach from infinity to the farthest real distance from the
+    lens, and are None where there is none.
+    """
+    known_m = [distance for each in metadata if not _by_sentinel(each) and (distance := each.focus_distance_m) and math.isfinite(distance)]
+    interval = [0.0, 1.0 / max(known_m)] if known_m else None
+    bounded = {"interval_dioptre": interval, "lens_interval_dioptre": interval}
+    records = ((each, focus_record(each)) for each in metadata)
+    return [record | bounded if record is not None and _by_sentinel(each) else record for each, record in records]
+
+
+def _by_sentinel(metadata: PhotoMetadata) -> bool:
+    return metadata.focus is not None and metadata.focus.is_sentinel
+
+
+def stated_by_sentinel(stack: FocalStack) -> Bool[np.ndarray, " slices"]:
+    """The slices whose camera stated no distance but a sentinel, whatever a calibration has found since."""
+    return np.array([bool((each.metadata.get("focus") or {}).get("sentinel", False)) for each in stack.slices], bool)

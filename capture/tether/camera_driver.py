@@ -1,14 +1,104 @@
-"""What every tethered camera can be asked for, whatever stands behind it."""
+"""What every tethered camera can be asked for, whatever stands behind it.
+
+What the steps of a focus motor mean: pairs of (steps from an end stop, dioptres), read off the lens once.
+
+Cameras move their motors by steps and tell no position. Counted from an end stop the steps are repeatable, and dioptres grow
+evenly with the extension of a thin lens, so that two known distances give the whole scale; more of them bend it piecewise.
+
+    {"format": "mrbokeh-focus-steps", "version": 1, "stop": "near", "points": [[180, 2.0], [1450, 0.5]]}
+"""
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.tether.focus_steps import FocusSteps, Stop
+from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
+
+FORMAT = "mrbokeh-focus-steps"
+VERSION = 1
+
+
+class Stop(StrEnum):
+    """The two ends of a lens's focus travel."""
+
+    near = "near"
+    infinity = "infinity"
+
+    @property
+    def away(self) -> int:
+        """The sign of steps that lead away from it, + being towards infinity."""
+        return 1 if self is Stop.near else -1
+
+
+@dataclass(frozen=True)
+class FocusSteps:
+    """points: (steps away from the stop, dioptres from the lens), at least two, in the order of their steps.
+
+    Steps count what the motor was told, moving away from the stop only: play is then part of the scale.
+    """
+
+    stop: Stop
+    points: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        rising = [after[0] > before[0] and (after[1] - before[1]) * self.stop.away < 0.0 for before, after in pairwise(self.points)]
+        if len(self.points) < 2 or not all(rising):
+            raise InputError(
+                f"steps from the {self.stop} stop need at least two points, each farther from it than the one before, "
+                f"in steps and in focus, got {[tuple(each) for each in self.points]} (steps, dioptres)"
+            )
+
+    def steps_at(self, dioptre: float) -> int:
+        """Whole steps from the stop; beyond the points the nearest two are continued."""
+        steps, dioptres = np.array(self.points).T
+        return round(_piecewise(dioptre * -self.stop.away, dioptres * -self.stop.away, steps))
+
+    def dioptre_at(self, steps: int) -> float:
+        known, dioptres = np.array(self.points).T
+        return _piecewise(float(steps), known, dioptres)
+
+    @property
+    def dioptres_per_step(self) -> float:
+        """On average over the points, positive."""
+        (first, start), (last, end) = self.points[0], self.points[-1]
+        return abs(end - start) / (last - first)
+
+
+def _piecewise(x: float, known_x: np.ndarray, known_y: np.ndarray) -> float:
+    """Through the points in straight lines, the outer ones continued; known_x rises."""
+    segment = int(np.clip(np.searchsorted(known_x, x) - 1, 0, len(known_x) - 2))
+    (x0, x1), (y0, y1) = known_x[segment : segment + 2], known_y[segment : segment + 2]
+    return float(y0 + (x - x0) * (y1 - y0) / (x1 - x0))
+
+
+def steps_to_json(steps: FocusSteps) -> dict[str, Any]:
+    return {"format": FORMAT, "version": VERSION, "stop": str(steps.stop), "points": [list(each) for each in steps.points]}
+
+
+def write_focus_steps(path: Path, steps: FocusSteps) -> None:
+    write_json(path, steps_to_json(steps))
+
+
+def read_focus_steps(path: Path) -> FocusSteps:
+    document = read_json(path, "the scale of a focus motor (focus_steps.json)")
+    return steps_from_json(document, str(path))
+
+
+def steps_from_json(document: Any, where: str) -> FocusSteps:
+    if not isinstance(document, dict) or (document.get("format"), document.get("version")) != (FORMAT, VERSION):
+        raise InputError(f"{where}: expected the scale of a focus motor, format {FORMAT!r}, version {VERSION}")
+    try:
+        points = tuple((float(steps), float(dioptre)) for steps, dioptre in document["points"])
+        return FocusSteps(Stop(document["stop"]), points)
+    except (KeyError, TypeError, ValueError) as error:
+        raise error if isinstance(error, InputError) else InputError(f"{where}: this scale is damaged ({error!r})") from None
+
 
 Preview = UInt8[np.ndarray, "height width 3"]
 

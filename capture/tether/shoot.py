@@ -2,21 +2,183 @@
 
 SHOOT/slice_00.nef, ...; shoot.json, the log; lens.toml with what the photographs do not state; .check/ with the first slice
 shot again at the end. The folder goes to `mrbokeh capture ingest` as it is.
+
+How a slice comes into focus: by the camera's motor, or by the photographer's hand.
+
+How a bracket is shot, and what a shoot needs of the world around it.
+
+One bracket while it is shot: a slice into focus, onto the disk and into the log; the first slice once more at the end.
 """
 
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
-from capture.tether.bracket import Bracket
-from capture.tether.camera_driver import Ability, CameraDescription, CameraDriver, CameraSettings
-from capture.tether.focus_axis import FocusAxis
+from capture.tether.camera_driver import Ability, CameraDescription, CameraDriver, CameraError, CameraSettings, FocusSteps, steps_to_json
+from capture.tether.focus_motor import FocusAxis
 from capture.tether.focus_plan import FocusPlan
-from capture.tether.focus_steps import steps_to_json
-from capture.tether.shoot_focus import ByHand, ByMotor, Focusing
-from capture.tether.shoot_log import ShootLog, open_log
-from capture.tether.shoot_options import ShootOptions, Surroundings
+from capture.tether.live_view import Spot, read_live
+from capture.tether.saved_shot import SavedShot, check_return, require_same_exposure, save_shot
+from capture.tether.shoot_log import ShootLog, open_log, write_sidecar
+from mrbokeh.optics.lens import film_plane_m
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
+
+
+@runtime_checkable
+class Focusing(Protocol):
+    def focus_on(self, index: int) -> float:
+        """Focus as the slice needs it; the dioptres reached, as far as known. Raises CameraError where it cannot be reached."""
+        ...
+
+
+@dataclass(frozen=True)
+class ByMotor:
+    """Whole steps of a motor, so that the focus is up to half a step off the plan."""
+
+    plan: FocusPlan
+    axis: FocusAxis
+    steps: FocusSteps
+
+    def focus_on(self, index: int) -> float:
+        wanted = self.steps.steps_at(self.plan.dioptres[index])
+        self.axis.move_to(wanted)
+        return max(self.steps.dioptre_at(wanted), 0.0)
+
+
+@dataclass(frozen=True)
+class ByHand:
+    """The photographer turns the ring; `ask` shows what to do and returns when it is done."""
+
+    plan: FocusPlan
+    ask: Callable[[str], None]
+
+    def focus_on(self, index: int) -> float:
+        lens = self.plan.lenses[index]
+        self.ask(
+            f"slice {index} of 0 to {len(self.plan) - 1}: focus at {film_plane_m(lens):.3f} m on the lens's scale "
+            f"({lens.focus_distance_m:.3f} m from the lens), always turning from near to far"
+        )
+        return self.plan.dioptres[index]
+
+
+@dataclass(frozen=True)
+class ShootOptions:
+    """settings: fixed for all slices. focus_steps: the motor's scale; None asks the camera. by_hand: leave the motor alone.
+
+    backlash_steps, settle_s: see FocusAxis. spot: where the live view's sharpness is read, None for the whole picture.
+    check: shoot slice 0 again at the end.
+    planned_distances: let lens.toml state the planned focus even where the photographs state their own.
+    """
+
+    settings: CameraSettings = field(default_factory=CameraSettings)
+    focus_steps: FocusSteps | None = None
+    by_hand: bool = False
+    backlash_steps: int = 200
+    settle_s: float = 0.5
+    spot: Spot | None = None
+    check: bool = True
+    planned_distances: bool = False
+    overwrite: bool = False
+
+
+def _wait_for_enter(text: str) -> None:
+    try:
+        input(f"{text}. Enter when ready: ")
+    except EOFError:
+        raise InputError("turning the ring by hand needs somebody at the terminal who presses Enter") from None
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """say: shows a line; ask: shows one and waits until the photographer is ready; sleep: waits some seconds; now: the time."""
+
+    say: Callable[[str], None] = print
+    ask: Callable[[str], None] = _wait_for_enter
+    sleep: Callable[[float], None] = time.sleep
+    now: Callable[[], datetime] = datetime.now
+
+
+CHECK_FOLDER = ".check"
+_SAME_LENS = 0.03
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """Everything that a shoot has at hand. abilities: of the camera."""
+
+    plan: FocusPlan
+    camera: CameraDriver
+    abilities: frozenset[Ability]
+    focusing: Focusing
+    log: ShootLog
+    options: ShootOptions
+    world: Surroundings
+
+    def take(self, index: int) -> None:
+        """One slice. Raises CameraError, which says how much is kept."""
+        try:
+            dioptre = self.focusing.focus_on(index)
+            live = self._live()
+            saved = save_shot(self.camera.capture(), self.log.folder, f"slice_{index:02d}")
+            taken_at = self.world.now().isoformat(timespec="seconds")
+            record = {"index": index, "dioptre": dioptre, "taken_at": taken_at, "live": live} | saved.record()
+            self._require_manual_exposure(record, saved)
+        except CameraError as error:
+            raise CameraError(
+                f"slice {index} could not be taken: {error}. {len(self.log.slices)} slices are kept in {self.log.folder}: "
+                f"the same command goes on"
+            ) from None
+        self.log.add(record)
+        write_sidecar(self.log, self.plan, planned_distances=self.options.planned_distances)
+
+    def check(self) -> None:
+        """Slice 0 again, compared with what it was; into the log, and warnings to the photographer."""
+        self.focusing.focus_on(0)
+        repeated = save_shot(self.camera.capture(), self.log.folder / CHECK_FOLDER, "slice_00_again")
+        second = self._path(1) if 1 in self.log.slices else None
+        result = check_return(self._path(0), repeated.path, second)
+        self.log.check = {"file": f"{CHECK_FOLDER}/{repeated.path.name}", "steps": repeated.shot.steps} | result.to_json()
+        self.log.write()
+        for warning in result.warnings:
+            self.world.say(f"warning: {warning}")
+
+    def lens_remarks(self) -> list[str]:
+        """Where the photographs state another lens than the one that was planned for."""
+        stated, remarks = self.log.slices[0]["stated"], []
+        for name, unit in (("focal_length_mm", " mm"), ("f_number", "")):
+            planned, real = getattr(self.plan.lens, name), stated[name]
+            if real and abs(real / planned - 1.0) > _SAME_LENS:
+                remarks.append(
+                    f"the plan is for {name} {planned:g}{unit}, the photographs state {real:g}{unit}: plan again, or set the lens"
+                )
+        return remarks
+
+    def _require_manual_exposure(self, record: dict[str, Any], saved: SavedShot) -> None:
+        """A photograph exposed otherwise than the first is taken back: it would come after others that are right."""
+        if not self.log.slices:
+            return
+        try:
+            require_same_exposure(self.log.slices[min(self.log.slices)], record)
+        except CameraError:
+            saved.path.unlink()
+            raise
+
+    def _live(self) -> dict[str, float] | None:
+        """Sharpness and exposure as the live view shows them, if there is one; the photograph matters more."""
+        if Ability.live_view not in self.abilities:
+            return None
+        try:
+            reading = asdict(read_live(self.camera.preview(), self.options.spot))
+        except CameraError:
+            return None
+        return {name: round(float(reading[name]), 6) for name in ("sharpness", "clipped", "black")}
+
+    def _path(self, index: int) -> Path:
+        return self.log.folder / str(self.log.slices[index]["file"])
 
 
 def shoot(plan: FocusPlan, camera: CameraDriver, out: Path, options: ShootOptions, world: Surroundings) -> ShootLog:

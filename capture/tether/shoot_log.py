@@ -3,20 +3,24 @@
 {"format": "mrbokeh-shoot", "version": 1, "camera": "...", "settings": {...}, "plan": {...}, "focus_steps": {...} or null,
  "slices": [{"index": 0, "file": "slice_00.nef", "camera_name": "DSC_0001.NEF", "bytes": 25165824, "steps": 180, ...}, ...],
  "check": {...} or null}
+
+lens.toml of a shoot: what its photographs do not state, from the plan and the motor.
 """
 
 import json
+import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from capture.photos.photo_files import PHOTO_SUFFIXES
-from capture.tether.focus_plan import FocusPlan
-from capture.tether.plan_file import plan_to_json
-from mrbokeh.system.atomic_files import read_json, write_json
+from capture.photos.sidecar import LENS_FILE
+from capture.tether.focus_plan import FocusPlan, plan_to_json
+from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.system.errors import InputError
 
-FILE_NAME = "shoot.json"
+_LOG_NAME = "shoot.json"
 FORMAT = "mrbokeh-shoot"
 VERSION = 1
 
@@ -41,7 +45,7 @@ class ShootLog:
 
     def write(self) -> None:
         write_json(
-            self.folder / FILE_NAME,
+            self.folder / _LOG_NAME,
             {
                 "format": FORMAT,
                 "version": VERSION,
@@ -60,7 +64,7 @@ def open_log(folder: Path, plan: FocusPlan, camera: str, *, overwrite: bool) -> 
     document = json.loads(json.dumps(plan_to_json(plan)))
     if overwrite:
         _remove(folder)
-    if not (folder / FILE_NAME).exists():
+    if not (folder / _LOG_NAME).exists():
         _require_no_strangers(folder)
         return ShootLog(folder, document, camera)
     log = read_log(folder)
@@ -75,7 +79,7 @@ def open_log(folder: Path, plan: FocusPlan, camera: str, *, overwrite: bool) -> 
 
 def read_log(folder: Path) -> ShootLog:
     """The log of a folder, without slices whose files are gone or not what they were."""
-    path = folder / FILE_NAME
+    path = folder / _LOG_NAME
     document = read_json(path, "the log of a shoot (shoot.json)")
     try:
         if (document["format"], document["version"]) != (FORMAT, VERSION):
@@ -100,8 +104,51 @@ def _require_no_strangers(folder: Path) -> None:
 
 def _remove(folder: Path) -> None:
     """The photographs that an earlier log names, and the log; nothing else."""
-    if not (folder / FILE_NAME).exists():
+    if not (folder / _LOG_NAME).exists():
         return
-    for record in read_json(folder / FILE_NAME, "the log of a shoot (shoot.json)").get("slices", []):
+    for record in read_json(folder / _LOG_NAME, "the log of a shoot (shoot.json)").get("slices", []):
         (folder / str(record.get("file", "."))).unlink(missing_ok=True)
-    (folder / FILE_NAME).unlink()
+    (folder / _LOG_NAME).unlink()
+
+
+_HEAD = "# written by mrbokeh capture shoot: what the photographs themselves do not state\n"
+
+
+def write_sidecar(log: ShootLog, plan: FocusPlan, *, planned_distances: bool = False) -> Path | None:
+    """Write, renew or remove the shoot's lens.toml; one that somebody else wrote is left alone. None where there is none of ours.
+
+    Focus distances are written where a photograph states none, where those stated do not tell the slices apart, since
+    cameras round them, or always (planned_distances), which suits a motor whose scale was measured.
+    """
+    path = log.folder / LENS_FILE
+    if path.exists() and not path.read_text(encoding="utf-8").startswith(_HEAD):
+        return None
+    lines = [*_lens_lines(log, plan), *([] if states_focus(log) and not planned_distances else _focus_lines(log))]
+    if not lines:
+        path.unlink(missing_ok=True)
+        return None
+    with atomic_path(path) as temporary:
+        temporary.write_text(_HEAD + "\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def states_focus(log: ShootLog) -> bool:
+    """Whether the photographs tell their focus distances well enough to tell the slices apart."""
+    stated = [each["stated"]["focus_dioptre"] for _, each in sorted(log.slices.items())]
+    return None not in stated and all(near > far for near, far in pairwise(stated))
+
+
+def _lens_lines(log: ShootLog, plan: FocusPlan) -> list[str]:
+    stated: list[dict[str, Any]] = [each["stated"] for each in log.slices.values()]
+    known = {"focal_length_mm": plan.lens.focal_length_mm, "f_number": plan.lens.f_number}
+    lines = [f"{name} = {value!r}" for name, value in known.items() if not all(each[name] for each in stated)]
+    return lines + ([] if all(each["sensor"] for each in stated) else [f"sensor_width_mm = {plan.lens.sensor_width_mm!r}"])
+
+
+def _focus_lines(log: ShootLog) -> list[str]:
+    rows = [f'"{each["file"]}" = {_metres(each["dioptre"])}' for _, each in sorted(log.slices.items())]
+    return ['focus_origin = "lens"', "", "[focus_distances_m]", *rows]
+
+
+def _metres(dioptre: float) -> str:
+    return "inf" if dioptre <= 0.0 or math.isinf(1.0 / dioptre) else repr(round(1.0 / dioptre, 6))

@@ -1,6 +1,10 @@
-"""One picture to check: its light, its alpha and the layers that a layered EXR keeps, with how finely its file can store light."""
+"""One picture to check: its light, its alpha and the layers that a layered EXR keeps, with how finely its file can store light.
 
-from collections.abc import Mapping
+Shots: what `mrbokeh check` opens: one picture, numbered pictures in a folder, the slices of a focal stack, or a film.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,9 +13,10 @@ from jaxtyping import Bool, Float32
 
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.exr_io import ExrPart, read_exr
-from mrbokeh.images.image_io import INTEGER_SUFFIXES, read_image, read_layer
+from mrbokeh.images.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES, read_image, read_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import stored_pixels
+from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 from mrbokeh.system.errors import InputError
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -118,3 +123,87 @@ def _layer(channels: Mapping[str, np.ndarray]) -> Layer:
     rgb = np.stack([channels.get(c, np.zeros(shape)) for c in "RGB"], axis=2).astype(np.float32)
     depth_m = channels.get("Z", np.full(shape, np.inf)).astype(np.float32)
     return Layer(rgb, channels.get("A", np.ones(shape)).astype(np.float32), depth_m)
+
+
+_PICTURES = INTEGER_SUFFIXES + LINEAR_SUFFIXES
+_LOSSLESS_CODECS = ("ffv1", "png", "huffyuv", "ffvhuff", "rawvideo")
+_NUMBER = re.compile(r"(\d+)(?=\D*$)")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """numbers: of the pictures as their names state them, or None for a film, where nobody knows before it is read.
+
+    missing: numbers that should be there. is_sequence: pictures follow one another in time. pictures: a fresh pass over them; one
+    that cannot be read comes as the sentence that says why.
+    """
+
+    path: Path
+    numbers: tuple[int, ...] | None
+    missing: tuple[int, ...]
+    is_sequence: bool
+    pictures: Callable[[], Iterator[CheckedPicture | str]]
+
+
+def open_shot(path: Path) -> Shot:
+    """Raises InputError where there is nothing to check."""
+    if not path.exists():
+        raise InputError(f"expected a picture, a folder of pictures, a focal stack or a film at {path}, but there is nothing")
+    if path.is_dir():
+        return _stack(path) if (path / FILE_NAME).is_file() else _numbered(path)
+    if path.suffix.lower() in _PICTURES:
+        return Shot(path, (0,), (), False, lambda: iter([read_picture(path)]))
+    return _film(path)
+
+
+def _numbered(folder: Path) -> Shot:
+    files = sorted(each for each in folder.iterdir() if each.suffix.lower() in _PICTURES and not each.name.startswith("."))
+    if not files:
+        raise InputError(f"{folder} holds no pictures ({', '.join(_PICTURES)}): give the folder of a sequence or of a focal stack")
+    found = [_NUMBER.search(each.stem) for each in files]
+    if len({each.suffix.lower() for each in files}) > 1 or any(each is None for each in found):
+        raise InputError(
+            f"{folder}: expected pictures of one format with numbers in their names (shot.0001.exr), got {files[0].name} and others"
+        )
+    by_number = dict(sorted((int(match.group()), file) for match, file in zip(found, files, strict=True) if match))
+    if len(by_number) < len(files):
+        raise InputError(f"{folder}: {len(files)} pictures share {len(by_number)} numbers: keep one sequence per folder")
+    missing = tuple(sorted(set(range(min(by_number), max(by_number) + 1)) - set(by_number)))
+    return Shot(folder, tuple(by_number), missing, True, lambda: _read(list(by_number.values())))
+
+
+def _stack(folder: Path) -> Shot:
+    paths = [folder / each.path for each in read_focal_stack(folder).slices]
+    missing = tuple(index for index, path in enumerate(paths) if not path.is_file())
+    present = [index for index in range(len(paths)) if index not in missing]
+    return Shot(folder, tuple(present), missing, False, lambda: _read([paths[index] for index in present]))
+
+
+def _read(paths: list[Path]) -> Iterator[CheckedPicture | str]:
+    for path in paths:
+        try:
+            yield read_picture(path)
+        except InputError as error:
+            yield str(error)
+
+
+def _film(path: Path) -> Shot:
+    from mrbokeh.video.clip import probe
+
+    probe(path)
+    return Shot(path, None, (), True, lambda: _frames(path))
+
+
+def _frames(path: Path) -> Iterator[CheckedPicture]:
+    from mrbokeh.video.clip import read_frames
+
+    storage = _film_storage(path)
+    for number, frame in enumerate(read_frames(path)):
+        yield CheckedPicture(f"frame {number}", frame.rgb, storage, time_s=frame.time_s)
+
+
+def _film_storage(path: Path) -> Storage:
+    import av
+
+    with av.open(str(path)) as container:
+        return LOSSLESS_FILM if container.streams.video[0].codec_context.name in _LOSSLESS_CODECS else LOSSY_FILM

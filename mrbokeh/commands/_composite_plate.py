@@ -6,7 +6,7 @@ from pathlib import Path
 from mrbokeh.commands._composite_options import PlateOptions
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.compositing.plate import Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
-from mrbokeh.depth.depth_settings import DepthSettings, parse_near_far
+from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.capture_bundle import CaptureBundle

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from mrbokeh.checks.check_shot import CheckSettings, check_shot
-from mrbokeh.checks.findings import CheckReport
-from mrbokeh.checks.shots import open_shot
+from mrbokeh.checks.checked_picture import open_shot
+from mrbokeh.checks.picture_checks import CheckReport
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 

@@ -41,8 +41,8 @@ def fit(
 
     Example: mrbokeh lens fit scene --out my_lens --regions 3x3
     """
+    from mrbokeh.lens_measuring.fitting.fit_results import bank_of
     from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
-    from mrbokeh.lens_measuring.fitting.measured_bank import bank_of
     from mrbokeh.optics.psf_bank_file import refuse_existing_bank, write_bank
     from mrbokeh.stacks.guessed_metres import metres_notes
 
@@ -105,7 +105,7 @@ def _regions(text: str) -> tuple[int, int]:
 
 def _draw(out: Path, fitted: "LensFit", bank: "PsfBank") -> None:
     from mrbokeh.figures.psf_bank_drawing import draw_bank
-    from mrbokeh.lens_measuring.fitting.evidence_picture import draw_evidence
+    from mrbokeh.lens_measuring.fitting.fit_results import draw_evidence
     from mrbokeh.system.atomic_files import atomic_path
 
     for name, figure in (("kernels.png", draw_bank(bank)), ("evidence.png", draw_evidence(fitted))):

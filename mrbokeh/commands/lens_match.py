@@ -34,8 +34,7 @@ def match(
     """
     from mrbokeh.images.image_io import ENCODED_SUFFIXES, read_image
     from mrbokeh.lens_measuring.matching.lens_match import match_lens
-    from mrbokeh.lens_measuring.matching.match_picture import draw_match
-    from mrbokeh.lens_measuring.matching.match_table import as_text, table_of
+    from mrbokeh.lens_measuring.matching.match_report import as_text, draw_match, table_of
     from mrbokeh.lens_measuring.matching.photo_facts import read_facts
     from mrbokeh.optics.lens_file import write_lens
     from mrbokeh.system.atomic_files import atomic_path, refuse_existing

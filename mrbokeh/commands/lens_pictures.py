@@ -59,7 +59,7 @@ def export(
 
     Example: mrbokeh lens export combined_bank --out kernels --format exr
     """
-    from mrbokeh.figures.psf_bank_export import export_bank
+    from mrbokeh.figures.psf_bank_drawing import export_bank
     from mrbokeh.optics.psf_bank_file import read_bank
 
     if format_ not in ("exr", "png"):

@@ -60,8 +60,7 @@ def psf(
     Example: mrbokeh lens psf physical --prescription dgauss.50mm.dat --focus 1.5 --f-number 2.8 --sensor-width 23.5
     --image-width 1920 --counts 40,40 --out double_gauss
     """
-    from mrbokeh.psf_models.build import build_bank
-    from mrbokeh.psf_models.choose import ModelOptions, choose_model
+    from mrbokeh.psf_models.build import ModelOptions, build_bank, choose_model
     from mrbokeh.system.console import kept_when_interrupted
 
     options = ModelOptions(

@@ -8,7 +8,7 @@ import typer
 from jaxtyping import Float32
 
 from mrbokeh.commands._former_names import formerly
-from mrbokeh.depth.depth_settings import DepthSettings, parse_known, parse_near_far, parse_stereo
+from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, parse_stereo
 from mrbokeh.optics.lens import Lens
 from mrbokeh.refocus.transferring import SharpPhotograph
 from mrbokeh.system.errors import InputError

@@ -5,7 +5,8 @@ p - u c / 2 of its sharp picture.
 """
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _STEPS = 3
 _NONE, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)

@@ -1,7 +1,8 @@
 """The loop over the pixels of an Overlay on 8-bit codes, compiled; it runs without the GIL."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

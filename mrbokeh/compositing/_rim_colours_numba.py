@@ -1,7 +1,8 @@
 """The loop over pixels of mrbokeh.compositing.rim_colours."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _ROUND = 1e-12
 _SPREAD = 6e-5

@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.depth.depth_map import DepthMap
-from mrbokeh.depth.depth_settings import DepthSettings
-from mrbokeh.depth.number_maps import from_levels
+from mrbokeh.depth.depth_map import DepthMap, DepthSettings
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
@@ -77,7 +75,7 @@ def network_depth(model: Path, photo_rgb: Rgb, settings: DepthSettings) -> Depth
         )
     low, high = float(given.min()), float(given.max())
     levels = ((given - low) / max(high - low, 1e-12)).astype(np.float32)
-    return from_levels(levels, settings.near_far_m, everywhere, model.name)
+    return DepthMap.of_levels(levels, settings.near_far_m, everywhere, model.name)
 
 
 def _fitted(given: Given, photo_rgb: Rgb, settings: DepthSettings) -> Given:

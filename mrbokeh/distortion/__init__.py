@@ -20,7 +20,6 @@ What lies where:
 """
 
 from mrbokeh.distortion.distortion import LensDistortion
-from mrbokeh.distortion.overscan import overscan_camera
-from mrbokeh.distortion.warping import distorted
+from mrbokeh.distortion.warping import distorted, overscan_camera
 
 __all__ = ["LensDistortion", "distorted", "overscan_camera"]

@@ -1,11 +1,12 @@
-"""The loops over pixels of mrbokeh.distortion.resampling."""
+"""The loops over pixels of mrbokeh.distortion.warping."""
 
 import math
 
 import numpy as np
-from numba import njit
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+from mrbokeh.system.kernels import njit
+
+_compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 """Without counting references, as mrbokeh.scene's kernels: nothing is allocated in here and the arrays outlive the call."""
 
 

@@ -1,17 +1,106 @@
-"""LensDistortion: where the pixels of an undistorted pinhole lie in the picture of a real lens, and back."""
+"""LensDistortion: where the pixels of an undistorted pinhole lie in the picture of a real lens, and back.
+
+ST maps: distortion as a picture that says for every pixel from where it is read, as Nuke's STMap takes them.
+
+Red is u, from 0 at the left edge of the frame to 1 at its right; green is v, from 0 at the *bottom* edge to 1 at the top: the
+centre of the lower left pixel has (0.5 / width, 0.5 / height). Values below 0 and above 1 address overscan.
+"""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.distortion.models import IN_LENGTHS, PARAMETERS, bent
-from mrbokeh.distortion.radial_inverse import fold_radius, unbent
-from mrbokeh.distortion.st_map import StMap
+from mrbokeh.distortion.models import IN_LENGTHS, PARAMETERS, bent, fold_radius, unbent
+from mrbokeh.images.exr_io import read_exr
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 
+KINDS = ("distort", "undistort")
+_NAMES = (("R", "G"), ("u", "v"), ("forward.u", "forward.v"))
+_HALF_STEP = 2.0**-11
+_COARSEST_PX = 0.25
+_BEYOND_CELLS = 1.6
+_STEPS = 40
+_RESIDUAL_PX = 1e-6
+
 Positions = Float[np.ndarray, "*batch 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class StMap:
+    """uv: (h, w, 2) as in the file, v upwards; of any resolution.
+
+    kind: "distort" (Nuke: redistort) holds for the plate's pixels the place in the undistorted picture: it turns renders into
+    plates. "undistort" holds for undistorted pixels the place in the plate. Prefer the first: it knows every pixel of the plate,
+    the second only what lies in the frame on both sides.
+    """
+
+    uv: Float[np.ndarray, "height width 2"]
+    kind: str = "distort"
+    path: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"an ST map is of the kind {' or '.join(KINDS)}, not {self.kind!r}")
+        if min(self.uv.shape[:2]) < 2:
+            raise InputError(f"an ST map needs at least 2x2 pixels, got {self.uv.shape[1]}x{self.uv.shape[0]}")
+
+    def distorted_px(self, xy_px: Positions, camera: Camera) -> Positions:
+        return self._looked_up(xy_px, camera)[0] if self.kind == "undistort" else self._inverse(xy_px, camera)
+
+    def undistorted_px(self, xy_px: Positions, camera: Camera) -> Positions:
+        return self._looked_up(xy_px, camera)[0] if self.kind == "distort" else self._inverse(xy_px, camera)
+
+    def _looked_up(self, xy_px: Positions, camera: Camera) -> tuple[Positions, Float[np.ndarray, "*batch 2 2"]]:
+        """The map's positions, from the four samples around, and their derivatives; NaN more than a pixel outside the map."""
+        rows, columns = self.uv.shape[:2]
+        size, cells = np.array([camera.width_px, camera.height_px]), np.array([columns, rows])
+        at = xy_px / size * cells - 0.5
+        inside = ((at >= -_BEYOND_CELLS) & (at <= cells - 1 + _BEYOND_CELLS)).all(axis=-1)
+        at = np.where(inside[..., None], at, 0.0)
+        cell = np.clip(np.floor(at), 0, cells - 2).astype(int)
+        (fx, fy), (x, y) = np.moveaxis(at - cell, -1, 0)[..., None], np.moveaxis(cell, -1, 0)
+        a, b, c, d = (self._position(y + down, x + right, size) for down in (0, 1) for right in (0, 1))
+        top, bottom = a + fx * (b - a), c + fx * (d - c)
+        per_px = cells / size
+        by = np.stack([((1.0 - fy) * (b - a) + fy * (d - c)) * per_px[0], (bottom - top) * per_px[1]], axis=-1)
+        return np.where(inside[..., None], top + fy * (bottom - top), np.nan), by
+
+    def _position(self, row: np.ndarray, column: np.ndarray, size: np.ndarray) -> np.ndarray:
+        u, v = np.moveaxis(self.uv[row, column].astype(np.float64), -1, 0)
+        return np.stack([u, 1.0 - v], axis=-1) * size
+
+    def _inverse(self, xy_px: Positions, camera: Camera) -> Positions:
+        """Newton's method on the map's bilinear surface; NaN where the map does not hold the position."""
+        edge = np.array([camera.width_px, camera.height_px], np.float64)
+        found = np.clip(xy_px, 0.0, edge)
+        for _ in range(_STEPS):
+            value, derivative = self._looked_up(found, camera)
+            error = value - xy_px
+            if not (np.abs(error) > _RESIDUAL_PX).any():
+                break
+            step = np.linalg.solve(np.where(np.isnan(derivative), np.eye(2), derivative), error[..., None])[..., 0]
+            found = np.clip(found - step, -1.0, edge + 1.0)
+        value, _ = self._looked_up(found, camera)
+        return np.where((np.abs(value - xy_px) <= _RESIDUAL_PX).all(axis=-1, keepdims=True), found, np.nan)
+
+
+def read_st_map(path: Path | str, kind: str = "distort") -> StMap:
+    """An EXR file with u in red and v in green (or channels u, v). InputError where it is too coarse, as half floats are."""
+    for part in read_exr(path):
+        for u, v in _NAMES:
+            if u in part.channels and v in part.channels:
+                right, up = part.channels[u], part.channels[v]
+                if right.dtype == np.float16 and right.shape[1] * _HALF_STEP > _COARSEST_PX:
+                    raise InputError(
+                        f"{path}: expected an ST map in 32-bit float, got half floats, whose steps are "
+                        f"{right.shape[1] * _HALF_STEP:.2f} px at this size: export it again in 32 bit"
+                    )
+                return StMap(np.stack([right, up], axis=-1).astype(np.float32), kind, str(path))
+    raise InputError(f"{path}: expected an ST map with u in red and v in green, but it has no such channels: export it as RGB")
+
 
 HUGIN_UNIT = 1.0 / np.hypot(1.0, 1.5)
 """Half the shorter side of a 3:2 picture, in half diagonals."""

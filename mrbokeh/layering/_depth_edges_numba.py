@@ -1,7 +1,8 @@
 """Edges of the depth map for layering.hidden_background, compiled. Whether a pixel needs a closer look at all is asked of whole rows."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _BESIDE = ((0, 1), (1, 0), (1, 1), (1, -1))
 

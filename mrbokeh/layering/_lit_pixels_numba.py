@@ -1,7 +1,8 @@
 """The search of mrbokeh.layering.lit_pixels, compiled: a bound that vectorises, then a count where the bound does not decide."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _MOST = 13  # of 25
 

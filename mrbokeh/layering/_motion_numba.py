@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 STEP_PX = 0.25
 """Places on a path are at most so far apart; each is shared out among the four pixels around it."""

@@ -1,10 +1,11 @@
 """The loop over pixels of mrbokeh.layering.pixel_box."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def widen(box: np.ndarray, flat: np.ndarray, channels: int) -> None:
     """Widen the box (top, bottom, left, right) by all pixels of rows (H, W * channels) that are not 0."""
     height, count = flat.shape

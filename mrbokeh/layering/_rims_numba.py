@@ -1,7 +1,8 @@
 """How mrbokeh.layering.hidden_background parts the pixels of a rim, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _LARGEST_SHARE = 0.6
 

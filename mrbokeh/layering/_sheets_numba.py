@@ -1,7 +1,8 @@
 """The loop of mrbokeh.layering.sheets, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

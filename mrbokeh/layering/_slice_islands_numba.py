@@ -4,7 +4,8 @@ So little work that other threads need not be let in meanwhile, as nogil would: 
 """
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True)

@@ -5,7 +5,8 @@ one row, without gaps: what is done for a pixel is done for neighbours in memory
 """
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,8 @@ The table of mrbokeh.optics.drawn_diameters, looked up pixel by pixel without a 
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from mrbokeh.psf_models import _physical_lens_numba as compiled
-from mrbokeh.psf_models._ray_tracing_numba import find_chief
+from mrbokeh.psf_models._physical_lens_numba import find_chief
+from mrbokeh.psf_models.base import sobol_blocks
 from mrbokeh.psf_models.lens_prescription import LensPrescription
-from mrbokeh.psf_models.quasi_random import sobol_blocks
 from mrbokeh.system.errors import InputError
 
 BANDS_UM = np.array([[0.6114, 0.04], [0.5491, 0.04], [0.4642, 0.04]])

@@ -31,8 +31,7 @@ from jaxtyping import Float64
 from mrbokeh.optics.psf import kernel_radius_px
 from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.optics.psf_grid import ProportionalGrid
-from mrbokeh.psf_models.base import Kernel, check_positive, nodes
-from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.psf_models.base import Kernel, check_positive, nodes, sobol_blocks
 
 CELLS = 400
 LARGEST_PX = 256.0
@@ -80,7 +79,7 @@ class Combined:
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
         """See `PsfModel.kernel`."""
-        from mrbokeh.psf_models._combined_numba import fill_capsule
+        from mrbokeh.psf_models._lens_points_numba import fill_capsule
 
         size = _size(float(box[0, 1]), float(box[1, 1]))
         total = np.zeros((size, size))
@@ -106,7 +105,7 @@ def _tracer(device: str) -> Callable[..., float]:
         from mrbokeh.psf_models.torch_tracing import trace_capsule as trace_on
 
         return partial(trace_on, device)
-    from mrbokeh.psf_models._combined_numba import trace_capsule
+    from mrbokeh.psf_models._lens_points_numba import trace_capsule
 
     return trace_capsule
 

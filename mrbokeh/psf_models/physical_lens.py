@@ -17,11 +17,9 @@ from jaxtyping import Float64
 from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import GREEN_UM, LensBeam, area_of
-from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest
-from mrbokeh.psf_models.biconvex_lens import biconvex_lens
+from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, sobol_blocks
 from mrbokeh.psf_models.lens_prescription import LensPrescription
-from mrbokeh.psf_models.lens_prescription_file import read_prescription
-from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.psf_models.lens_prescription_file import biconvex_lens, read_prescription
 from mrbokeh.system.errors import InputError
 
 EXPONENTS = (2.5, 1.2)

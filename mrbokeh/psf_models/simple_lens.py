@@ -11,8 +11,7 @@ from jaxtyping import Float64, Int64
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf import kernel_radius_px
 from mrbokeh.optics.psf_bank import Axis, Turns
-from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, nodes
-from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, nodes, sobol_blocks
 from mrbokeh.system.errors import InputError
 
 EXPONENT = 2.0
@@ -109,7 +108,7 @@ def _tracer(device: str) -> Callable[..., float]:
         from mrbokeh.psf_models.torch_tracing import trace_lens as trace_on
 
         return partial(trace_on, device)
-    from mrbokeh.psf_models._simple_lens_numba import trace_lens
+    from mrbokeh.psf_models._lens_points_numba import trace_lens
 
     return trace_lens
 

@@ -9,8 +9,7 @@ from jaxtyping import Float, Float64
 
 from mrbokeh.optics.psf import kernel_radius_px
 from mrbokeh.optics.psf_bank import Axis, Turns
-from mrbokeh.psf_models.base import Kernel, check_positive, digest, nodes
-from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.psf_models.base import Kernel, check_positive, digest, nodes, sobol_blocks
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -112,7 +111,7 @@ def _tracer(device: str) -> Callable[..., float]:
         from mrbokeh.psf_models.torch_tracing import trace_picture as trace_on
 
         return partial(trace_on, device)
-    from mrbokeh.psf_models._stylized_numba import trace_picture
+    from mrbokeh.psf_models._lens_points_numba import trace_picture
 
     return trace_picture
 

@@ -15,8 +15,7 @@ from jaxtyping import Float64, Int64
 
 from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _volume_numba as compiled
-from mrbokeh.psf_models.base import Kernel, check_positive
-from mrbokeh.psf_models.quasi_random import sobol_blocks
+from mrbokeh.psf_models.base import Kernel, check_positive, sobol_blocks
 from mrbokeh.system.errors import InputError
 
 SAMPLES = 200

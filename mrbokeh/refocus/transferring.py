@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.depth.depth_map import DepthMap
-from mrbokeh.depth.depth_settings import DepthSettings
+from mrbokeh.depth.depth_map import DepthMap, DepthSettings
 from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb

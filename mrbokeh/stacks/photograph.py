@@ -17,7 +17,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
 _log = logging.getLogger(__name__)
-_READER = "capture.photos.photograph"
+_READER = "capture.photos.developing"
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ import numpy as np
 from mrbokeh.images.image_io import write_image
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.lens_measuring.fitting.fit_results import bank_of
 from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
-from mrbokeh.lens_measuring.fitting.measured_bank import bank_of
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import PsfBank

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from mrbokeh.images.layer import opaque
+from mrbokeh.lens_measuring.fitting.fit_results import bank_of
 from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
-from mrbokeh.lens_measuring.fitting.measured_bank import bank_of
-from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, usable_pixels
-from mrbokeh.lens_measuring.fitting.stack_views import StackSlices
+from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, StackSlices, usable_pixels
 from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks

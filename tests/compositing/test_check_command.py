@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.checks.checked_picture import Storage
-from mrbokeh.checks.leak_map import reach_of_sharp
+from mrbokeh.checks.picture_checks import reach_of_sharp
 from mrbokeh.commands.check import app
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of

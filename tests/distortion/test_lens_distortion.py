@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.distortion import LensDistortion
-from mrbokeh.distortion.colmap import colmap_distortion
-from mrbokeh.distortion.distortion_json import distortion_from_json, distortion_to_json
-from mrbokeh.distortion.st_map import StMap, read_st_map
+from mrbokeh.distortion.distortion import StMap, read_st_map
+from mrbokeh.distortion.distortion_json import colmap_distortion, distortion_from_json, distortion_to_json
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
@@ -120,49 +119,6 @@ def test_colmap_projects_alike(model: str, values: tuple[float, ...]) -> None:
     xy_px = some_px()
     points_m = camera.unproject(xy_px, np.full(len(xy_px), 3.0))
     np.testing.assert_allclose(distortion.distorted_px(xy_px, camera), theirs.img_from_cam(points_m), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("camera_model", "lens_model", "focal_mm"),
-    [
-        ("NIKON D3S", "Nikkor 28mm f/2.8D AF", 28.0),
-        ("Canon EOS 5D Mark III", "Canon EF 24-105mm f/4L IS USM", 24.0),
-        ("Canon EOS 7D", "Canon EF 24-105mm f/4L IS USM", 35.0),
-        ("E-M1", "Olympus M.Zuiko Digital ED 12-40mm f/2.8 Pro", 12.0),
-    ],
-)
-@pytest.mark.parametrize("size_px", [(300, 200), (200, 300), (320, 180)])
-def test_lensfun_undistorts_alike(camera_model: str, lens_model: str, focal_mm: float, size_px: tuple[int, int]) -> None:
-    """lensfun spans a frame from the centre of its first pixel to that of its last: one pixel more makes its numbers our edges.
-
-    Calibrated at 3:2 and 4:3, on frames of the same and of other crop factors. It is asked for one column at a time, because
-    of four pixels of a row that it takes at once, three are off by up to 0.2 px (0.3.4). It counts in float32.
-    """
-    lensfunpy = pytest.importorskip("lensfunpy")
-    from mrbokeh.distortion.lensfun_database import _found, lensfun_distortion
-
-    width, height = size_px
-    found, lens = _found(None, camera_model, lens_model)
-    modifier = lensfunpy.Modifier(lens, found.crop_factor, width + 1, height + 1)
-    modifier.initialize(focal_mm, 4.0, 1000.0, 1.0, flags=lensfunpy.ModifyFlags.DISTORTION)
-    camera = Camera(width, height, (300.0, 300.0), (width / 2, height / 2))
-    distortion, farthest_px = lensfun_distortion(camera_model, lens_model, focal_mm), 0.0
-    for x in range(0, width + 1, 10):
-        edges_px = np.stack([np.full(height + 1, float(x)), np.arange(height + 1.0)], axis=-1)
-        theirs_px = np.asarray(modifier.apply_geometry_distortion(x, 0, 1, height + 1)).reshape(-1, 2)
-        farthest_px = max(farthest_px, float(np.abs(theirs_px - edges_px).max()))
-        np.testing.assert_allclose(distortion.distorted_px(edges_px, camera), theirs_px, atol=4e-4)
-    assert farthest_px > 0.05
-
-
-def test_lensfun_says_what_it_does_not_know() -> None:
-    pytest.importorskip("lensfunpy")
-    from mrbokeh.distortion.lensfun_database import lensfun_distortion
-
-    with pytest.raises(InputError, match="knows no camera"):
-        lensfun_distortion("Zorki 99", "any", 50.0)
-    with pytest.raises(InputError, match="fisheye"):
-        lensfun_distortion("Canon EOS 5D Mark III", "Canon EF 8-15mm f/4L Fisheye USM", 15.0)
 
 
 @pytest.mark.parametrize("name", MODELS)

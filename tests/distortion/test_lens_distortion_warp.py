@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.distortion import LensDistortion, distorted, overscan_camera
-from mrbokeh.distortion.overscan import source_positions_px
-from mrbokeh.distortion.resampling import resampled
-from mrbokeh.distortion.st_map import StMap
-from mrbokeh.distortion.warping import sampled_positions_px
+from mrbokeh.distortion.distortion import StMap
+from mrbokeh.distortion.warping import resampled, sampled_positions_px, source_positions_px
 from mrbokeh.images.layer import Layer, clear
 from mrbokeh.layering.motion import MOTION, with_motion
 from mrbokeh.layering.pixel_box import Box, lit_box

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from mrbokeh import cli
-from mrbokeh.checks.findings import CheckReport
-from mrbokeh.checks.light_checks import check_numbers
-from mrbokeh.checks.shots import open_shot
+from mrbokeh.checks.checked_picture import open_shot
+from mrbokeh.checks.picture_checks import CheckReport, check_numbers
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.layer import Layer

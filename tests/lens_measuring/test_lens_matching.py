@@ -18,11 +18,9 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.layer import opaque
 from mrbokeh.layering.layering import Layering
 from mrbokeh.lens_measuring.matching.discs import Disc, find_discs
-from mrbokeh.lens_measuring.matching.focus_from_size import depth_from_size, effective_f_number, focus_from_size
-from mrbokeh.lens_measuring.matching.lens_match import LensMatch, match_lens
-from mrbokeh.lens_measuring.matching.match_table import table_of
-from mrbokeh.lens_measuring.matching.outline_fit import fit_outlines
-from mrbokeh.lens_measuring.matching.outline_model import Opening, outline_radius
+from mrbokeh.lens_measuring.matching.lens_match import LensMatch, depth_from_size, effective_f_number, focus_from_size, match_lens
+from mrbokeh.lens_measuring.matching.match_report import table_of
+from mrbokeh.lens_measuring.matching.outline_fit import Opening, fit_outlines, outline_radius
 from mrbokeh.lens_measuring.matching.photo_facts import PhotoFacts, read_facts
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.figures.psf_bank_drawing import draw_bank
-from mrbokeh.figures.psf_bank_export import export_bank
+from mrbokeh.figures.psf_bank_drawing import draw_bank, export_bank
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.optics.psf_bank_file import cell_path, read_bank, write_bank

@@ -11,12 +11,11 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import BANDS_UM, GREEN_UM
-from mrbokeh.psf_models._ray_tracing_numba import trace_ray
-from mrbokeh.psf_models.biconvex_lens import biconvex_lens
-from mrbokeh.psf_models.glass import cauchy_coefficients, index_at
-from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
+from mrbokeh.psf_models._physical_lens_numba import trace_ray
+from mrbokeh.psf_models.base import sobol_blocks
+from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, cauchy_coefficients, index_at
+from mrbokeh.psf_models.lens_prescription_file import biconvex_lens
 from mrbokeh.psf_models.physical_lens import PhysicalLens
-from mrbokeh.psf_models.quasi_random import sobol_blocks
 from mrbokeh.system.errors import InputError
 
 RAYS = 1 << 15

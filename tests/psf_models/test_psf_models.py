@@ -6,9 +6,8 @@ from jaxtyping import Float
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank import Axis
-from mrbokeh.psf_models.base import PsfModel
+from mrbokeh.psf_models.base import PsfModel, sobol_blocks
 from mrbokeh.psf_models.combined import PAPER_COUNTS, Combined
-from mrbokeh.psf_models.quasi_random import sobol_blocks
 from mrbokeh.psf_models.simple_lens import SimpleLens, banded_edges
 from mrbokeh.psf_models.stylized import Stylized
 from mrbokeh.system.errors import InputError
@@ -185,7 +184,7 @@ def test_the_opening_that_rays_see_is_made_of_its_polygons(aperture: Aperture) -
     """The bands of edges against the library's point-in-polygon for each outline in turn."""
     from shapely import Polygon, contains_xy
 
-    from mrbokeh.psf_models._simple_lens_numba import opening_at
+    from mrbokeh.psf_models._lens_points_numba import opening_at
 
     extent = aperture.unit_radius
     places = extent * (2.0 * np.random.default_rng(2).random((3000, 2)) - 1.0)

@@ -19,12 +19,11 @@ from mrbokeh.commands.lens import app
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank_file import cell_path, read_bank
 from mrbokeh.psf_models import _volume_numba as compiled
-from mrbokeh.psf_models.base import PsfModel
+from mrbokeh.psf_models.base import PsfModel, sobol_blocks
 from mrbokeh.psf_models.build import bank_head, build_bank
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
-from mrbokeh.psf_models.quasi_random import sobol_blocks
 from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.psf_models.stylized import Stylized
 from mrbokeh.psf_models.volume import Volume
@@ -33,7 +32,7 @@ from mrbokeh.system.errors import InputError, MissingExtraError
 torch = pytest.importorskip("torch")
 
 from mrbokeh.psf_models.torch_tracing import LandedRays, photons_in_rings, trace_photons  # noqa: E402
-from mrbokeh.psf_models.torch_tracing._sums import summed  # noqa: E402
+from mrbokeh.psf_models.torch_tracing._lens_points import summed  # noqa: E402
 from mrbokeh.psf_models.torch_tracing._volume import first_states, uniform  # noqa: E402
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

@@ -4,7 +4,8 @@
 """
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True, inline="always")

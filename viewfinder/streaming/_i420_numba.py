@@ -1,7 +1,8 @@
 """The loop over 2x2 pixels from 8-bit BGR to I420, compiled; it runs without the GIL."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 SHIFT = 16
 

@@ -1,7 +1,8 @@
 """The loops over the pixels of mrbokeh.compositing.plate_look, compiled; they run without the GIL."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,7 +1,8 @@
 """What each cell of the pupil sees of the sharp picture from a blurred pixel, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _STEPS = 3
 

@@ -1,9 +1,91 @@
-"""Evidence: the normal equations of many pixels, for every knot and colour."""
+"""Evidence: the normal equations of many pixels, for every knot and colour.
 
-from dataclasses import dataclass
+Knots: the places over side of the focus, diameter and field at which a lens is measured.
+
+Sharing: colours, ranges of diameters or sides of the focus that have one picture of the pupil in common.
+
+What is shared is measured from the evidence of all that share it, with less noise, and costs renderers less. Whether a lens may be
+described so is asked of slices that the fit has not seen: the simplest description is taken that is no worse than the best one, within the
+standard error of their difference (Breiman et al. 1984, Section 3.4.3: the one-standard-error rule).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
+
+from mrbokeh.system.errors import InputError
+
+_FARTHEST = 1.0  # half diagonals: a corner
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Where kernels are solved for. Each stands for what is nearest to it; in front of the focus come first, then diameters, then places.
+
+    diameters_px: ascending, above 0, the middles of the ranges of diameters (in proportion) whose kernels share a shape.
+    regions: columns and rows into which the frame is cut. rings: more than 0 makes the lens symmetric instead: so many ranges of
+    eccentricity, the kernels of each those of a source to the right of the middle, turned with the place.
+    highs: how far the frame reaches right and down of its middle, in half diagonals.
+    """
+
+    diameters_px: tuple[float, ...]
+    regions: tuple[int, int] = (1, 1)
+    rings: int = 0
+    highs: tuple[float, float] = (0.832, 0.555)
+
+    def __post_init__(self) -> None:
+        steps = np.diff([0.0, *self.diameters_px])
+        if not self.diameters_px or not (steps > 0.0).all() or not np.isfinite(self.diameters_px).all():
+            raise InputError(f"expected diameters in px that grow from above 0, such as 10 20, got {self.diameters_px}")
+        if min(self.regions) < 1 or self.rings < 0:
+            raise InputError(f"expected at least 1x1 regions of the frame, got {self.regions[0]}x{self.regions[1]}")
+
+    @property
+    def fields(self) -> int:
+        """How many parts of the field are told apart."""
+        return self.rings or self.regions[0] * self.regions[1]
+
+    def __len__(self) -> int:
+        return 2 * len(self.diameters_px) * self.fields
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Sides, diameters, parts of the field."""
+        return 2, len(self.diameters_px), self.fields
+
+    def fields_at(self, field_xy: Float[np.ndarray, "*batch 2"]) -> Int64[np.ndarray, "*batch"]:
+        """The part of the field of each position; regions row by row."""
+        if self.rings:
+            shares = np.hypot(field_xy[..., 0], field_xy[..., 1]) / _FARTHEST
+            return np.asarray(np.clip((shares * self.rings).astype(np.int64), 0, self.rings - 1))
+        steps = [np.clip((0.5 + 0.5 * field_xy[..., i] / self.highs[i]) * self.regions[i], 0, self.regions[i] - 1) for i in (0, 1)]
+        return np.asarray(steps[1].astype(np.int64) * self.regions[0] + steps[0].astype(np.int64))
+
+    def at(self, coc_px: Float[np.ndarray, "*batch"], field_xy: Float[np.ndarray, "*batch 2"]) -> Int64[np.ndarray, "*batch"]:
+        """The knot of a signed diameter at a position."""
+        middles = np.sqrt(np.array(self.diameters_px[:-1]) * np.array(self.diameters_px[1:]))
+        step = np.searchsorted(middles, np.abs(coc_px))
+        return np.asarray(((np.asarray(coc_px) > 0) * len(self.diameters_px) + step) * self.fields + self.fields_at(field_xy))
+
+    def turns(self, field_xy: Float[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points 2"]:
+        """Cosine and sine of the angle by which kernels are turned at each position: none unless the lens is symmetric."""
+        angles = np.arctan2(field_xy[:, 1], field_xy[:, 0]) * bool(self.rings)
+        return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+    def neighbours(self) -> dict[str, Int64[np.ndarray, "pairs 2"]]:
+        """Pairs of knots that differ by one step of "diameter" or "field", or by "side" alone."""
+        numbers = np.arange(len(self)).reshape(self.shape)
+        across = numbers.reshape(*self.shape[:2], 1, -1) if self.rings else numbers.reshape(*self.shape[:2], *self.regions[::-1])
+        field = [_pairs(across, axis) for axis in (2, 3)]
+        return {"side": _pairs(numbers, 0), "diameter": _pairs(numbers, 1), "field": np.concatenate(field)}
+
+
+def _pairs(numbers: Int64[np.ndarray, "..."], axis: int) -> Int64[np.ndarray, "pairs 2"]:
+    ordered = np.moveaxis(numbers, axis, 0)
+    return np.stack([ordered[:-1].ravel(), ordered[1:].ravel()], axis=1)
+
 
 _HUBER = 1.345
 _LEAST_DEVIATION = 1e-3  # no slice is known better than this, over the root of its radiance
@@ -83,3 +165,54 @@ class Evidence:
         left = self.energies + (explained * pictures).sum(axis=(1, 2))
         of = np.where(self.counts > 0, self.counts * self.sides.shape[1], np.nan)
         return np.asarray(np.sqrt(np.maximum(left, 0.0) / of))
+
+
+@dataclass(frozen=True)
+class Sharing:
+    """Which pictures are one and the same."""
+
+    colours: bool = False
+    diameters: bool = False
+    sides: bool = False
+
+    def merged(self, evidence: Evidence, knots: Knots) -> tuple[Evidence, Knots]:
+        """The evidence of those that share, and the knots that are left; sides stay two, each with the evidence of both."""
+        fewer = replace(knots, diameters_px=knots.diameters_px[:1]) if self.diameters else knots
+
+        def summed(of_knots: np.ndarray, with_channels: bool) -> np.ndarray:
+            whole = of_knots.reshape(*knots.shape, *of_knots.shape[1:])
+            whole = whole.sum(axis=1, keepdims=True) if self.diameters else whole
+            whole = whole.sum(axis=3, keepdims=True) if self.colours and with_channels else whole
+            both = np.broadcast_to(whole.sum(axis=0, keepdims=True), whole.shape) if self.sides else whole
+            return both.reshape(len(fewer), *both.shape[3:])
+
+        channels = (summed(each, True) for each in (evidence.matrices, evidence.sides))
+        return Evidence(*channels, *(summed(each, False) for each in (evidence.energies, evidence.counts))), fewer
+
+    def spread(
+        self, pictures: Float64[np.ndarray, "fewer shared cells"], knots: Knots, channels: int
+    ) -> Float64[np.ndarray, "knots channels cells"]:
+        """Those of all knots and colours, from those of `merged`."""
+        shape = (2, -1, knots.fields, *pictures.shape[1:])
+        whole = np.broadcast_to(pictures.reshape(shape), (*knots.shape, channels, pictures.shape[-1]))
+        return np.ascontiguousarray(whole.reshape(len(knots), channels, -1))
+
+
+NOTHING = Sharing()
+SIMPLEST_FIRST = (
+    Sharing(colours=True, diameters=True, sides=True),
+    Sharing(colours=True, diameters=True),
+    Sharing(colours=True, sides=True),
+    Sharing(colours=True),
+)
+"""Sharings that are tried, from the one with the fewest pictures to that with the most."""
+
+
+def simplest_of(errors: Sequence[Sequence[float]]) -> int:
+    """The first description, of those given from the simplest on, that is no worse than the best. errors: of each, slice by slice."""
+    squares = np.square(np.asarray(errors, np.float64))
+    if squares.size == 0:
+        return len(squares) - 1
+    worse = squares - squares[squares.sum(axis=1).argmin()]
+    deviation = worse.std(axis=1, ddof=1) if squares.shape[1] > 1 else np.zeros(len(squares))
+    return int(np.argmax(worse.mean(axis=1) <= deviation / np.sqrt(squares.shape[1])))

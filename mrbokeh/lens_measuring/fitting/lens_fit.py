@@ -6,14 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from mrbokeh.lens_measuring.fitting.evidence import Equations, Evidence, Pictures
-from mrbokeh.lens_measuring.fitting.knots import Knots
+from mrbokeh.lens_measuring.fitting.evidence import NOTHING, SIMPLEST_FIRST, Equations, Evidence, Knots, Pictures, Sharing, simplest_of
 from mrbokeh.lens_measuring.fitting.point_lights import PointLight, best_scale, equations_of_light, light_count
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid
-from mrbokeh.lens_measuring.fitting.sharing import NOTHING, SIMPLEST_FIRST, Sharing, simplest_of
 from mrbokeh.lens_measuring.fitting.solving import Smoothness, solve
-from mrbokeh.lens_measuring.fitting.stack_equations import LEAST_DIAMETER_PX, SliceView, drawn_pixels, equations_of
-from mrbokeh.lens_measuring.fitting.stack_views import StackSlices, largest_diameter_px
+from mrbokeh.lens_measuring.fitting.stack_equations import (
+    LEAST_DIAMETER_PX,
+    SliceView,
+    StackSlices,
+    drawn_pixels,
+    equations_of,
+    largest_diameter_px,
+)
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.console import track

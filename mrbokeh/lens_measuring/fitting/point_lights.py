@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import binary_dilation, find_objects, label
 
-from mrbokeh.lens_measuring.fitting.evidence import Equations, Pictures
-from mrbokeh.lens_measuring.fitting.knots import Knots
+from mrbokeh.lens_measuring.fitting.evidence import Equations, Knots, Pictures
 from mrbokeh.lens_measuring.fitting.pupil_picture import EXTENT, PupilGrid
 from mrbokeh.lens_measuring.fitting.stack_equations import LEAST_DIAMETER_PX, Rgb
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-from mrbokeh.lens_measuring.fitting.evidence import Evidence
-from mrbokeh.lens_measuring.fitting.knots import Knots
+from mrbokeh.lens_measuring.fitting.evidence import Evidence, Knots
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid
 from mrbokeh.system.console import track
 

@@ -1,13 +1,108 @@
-"""Out-of-focus lights of a photograph: bright even plateaus with a sharp closed contour on darker surroundings."""
+"""Out-of-focus lights of a photograph: bright even plateaus with a sharp closed contour on darker surroundings.
 
-from collections.abc import Sequence
+Closed contours of a picture by linear interpolation between the centres of pixels, and measures of them.
+
+Where a photograph may have out-of-focus lights: compact parts above levels of light that step down.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 
-from mrbokeh.lens_measuring.matching.bright_parts import LARGEST_ASPECT, Box, bright_parts
-from mrbokeh.lens_measuring.matching.contours import Contour, area_and_centroid, even_points, inside, level_contour
+Contour = Float64[np.ndarray, "_ 2"]
+
+
+def level_contour(picture: Float64[np.ndarray, "height width"], level: float, around_px: Float64[np.ndarray, "2"]) -> Contour | None:
+    """The closed contour at `level` that encloses a place and the most area; None where there is none."""
+    from contourpy import contour_generator
+
+    tracer: Any = contour_generator(z=picture)
+    best, most = None, 0.0
+    for line in tracer.lines(level):
+        if len(line) < 8 or not np.array_equal(line[0], line[-1]):
+            continue
+        contour = line[:-1] + 0.5
+        area = area_and_centroid(contour)[0]
+        if area > most and _encloses(contour, around_px):
+            best, most = contour, area
+    return best
+
+
+def _encloses(contour: Contour, place: Float64[np.ndarray, "2"]) -> bool:
+    """The even-odd rule along a ray to the right."""
+    start, stop = contour - place, np.roll(contour, -1, axis=0) - place
+    crosses = (start[:, 1] > 0.0) != (stop[:, 1] > 0.0)
+    start, stop = start[crosses], stop[crosses]
+    at = start[:, 0] - start[:, 1] * (stop[:, 0] - start[:, 0]) / (stop[:, 1] - start[:, 1])
+    return bool(int((at > 0.0).sum()) % 2)
+
+
+def area_and_centroid(contour: Contour) -> tuple[float, Float64[np.ndarray, "2"]]:
+    """By the shoelace formula."""
+    following = np.roll(contour, -1, axis=0)
+    cross = contour[:, 0] * following[:, 1] - following[:, 0] * contour[:, 1]
+    total = float(cross.sum())
+    if total == 0.0:
+        return 0.0, contour.mean(axis=0)
+    return 0.5 * abs(total), ((contour + following) * cross[:, None]).sum(axis=0) / (3.0 * total)
+
+
+def even_points(contour: Contour, count: int) -> Contour:
+    """`count` points at equal steps along a closed contour."""
+    closed = np.concatenate([contour, contour[:1]])
+    along = np.concatenate([[0.0], np.hypot(*np.diff(closed, axis=0).T).cumsum()])
+    places = along[-1] * np.arange(count) / count
+    return np.stack([np.interp(places, along, closed[:, i]) for i in (0, 1)], axis=1)
+
+
+def inside(shape: tuple[int, ...], contour: Contour, inset_px: float) -> Bool[np.ndarray, "height width"]:
+    """Pixels whose centres lie at least `inset_px` within a contour; negative: at most so far outside."""
+    from shapely import Polygon, contains_xy, prepare
+
+    area = Polygon(contour).buffer(-inset_px)
+    prepare(area)
+    rows, columns = np.indices(shape)
+    return np.asarray(contains_xy(area, columns.ravel() + 0.5, rows.ravel() + 0.5)).reshape(shape)
+
+
+LARGEST_ASPECT = 2.6
+_LARGEST_SHARE = 0.45  # of the shorter side of the frame
+_LEVELS = 14
+_BORDER_PX = 2
+
+Box = tuple[int, int, int, int]
+
+
+def bright_parts(grey: Float32[np.ndarray, "height width"], least_px: float) -> Iterator[Box]:
+    """Boxes (left, top, width, height), clear of the border, from levels between the brightest light and near the median."""
+    import cv2
+
+    smooth = cv2.GaussianBlur(grey, (0, 0), 0.8)
+    bright, dark = float(np.percentile(smooth, 99.97)), float(np.median(smooth))
+    lowest = max(1.3 * dark, 2e-3 * bright, 1e-6)
+    seen: set[Box] = set()
+    for level in np.geomspace(0.9 * bright, lowest, _LEVELS) if bright > lowest else ():
+        _, _, parts, _ = cv2.connectedComponentsWithStats((smooth > level).astype(np.uint8), connectivity=4)
+        for left, top, wide, high, area in parts[1:].tolist():
+            box = (left, top, wide, high)
+            if box not in seen and area >= 0.5 * wide * high and _is_sized(box, grey.shape, least_px):
+                seen.add(box)
+                yield box
+
+
+def _is_sized(box: Box, frame: tuple[int, ...], least_px: float) -> bool:
+    left, top, wide, high = box
+    height, width = frame
+    clear = min(left, top) > _BORDER_PX and left + wide < width - _BORDER_PX and top + high < height - _BORDER_PX
+    return (
+        clear
+        and min(wide, high) >= least_px
+        and max(wide, high) <= min(_LARGEST_SHARE * min(height, width), LARGEST_ASPECT * min(wide, high))
+    )
+
 
 POINTS = 72
 LEAST_DIAMETER_PX = 7.0

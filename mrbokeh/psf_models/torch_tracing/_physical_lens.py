@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from mrbokeh.psf_models._lens_beam import BANDS_UM, LensBeam
-from mrbokeh.psf_models.torch_tracing._sums import number, on, pixels, summed
+from mrbokeh.psf_models.torch_tracing._lens_points import number, on, pixels, summed
 from mrbokeh.system.torch_device import device_named
 
 Rays = Float64[Tensor, " rays"]

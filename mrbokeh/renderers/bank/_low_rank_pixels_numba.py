@@ -1,7 +1,8 @@
 """One-pass loops over pixels that prepare a low-rank scatter: what is blurred, on which side, by which level, and how bright."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 SHARP, NOT_FINITE = 0, 1
 IN_FRONT, BEHIND, NEGATIVE = 2, 4, 8

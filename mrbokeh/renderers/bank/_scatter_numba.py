@@ -1,7 +1,8 @@
 """The loop over pixels of a bank's plain twin, compiled; same words, nothing cleverer."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -1,7 +1,8 @@
 """Tridiagonal sweeps of mrbokeh.renderers.kernels.laplacian_integration, compiled: one system per sine mode, modes side by side."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

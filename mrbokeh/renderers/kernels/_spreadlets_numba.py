@@ -6,7 +6,8 @@ Pixels of a Laplacian come as xy (M, 2) whole pixels with charges (M, C) and imp
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

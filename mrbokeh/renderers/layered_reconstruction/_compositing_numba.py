@@ -1,7 +1,8 @@
 """Filtered layers of a tile laid behind one another, and what none of them claims."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 SUMS = 8
 """Columns of a row of sums: count, r, r^2, m_x, m_y, m_x^2, m_x m_y, m_y^2, with r half the signed circle of confusion."""

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._direct_gaussian_numba import direct_gaussian
 from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANCE, axes, sheared_filter
@@ -11,6 +10,7 @@ from mrbokeh.renderers.layered_reconstruction._reprojection_numba import evened_
 from mrbokeh.renderers.layered_reconstruction._sheared_gaussian_numba import sheared_gaussian
 from mrbokeh.renderers.layered_reconstruction._texture_gaussian_numba import texture_gaussian
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions, Slope
+from mrbokeh.system.kernels import njit
 
 DIRECT, SHEARED, TEXTURE, TEXTURE_ONE_TAP, WINDOWS = 0, 1, 2, 3, 4
 

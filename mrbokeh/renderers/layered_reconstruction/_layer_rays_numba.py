@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _THICKNESS_PX = 1.0
 _FIXED_POINT_ROUNDS = 3

@@ -3,11 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._filter_numba import extents, slope_distance, spread_px
 from mrbokeh.renderers.layered_reconstruction._statistics_numba import rows_of_tile
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions
+from mrbokeh.system.kernels import njit
 
 WIDEST_PX = 6.0
 """Slopes may differ by the tolerance times the blur, and by that times so many pixels (a standard deviation) where the blur is

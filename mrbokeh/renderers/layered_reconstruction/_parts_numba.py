@@ -5,12 +5,12 @@ place in the pupil, or the time, decides what. A picture of a quarter of the res
 """
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._compositing_numba import share_out
 from mrbokeh.renderers.layered_reconstruction._tile_data import Pupil, WindowLayer
 from mrbokeh.renderers.layered_reconstruction._window_layer_numba import lay_parts
 from mrbokeh.renderers.layered_reconstruction._window_numba import window_guards
+from mrbokeh.system.kernels import njit
 
 COARSE_PX = 4
 """Side of the pixels on which the whole and its parts are compared."""

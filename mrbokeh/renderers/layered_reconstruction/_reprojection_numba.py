@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._samples_numba import morton
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, BLOCKS_ACROSS, Light, Partitions, Slope
+from mrbokeh.system.kernels import njit
 
 BESIDE_DEPTHS = 16
 """Up to so many depth buckets in front of a partition may belong to the same slanted surface."""

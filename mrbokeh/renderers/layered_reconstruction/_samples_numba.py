@@ -1,9 +1,9 @@
 """Samples in the order in which they are worked through: tile by tile, within a tile by pixels in Morton order."""
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._filter_numba import axes, sheared_axes
+from mrbokeh.system.kernels import njit
 
 _LEAST_VARIANCE = 1e-3
 

@@ -4,11 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS
 from mrbokeh.renderers.layered_reconstruction._samples_numba import morton
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, BLOCKS_ACROSS, Choice, Light
+from mrbokeh.system.kernels import njit
 
 
 class Rows(NamedTuple):

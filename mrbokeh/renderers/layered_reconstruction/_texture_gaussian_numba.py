@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 _MOST_PROBES = 16
 

@@ -1,7 +1,6 @@
 """One tile after the other: its partitions, front to back, filtered and laid behind one another."""
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._compositing_numba import composite, own_means, share_out
 from mrbokeh.renderers.layered_reconstruction._gaussian_layer_numba import WINDOWS, gaussian_layer
@@ -16,6 +15,7 @@ from mrbokeh.renderers.layered_reconstruction._parts_numba import (
 )
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Choice, Light, Partitions, Pupil
 from mrbokeh.renderers.layered_reconstruction._window_layer_numba import lay_parts, window_layer
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,6 @@ Whether a partition hides another depends on the place in the pupil and on the t
 import math
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.layered_reconstruction._compositing_numba import composite
 from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANCE, sheared_slopes
@@ -21,6 +20,7 @@ from mrbokeh.renderers.layered_reconstruction._window_numba import (
     sums_along_x,
     window_guards,
 )
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 STRIPS_FOR_PX = 2.0
 """Up to this radius the coarsest drawing of the pupil does, up to twice of it the next."""

@@ -5,7 +5,8 @@ Its work (rows of one level's share of the picture, and one term's rows filtered
 """
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 TILE_FLOATS = 128
 _ROWS_AT_ONCE = 4

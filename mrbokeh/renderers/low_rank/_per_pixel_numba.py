@@ -1,7 +1,8 @@
 """McGraw's passes, compiled: across with the kernel of the source, down with the kernel of the pixel that was reached."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -1,7 +1,8 @@
 """Exact scatter of single pixels with tabulated 2D kernels; what the low-rank sum must not touch goes this way."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

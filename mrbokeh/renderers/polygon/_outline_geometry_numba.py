@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 SLACK = 1e-8
 """Lengths up to this are rounding: a point so near a line is on it, one so far beyond a reach still within."""

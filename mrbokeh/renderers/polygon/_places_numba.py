@@ -1,7 +1,8 @@
 """Corners of an aperture as places in the ring of polygon_differences."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True)

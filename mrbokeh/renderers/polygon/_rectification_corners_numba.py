@@ -5,10 +5,10 @@ along the outline up to each vertex, and once around.
 """
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.polygon._outline_geometry_numba import SLACK, cross
 from mrbokeh.renderers.polygon._rectification_lines_numba import ARRIVING, FLAT, LEAVING, THROUGH
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True)

@@ -9,9 +9,9 @@ outline. The matching row of `places` is (index of the vertex, kind).
 import math
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.polygon._outline_geometry_numba import cross
+from mrbokeh.system.kernels import njit
 
 THROUGH, ARRIVING, LEAVING = 0, 1, 2
 """Kinds of line: touching on both sides of the vertex; ending or starting at a vertex that points inwards."""

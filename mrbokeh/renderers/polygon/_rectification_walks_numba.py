@@ -4,7 +4,8 @@ starts, targets, areas: the arcs, line after line, as `mrbokeh.renderers.polygon
 """
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 ALIKE = 1e-12
 """Areas closer than this are the same; of such walks the one with fewer lines is taken."""

@@ -7,7 +7,8 @@ One plane of impulses for each pair of directions that meets in a corner, and, l
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 BLOCK_ROWS = 64
 """Rows of which the same columns are splatted before the next columns, so that the cells they share stay in the cache."""
@@ -21,7 +22,7 @@ APART_PX = 8
 """Pixels that follow one another when they are splatted are so far apart: neighbours add to overlapping pairs of cells, and
 the second would wait for the first."""
 
-compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False)  # type: ignore[call-overload]
+compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 """Without counting references, which would be atomic and cost as much as the work: nothing here allocates."""
 
 

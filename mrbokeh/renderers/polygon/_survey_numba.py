@@ -1,7 +1,8 @@
 """What polygon_differences must know of a picture before it is spread: where light is, how strong, and which pixels are highlights."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 TILE_PX = 8
 """Side of the tiles in which light is counted; at most the half side of the smallest window, so that a pixel's own tile lies in it."""
@@ -10,7 +11,7 @@ BLOCK_PX = 64
 HIGHLIGHT = 0.05
 """From this share of all light in its window a pixel starts to be spread by its exact kernel; from twice that it is wholly."""
 
-compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 
 
 @compiled

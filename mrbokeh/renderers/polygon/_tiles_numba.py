@@ -4,11 +4,11 @@ So little work that other threads need not be let in meanwhile, as nogil would: 
 """
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.polygon._survey_numba import HIGHLIGHT, TILE_PX
+from mrbokeh.system.kernels import njit
 
-compiled = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+compiled = njit(cache=True, error_model="numpy", _nrt=False)
 
 
 @compiled

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.optics._aperture_numba import fill_psf
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

@@ -1,7 +1,8 @@
 """Lamps among the pixels whose kernels are sparse, compiled."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 NONE = -1
 _STRETCH_PX = 64

@@ -1,9 +1,9 @@
 """Splatting of points, compiled: every pixel adds its value times the points of its cell to an accumulator."""
 
 import numpy as np
-from numba import njit
 
 from mrbokeh.renderers.spreadlets._points_numba import add_points, add_points_of_two
+from mrbokeh.system.kernels import njit
 
 NONE = -1
 LANES = 4

@@ -1,7 +1,8 @@
 """Sums in whole numbers, compiled: how large they can be, and back to reals."""
 
 import numpy as np
-from numba import njit
+
+from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, nogil=True)

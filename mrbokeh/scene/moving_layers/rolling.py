@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.distortion.resampling import resampled
+from mrbokeh.distortion.warping import resampled
 from mrbokeh.images.layer import Layer
 from mrbokeh.scene.moving_layers.paths import Paths
 from mrbokeh.scene.moving_layers.shutter import ShutterTiming
