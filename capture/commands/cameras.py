@@ -16,7 +16,7 @@ def cameras_command() -> None:
     from rich.table import Table
 
     from capture.tether.camera_driver import Ability
-    from capture.tether.gphoto2_cameras import list_cameras
+    from capture.tether.gphoto2_camera import list_cameras
     from mrbokeh.system.gphoto2_library import NOTHING_FOUND
 
     cameras = list_cameras()

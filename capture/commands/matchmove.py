@@ -36,10 +36,10 @@ def matchmove_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the track, and find poses again from the start")] = False,
 ) -> None:
     from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
-    from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
+    from capture.matchmove.ground import parse_frame_distance, parse_ground, parse_ruler
     from mrbokeh.system.console import kept_when_interrupted
     from mrbokeh.tracking.camera_track.formats import format_of_name, write_track
-    from mrbokeh.tracking.charuco.board_file import read_board
+    from mrbokeh.tracking.charuco.board import read_board
 
     if not clip.is_file():
         raise InputError(f"expected a video at {clip}, but {'it is a folder' if clip.is_dir() else 'there is none'}")

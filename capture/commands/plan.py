@@ -46,9 +46,7 @@ def plan_command(
 ) -> None:
     from rich.console import Console
 
-    from capture.tether.focus_plan import plan_focus, plan_for_motor
-    from capture.tether.plan_file import write_plan, write_plan_table
-    from capture.tether.plan_table import print_plan
+    from capture.tether.focus_plan import plan_focus, plan_for_motor, print_plan, write_plan, write_plan_table
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.system.atomic_files import require_safe_outputs
 

@@ -45,11 +45,11 @@ def process_command(
     from capture.commands.poses import poses_command
     from capture.commands.report import report_command
     from capture.commands.scale import scale_command
-    from capture.report.strictness import require_gates
-    from capture.scale.board_options import board_from_options
-    from capture.scale.distance import parse_distance
-    from capture.stacks.begun_scene import taken_away_when_refused
+    from capture.report.scene_report import require_gates
+    from capture.scale.answer import parse_distance
+    from capture.scale.board import board_from_options
     from capture.stacks.session import FILE_NAME as SESSION_NAME
+    from capture.stacks.session import taken_away_when_refused
     from mrbokeh.stacks.focal_stack import find_focal_stacks
     from mrbokeh.system.errors import InputError
 
@@ -79,6 +79,6 @@ def process_command(
 
 def _is_of_use(stacks: "Sequence[FocalStack]") -> bool:
     """Whether one is merged, or may be once the first, at which merging stopped, is mended."""
-    from capture.stacks.stack_remarks import FEWEST_TO_MERGE
+    from capture.stacks.stack_description import FEWEST_TO_MERGE
 
     return any(each.merged for each in stacks) or any(len(each) >= FEWEST_TO_MERGE for each in stacks[1:])

@@ -60,10 +60,9 @@ def scale_command(
     calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="calibrate the focus of the stacks")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find the scale again")] = False,
 ) -> None:
-    from capture.scale.board_options import board_from_options
-    from capture.scale.distance import parse_distance
-    from capture.scale.metric_scale import ScaleRequest, scale_scene
-    from capture.scale.text import scale_lines
+    from capture.scale.answer import parse_distance
+    from capture.scale.board import board_from_options
+    from capture.scale.metric_scale import ScaleRequest, scale_lines, scale_scene
 
     if ruler or distance_at or nearest:
         of_scenes = {
@@ -91,8 +90,8 @@ def scale_command(
 
 
 def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | None, overwrite: bool) -> None:
-    from capture.merging.known_metres import Fact, parse_known_distance, parse_length
-    from capture.merging.stack_metres import lines_of, tell_metres, tell_nearest
+    from capture.merging.metres.known_metres import Fact, parse_known_distance, parse_length
+    from capture.merging.metres.stack_metres import lines_of, tell_metres, tell_nearest
     from mrbokeh.stacks.focal_stack import find_focal_stacks
     from mrbokeh.stacks.guessed_metres import metres_note
 
@@ -113,8 +112,7 @@ def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | 
 
 
 def _apply(scene: Path, path: Path) -> None:
-    from capture.poses.lens_calibration import read_lens_calibration
-    from capture.poses.lens_calibration_stacks import calibrate_scene
+    from capture.poses.lens_calibration import calibrate_scene, read_lens_calibration
 
     for stack in calibrate_scene(scene, read_lens_calibration(path)):
         typer.echo(f"{stack.folder}: focus distances calibrated by {path}")

@@ -9,10 +9,9 @@ import typer
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from capture.tether.camera_driver import CameraDriver
-    from capture.tether.focus_steps import FocusSteps
-    from capture.tether.focus_sweep import Target
-    from capture.tether.live_reading import Spot
+    from capture.tether.camera_driver import CameraDriver, FocusSteps
+    from capture.tether.focus_motor import Target
+    from capture.tether.live_view import Spot
 
 HELP = "\n\n".join(
     (
@@ -66,13 +65,10 @@ def shoot_command(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="shoot everything again")] = False,
 ) -> None:
-    from capture.tether.camera_driver import CameraSettings
-    from capture.tether.focus_steps import read_focus_steps
-    from capture.tether.opening import open_named
-    from capture.tether.plan_file import read_plan
-    from capture.tether.shoot import shoot
-    from capture.tether.shoot_arguments import parse_seconds, parse_spot, parse_target, steps_between
-    from capture.tether.shoot_options import ShootOptions, Surroundings
+    from capture.tether.camera_driver import CameraSettings, read_focus_steps
+    from capture.tether.focus_plan import read_plan
+    from capture.tether.shoot import ShootOptions, Surroundings, shoot
+    from capture.tether.shoot_arguments import open_named, parse_seconds, parse_spot, parse_target, steps_between
     from mrbokeh.system.console import kept_when_interrupted
 
     planned = read_plan(plan)
@@ -96,7 +92,7 @@ def watch(driver: "CameraDriver", spot: "Spot | None") -> None:
     """Show the live view until Enter."""
     from rich.console import Console
 
-    from capture.tether.live_table import enter_pressed, show_live
+    from capture.tether.live_view import enter_pressed, show_live
 
     show_live(driver, enter_pressed(), Console(), spot)
 
@@ -105,9 +101,8 @@ def measured(
     driver: "CameraDriver", targets: list["Target"], out: Path, *, home: str, backlash: int, settle: float, step: int, again: bool
 ) -> "FocusSteps":
     """Sweep the focus over targets; the scale is kept in OUT/focus_steps.json and taken from there when a shoot goes on."""
-    from capture.tether.focus_axis import FocusAxis
-    from capture.tether.focus_steps import read_focus_steps, write_focus_steps
-    from capture.tether.focus_sweep import measure_focus_steps
+    from capture.tether.camera_driver import read_focus_steps, write_focus_steps
+    from capture.tether.focus_motor import FocusAxis, measure_focus_steps
     from capture.tether.shoot_arguments import parse_stop
     from mrbokeh.system.console import working
 

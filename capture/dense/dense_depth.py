@@ -3,6 +3,8 @@
 A sweep over planes (at a resolution that bounds memory) and a semi-global labelling find the surfaces; sweeps of a few steps
 around them, level by level up to the full picture, make them exact; edges are moved onto those of the picture; what neither
 views nor focus know is filled from its surroundings and has no confidence.
+
+Sizes of the pyramid on which dense depth is found: the coarsest bounds memory, each finer one has at most twice its pixels a side.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,15 +15,34 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.dense.clues import Clues
-from capture.dense.depth_fusion import add_focus_votes
+from capture.dense.depth_priors import Clues, add_focus_votes
 from capture.dense.finish import DenseDepth, FinishSettings, Surface, finished
-from capture.dense.labelling import Penalties, label_planes
-from capture.dense.levels import halvings, level_sizes, scaled_size
-from capture.dense.plane_sweep import Costs, Matching, plane_sweep
-from capture.dense.plane_sweep_planes import by_parallax, dioptre_planes, pixels_per_dioptre
-from capture.dense.plane_sweep_refinement import Refined, refine
-from capture.poses.sweep_view import SweepView
+from capture.dense.guided_depth import Penalties, label_planes
+from capture.dense.plane_sweep import Costs, Matching, Refined, by_parallax, dioptre_planes, pixels_per_dioptre, plane_sweep, refine
+from capture.dense.sweep_view import SweepView
+
+_FACTOR = 2.0
+
+
+def level_sizes(width_px: int, height_px: int, planes: int, most_cells: int) -> list[tuple[int, int]]:
+    """(width, height) from the coarsest level, of at most `most_cells` pixels times planes, to the full picture."""
+    shrink = max(1.0, np.sqrt(width_px * height_px * planes / most_cells))
+    steps = int(np.ceil(np.log(shrink) / np.log(_FACTOR) - 1e-9))
+    scales = [shrink ** (-(steps - k) / steps) for k in range(steps)] + [1.0] if steps else [1.0]
+    widths = [max(int(width_px * scale), 1) if scale < 1.0 else width_px for scale in scales]
+    return [scaled_size((width_px, height_px), width / width_px) for width in widths]
+
+
+def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """(width, height) in whole pixels."""
+    return max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
+
+
+def halvings(step: float, finest: float) -> list[float]:
+    """Half of the step, half of that and so on, down to `finest` or a little below; one at least."""
+    count = max(int(np.ceil(np.log2(step / finest) - 1e-9)), 1)
+    return [step * 0.5 ** (k + 1) for k in range(count)]
+
 
 Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]

@@ -1,4 +1,7 @@
-"""The last step of dense depth: edges on those of the picture, trust in each pixel, focus where views know less, gaps filled."""
+"""The last step of dense depth: edges on those of the picture, trust in each pixel, focus where views know less, gaps filled.
+
+How sure a dense depth is: from the agreement of views, the lead over the next best plane, focus, and other views' depths.
+"""
 
 from dataclasses import dataclass
 
@@ -6,15 +9,37 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from capture.dense.clues import Clues
-from capture.dense.confidence import either, sweep_trust, with_consistency
-from capture.dense.consistency import consistency
-from capture.dense.depth_fusion import FocusVote, agreement
-from capture.dense.edges import near_steps, weighted_medians
-from capture.dense.smoothing import interpolate
-from capture.poses.sweep_view import BRIGHTEST, SweepView
+from capture.dense.depth_priors import Clues, Consistency, FocusVote, agreement, consistency
+from capture.dense.guided_depth import interpolate, near_steps, weighted_medians
+from capture.dense.sweep_view import BRIGHTEST, SweepView
 
 Plane = Float32[np.ndarray, "height width"]
+
+_MARGIN_OF_HALF = 20.0
+_LEAST_SCORE, _FULL_SCORE = 0.2, 0.8
+_CONTRADICTED = 0.2
+
+
+def sweep_trust(score: Plane, margin: Plane) -> Plane:
+    """From 0 to 1. score: correlation of the windows; margin: lead of the plane over all others, in units of cost per path (`Labels`).
+
+    Measured on traced scenes: with a margin below 50 one pixel in four is wrong, above it one in a hundred.
+    """
+    agreeing = np.clip((score - _LEAST_SCORE) / (_FULL_SCORE - _LEAST_SCORE), 0.0, 1.0)
+    return (agreeing * margin / (margin + _MARGIN_OF_HALF)).astype(np.float32)
+
+
+def either(a: Plane, b: Plane) -> Plane:
+    """Trust in what two witnesses vouch for, each on its own."""
+    return (1.0 - (1.0 - a) * (1.0 - b)).astype(np.float32)
+
+
+def with_consistency(trust: Plane, seen: Consistency) -> Plane:
+    """More where another view's depth has the same surface, little where more views see through it than have it."""
+    supported = np.where(seen.supports > 0, 1.0 - 0.5 * (1.0 - trust), trust)
+    return np.where(seen.contradictions > seen.supports, _CONTRADICTED * trust, supported).astype(np.float32)
+
+
 Rgb = Float32[np.ndarray, "height width 3"]
 
 SWEEP, FOCUS, FILLED = 0, 1, 2

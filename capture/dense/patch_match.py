@@ -3,6 +3,8 @@
 The packages pycolmap and pycolmap-cuda12 hold one module of the same name: never install both. `pycolmap.has_cuda` tells how the
 module was built, not whether a GPU is there, and COLMAP ends the whole process where none is: so the driver is asked first.
 Not run in the project's own tests, for want of such a machine; what surrounds the call is.
+
+PatchMatch depths of a whole scene as clues for its dense depth; run once, in SCENE/reconstruction/patch_match.
 """
 
 import ctypes
@@ -12,9 +14,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.dense.clues import SparseDepths
-from capture.poses.distortion import Distortion, undistorted_px
+from capture.dense.depth_priors import SparseDepths
+from capture.poses.colmap import JOB_NAME, RECONSTRUCTION_FOLDER
+from capture.poses.colmap_job import job_from_json
+from capture.poses.sparse_model import Distortion, SparseModel, undistorted_px
 from mrbokeh.optics.camera import Camera
+from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
@@ -89,3 +94,28 @@ def patch_match_clue(depth_m: Plane) -> SparseDepths:
     """All known pixels as depths known at single places, for `Clues.sparse`: the sweep then looks only near them."""
     row, column = np.nonzero(np.isfinite(depth_m))
     return SparseDepths(np.stack([column + 0.5, row + 0.5], axis=-1), depth_m[row, column].astype(np.float64))
+
+
+WORKSPACE = "patch_match"
+_FINISHED = "finished"
+
+
+class PatchMatchScene:
+    """model: in COLMAP's own unit, with its scale. Raises InputError where PatchMatch cannot run."""
+
+    def __init__(self, scene: Path, model: SparseModel) -> None:
+        obstacle = patch_match_obstacle()
+        if obstacle:
+            raise InputError(obstacle)
+        folder = scene / RECONSTRUCTION_FOLDER
+        job = job_from_json(read_json(folder / JOB_NAME, "what COLMAP was asked to do (run `mrbokeh capture poses --overwrite`)"))
+        self._job, self._model, self._workspace = job, model, folder / WORKSPACE
+        if not (self._workspace / _FINISHED).is_file():
+            run_patch_match(folder / "sparse", folder / job.pictures_folder, self._workspace)
+            (self._workspace / _FINISHED).touch()
+
+    def depths_in(self, name: str) -> SparseDepths:
+        """Every pixel of a view that PatchMatch knows, in metres."""
+        view = self._model.view(name)
+        depth = read_patch_match(self._workspace, self._job.file_of(name), view.camera, view.distortion)
+        return patch_match_clue((depth * np.float32(self._model.metres_per_unit)).astype(np.float32))

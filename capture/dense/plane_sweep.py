@@ -3,6 +3,10 @@
 Collins 1996 (A space-sweep approach to true multi-image matching), with zero-mean normalised cross-correlation in windows and
 the mean of the best few neighbours (Kang, Szeliski and Chai 2001), so that a view in which a point is hidden has no say.
 Planes lie equally apart in dioptres: so do their pictures in a neighbour, and so does blur.
+
+Planes of a sweep, equally spaced in dioptres: steps that move the picture of the widest neighbour by so many pixels.
+
+A second, fine sweep around a surface: windows slant with it, so that steep surfaces are matched as sharply as those that face us.
 """
 
 from collections.abc import Sequence
@@ -12,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from capture.poses.sweep_view import Plane, SweepView, packed_view, rays_of
+from capture.dense.sweep_view import Plane, SweepView, neighbour_from_reference, packed_view, rays_of
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.workers import in_bands, workers
 
@@ -107,3 +111,107 @@ class PlaneScores:
         best = np.empty(each.shape[1:], np.float32)
         mean_of_best(each, matching.best_of(len(self._views)), best)
         return best
+
+
+LEAST_PARALLAX_PX = 8.0
+_PROBES = 5
+
+
+def pixels_per_dioptre(reference: SweepView, neighbour: SweepView, nearest_dioptre: float, farthest_dioptre: float) -> float:
+    """The fastest that a point moves in the neighbour's picture with its dioptre (0 for a neighbour at the same place)."""
+    camera = reference.camera
+    x, y = np.meshgrid(np.linspace(0.0, camera.width_px, _PROBES), np.linspace(0.0, camera.height_px, _PROBES))
+    plane = (np.stack([x, y], axis=-1) - camera.principal_px) / np.asarray(camera.focal_px)
+    rays = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
+    pose = neighbour_from_reference(camera, neighbour.camera)
+    rotated = rays @ pose[:3, :3].T
+    fastest = 0.0
+    for dioptre in np.linspace(farthest_dioptre, nearest_dioptre, _PROBES):
+        x_y_z = rotated + dioptre * pose[:3, 3]
+        before = x_y_z[..., 2] > 1e-3
+        if before.any():
+            moves = (pose[:2, 3] * x_y_z[..., 2:] - x_y_z[..., :2] * pose[2, 3]) / x_y_z[..., 2:] ** 2
+            fastest = max(fastest, float(np.linalg.norm(moves * neighbour.camera.focal_px, axis=-1)[before].max()))
+    return fastest
+
+
+def dioptre_planes(
+    reference: SweepView, neighbours: Sequence[SweepView], dioptre_range: tuple[float, float], step_px: float = 0.5, most: int = 0
+) -> Float[np.ndarray, " planes"]:
+    """Dioptres from far to near (ascending) in steps of at most `step_px` in the widest neighbour; `most` > 0 caps their number.
+
+    dioptre_range: (farthest, nearest), 1 / metres. Raises InputError where no neighbour stands apart from the reference.
+    """
+    farthest, nearest = dioptre_range
+    if not 0.0 <= farthest < nearest:
+        raise InputError(f"a plane sweep needs a range of depths from far to near, got {farthest:g} to {nearest:g} dioptres")
+    rates = [pixels_per_dioptre(reference, each, nearest, farthest) for each in neighbours]
+    travel_px = max(rates, default=0.0) * (nearest - farthest)
+    if travel_px < 1.0:
+        raise InputError(
+            f"no neighbouring view shows parallax (the largest shift is {travel_px:.2f} px over the range of depths): "
+            f"photograph from places that lie apart, or keep the depth from focus"
+        )
+    count = int(np.ceil(travel_px / step_px)) + 1
+    return np.linspace(farthest, nearest, min(count, most) if most else count)
+
+
+def by_parallax(reference: SweepView, neighbours: Sequence[SweepView], dioptre_range: tuple[float, float]) -> list[SweepView]:
+    """The neighbours, least parallax first, for in those planes lie densest; but last those that show too little to tell depth."""
+    farthest, nearest = dioptre_range
+
+    def place(neighbour: SweepView) -> tuple[bool, float]:
+        travel_px = pixels_per_dioptre(reference, neighbour, nearest, farthest) * (nearest - farthest)
+        return travel_px < LEAST_PARALLAX_PX, travel_px
+
+    return sorted(neighbours, key=place)
+
+
+_LEAST_CURVATURE = 1e-4
+
+
+@dataclass(frozen=True)
+class Refined:
+    """dioptre (H, W); score: correlation there, -1..1 (-2 where no neighbour sees the point); curvature: how sharply the score falls
+    off within a step, 0 where the best is at the end of the shell; there the dioptre is left as it was."""
+
+    dioptre: Plane
+    score: Plane
+    curvature: Plane
+
+
+def refine(
+    reference: SweepView,
+    neighbours: Sequence[SweepView],
+    base_dioptre: Plane,
+    step_dioptre: float,
+    reach: int = 2,
+    matching: Matching | None = None,
+) -> Refined:
+    """The best of 2 reach + 1 surfaces, step_dioptre apart, around base_dioptre, and between them by a parabola."""
+    sweep = PlaneScores(reference, neighbours, matching or Matching(), base_dioptre)
+    offsets = [step_dioptre * k for k in range(-reach, reach + 1)]
+    result = Refined(*(np.empty_like(base_dioptre) for _ in range(3)))
+
+    def fill(first: int, end: int) -> None:
+        best, score, curvature = _peak(np.stack([sweep.of_rows(first, end, offset) for offset in offsets]))
+        result.dioptre[first:end] = base_dioptre[first:end] + step_dioptre * (best - reach)
+        result.score[first:end], result.curvature[first:end] = score, curvature
+
+    height, width = base_dioptre.shape
+    with workers(height * width) as pool:
+        in_bands(pool, height, _LEAST_BAND, fill)
+    return result
+
+
+def _peak(
+    scores: Float32[np.ndarray, "offsets rows width"],
+) -> tuple[Float32[np.ndarray, "rows width"], Float32[np.ndarray, "rows width"], Float32[np.ndarray, "rows width"]]:
+    """(fractional index of the peak, its score, its curvature); the middle index and curvature 0 where the peak is at an end."""
+    best = scores.argmax(axis=0)
+    middle, inside = len(scores) // 2, (best > 0) & (best < len(scores) - 1)
+    at = np.where(inside, best, middle)
+    before, here, after = (np.take_along_axis(scores, (at + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    curvature = np.where(inside, 2.0 * here - before - after, 0.0)
+    offset = np.where(curvature > _LEAST_CURVATURE, 0.5 * (after - before) / np.maximum(curvature, _LEAST_CURVATURE), 0.0)
+    return (at + np.clip(offset, -0.5, 0.5)).astype(np.float32), here, np.maximum(curvature, 0.0).astype(np.float32)

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.dense.plane_sweep import Matching
-from capture.poses.distortion import distorted_px, undistorted_px
-from capture.poses.sweep_view import SweepView
+from capture.dense.sweep_view import SweepView
+from capture.poses.sparse_model import distorted_px, undistorted_px
 
 Score = Float[np.ndarray, "height width"]
 

@@ -1,29 +1,96 @@
-"""Match-move of a clip: keyframes to COLMAP, then every frame against the model that comes back."""
+"""Match-move of a clip: keyframes to COLMAP, then every frame against the model that comes back.
 
-from collections.abc import Iterator, Mapping
+Keyframes of a clip, evenly spread over the motion of the picture: none where the camera rests, many where it is thrown.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float64
 
-from capture.matchmove.doubts import doubts, require_walking
 from capture.matchmove.frame_poses import FramePose, poses_between
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, ruler_scale
-from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip, view_name, write_keyframes
+from capture.matchmove.quality_warnings import doubts, require_walking
 from capture.poses.colmap import PoseSettings, find_picture_poses
 from capture.poses.colmap_matches import median_parallax_deg
 from capture.poses.sparse_model import SparseModel, SparseView
+from capture.scale.answer import distance_scale
 from capture.scale.board import board_scale
-from capture.scale.distance import distance_scale
 from mrbokeh.optics.camera import Camera
+from mrbokeh.system.console import track
 from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.tracking.charuco.board import CharucoBoard
+from mrbokeh.tracking.charuco.corner_flow import flow
 from mrbokeh.tracking.charuco.detector import Grey
 from mrbokeh.video.clip import VideoInfo, probe, read_display_frames
+
+_SEARCH_WIDTH_PX = 480
+_FEATURES = 200
+_APART_SHARE = 0.035
+"""Of the picture's width, by which neighbouring keyframes differ where there may be keyframes enough."""
+
+_FEWEST = 8
+_LOST_SHARE = 0.1
+"""Motion counted for a step in which no feature could be followed: a fast blur."""
+
+
+def motion_of_clip(clip: Path, info: VideoInfo) -> Float64[np.ndarray, " frames"]:
+    """Of each frame, how far the picture has moved since the first one: the sum of median displacements, in picture widths."""
+    width_px = min(_SEARCH_WIDTH_PX, info.width_px)
+    height_px = max(16, round(info.height_px * width_px / info.width_px))
+    moved: list[float] = []
+    before: Grey | None = None
+    for frame in track(read_display_frames(clip, width_px, height_px), "motion", info.frame_count or 0):
+        grey = cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
+        moved.append(0.0 if before is None else _step(before, grey) / width_px)
+        before = grey
+    return np.cumsum(np.array(moved, np.float64))
+
+
+def chosen_keyframes(motion: Float64[np.ndarray, " frames"], most: int) -> list[int]:
+    """Frame numbers; the first and the last are always among them."""
+    count = int(np.clip(motion[-1] / _APART_SHARE + 1, _FEWEST, most))
+    if count >= len(motion):
+        return list(range(len(motion)))
+    # A little of plain time keeps places apart where nothing moves.
+    along = motion + 1e-3 * np.arange(len(motion)) / len(motion)
+    wanted = np.linspace(along[0], along[-1], count)
+    return sorted({int(each) for each in np.abs(along[:, None] - wanted).argmin(axis=0)} | {0, len(motion) - 1})
+
+
+def write_keyframes(clip: Path, info: VideoInfo, numbers: Sequence[int], folder: Path) -> None:
+    """frame_000012.png, as the codes of the video are, at its full size; those that lie there already stay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = {number: folder / f"{view_name(number)}.png" for number in numbers}
+    for stale in set(folder.glob("frame_*.png")) - set(wanted.values()):
+        stale.unlink()
+    if all(path.exists() for path in wanted.values()):
+        return
+    for number, frame in enumerate(track(read_display_frames(clip, info.width_px, info.height_px), "keyframes", info.frame_count or 0)):
+        if number in wanted:
+            cv2.imwrite(str(wanted[number]), frame.bgr)
+
+
+def view_name(number: int) -> str:
+    return f"frame_{number:06d}"
+
+
+def _step(before: Grey, grey: Grey) -> float:
+    """Median displacement in pixels."""
+    places = cv2.goodFeaturesToTrack(before, _FEATURES, 0.01, 8.0)
+    if places is None:
+        return 0.0
+    start = places.reshape(-1, 2).astype(np.float64) + 0.5
+    there, good = flow(before, grey, start)
+    if np.count_nonzero(good) < 0.1 * len(start):
+        return _LOST_SHARE * grey.shape[1]
+    return float(np.median(np.linalg.norm(there[good] - start[good], axis=1)))
+
 
 _STILL_SHARE = 0.02
 

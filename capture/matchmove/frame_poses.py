@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from capture.poses.distortion import Distortion, undistorted_px
-from capture.poses.sparse_model import SparseModel, SparseView
+from capture.poses.sparse_model import Distortion, SparseModel, SparseView, undistorted_px
 from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.camera_track.between_frames import camera_between
+from mrbokeh.tracking.camera_track.track import camera_between
 from mrbokeh.tracking.charuco.corner_flow import flow
 from mrbokeh.tracking.charuco.detector import Grey
 from mrbokeh.tracking.charuco.pose_from_points import Pose, opencv_matrix

@@ -1,4 +1,7 @@
-"""The world of a match-move on the ground: a plane through points of the model around picked pixels, the first pick as its origin."""
+"""The world of a match-move on the ground: a plane through points of the model around picked pixels, the first pick as its origin.
+
+Pixels of a clip as people write them: FRAME:X,Y/X,Y/...
+"""
 
 from dataclasses import dataclass
 
@@ -101,3 +104,40 @@ def _on_plane(view: SparseView, xy_px: np.ndarray, normal: np.ndarray, offset: f
     if not 0.0 < along < float("inf"):
         raise InputError(f"the pixel {xy_px[0]:g},{xy_px[1]:g} looks above the horizon of the ground: pick one on the ground")
     return view.centre + along * ray
+
+
+def parse_ground(text: str) -> GroundPicks:
+    """FRAME:X,Y/X,Y/X,Y, three pixels or more."""
+    expected = "--ground must be FRAME:X,Y/X,Y/X,Y, three pixels or more with ground between them, such as 0:300,900/1500,900/900,700"
+    try:
+        frame, pixels = text.split(":")
+        picks = GroundPicks(int(frame), np.array([_pixel(each) for each in pixels.split("/")], np.float64))
+    except ValueError:
+        raise InputError(f"{expected}, got {text!r}") from None
+    if len(picks.xy_px) < 3 or picks.frame < 0:
+        raise InputError(f"{expected}, got {text!r}")
+    return picks
+
+
+def parse_ruler(text: str) -> Ruler:
+    """FRAME:X,Y/X,Y/METRES."""
+    try:
+        frame, rest = text.split(":")
+        one, other, metres = rest.split("/")
+        return Ruler(int(frame), np.array([_pixel(one), _pixel(other)], np.float64), float(metres))
+    except ValueError:
+        raise InputError(f"--ruler must be FRAME:X,Y/X,Y/METRES such as 0:300,900/1500,900/2.4, got {text!r}") from None
+
+
+def parse_frame_distance(text: str) -> tuple[int, int, float]:
+    """FRAME_A,FRAME_B,METRES."""
+    try:
+        one, other, metres = text.split(",")
+        return int(one), int(other), float(metres)
+    except ValueError:
+        raise InputError(f"--distance must be FRAME,FRAME,METRES such as 0,120,1.5, got {text!r}") from None
+
+
+def _pixel(text: str) -> tuple[float, float]:
+    x, y = text.split(",")
+    return float(x), float(y)

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.poses.sparse_model import SparseModel
-from capture.poses.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
+from capture.poses.sparse_model import POSES_NAME, SCALE_NAME, SparseModel, read_sparse_model
 from capture.report.gates import Gate, Rule
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.atomic_files import read_json

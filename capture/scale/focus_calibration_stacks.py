@@ -17,9 +17,8 @@ from capture.poses.lens_calibration import (
 )
 from capture.poses.sparse_model import SparseModel, SparseView
 from capture.scale.focus import FocusSample
-from capture.scale.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit, FocusStart, calibrate_focus
-from capture.scale.focus_calibration_blur import WINDOW_PX, Plane, measure_blur
-from capture.stacks.sentinel_focus import stated_by_sentinel
+from capture.scale.focus_calibration import FOCUS_SIGMA_DIOPTRE, WINDOW_PX, FocusFit, FocusStart, Plane, calibrate_focus, measure_blur
+from capture.stacks.slice_files import stated_by_sentinel
 from mrbokeh.images.color import luminance
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import METRES, FocalStack

@@ -1,4 +1,7 @@
-"""The scale of a scene's camera poses in metres by every means at hand, and what follows from it: calibrated focus, metric cameras."""
+"""The scale of a scene's camera poses in metres by every means at hand, and what follows from it: calibrated focus, metric cameras.
+
+What was found about scale and focus, in lines for people.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -10,16 +13,12 @@ from jaxtyping import UInt8
 
 from capture.poses.colmap_job import job_from_json
 from capture.poses.lens_calibration import FILE_NAME as CALIBRATION_NAME
-from capture.poses.lens_calibration import LensCalibration, write_lens_calibration
-from capture.poses.lens_calibration_stacks import write_calibrated
-from capture.poses.sparse_model import SparseModel
-from capture.poses.sparse_model_file import POSES_NAME, SCALE_NAME, read_sparse_model
-from capture.scale.answer import ScaleAnswer
+from capture.poses.lens_calibration import LensCalibration, write_calibrated, write_lens_calibration
+from capture.poses.sparse_model import POSES_NAME, SCALE_NAME, SparseModel, read_sparse_model
+from capture.scale.answer import ScaleAnswer, ScaleResult, distance_scale, read_scale, write_scale
 from capture.scale.board import board_scale
-from capture.scale.distance import distance_scale
 from capture.scale.focus import FocusSample, focus_sample, focus_scale
 from capture.scale.focus_calibration_stacks import StackFocus, calibrated_stack, focus_start, lens_calibrations, stack_focus, with_view
-from capture.scale.scale_file import ScaleResult, read_scale, write_scale
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_NAME
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.guessed_metres import metres_facts
@@ -167,3 +166,33 @@ def numbered(name: str, number: int) -> str:
 def offset_of(result: ScaleResult) -> float:
     """The offset of the lens that came with the focus distances; 0 where they have no answer."""
     return next((float(each.facts["offset_m"]) for each in result.answers if each.method == "focus"), 0.0)
+
+
+def scale_lines(scaled: ScaledScene) -> Iterator[str]:
+    result = scaled.result
+    for each in result.answers:
+        difference = result.disagreement.get(each.method)
+        compared = "used" if difference is None else f"{100 * difference:+.2f} % from the one used"
+        yield (f"{each.method}: {each.metres_per_unit:.6g} metres per unit +- {100 * each.uncertainty:.3f} % ({compared}; {_basis(each)})")
+    for method, why in result.missing.items():
+        yield f"{method}: no answer, for {why}"
+    for method in result.contradictions:
+        yield f"warning: {method} contradicts {result.used.method}: measure the print or the distance again, or check the focus distances"
+    for name, found in scaled.calibrated.items():
+        fit = found.fit
+        yield (
+            f"{name}: focus from {1 / fit.dioptres.max():.3f} to {1 / max(fit.dioptres.min(), 1e-6):.3f} m "
+            f"+- {float(np.median(fit.sigma_dioptre)):.4f} dioptres, blur {np.median(fit.px_per_dioptre):.2f} px per dioptre"
+        )
+    for name, why in scaled.uncalibrated.items():
+        yield f"{name}: focus not calibrated ({why})"
+
+
+def _basis(answer: ScaleAnswer) -> str:
+    facts = answer.facts
+    if answer.method == "board":
+        return f"{facts['detections']} sightings of {facts['corners']} corners, residual {facts['residual_px']:.2f} px"
+    if answer.method == "distance":
+        return f"{facts['metres']:g} m between {' and '.join(facts['views'])}, for a ruler of 1 mm"
+    offset = f"offset of the lens {1000 * facts['offset_m']:+.0f} mm"
+    return f"{facts['points']} points of {facts['stacks']} stacks, {offset}, residual {facts['residual_dioptre']:.3f} dioptres"

@@ -1,11 +1,15 @@
-"""The words of `mrbokeh capture shoot` on the command line, read."""
+"""The words of `mrbokeh capture shoot` on the command line, read.
+
+The camera that a word on the command line stands for.
+"""
 
 from fractions import Fraction
+from pathlib import Path
 
+from capture.tether.camera_driver import CameraDriver, FocusSteps, Stop
+from capture.tether.focus_motor import Target
 from capture.tether.focus_plan import FocusPlan
-from capture.tether.focus_steps import FocusSteps, Stop
-from capture.tether.focus_sweep import Target
-from capture.tether.live_reading import Spot
+from capture.tether.live_view import Spot
 from mrbokeh.system.errors import InputError
 
 
@@ -58,3 +62,21 @@ def parse_target(text: str) -> Target:
     if spot is None or not equals or not distance_m > 0.0:
         raise InputError(f"--target must be X,Y=METRES, such as 0.3,0.5=0.6, got {text!r}")
     return Target(spot, distance_m)
+
+
+def open_named(name: str, plan: FocusPlan, *, timeout_s: float, focus_level: int, reverse_focus: bool) -> CameraDriver:
+    """gphoto2, gphoto2:PORT, folder:DIR or simulated."""
+    kind, _, rest = name.partition(":")
+    if kind == "gphoto2":
+        from capture.tether.gphoto2_camera import open_camera
+
+        return open_camera(rest or None, focus_level=focus_level, reverse_focus=reverse_focus)
+    if kind == "folder" and rest:
+        from capture.tether.watched_folder import WatchedFolder
+
+        return WatchedFolder(Path(rest), timeout_s=timeout_s)
+    if name == "simulated":
+        from capture.tether.simulated_camera import SimulatedCamera
+
+        return SimulatedCamera.for_plan(plan)
+    raise InputError(f"--camera must be gphoto2, gphoto2:PORT, folder:DIR or simulated, got {name!r}")

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.poses.sparse_model_file import read_sparse_model
+from capture.poses.sparse_model import read_sparse_model
+from capture.scale.answer import read_scale
 from capture.scale.board import umeyama
-from capture.scale.scale_file import read_scale
 from datasets_scripts.lab_scene import BOARD_MARKER_M, BOARD_SQUARE_M, BOARD_SQUARES
 from datasets_scripts.make_raw_stack import make_raw_stack
 from datasets_scripts.raw_stack_truth import StackPlan

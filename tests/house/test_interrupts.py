@@ -62,7 +62,7 @@ def test_what_is_kept_and_how_to_go_on(
 def test_a_camera_is_let_go_when_a_shoot_is_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from capture.tether.simulated import SimulatedCamera
+    from capture.tether.simulated_camera import SimulatedCamera
 
     write_lens(tmp_path / "lens.json", Lens(50.0, 2.0, 1.0, 36.0))
     plan = ["--near", "0.8", "--far", "3", "--image-width", "100", "--out", f"{tmp_path}/plan.json"]

@@ -7,9 +7,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-import capture.tether.gphoto2_cameras as cameras_module
+import capture.tether.gphoto2_camera as cameras_module
 from capture.commands.cameras import cameras_command
-from capture.tether.gphoto2_errors import explained
+from capture.tether.gphoto2_config import explained
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.system.gphoto2_library import library
 from tests.tether.test_gphoto2 import card, in_own_interpreter

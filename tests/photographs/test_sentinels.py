@@ -7,17 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.merging.breathing import breathing_of
+from capture.merging.registration.registration_file import breathing_of
 from capture.photos.focus_metadata import FocusReading, at_infinity
 from capture.photos.photo_metadata import PhotoMetadata
-from capture.photos.stated_focus import StatedFocus
-from capture.report.focus_spacing import focus_spacing
-from capture.scale.focus import FocusSample, focus_scale, stated_sigma_dioptre
+from capture.photos.sidecar import StatedFocus
+from capture.report.findings import focus_spacing
+from capture.scale.focus import FocusSample, focus_scale, sharpness_peaks, stated_sigma_dioptre
 from capture.scale.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit
 from capture.scale.focus_calibration_stacks import StackFocus, focus_start, lens_calibrations
-from capture.scale.sharpness import sharpness_peaks
 from capture.stacks.ingest import ingest
-from capture.stacks.sentinel_focus import bounded_focus_records, stated_by_sentinel
+from capture.stacks.slice_files import bounded_focus_records, stated_by_sentinel
 from mrbokeh.optics.lens import Lens, lens_distance_m
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack
 from tests.scenes.made_photographs import LENS, make_shoot, only_stack, sources

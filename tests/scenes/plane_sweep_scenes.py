@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.poses.sweep_view import SweepView, structure_of
+from capture.dense.sweep_view import SweepView, structure_of
 from datasets_scripts.procedural_textures import mottled
 from datasets_scripts.thin_lens_tracer import trace_pinhole
 from datasets_scripts.traced_scene import Quad, Scene, emissive_quad, plain_texture

@@ -6,15 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.tether.camera_driver import CameraDescription, CameraSettings, EndStop, Preview, Shot
-from capture.tether.focus_axis import FocusAxis, TravelEndError
+from capture.tether.camera_driver import (
+    CameraDescription,
+    CameraSettings,
+    EndStop,
+    FocusSteps,
+    Preview,
+    Shot,
+    Stop,
+    read_focus_steps,
+    write_focus_steps,
+)
+from capture.tether.focus_motor import FocusAxis, FocusSweep, Target, TravelEndError, measure_focus_steps, peak_steps
 from capture.tether.focus_plan import FocusRange, plan_focus
-from capture.tether.focus_steps import FocusSteps, Stop, read_focus_steps, write_focus_steps
-from capture.tether.focus_sweep import FocusSweep, Target, measure_focus_steps, peak_steps
-from capture.tether.live_reading import Spot, read_live
-from capture.tether.live_table import show_live
-from capture.tether.simulated import SimulatedCamera
-from capture.tether.simulated_motor import SimulatedMotor
+from capture.tether.live_view import Spot, read_live, show_live
+from capture.tether.simulated_camera import SimulatedCamera, SimulatedMotor
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 

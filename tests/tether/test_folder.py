@@ -8,13 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.tether.camera_driver import CameraError, CameraSettings
+from capture.tether.camera_driver import CameraError, CameraSettings, Stop
 from capture.tether.focus_plan import FocusRange, plan_focus
-from capture.tether.focus_steps import Stop
-from capture.tether.shoot import shoot
-from capture.tether.shoot_options import ShootOptions, Surroundings
-from capture.tether.watched_folder import WatchedFolder
-from capture.tether.whole_photo import is_whole
+from capture.tether.shoot import ShootOptions, Surroundings, shoot
+from capture.tether.watched_folder import WatchedFolder, is_whole
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
 from mrbokeh.optics.lens import Lens

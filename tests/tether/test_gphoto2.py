@@ -19,14 +19,11 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.tether.camera_driver import Ability, CameraError, CameraSettings, EndStop
-from capture.tether.focus_axis import FocusAxis
-from capture.tether.focus_steps import Stop
-from capture.tether.gphoto2_camera import Gphoto2Camera
-from capture.tether.gphoto2_config import CameraConfig, number_in
-from capture.tether.gphoto2_focus import CANON_STEPS_HOME
-from capture.tether.gphoto2_settings import is_fixed_white_balance, is_manual, is_off, is_raw_only
-from capture.tether.simulated_motor import SimulatedMotor
+from capture.tether.camera_driver import Ability, CameraError, CameraSettings, EndStop, Stop
+from capture.tether.focus_motor import FocusAxis
+from capture.tether.gphoto2_camera import CANON_STEPS_HOME, Gphoto2Camera
+from capture.tether.gphoto2_config import CameraConfig, is_fixed_white_balance, is_manual, is_off, is_raw_only, number_in
+from capture.tether.simulated_camera import SimulatedMotor
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
 from mrbokeh.optics.lens import Lens
@@ -38,7 +35,7 @@ SCRIPT = """
 import json, sys, warnings
 warnings.simplefilter("error")
 from capture.tether.camera_driver import CameraSettings
-from capture.tether.gphoto2_cameras import list_cameras, open_camera
+from capture.tether.gphoto2_camera import list_cameras, open_camera
 from mrbokeh.system.errors import InputError
 
 def sentence(what):

@@ -12,8 +12,18 @@ import typer
 from typer.testing import CliRunner
 
 from capture.commands.plan import plan_command
-from capture.tether.focus_plan import MOST_SLICES, FocusPlan, FocusRange, on_scale, plan_focus, plan_for_motor
-from capture.tether.plan_file import plan_from_json, plan_to_json, read_plan, write_plan
+from capture.tether.focus_plan import (
+    MOST_SLICES,
+    FocusPlan,
+    FocusRange,
+    on_scale,
+    plan_focus,
+    plan_for_motor,
+    plan_from_json,
+    plan_to_json,
+    read_plan,
+    write_plan,
+)
 from mrbokeh.optics.lens import Lens, film_plane_m, lens_distance_m
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError

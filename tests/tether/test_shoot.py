@@ -16,16 +16,12 @@ from typer.testing import CliRunner
 from capture.commands.shoot import shoot_command
 from capture.photos.metadata import read_metadata
 from capture.stacks.ingest import ingest
-from capture.tether.camera_driver import CameraError, CameraSettings, Shot
-from capture.tether.focus_plan import FocusPlan, FocusRange, plan_focus
-from capture.tether.focus_steps import FocusSteps, Stop, read_focus_steps
-from capture.tether.plan_file import write_plan
+from capture.tether.camera_driver import CameraError, CameraSettings, FocusSteps, Shot, Stop, read_focus_steps
+from capture.tether.focus_plan import FocusPlan, FocusRange, plan_focus, write_plan
 from capture.tether.saved_shot import save_shot
-from capture.tether.shoot import shoot
+from capture.tether.shoot import ShootOptions, Surroundings, shoot
 from capture.tether.shoot_log import read_log
-from capture.tether.shoot_options import ShootOptions, Surroundings
-from capture.tether.simulated import SimulatedCamera
-from capture.tether.simulated_picture import unstated
+from capture.tether.simulated_camera import SimulatedCamera, unstated
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
 from mrbokeh.optics.lens import Lens

@@ -9,11 +9,9 @@ import pytest
 from jaxtyping import Float32
 
 from capture.photos.metadata import read_metadata
-from capture.tether.camera_driver import Ability, CameraSettings
+from capture.tether.camera_driver import Ability, CameraSettings, Stop
 from capture.tether.focus_plan import FocusRange, plan_focus
-from capture.tether.focus_steps import Stop
-from capture.tether.simulated import SimulatedCamera
-from capture.tether.simulated_picture import nikon_code, to_centimetre, unstated
+from capture.tether.simulated_camera import SimulatedCamera, nikon_code, to_centimetre, unstated
 from capture.tether.simulated_scene import Card, SimulatedScene
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.lens import Lens, film_plane_m
@@ -70,7 +68,7 @@ def test_breathing_moves_an_edge_outwards() -> None:
 
 
 def test_each_card_is_sharpest_in_its_focus() -> None:
-    from capture.tether.live_reading import Spot, sharpness
+    from capture.tether.live_view import Spot, sharpness
 
     spots = {2.0: Spot(0.22, 0.58, 0.2), 1.2: Spot(0.73, 0.44, 0.2), 0.4: Spot(0.5, 0.9, 0.1)}
     frames = {focus: camera_at(focus).preview() for focus in spots}

@@ -11,12 +11,10 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from capture.cli import app
-from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
+from capture.matchmove.clip_matchmove import MatchmoveSettings, chosen_keyframes, matchmove_clip, motion_of_clip
 from capture.matchmove.frame_poses import poses_between
-from capture.matchmove.ground import GroundPicks, Ruler, on_ground, ruler_scale
-from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip
-from capture.matchmove.only_turning import model_residual_px, turning_residual_px
-from capture.matchmove.picks import parse_frame_distance, parse_ground, parse_ruler
+from capture.matchmove.ground import GroundPicks, Ruler, on_ground, parse_frame_distance, parse_ground, parse_ruler, ruler_scale
+from capture.matchmove.quality_warnings import model_residual_px, turning_residual_px
 from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError

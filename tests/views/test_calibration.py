@@ -14,13 +14,12 @@ from capture.poses.lens_calibration import (
     CalibratedFocus,
     LensCalibration,
     apply_lens_calibration,
+    calibrate_scene,
     read_lens_calibration,
     stated_distances_m,
     write_lens_calibration,
 )
-from capture.poses.lens_calibration_stacks import calibrate_scene
-from capture.scale.focus_calibration import FocusStart, _Fit, calibrate_focus
-from capture.scale.focus_calibration_blur import BlurSamples, measure_blur
+from capture.scale.focus_calibration import BlurSamples, FocusStart, _Fit, calibrate_focus, measure_blur
 from capture.scale.focus_calibration_stacks import StackFocus, lens_calibrations, reduced, spread_points
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.aperture import Aperture

@@ -6,19 +6,23 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from capture.dense._labelling_numba import aggregate
-from capture.dense.clues import Clues, SparseDepths
-from capture.dense.confidence import sweep_trust, with_consistency
-from capture.dense.consistency import Consistency, ViewDepth, consistency
-from capture.dense.dense_depth import DenseSettings, dense_depth
-from capture.dense.depth_fusion import FocusVote
-from capture.dense.edges import near_steps, weighted_medians, weighted_medians_plainly
-from capture.dense.finish import FILLED, FOCUS, SWEEP, DenseDepth
-from capture.dense.labelling import Penalties, aggregate_plainly, label_planes
-from capture.dense.levels import halvings, level_sizes
+from capture.dense._guided_numba import aggregate
+from capture.dense.dense_depth import DenseSettings, dense_depth, halvings, level_sizes
+from capture.dense.depth_priors import Clues, Consistency, FocusVote, SparseDepths, ViewDepth, consistency
+from capture.dense.finish import FILLED, FOCUS, SWEEP, DenseDepth, sweep_trust, with_consistency
+from capture.dense.guided_depth import (
+    Penalties,
+    aggregate_plainly,
+    interpolate,
+    label_planes,
+    near_steps,
+    smooth,
+    smooth_plainly,
+    weighted_medians,
+    weighted_medians_plainly,
+)
 from capture.dense.patch_match import on_original_pixels, patch_match_clue, patch_match_obstacle
-from capture.dense.smoothing import interpolate, smooth, smooth_plainly
-from capture.poses.sweep_view import SweepView
+from capture.dense.sweep_view import SweepView
 from mrbokeh.optics.camera import Camera
 from tests.scenes.plane_sweep_scenes import FOCAL_PX, HEIGHT_PX, WIDTH_PX, TracedViews, card, grey_card, traced, wall
 

@@ -10,13 +10,12 @@ from typer.testing import CliRunner
 
 from capture.cli import app
 from capture.dataset.stack_writer import require_usable
-from capture.dense.patch_match_scene import PatchMatchScene
+from capture.dense.patch_match import PatchMatchScene
 from capture.dense.scene_depth import DEPTH_SOURCE, SceneDepthSettings, deepen_scene
+from capture.dense.sweep_view import nearest_views
 from capture.merging.merge import merge_scene
 from capture.poses.colmap_job import ColmapJob, ColmapPicture, job_to_json
-from capture.poses.neighbours import nearest_views
-from capture.poses.sparse_model import SparseModel, SparseView
-from capture.poses.sparse_model_file import read_sparse_model, write_sparse_model
+from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model, write_sparse_model
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
 from mrbokeh.demo.plan import DATA, VIEWS
@@ -188,9 +187,9 @@ def test_depths_of_patch_match_come_in_metres(merged: Path, tmp_path: Path, monk
     job = ColmapJob((ColmapPicture(VIEWS[0], f"{VIEWS[0]}.png", "", 0),), (None,))
     write_json(scene / "reconstruction" / "colmap_job.json", job_to_json(job))
     ran: list[Path] = []
-    monkeypatch.setattr("capture.dense.patch_match_scene.patch_match_obstacle", lambda: None)
-    monkeypatch.setattr("capture.dense.patch_match_scene.run_patch_match", lambda _s, _p, folder: (folder.mkdir(), ran.append(folder)))
-    monkeypatch.setattr("capture.dense.patch_match_scene.read_patch_match", lambda *_: np.full((2, 3), 3.0, np.float32))
+    monkeypatch.setattr("capture.dense.patch_match.patch_match_obstacle", lambda: None)
+    monkeypatch.setattr("capture.dense.patch_match.run_patch_match", lambda _s, _p, folder: (folder.mkdir(), ran.append(folder)))
+    monkeypatch.setattr("capture.dense.patch_match.read_patch_match", lambda *_: np.full((2, 3), 3.0, np.float32))
     for _ in range(2):
         found = PatchMatchScene(scene, model).depths_in(VIEWS[0])
     np.testing.assert_array_equal(found.depth_m, 1.5)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture.dense.depth_fusion import (
+from capture.dense.depth_priors import (
     SHARE_OF_FOCUS,
     FocusVote,
     add_focus_votes,

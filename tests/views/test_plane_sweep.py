@@ -7,11 +7,19 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.dense.plane_sweep import UNSEEN, WORST_COST, Matching, PlaneScores, plane_sweep
+from capture.dense.plane_sweep import (
+    UNSEEN,
+    WORST_COST,
+    Matching,
+    PlaneScores,
+    by_parallax,
+    dioptre_planes,
+    pixels_per_dioptre,
+    plane_sweep,
+    refine,
+)
 from capture.dense.plane_sweep_plainly import scores_of_surface
-from capture.dense.plane_sweep_planes import by_parallax, dioptre_planes, pixels_per_dioptre
-from capture.dense.plane_sweep_refinement import refine
-from capture.poses.sweep_view import BRIGHTEST, SweepView, structure_of
+from capture.dense.sweep_view import BRIGHTEST, SweepView, structure_of
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from tests.scenes.plane_sweep_scenes import FOCAL_PX, TracedViews, card, traced, wall
@@ -142,7 +150,7 @@ def test_a_distorted_picture_needs_its_distortion() -> None:
 
 def _bent(view: SweepView, k1: float) -> np.ndarray:
     """The picture that a lens with k1 takes instead: at a distorted place what the pinhole has at the undistorted one."""
-    from capture.poses.distortion import undistorted_px
+    from capture.poses.sparse_model import undistorted_px
 
     x, y = np.moveaxis(undistorted_px(view.camera, (k1, 0.0), view.camera.pixel_centres_px()) - 0.5, -1, 0).astype(np.float32)
     return cv2.remap(view.structure, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -7,7 +7,7 @@ import pytest
 
 from capture.dense.dense_depth import DenseSettings, dense_depth
 from capture.dense.plane_sweep import Matching, plane_sweep
-from capture.poses.sweep_view import SweepView
+from capture.dense.sweep_view import SweepView
 from mrbokeh.system.errors import InputError
 from tests.scenes.plane_sweep_scenes import card, traced, wall
 from tests.views.test_plane_sweep import turned_view

@@ -11,14 +11,22 @@ import typer
 from typer.testing import CliRunner
 
 from capture.commands import poses
-from capture.poses import colmap, colmap_process
-from capture.poses.colmap import PoseSettings, find_picture_poses, find_scene_poses
-from capture.poses.colmap_job import ColmapJob, ColmapPicture, camera_model_for, job_from_json, job_to_json
+from capture.poses import colmap
+from capture.poses.colmap import PoseSettings, find_picture_poses, find_scene_poses, run_colmap
+from capture.poses.colmap_job import (
+    ColmapJob,
+    ColmapPicture,
+    camera_model_for,
+    common_exposure_stops,
+    job_from_json,
+    job_to_json,
+    picture_cameras,
+    pictures_in,
+    stack_cameras,
+    write_stack_pictures,
+)
 from capture.poses.colmap_matches import failure_message, median_parallax_deg, weak_model_message
-from capture.poses.colmap_pictures import common_exposure_stops, picture_cameras, pictures_in, stack_cameras, write_stack_pictures
-from capture.poses.colmap_process import run_colmap
-from capture.poses.sparse_model import SparseModel, SparseView
-from capture.poses.sparse_model_file import write_sparse_model
+from capture.poses.sparse_model import SparseModel, SparseView, write_sparse_model
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
@@ -161,14 +169,14 @@ def test_the_death_of_colmap_is_one_sentence(tmp_path: Path) -> None:
 def test_an_abort_is_named_by_its_signal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dying_worker.py").write_text('import os\nprint(\'{"stage": "matches", "done": 1, "total": 3}\', flush=True)\nos.abort()\n')
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(colmap_process, "_WORKER", "dying_worker")
-    monkeypatch.setattr(colmap_process, "find_spec", lambda name: name)
+    monkeypatch.setattr(colmap, "_WORKER", "dying_worker")
+    monkeypatch.setattr(colmap, "find_spec", lambda name: name)
     with pytest.raises(InputError, match="COLMAP stopped with SIGABRT while matching"):
         run_colmap(tmp_path, 3)
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(colmap_process, "find_spec", {}.get)
+    monkeypatch.setattr(colmap, "find_spec", {}.get)
     with pytest.raises(MissingExtraError, match=r"mrbokeh\[capture\]"):
         run_colmap(tmp_path, 3)
 

@@ -8,9 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.poses.distortion import distorted_px, undistorted_px
-from capture.poses.sparse_model import SparseModel, SparseView
-from capture.poses.sparse_model_file import read_sparse_model, write_sparse_model
+from capture.poses.sparse_model import SparseModel, SparseView, distorted_px, read_sparse_model, undistorted_px, write_sparse_model
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 

@@ -10,22 +10,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from capture.poses.sparse_model import SparseModel, SparseView
-from capture.poses.sparse_model_file import write_sparse_model
-from capture.report.charts import Axes, chart
-from capture.report.exclusion_masks import REASONS, board_mask, exclusion_masks
-from capture.report.exposure_drift import low_frequency_gain
-from capture.report.findings import SliceFindings, StackFindings
-from capture.report.focus_curve import focus_curve
-from capture.report.focus_spacing import focus_spacing
-from capture.report.picture_evidence import PictureFindings
-from capture.report.poses_view import poses_view, scene_of
-from capture.report.reblur import Reblur
-from capture.report.registration_drift import drift_of, registration_drift
+from capture.poses.sparse_model import SparseModel, SparseView, write_sparse_model
+from capture.report.exclusion import REASONS, board_mask, exclusion_masks
+from capture.report.findings import SliceFindings, StackFindings, focus_curve, focus_spacing
+from capture.report.picture_sharpness import PictureFindings
+from capture.report.registration_check import drift_of, registration_drift
 from capture.report.scene_gates import Reconstruction, scales_in, scene_gates
-from capture.report.scene_page import SceneReport
-from capture.report.scene_report import report_scene
+from capture.report.scene_report import SceneReport, poses_view, report_scene, scene_of
+from capture.report.slice_fit import low_frequency_gain
 from capture.report.stack_gates import stack_gates
+from capture.report.stack_section import Axes, chart
+from capture.report.stack_view import Reblur
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.layering.layering import Layering

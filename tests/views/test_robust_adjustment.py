@@ -12,7 +12,7 @@ if find_spec("pycolmap") is None:
 
 import pycolmap
 
-from capture.poses.robust_adjustment import adjusted
+from capture.poses.colmap_worker import adjusted
 from capture.scale.board import umeyama
 from datasets_scripts.lab_scene import LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera
 from datasets_scripts.stack_scenes import STACK_SCENES

@@ -10,29 +10,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.poses.cauchy_loss import squared_under_cauchy, squared_under_cauchy_slope
-from capture.poses.sparse_model import SparseModel, SparseView
-from capture.poses.sparse_model_file import read_sparse_model, write_sparse_model
-from capture.scale.answer import ScaleAnswer
+from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model, write_sparse_model
+from capture.scale.answer import ScaleAnswer, ScaleResult, distance_scale, parse_distance, read_scale, write_scale
 from capture.scale.board import (
     POSES_SIGMA,
     POSES_SIGMA_WITH_DISTORTION,
     BoardDetections,
+    BoardSearch,
+    board_from_options,
     detect_board,
     scale_of_detections,
     triangulate,
     umeyama,
 )
-from capture.scale.board_options import board_from_options
-from capture.scale.board_search import BoardSearch
-from capture.scale.distance import distance_scale, parse_distance
-from capture.scale.focus import FocusSample, focus_scale, stated_sigma_dioptre
-from capture.scale.scale_file import ScaleResult, read_scale, write_scale
-from capture.scale.sharpness import SharpnessPeaks, sharpness_curves, sharpness_peaks
+from capture.scale.focus import FocusSample, SharpnessPeaks, focus_scale, sharpness_curves, sharpness_peaks, stated_sigma_dioptre
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.tracking.charuco.board_file import read_board
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board
 
 METRES_PER_UNIT = 0.2
 BOARD = CharucoBoard((CharucoGrid((8, 6), 30.0, 22.0),))

@@ -9,12 +9,9 @@ import pytest
 
 from capture.poses.colmap import PoseSettings, find_scene_poses
 from capture.poses.lens_calibration import read_lens_calibration, stated_distances_m
-from capture.poses.sparse_model import SparseModel
-from capture.poses.sparse_model_file import read_sparse_model
-from capture.scale.board import Similarity, umeyama
-from capture.scale.board_search import BoardSearch
-from capture.scale.metric_scale import ScaledScene, ScaleRequest, scale_scene
-from capture.scale.text import scale_lines
+from capture.poses.sparse_model import SparseModel, read_sparse_model
+from capture.scale.board import BoardSearch, Similarity, umeyama
+from capture.scale.metric_scale import ScaledScene, ScaleRequest, scale_lines, scale_scene
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError

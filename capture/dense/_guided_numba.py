@@ -1,0 +1,186 @@
+"""Weighted median around the edges of a depth map, compiled.
+
+Semi-global aggregation of costs in 0..255 along eight directions with penalties that bend to a guide picture, compiled.
+
+Tridiagonal solves of the fast global smoother along rows and columns, compiled.
+"""
+
+import numpy as np
+
+from mrbokeh.system.kernels import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weighted_medians(
+    values: np.ndarray,
+    weights: np.ndarray,
+    guide: np.ndarray,
+    where: np.ndarray,
+    radius: int,
+    contrast: float,
+    rows: tuple[int, int],
+    out: np.ndarray,
+) -> None:
+    """For each pixel of rows first <= y < end marked in `where`: see `dense_edges.weighted_medians_plainly`, the twin."""
+    height, width = values.shape
+    colours = guide.shape[2]
+    found = np.empty((2 * radius + 1) ** 2, np.float32)
+    share = np.empty((2 * radius + 1) ** 2, np.float32)
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            if not where[y, x]:
+                continue
+            count, total = 0, 0.0
+            for j in range(max(y - radius, 0), min(y + radius + 1, height)):
+                for i in range(max(x - radius, 0), min(x + radius + 1, width)):
+                    difference = 0.0
+                    for c in range(colours):
+                        step = guide[j, i, c] - guide[y, x, c]
+                        difference += step * step
+                    found[count] = values[j, i]
+                    share[count] = weights[j, i] * np.exp(-difference / (contrast * contrast))
+                    total += share[count]
+                    count += 1
+            if total <= 0.0:
+                continue
+            order = np.argsort(found[:count])
+            passed = 0.0
+            for place in range(count):
+                passed += share[order[place]]
+                if passed >= 0.5 * total:
+                    out[y, x] = found[order[place]]
+                    break
+
+
+_FAR = np.float32(1e9)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(before: np.ndarray, cost: np.ndarray, small: np.float32, large: np.float32, path: np.ndarray) -> None:
+    """Cheapest way to each label of this pixel from any of the previous one; both carry a margin of one on either side, and the
+    cheapest of all at their end."""
+    count = cost.shape[0]
+    cheapest = before[count + 2]
+    jump = cheapest + large
+    least = _FAR
+    for label in range(count):
+        best = min(min(before[label + 1], jump), min(before[label], before[label + 2]) + small)
+        value = np.float32(cost[label]) + best - cheapest
+        path[label + 1] = value
+        least = min(least, value)
+    path[count + 2] = least
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sweep(
+    costs: np.ndarray, guide: np.ndarray, direction: tuple[int, int], small: float, large: float, contrast: float, total: np.ndarray
+) -> None:
+    """Add the path costs of one direction; costs and total are (H, W, L)."""
+    height, width, labels = costs.shape
+    dx, dy = direction
+    small32, large32 = np.float32(small), np.float32(large)
+    above = np.full((width, labels + 3), _FAR, np.float32)
+    row = np.full((width, labels + 3), _FAR, np.float32)
+    start = np.full(labels + 3, np.float32(0.0))
+    start[0], start[labels + 1] = _FAR, _FAR
+    for step_y in range(height):
+        y = step_y if dy >= 0 else height - 1 - step_y
+        for step_x in range(width):
+            x = step_x if dx >= 0 else width - 1 - step_x
+            from_x, from_y = x - dx, y - dy
+            if from_x < 0 or from_x >= width or from_y < 0 or from_y >= height:
+                _step(start, costs[y, x], small32, large32, row[x])
+            else:
+                edge = abs(guide[y, x] - guide[from_y, from_x])
+                penalty = max(large32 / (np.float32(1.0) + edge / np.float32(contrast)), small32)
+                _step(row[from_x] if dy == 0 else above[from_x], costs[y, x], small32, penalty, row[x])
+            for label in range(labels):
+                total[y, x, label] += np.uint16(row[x, label + 1])
+        above, row = row, above
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def aggregate(costs: np.ndarray, guide: np.ndarray, small: float, large: float, contrast: float) -> np.ndarray:
+    """(H, W, L) uint8 costs to their sums over eight paths, uint16, rounded down path by path."""
+    total = np.zeros(costs.shape, np.uint16)
+    for direction in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)):
+        _sweep(costs, guide, direction, small, large, contrast, total)
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def winners(total: np.ndarray, apart: int, index: np.ndarray, margin: np.ndarray) -> None:
+    """Per pixel the fractional index of the cheapest label, and how much dearer the cheapest one more than `apart` labels away is."""
+    height, width, labels = total.shape
+    for y in range(height):
+        for x in range(width):
+            cost = total[y, x]
+            best = 0
+            for label in range(1, labels):
+                if cost[label] < cost[best]:
+                    best = label
+            rival = np.float32(65535.0)
+            for label in range(labels):
+                if abs(label - best) > apart:
+                    rival = min(rival, np.float32(cost[label]))
+            here = np.float32(cost[best])
+            margin[y, x] = rival - here
+            index[y, x] = best
+            if 0 < best < labels - 1:
+                before, after = np.float32(cost[best - 1]), np.float32(cost[best + 1])
+                bend = before + after - np.float32(2.0) * here
+                if bend > 0:
+                    index[y, x] += min(max(np.float32(0.5) * (before - after) / bend, np.float32(-0.5)), np.float32(0.5))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve_rows(values: np.ndarray, links: np.ndarray, smoothness: float, first: int, end: int) -> None:
+    """Rows first <= y < end of values (H, W, C) become the u of (1 + s (l_left + l_right)) u - s l_left u_left - s l_right u_right
+    = value; links (H, W - 1) join a pixel with its right neighbour. Thomas's algorithm."""
+    _, width, channels = values.shape
+    ahead = np.empty(width)
+    solved = np.empty((width, channels))
+    for y in range(first, end):
+        left = 0.0
+        for x in range(width):
+            right = smoothness * links[y, x] if x < width - 1 else 0.0
+            carried = left * ahead[x - 1] if x > 0 else 0.0
+            pivot = 1.0 / (1.0 + left + right - carried)
+            ahead[x] = right * pivot
+            for c in range(channels):
+                before = left * solved[x - 1, c] if x > 0 else 0.0
+                solved[x, c] = (values[y, x, c] + before) * pivot
+            left = right
+        for x in range(width - 2, -1, -1):
+            for c in range(channels):
+                solved[x, c] += ahead[x] * solved[x + 1, c]
+        for x in range(width):
+            for c in range(channels):
+                values[y, x, c] = solved[x, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve_columns(values: np.ndarray, links: np.ndarray, smoothness: float, first: int, end: int) -> None:
+    """The same along columns first <= x < end; links (H - 1, W) join a pixel with the one below."""
+    height, _, channels = values.shape
+    ahead = np.empty((height, end - first))
+    solved = np.empty((height, end - first, channels))
+    for y in range(height):
+        for x in range(first, end):
+            i = x - first
+            above = smoothness * links[y - 1, x] if y > 0 else 0.0
+            below = smoothness * links[y, x] if y < height - 1 else 0.0
+            carried = above * ahead[y - 1, i] if y > 0 else 0.0
+            pivot = 1.0 / (1.0 + above + below - carried)
+            ahead[y, i] = below * pivot
+            for c in range(channels):
+                before = above * solved[y - 1, i, c] if y > 0 else 0.0
+                solved[y, i, c] = (values[y, x, c] + before) * pivot
+    for y in range(height - 2, -1, -1):
+        for i in range(end - first):
+            for c in range(channels):
+                solved[y, i, c] += ahead[y, i] * solved[y + 1, i, c]
+    for y in range(height):
+        for x in range(first, end):
+            for c in range(channels):
+                values[y, x, c] = solved[y, x - first, c]

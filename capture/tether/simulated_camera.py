@@ -1,0 +1,231 @@
+"""A focus motor with what makes real ones hard: it counts nothing, its gears have play, and its travel ends.
+
+The files of the simulated camera: 16-bit TIFF with EXIF, its focus distance as coarse as real cameras state it.
+
+TIFF and not DNG: a mosaic would need a model of a sensor, which is data sets' business, and RAW adds nothing to what a bracket
+has to prove. 16 bits keep the light linear to 0.01 %, and the file takes the way of every other photograph.
+
+A camera without hardware: a thin lens before a small scene, on a motor with play and stops. For the demo and for tests.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from fractions import Fraction
+
+import cv2
+import numpy as np
+
+from capture.tether.camera_driver import Ability, CameraDescription, CameraError, CameraSettings, EndStop, FocusSteps, Preview, Shot, Stop
+from capture.tether.focus_plan import FocusPlan
+from capture.tether.simulated_scene import Rgb, SimulatedScene
+from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.optics.lens import Lens, film_plane_m
+from mrbokeh.system.errors import MissingExtraError
+
+
+@dataclass
+class SimulatedMotor:
+    """A gear that pushes a lens; the lens lies up to `backlash_steps` behind the gear.
+
+    travel_steps: of the lens, from its near stop (0) to infinity. The focus changes evenly in dioptres, from
+    nearest_dioptre to 0. gear, lens: where both are; a motor that was switched on may stand anywhere.
+    """
+
+    nearest_dioptre: float
+    travel_steps: int = 2400
+    backlash_steps: int = 40
+    lens: float = 900.0
+    gear: float = 920.0
+
+    @property
+    def dioptre(self) -> float:
+        """In focus, from the lens; 0 is infinity."""
+        return self.nearest_dioptre * (1.0 - self.lens / self.travel_steps)
+
+    @property
+    def focus_steps(self) -> FocusSteps:
+        """The scale as it shows when one counts from the near stop and moves away from it: the play comes first."""
+        far = self.backlash_steps + self.travel_steps
+        return FocusSteps(Stop.near, ((float(self.backlash_steps), self.nearest_dioptre), (float(far), 0.0)))
+
+    def drive(self, steps: int) -> None:
+        """Positive is towards infinity. Raises EndStop where a stop was met on the way."""
+        self.gear += steps
+        # The gear takes the lens along forwards once the play is used up, backwards at its front face.
+        self.lens = min(max(self.lens, self.gear - self.backlash_steps), self.gear)
+        if not 0 <= self.lens <= self.travel_steps:
+            at_near = self.lens < 0
+            self.lens = 0.0 if at_near else float(self.travel_steps)
+            self.gear = self.lens if at_near else self.lens + self.backlash_steps
+            raise EndStop
+
+    def bump(self, steps: float) -> None:
+        """Somebody touches the ring: the lens slips on its gear."""
+        self.lens = min(max(self.lens + steps, 0.0), float(self.travel_steps))
+        self.gear = min(max(self.gear, self.lens), self.lens + self.backlash_steps)
+
+
+CAMERA_MODEL = "Simulated Thin Lens"
+ELECTRONS_AT_WHITE = 40000.0
+_NIKON_LARGEST = 254
+_FINE = 100000
+_CENTIMETRES = 3
+
+FocusQuantum = Callable[[float], float | None]
+
+
+def nikon_code(distance_m: float) -> float:
+    """The distance that Nikon's 8-bit code stands for: 0.01 * 10^(v / 40) m, steps of 5.9 %."""
+    code = _NIKON_LARGEST if math.isinf(distance_m) else min(round(40.0 * math.log10(distance_m / 0.01)), _NIKON_LARGEST)
+    return float(0.01 * 10.0 ** (code / 40.0))
+
+
+def to_centimetre(distance_m: float) -> float | None:
+    """Whole centimetres; infinity is not stated."""
+    return None if math.isinf(distance_m) else round(distance_m, 2)
+
+
+def unstated(distance_m: float) -> None:  # noqa: ARG001
+    """Most cameras say nothing."""
+    return
+
+
+def exposed(light: Rgb, rng: np.random.Generator) -> Rgb:
+    """Photon noise on light whose 1.0 fills the sensor, then the sensor's limit."""
+    electrons = rng.poisson(np.clip(light, 0.0, 2.0) * ELECTRONS_AT_WHITE)
+    return np.minimum(electrons / ELECTRONS_AT_WHITE, 1.0).astype(np.float32)
+
+
+def encoded_tiff(rgb: Rgb, exif: dict[str, str]) -> bytes:
+    """A 16-bit sRGB TIFF in memory, with EXIF."""
+    try:
+        import pyexiv2
+    except ImportError:
+        raise MissingExtraError("pyexiv2", "capture") from None
+    integers = np.round(np.clip(linear_to_srgb(rgb), 0.0, 1.0) * 65535.0).astype(np.uint16)
+    done, data = cv2.imencode(".tif", np.ascontiguousarray(integers[..., ::-1]))
+    if not done:
+        raise CameraError(f"the simulated camera cannot encode a picture of shape {rgb.shape}")
+    with pyexiv2.ImageData(data.tobytes()) as image:
+        image.modify_exif(exif)
+        return bytes(image.get_bytes())
+
+
+def exif_of(lens: Lens, width_px: int, exposure_time_s: float, iso: float, taken_at: datetime, quantum: FocusQuantum) -> dict[str, str]:
+    """The Exif directory as a camera writes it. quantum: distance from the film plane to the one that is stated, or None."""
+    per_cm = Fraction(width_px * 10) / Fraction(str(lens.sensor_width_mm))
+    stated = quantum(film_plane_m(lens))
+    exif = {
+        "Exif.Image.Make": "mrbokeh",
+        "Exif.Image.Model": CAMERA_MODEL,
+        "Exif.Photo.ExposureTime": _rational(exposure_time_s, 1000000),
+        "Exif.Photo.FNumber": _rational(lens.f_number, 100),
+        "Exif.Photo.ExposureProgram": "1",
+        "Exif.Photo.ISOSpeedRatings": str(round(iso)),
+        "Exif.Photo.DateTimeOriginal": taken_at.strftime("%Y:%m:%d %H:%M:%S"),
+        "Exif.Photo.FocalLength": _rational(lens.focal_length_mm, 100),
+        "Exif.Photo.FocalPlaneXResolution": f"{per_cm.numerator}/{per_cm.denominator}",
+        "Exif.Photo.FocalPlaneYResolution": f"{per_cm.numerator}/{per_cm.denominator}",
+        "Exif.Photo.FocalPlaneResolutionUnit": str(_CENTIMETRES),
+    }
+    return exif if stated is None else exif | {"Exif.Photo.SubjectDistance": _rational(stated, _FINE if stated < 1000.0 else 1)}
+
+
+def _rational(value: float, denominator: int) -> str:
+    return f"{round(value * denominator)}/{denominator}"
+
+
+NORMAL_EXPOSURE_S = 1.0 / 60.0
+NORMAL_ISO = 100.0
+LARGEST_WIDTH_PX = 960
+_ASPECT = 1.5
+_BEFORE_NEAR = 0.25
+_PREVIEW_SHARE = 0.5
+
+
+@dataclass
+class SimulatedCamera:
+    """A CameraDriver. lens: wide open, its focus is the motor's; exposure time and ISO act on the light, f-number on the blur.
+
+    quantum: how it states the focus distance. knows_steps: whether it tells what its steps mean (no real camera does).
+    """
+
+    lens: Lens
+    scene: SimulatedScene
+    motor: SimulatedMotor
+    width_px: int = 480
+    quantum: FocusQuantum = nikon_code
+    knows_steps: bool = True
+    seed: int = 0
+    now: Callable[[], datetime] = datetime.now
+    exposure_time_s: float = NORMAL_EXPOSURE_S
+    iso: float = NORMAL_ISO
+    counter: int = 0
+    shots: int = 0
+    _light: tuple[object, Rgb] | None = field(default=None, repr=False)
+
+    @classmethod
+    def for_plan(cls, plan: FocusPlan) -> "SimulatedCamera":
+        """The plan's lens before cards at the distances that the plan spans; its near stop is a little nearer than the plan."""
+        width_px = min(plan.image_width_px, LARGEST_WIDTH_PX)
+        nearest = plan.dioptres[0] + _BEFORE_NEAR * max(plan.dioptres[0] - plan.dioptres[-1], 0.1)
+        return cls(plan.lens, SimulatedScene.between(plan.range.near_m, plan.range.far_m), SimulatedMotor(nearest), width_px)
+
+    def describe(self) -> CameraDescription:
+        steps = self.motor.focus_steps if self.knows_steps else None
+        return CameraDescription(CAMERA_MODEL, "simulated", frozenset(Ability) - {Ability.raw}, steps)
+
+    def configure(self, settings: CameraSettings) -> dict[str, str]:
+        self.exposure_time_s = settings.exposure_time_s or self.exposure_time_s
+        self.iso = settings.iso or self.iso
+        if settings.f_number:
+            self.lens = replace(self.lens, f_number=settings.f_number)
+        return {
+            "exposure mode": "manual",
+            "exposure time": f"{self.exposure_time_s:g} s",
+            "ISO": f"{self.iso:g}",
+            "f-number": f"{self.lens.f_number:g}",
+            "white balance": "fixed",
+            "autofocus": "off",
+            "file format": "16-bit TIFF",
+        }
+
+    def preview(self) -> Preview:
+        width_px = round(self.width_px * _PREVIEW_SHARE)
+        rgb = self._photographed(width_px)
+        return np.round(np.clip(linear_to_srgb(rgb), 0.0, 1.0) * 255.0).astype(np.uint8)
+
+    def focus_step(self, steps: int) -> None:
+        self.motor.drive(steps)
+        self.counter += steps
+
+    def home(self, stop: Stop) -> None:
+        try:
+            while True:
+                self.motor.drive(-stop.away * self.motor.travel_steps)
+        except EndStop:
+            self.counter = 0
+
+    def capture(self) -> Shot:
+        self.shots += 1
+        exif = exif_of(self.focused_lens, self.width_px, self.exposure_time_s, self.iso, self.now(), self.quantum)
+        return Shot(encoded_tiff(self._photographed(self.width_px), exif), f"SIM_{self.shots:04d}.TIF", self.counter)
+
+    def close(self) -> None:
+        pass
+
+    @property
+    def focused_lens(self) -> Lens:
+        """The lens as its motor has it."""
+        return self.lens.focused_at(1.0 / self.motor.dioptre if self.motor.dioptre > 0.0 else float("inf"))
+
+    def _photographed(self, width_px: int) -> Rgb:
+        """What the sensor counts, with new noise each time; the light behind it is kept while nothing moves."""
+        state = (self.focused_lens.focus_distance_m, self.lens.f_number, width_px)
+        if self._light is None or self._light[0] != state:
+            self._light = state, self.scene.photographed(self.focused_lens, width_px, round(width_px / _ASPECT))
+        exposure = self.exposure_time_s * self.iso / (NORMAL_EXPOSURE_S * NORMAL_ISO)
+        self.seed += 1
+        return exposed(self._light[1] * np.float32(exposure), np.random.default_rng(self.seed))
