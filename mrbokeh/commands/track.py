@@ -12,9 +12,8 @@ from mrbokeh.system.errors import InputError
 if TYPE_CHECKING:
     from mrbokeh.optics.camera import Camera
     from mrbokeh.tracking.camera_track.board_track import BoardTrack
-    from mrbokeh.tracking.camera_track.options import TrackOptions
-    from mrbokeh.tracking.camera_track.track import CameraTrack
-    from mrbokeh.tracking.camera_track.tracked_frame import Distortion
+    from mrbokeh.tracking.camera_track.track import CameraTrack, Distortion
+    from mrbokeh.tracking.camera_track.track_file import TrackOptions
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="The camera of every frame of a clip, and its files.")
 
@@ -49,7 +48,7 @@ def track(
     """
     from mrbokeh.tracking.camera_track.board_track import TrackSettings, calibrate_clip, track_board
     from mrbokeh.tracking.camera_track.formats import format_of_name
-    from mrbokeh.tracking.charuco.board_file import read_board
+    from mrbokeh.tracking.charuco.board import read_board
 
     require_safe_outputs((out,), (clip, board, camera), overwrite)
     if format_ is None:
@@ -98,7 +97,7 @@ def convert(
     Example: mrbokeh track convert track.json track.chan
     """
     from mrbokeh.tracking.camera_track.formats import read_track
-    from mrbokeh.tracking.camera_track.options import TrackOptions
+    from mrbokeh.tracking.camera_track.track_file import TrackOptions
 
     refuse_existing(out, overwrite)
     options = TrackOptions(up, _size_px(size), rotation_order, sensor_width, metric, distortion)

@@ -1,12 +1,19 @@
-"""Scene: what a virtual object brings, flattened to world space: meshes, lights, environment."""
+"""Scene: what a virtual object brings, flattened to world space: meshes, lights, environment.
+
+The protocol of everything that turns a virtual scene and a camera into a Layer.
+
+A shadow as a layer of premultiplied black: the lens blurs it like anything that lies there, "over" darkens the photograph.
+"""
 
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
-from mrbokeh.scene.environment import Environment, neutral_environment
-from mrbokeh.scene.light import Light
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera, level_plane_dioptres
+from mrbokeh.scene.light import Environment, Light, neutral_environment
 from mrbokeh.scene.material import Triple
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.system.errors import InputError
@@ -95,3 +102,37 @@ def world_from_scene_placing(
     world_from_scene[:3, :3] = scale * np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     world_from_scene[:3, 3] = np.asarray(stands_at_m) - world_from_scene[:3, :3] @ underside
     return world_from_scene
+
+
+@runtime_checkable
+class SceneRenderer(Protocol):
+    """Renders virtual objects with everything in focus; the lens blur comes afterwards.
+
+    What every backend owes (tests/objects/test_scene_backends.py asks all of them):
+    rgb is scene-linear, unclipped and premultiplied; emissive radiance L reads L.
+    alpha is the covered share of the pixel's square. depth_m is exact at the pixel's centre, along the optical axis; at a pixel
+    that is only partly covered it is the nearest covering surface where the centre sees nothing, never a mixture; inf where
+    alpha is 0. The focal lengths and the principal point are any. Single-sided surfaces are invisible from behind.
+    The environment lights the objects but is not drawn, and meshes with catches_shadow are not drawn either.
+    """
+
+    def render(self, scene: Scene, camera: Camera) -> Layer:
+        """The scene as the camera sees it, without lens blur."""
+        ...
+
+    def render_shadow_mask(self, scene: Scene, camera: Camera, catcher: Mesh) -> Float32[np.ndarray, "height width"]:
+        """(H, W): what share of the lights' irradiance on the catcher the scene's meshes let through; 1 is lit.
+
+        It is 1 where the catcher is not in the picture, turned away from the lights, or there are no lights. The catcher
+        is seen through the virtual objects, so that a soft edge of an object blends over the right value.
+        """
+        ...
+
+
+def shadow_layer(renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, strength: float) -> Layer:
+    """The scene's shadow on a level catcher. strength: the alpha where none of the lights arrives."""
+    alpha = (strength * (1.0 - renderer.render_shadow_mask(scene, camera, catcher))).astype(np.float32)
+    dioptres = level_plane_dioptres(camera, float(catcher.positions_m[0, 1]))
+    depth_m = np.full(alpha.shape, np.inf, np.float32)
+    np.divide(1.0, dioptres, out=depth_m, where=(alpha > 0) & (dioptres > 0))
+    return Layer(np.zeros((*alpha.shape, 3), np.float32), alpha, depth_m)

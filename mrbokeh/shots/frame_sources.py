@@ -15,10 +15,8 @@ from mrbokeh.shots.hooks import CameraSource, DepthSource, FocusSource, MatteSou
 from mrbokeh.shots.kept import Kept
 from mrbokeh.shots.scene_camera import scene_track
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.focus_metadata import read_focus_pull
-from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
+from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys, read_focus_pull
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.video.clip import VideoInfo
 from mrbokeh.video.picture_sources.numbered_files import is_pattern, numbered
 

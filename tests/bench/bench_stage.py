@@ -25,7 +25,7 @@ from mrbokeh.scene.gltf.gltf_loader import GltfAsset
 from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.scene_description import PlacedObject, SceneDescription, ShadowPlane
 from mrbokeh.scene.staging.staged_scene import StagedObject, StagedScene
-from mrbokeh.tracking.upright import upright_camera
+from mrbokeh.tracking.world_axes import upright_camera
 from tests.bench.machine import machine_line, memory_line
 from tests.scenes.stage_scenes import looking
 from viewfinder.stage.drawn_layer import Brushes, Drawing, DrawRequest, draw
@@ -33,7 +33,7 @@ from viewfinder.stage.layer_depth import LayerDepth
 from viewfinder.stage.resolution import RESOLUTIONS
 from viewfinder.stage.stage import Stage
 from viewfinder.stage.stage_setup import live_backend, live_renderer
-from viewfinder.tracking.base import TrackedPose
+from viewfinder.tracking.tracker import TrackedPose
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=0.8, sensor_width_mm=36.0)
 WIDTH, HEIGHT = 640, 360

@@ -20,7 +20,7 @@ from mrbokeh.images.image_io import write_layer
 from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.world_axes import inverted
+from mrbokeh.tracking.world_axes import inverted
 from tests.live.test_sources_browser import Canvas, Sender
 from tests.scenes.phone_on_camera import (
     CAMERA_FROM_PHONE,
@@ -39,18 +39,18 @@ from viewfinder.commands.browser_cameras import browser_cameras
 from viewfinder.commands.calibrate_phone import calibrate_phone_command
 from viewfinder.commands.serve import opened
 from viewfinder.commands.serve_options import ServeOptions
-from viewfinder.flow.frames import CameraFrame, Pose
+from viewfinder.frames import CameraFrame, Pose
 from viewfinder.server.access import Access, needed_role
 from viewfinder.server.app import serving_site
 from viewfinder.server.sessions import Role
 from viewfinder.sources.browser_camera import BrowserCameraSource
 from viewfinder.sources.pattern import PatternSource
-from viewfinder.tracking.base import TrackedPose
 from viewfinder.tracking.phone_calibration import Calibration
 from viewfinder.tracking.phone_rig import PhoneRig, read_phone_rig, write_phone_rig
 from viewfinder.tracking.phone_tracker import PhoneTracker
 from viewfinder.tracking.rigid_motion import angle_deg, rigid_of
 from viewfinder.tracking.still_pairs import StillPairs
+from viewfinder.tracking.tracker import TrackedPose
 
 app = typer.Typer()
 app.command("calibrate-phone")(calibrate_phone_command)

@@ -15,7 +15,7 @@ from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene.staging.picture_box import box_around
 from mrbokeh.scene.staging.scene_description import RealThings
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import upright_camera
+from mrbokeh.tracking.world_axes import upright_camera
 from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
 from viewfinder.stage.drawn_layer import Drawing, DrawRequest, draw
 from viewfinder.stage.layer_depth import LayerDepth

@@ -9,7 +9,7 @@ import pytest
 from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.optics.camera import level_plane_dioptres
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
+from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
 from tests.scenes.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
 from viewfinder.stage.drawn_layer import DrawRequest, draw
 from viewfinder.stage.occlusion import Occlusion, RealDepth

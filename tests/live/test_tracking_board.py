@@ -16,13 +16,18 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import calibrated
-from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.tracking.charuco.board_file import board_from_json, board_to_json, read_board, write_board
+from mrbokeh.tracking.charuco.board import (
+    CharucoBoard,
+    CharucoGrid,
+    black_rectangles_mm,
+    board_from_json,
+    board_to_json,
+    read_board,
+    write_board,
+)
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
-from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
 from tests.scenes.traced_board_clip import BOARD
-from viewfinder.tracking.board_pdf import MARGIN_MM, page_for, write_board_pdf
-from viewfinder.tracking.board_planner import View, plan_board
+from viewfinder.tracking.printed_board import MARGIN_MM, View, page_for, plan_board, write_board_pdf
 
 SIMPLE = CharucoBoard((CharucoGrid((5, 4), 24.0, 18.0),))
 POINTS_PER_MM = 72.0 / 25.4

@@ -12,8 +12,7 @@ from datasets_scripts.sheet_tracer import Sheet, pack_table, trace_sheet, with_n
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.charuco.board_file import write_board
-from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
+from mrbokeh.tracking.charuco.board import black_rectangles_mm, write_board
 from mrbokeh.video.clip import read_frames
 from tests.scenes.traced_board_clip import BOARD
 

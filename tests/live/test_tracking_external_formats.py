@@ -11,16 +11,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.between_frames import pose_between
-from mrbokeh.tracking.camera_track.stage_axes import pan_tilt_roll_deg
-from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
-from viewfinder.flow.frames import LensState
-from viewfinder.tracking.encoder_table import read_encoder_table
-from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, freed_sample, read_freed, write_freed
-from viewfinder.tracking.opentrackio import StageReading, decode_opentrackio, encode_opentrackio, opentrackio_document
-from viewfinder.tracking.opentrackio_packets import CBOR, JSON, Reassembly, fletcher16, packets, read_packet
+from mrbokeh.tracking.camera_track.track import pose_between
+from mrbokeh.tracking.world_axes import inverted, pan_tilt_roll_deg, rigid
+from viewfinder.frames import LensState
+from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, freed_sample, read_encoder_table, read_freed, write_freed
+from viewfinder.tracking.opentrackio import (
+    CBOR,
+    JSON,
+    Reassembly,
+    StageReading,
+    decode_opentrackio,
+    encode_opentrackio,
+    fletcher16,
+    opentrackio_document,
+    packets,
+    read_packet,
+)
+from viewfinder.tracking.pose_history import MalformedMessageError, TrackingSample, lens_between
 from viewfinder.tracking.rigid_motion import rigid_of
-from viewfinder.tracking.tracking_sample import MalformedMessageError, TrackingSample, lens_between
 
 IDENTITY = {"pan": 0.0, "tilt": 0.0, "roll": 0.0}
 

@@ -13,12 +13,11 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
+from mrbokeh.tracking.world_axes import inverted, rigid
 from tests.scenes.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera
-from viewfinder.flow.frames import CameraFrame, Pose
-from viewfinder.tracking.detection_thread import ImmediateDetections
-from viewfinder.tracking.map_localiser import MapLocaliser, matches
-from viewfinder.tracking.map_pose import pose_in_map, pose_refined
+from viewfinder.frames import CameraFrame, Pose
+from viewfinder.tracking.charuco_tracker import ImmediateDetections
+from viewfinder.tracking.map_localiser import MapLocaliser, matches, pose_in_map, pose_refined
 from viewfinder.tracking.map_tracker import MapTracker
 from viewfinder.tracking.rigid_motion import angle_deg
 from viewfinder.tracking.sparse_map import CACHE_NAME, SparseMap, read_sparse_map

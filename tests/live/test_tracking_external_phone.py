@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.world_axes import inverted
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.tracking.base import TrackedPose
+from mrbokeh.tracking.world_axes import inverted
+from viewfinder.frames import CameraFrame
 from viewfinder.tracking.phone_rig import (
     PhoneRig,
     PosePair,
@@ -24,6 +23,7 @@ from viewfinder.tracking.phone_rig import (
 )
 from viewfinder.tracking.phone_tracker import PhoneTracker
 from viewfinder.tracking.rigid_motion import angle_deg, rigid_of
+from viewfinder.tracking.tracker import TrackedPose
 
 # The phone 8 cm above the lens, 3 cm to its left, a little askew.
 CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.08, 0.02]))

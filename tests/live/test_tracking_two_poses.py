@@ -15,16 +15,14 @@ from datasets_scripts.sheet_tracer import Sheet
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.camera_track.board_track import poses_of
-from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector
 from mrbokeh.tracking.charuco.detector import Corners
-from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot, pose_from_plane
 from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
 from tests.scenes.traced_board_clip import BOARD, camera_frames
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.tracking.charuco_tracker import CharucoTracker
-from viewfinder.tracking.detection_thread import ImmediateDetections
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.charuco_tracker import CharucoTracker, ImmediateDetections
 
 CAMERA = Camera(640, 360, (590.0, 590.0), (320.0, 180.0))
 SMALL = CharucoBoard((CharucoGrid((6, 5), 12.0, 9.0),))

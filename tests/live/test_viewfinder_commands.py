@@ -34,8 +34,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.tracking.charuco.board_file import read_board, write_board
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board, write_board
 from tests.scenes.phone_on_camera import PHONE
 from tests.scenes.thin_lens_board import Shot, camera_over, display_bgr, photograph
 from viewfinder.app.focus_choice import open_focus
@@ -44,12 +43,11 @@ from viewfinder.commands.board import board_command
 from viewfinder.commands.listening import Door, ListeningOptions, open_door
 from viewfinder.commands.serve import opened
 from viewfinder.commands.serve_options import ServeOptions
-from viewfinder.flow.frames import CameraFrame, LensState
-from viewfinder.focus.frame_focus import FrameFocus
-from viewfinder.focus.manual_focus import ManualFocus
+from viewfinder.focus.sources import FrameFocus, ManualFocus
+from viewfinder.frames import CameraFrame, LensState
 from viewfinder.server.access import Access
 from viewfinder.server.sessions import Role, Sessions
-from viewfinder.tracking.base import TrackedPose
+from viewfinder.tracking.tracker import TrackedPose
 
 ROOT = Path(__file__).resolve().parents[2]
 DOC = ROOT / "docs" / "viewfinder.md"

@@ -17,15 +17,15 @@ from typer.testing import CliRunner
 from mrbokeh.commands.blender_addon import app
 from mrbokeh.optics.camera import camera_from_json
 from mrbokeh.optics.lens import Lens
-from mrbokeh.scene.blender import mrbokeh_export
-from mrbokeh.scene.blender.mrbokeh_export import Film, camera_from_world, check_scene, intrinsics, track_frame
+from mrbokeh.scene import blender_addon
+from mrbokeh.scene.blender_addon import Film, camera_from_world, check_scene, intrinsics, track_frame
 from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import read_track
-from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD
+from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD
 
 DATA = Path(__file__).parents[1] / "data" / "blender"
-ADDON = Path(mrbokeh_export.__file__)
+ADDON = Path(blender_addon.__file__)
 
 
 def test_a_full_frame_camera() -> None:

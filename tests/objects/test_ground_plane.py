@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.upright import turned
+from mrbokeh.tracking.world_axes import turned
 from viewfinder.app.ground_plane import ground_from_picture
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.scene.shadow_layer import shadow_layer
 from mrbokeh.scene.staging.filming import FilmedLayers, Filming
 from mrbokeh.scene.staging.one_object import OneObject
 from mrbokeh.scene.staging.picture_box import shadow_box
-from mrbokeh.tracking.upright import upright_camera
+from mrbokeh.scene.virtual_scene import shadow_layer
+from mrbokeh.tracking.world_axes import upright_camera
 
 ALIEN = Path(__file__).resolve().parents[2] / "mrbokeh" / "demo_data" / "objects" / "alien.glb"
 CAMERA = Camera(160, 112, (220.0, 220.0), (80.0, 56.0))

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.focus_metadata import read_focus_pull
-from mrbokeh.tracking.camera_track.focus_pull import FocusPull, focus_of_track, parse_focus_keys
-from mrbokeh.tracking.camera_track.focus_steps import quantisation_steps, smoothed_within_steps
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
+from mrbokeh.tracking.camera_track.focus_pull import (
+    FocusPull,
+    focus_of_track,
+    parse_focus_keys,
+    quantisation_steps,
+    read_focus_pull,
+    smoothed_within_steps,
+)
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from tests.tracking.test_camera_track import two_frames
 
 

@@ -13,10 +13,10 @@ from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import write_json
-from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
-from mrbokeh.tracking.charuco.board_file import write_board
+from mrbokeh.tracking.charuco.board import write_board
+from mrbokeh.tracking.world_axes import inverted, rigid
 from tests.scenes.traced_board_clip import BOARD, clip_of
-from viewfinder.flow.frames import Pose
+from viewfinder.frames import Pose
 from viewfinder.tracking.rigid_motion import rigid_of
 
 CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.06, 0.02]))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
+from mrbokeh.tracking.world_axes import inverted, rigid
 
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 400, 300, 380.0
 _TEXTURE_PX = 1024

@@ -13,8 +13,7 @@ import numpy as np
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import MM_PER_M, Lens
-from mrbokeh.tracking.charuco.board import CharucoBoard
-from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
+from mrbokeh.tracking.charuco.board import CharucoBoard, black_rectangles_mm
 
 DARK, LIGHT, TABLE = 0.03, 0.75, 0.3
 _RIM_MM = 10.0

@@ -12,9 +12,8 @@ from datasets_scripts.sheet_tracer import Sheet
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import MM_PER_M, Lens
-from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
-from viewfinder.flow.frames import CameraFrame, Pose
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm
+from viewfinder.frames import CameraFrame, Pose
 
 BOARD = CharucoBoard((CharucoGrid((4, 3), 46.0, 34.0), CharucoGrid((9, 5), 20.0, 15.0, (0.0, 143.0), 6)))
 """Fits on A4: 184 x 243 mm."""

@@ -19,13 +19,10 @@ from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import calibrated
-from mrbokeh.tracking.camera_track.board_corners import RollingCorners, Undistorting
-from mrbokeh.tracking.camera_track.board_smoothing import Observation, steadied
-from mrbokeh.tracking.camera_track.board_track import TrackSettings, poses_of, track_board
+from mrbokeh.tracking.camera_track.board_smoothing import Observation, steadied, steady_poses, whittaker
+from mrbokeh.tracking.camera_track.board_track import RollingCorners, TrackSettings, Undistorting, poses_of, track_board
 from mrbokeh.tracking.camera_track.formats import read_track
-from mrbokeh.tracking.camera_track.steady_poses import steady_poses, whittaker
-from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.tracking.charuco.board_file import write_board
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, write_board
 from mrbokeh.tracking.charuco.detector import Corners
 from mrbokeh.video.clip import VideoWriter
 from tests.scenes.traced_board_clip import BOARD, MOTION, clip_of, pose_error

@@ -8,10 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.track import CameraTrack, fixed_track
-from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.tracking.camera_track.world_axes import with_up
-from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD, upright_camera
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, fixed_track
+from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, upright_camera
 
 
 def camera_at(place_m: tuple[float, float, float], turn: Rotation) -> Camera:
@@ -89,7 +87,7 @@ def test_a_fixed_camera_stands_for_every_frame() -> None:
 def test_worlds_with_another_axis_up_hold_the_same_upright_camera(up: str) -> None:
     """Whatever axis points up, the camera in the upright world is the same; and nothing is mirrored."""
     track = two_frames()
-    turned = with_up(track, up)
+    turned = track.with_up(up)
     for number in track.numbers:
         one, other = (upright_camera(each.at(number).camera, each.up).camera_from_world for each in (track, turned))
         np.testing.assert_allclose(one, other, atol=1e-12)

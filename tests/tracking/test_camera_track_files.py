@@ -11,10 +11,8 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import FORMATS, read_track, write_track
-from mrbokeh.tracking.camera_track.options import ROTATION_ORDERS, TrackOptions
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.tracking.camera_track.world_axes import with_up
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
+from mrbokeh.tracking.camera_track.track_file import ROTATION_ORDERS, TrackOptions
 
 SIZE_PX = (640, 360)
 NAMES = {
@@ -45,7 +43,7 @@ def moving(*, plain: bool) -> CameraTrack:
 
 def assert_same_views(one: CameraTrack, other: CameraTrack) -> None:
     """The same upright points fall on the same pixels, to a millionth."""
-    other = with_up(other, one.up)
+    other = other.with_up(one.up)
     assert other.numbers == one.numbers
     for number in one.numbers:
         np.testing.assert_allclose(

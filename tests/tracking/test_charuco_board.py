@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.tracking.charuco.board_file import read_board, write_board
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm, read_board, write_board
 from mrbokeh.tracking.charuco.detector import CharucoDetector
-from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
 
 EVEN = CharucoBoard((CharucoGrid((5, 4), 24.0, 18.0),), legacy=True)
 ODD = CharucoBoard((CharucoGrid((4, 5), 24.0, 18.0),), legacy=True)

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.clip_intrinsics import Intrinsics, intrinsics_of_clip
-from mrbokeh.tracking.camera_track.tracked_frame import DISTORTION_NAMES
+from mrbokeh.tracking.camera_track.board_track import Intrinsics, intrinsics_of_clip
+from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES
 
 LEVEL = Intrinsics(Camera(640, 360, (600.0, 620.0), (330.0, 170.0)), {"k1": -0.1, "p1": 0.01, "p2": -0.02, "k3": 0.03})
 POINTS_M = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.0], [0.0, 0.15, 1.0], [0.25, 0.12, 1.0]])

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.upright import upright_camera
+from mrbokeh.tracking.world_axes import upright_camera
 
 _LEAST_DETERMINANT = 1e-12
 

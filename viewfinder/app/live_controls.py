@@ -6,16 +6,15 @@ from pathlib import Path
 
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import turned, turned_back
+from mrbokeh.tracking.world_axes import turned, turned_back
 from viewfinder.app.captures import Captures
 from viewfinder.app.ground_plane import ground_from_picture
 from viewfinder.app.live_compositor import LiveCompositor, Moment
-from viewfinder.focus.first_known import FirstKnown
-from viewfinder.focus.manual_focus import ManualFocus
+from viewfinder.focus.sources import FirstKnown, ManualFocus
 from viewfinder.server.controls import ObjectState, State
 from viewfinder.stage.stage import Stage
 from viewfinder.streaming.recording import Recorder, recording_path
-from viewfinder.tracking.smoothed_tracker import SmoothedTracker
+from viewfinder.tracking.smoothing import SmoothedTracker
 
 
 class LiveControls:

@@ -8,9 +8,9 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from viewfinder.sources.base import FrameSource
 from viewfinder.sources.choose import open_source
-from viewfinder.tracking.base import Tracker
 from viewfinder.tracking.phone_tracker import PhoneTracker
-from viewfinder.tracking.tracking_socket import SocketTracker, TrackingAddress
+from viewfinder.tracking.socket_tracker import SocketTracker, TrackingAddress
+from viewfinder.tracking.tracker import Tracker
 
 # Corners are found to a part of a pixel, so that more than this costs time and tells little.
 _PHONE_WIDTH_PX = 1280
@@ -74,7 +74,7 @@ def open_phone(source: str, max_width_px: int | None = _PHONE_WIDTH_PX) -> Frame
 
 
 def _board(choice: TrackingChoice) -> Tracker:
-    from mrbokeh.tracking.charuco.board_file import read_board
+    from mrbokeh.tracking.charuco.board import read_board
     from viewfinder.tracking.charuco_tracker import CharucoTracker
 
     assert choice.board is not None, "chosen"
@@ -83,8 +83,8 @@ def _board(choice: TrackingChoice) -> Tracker:
 
 def _phone(choice: TrackingChoice) -> Tracker:
     """All files are read before the phone's camera is opened."""
-    from viewfinder.tracking.fixed_pose import read_fixed_pose
     from viewfinder.tracking.phone_rig import read_phone_rig
+    from viewfinder.tracking.tracker import read_fixed_pose
 
     phone = choice.phone
     assert phone is not None, "chosen"
@@ -100,7 +100,7 @@ def _phone(choice: TrackingChoice) -> Tracker:
 
 
 def _pose(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.fixed_pose import read_fixed_pose
+    from viewfinder.tracking.tracker import read_fixed_pose
 
     assert choice.pose is not None, "chosen"
     return read_fixed_pose(choice.pose)
@@ -118,16 +118,15 @@ def _map(choice: TrackingChoice) -> Tracker:
 
 
 def _opentrackio(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.tracking_socket import opentrackio_decoder
+    from viewfinder.tracking.socket_tracker import opentrackio_decoder
 
     assert choice.opentrackio is not None, "chosen"
     return SocketTracker(TrackingAddress(choice.opentrackio, host=choice.host), opentrackio_decoder())
 
 
 def _freed(choice: TrackingChoice) -> Tracker:
-    from viewfinder.tracking.encoder_table import read_encoder_table
-    from viewfinder.tracking.freed import FreeDReading
-    from viewfinder.tracking.tracking_socket import freed_decoder
+    from viewfinder.tracking.freed import FreeDReading, read_encoder_table
+    from viewfinder.tracking.socket_tracker import freed_decoder
 
     assert choice.freed is not None, "chosen"
     reading = FreeDReading() if choice.lens_table is None else FreeDReading(table=read_encoder_table(choice.lens_table))

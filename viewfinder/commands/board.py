@@ -27,9 +27,8 @@ def board_command(
     """
     from mrbokeh.optics.lens_file import read_lens
     from mrbokeh.system.atomic_files import refuse_existing
-    from mrbokeh.tracking.charuco.board_file import write_board
-    from viewfinder.tracking.board_pdf import write_board_pdf
-    from viewfinder.tracking.board_planner import View, plan_board
+    from mrbokeh.tracking.charuco.board import write_board
+    from viewfinder.tracking.printed_board import View, plan_board, write_board_pdf
 
     if out.suffix.lower() != ".pdf":
         raise InputError(f"--out: expected a name that ends in .pdf, got {out}")

@@ -15,7 +15,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.system.atomic_files import refuse_existing
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.charuco.board_file import read_board
+from mrbokeh.tracking.charuco.board import read_board
 from viewfinder.app.tracking_choice import open_phone
 from viewfinder.commands.browser_cameras import CAMERA_PAGE, browser_cameras
 from viewfinder.commands.listening import Door, ListeningOptions, on_stop, open_door
@@ -25,10 +25,10 @@ from viewfinder.server.page_files import page_routes
 from viewfinder.server.site import Part, Site
 from viewfinder.sources.choose import open_source
 from viewfinder.tracking.charuco_tracker import CharucoTracker
-from viewfinder.tracking.fixed_pose import read_fixed_pose
 from viewfinder.tracking.phone_calibration import Calibration
 from viewfinder.tracking.phone_rig import PhoneRig, write_phone_rig
 from viewfinder.tracking.phone_tracker import PhoneTracker
+from viewfinder.tracking.tracker import read_fixed_pose
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ import typer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
-from mrbokeh.tracking.charuco.board import CharucoBoard
-from mrbokeh.tracking.charuco.board_file import read_board
+from mrbokeh.tracking.charuco.board import CharucoBoard, read_board
 from viewfinder.app.assembly import open_scenery, read_lenses, renderers_of
 from viewfinder.app.running import Parts, Viewfinder, running
 from viewfinder.app.tracking_choice import open_tracker
@@ -24,9 +23,8 @@ from viewfinder.sources.choose import open_source
 from viewfinder.sources.exact_size import ExactSize
 from viewfinder.stage.still_layer import StillLayer
 from viewfinder.streaming.virtual_webcam import VirtualWebcam
-from viewfinder.tracking.base import Tracker
-from viewfinder.tracking.fixed_pose import FixedPose, read_fixed_pose
 from viewfinder.tracking.phone_tracker import PhoneTracker
+from viewfinder.tracking.tracker import FixedPose, Tracker, read_fixed_pose
 
 
 @contextmanager

@@ -13,10 +13,10 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.scene import SceneRenderer
-from mrbokeh.scene.shadow_layer import shadow_layer
 from mrbokeh.scene.staging.picture_box import NEAREST_M, PictureBox, box_around
 from mrbokeh.scene.staging.staged_scene import StagedScene
-from mrbokeh.tracking.upright import upright_camera
+from mrbokeh.scene.virtual_scene import shadow_layer
+from mrbokeh.tracking.world_axes import upright_camera
 from viewfinder.stage.layer_depth import GRID_PX, LayerDepth
 from viewfinder.stage.occlusion import Occlusion
 from viewfinder.stage.reprojection import MovableLayer

@@ -16,7 +16,7 @@ from mrbokeh.optics.lens_file_values import read_transmission
 from mrbokeh.scene.staging.scene_description import RealThings
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import upright_camera
+from mrbokeh.tracking.world_axes import upright_camera
 
 Plane = Float32[np.ndarray, "height width"]
 _FINER = 1.25

@@ -7,7 +7,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene
 from mrbokeh.scene.staging.scene_description import Triple
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import rays, turned_back
+from mrbokeh.tracking.world_axes import rays, turned_back
 from viewfinder.stage.occlusion import Occlusion
 from viewfinder.stage.seen import Seen
 

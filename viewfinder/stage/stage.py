@@ -14,8 +14,8 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.staging.scene_description import PlacedObject, Triple
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import upright_camera
-from viewfinder.flow.frames import Bgr
+from mrbokeh.tracking.world_axes import upright_camera
+from viewfinder.frames import Bgr
 from viewfinder.stage.drawing_thread import DrawingThread
 from viewfinder.stage.drawn_layer import DrawRequest, sharp_layers
 from viewfinder.stage.fade import Fade
@@ -25,7 +25,7 @@ from viewfinder.stage.seen import Seen
 from viewfinder.stage.stage_setup import SetupLoader, live_renderer
 from viewfinder.stage.stage_status import StageStatus, status_of
 from viewfinder.stage.views import VIEWS, view_picture
-from viewfinder.tracking.base import TrackedPose
+from viewfinder.tracking.tracker import TrackedPose
 
 _STILL_S = 0.4
 """After so long without movement a drawing of reduced resolution is drawn again at every pixel."""

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.lens import MM_PER_M
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
-from viewfinder.flow.frames import Pose
+from mrbokeh.tracking.world_axes import inverted, rigid
+from viewfinder.frames import Pose
 from viewfinder.tracking.rigid_motion import angle_deg, parameters_of, rigid_of
 
 FORMAT = "mrbokeh-phone-rig"

@@ -1,12 +1,50 @@
-"""PoseHistory: the last poses of a tracking system with their times, and the pose at any time among them."""
+"""PoseHistory: the last poses of a tracking system with their times, and the pose at any time among them.
+
+What one message of an external tracking system says, in our conventions.
+
+SenderClock: the sender's time in ours, freed of the network's jitter.
+"""
 
 from bisect import bisect_right, insort
+from collections import deque
 from dataclasses import dataclass
 from threading import Lock
 
-from mrbokeh.tracking.camera_track.between_frames import pose_between
-from viewfinder.flow.frames import LensState, Pose
-from viewfinder.tracking.tracking_sample import TrackingSample, lens_between
+import numpy as np
+
+from mrbokeh.tracking.camera_track.track import focus_between_m, pose_between, stop_between
+from viewfinder.frames import UNKNOWN_LENS, LensState, Pose
+
+STAGE_FROM_BOARD = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Our world (x right, y down the board, z into it) lies on the stage's ground: y along -Y, z along -Z."""
+
+
+class MalformedMessageError(ValueError):
+    """A message from the network that is not what its format says; it is counted and otherwise ignored."""
+
+
+@dataclass(frozen=True)
+class TrackingSample:
+    """camera_from_world: at the entrance pupil, our axes, metres. sender_s: when it was taken, by the sender's clock; None: not said.
+
+    ignored: what the message says and nothing here makes use of.
+    """
+
+    camera_from_world: Pose
+    lens: LensState = UNKNOWN_LENS
+    sender_s: float | None = None
+    ignored: frozenset[str] = frozenset()
+
+
+def lens_between(a: LensState, b: LensState, share: float) -> LensState:
+    """Focus in dioptres, f-numbers in stops: as the rings of a lens turn; what only one knows is taken from it."""
+    a, b = a.completed_by(b), b.completed_by(a)
+    both_mm = a.focal_length_mm, b.focal_length_mm
+    return LensState(
+        focus_between_m(a.focus_distance_m, b.focus_distance_m, share),
+        stop_between(a.f_number, b.f_number, share),
+        None if both_mm[0] is None or both_mm[1] is None else (1.0 - share) * both_mm[0] + share * both_mm[1],
+    )
 
 
 @dataclass(frozen=True)
@@ -57,3 +95,19 @@ class PoseHistory:
         share = (time_s - before_s) / (after_s - before_s)
         pose = pose_between(before.camera_from_world, following.camera_from_world, share)
         return PoseAtTime(pose, lens_between(before.lens, following.lens, share), 0.0)
+
+
+class SenderClock:
+    """A packet is never early: of the last arrivals the least delayed one tells how the clocks differ (as in NTP's clock filter,
+    RFC 5905). What all packets are late by stays in; the delay between video and pose, which the user sets, contains it.
+    """
+
+    def __init__(self, window: int = 128) -> None:
+        self._differences_s: deque[float] = deque(maxlen=window)
+
+    def ours_s(self, sender_s: float | None, arrived_s: float) -> float:
+        """When it was sent, by our clock; a sender that says no time is taken at the arrival."""
+        if sender_s is None:
+            return arrived_s
+        self._differences_s.append(arrived_s - sender_s)
+        return sender_s + min(self._differences_s)

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mrbokeh.tracking.camera_track.world_axes import rigid
-from viewfinder.flow.frames import Pose
+from mrbokeh.tracking.world_axes import rigid
+from viewfinder.frames import Pose
 
 
 def rigid_of(parameters: Float[np.ndarray, "6"]) -> Pose:

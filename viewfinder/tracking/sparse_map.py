@@ -2,6 +2,8 @@
 
 The folder is what `mrbokeh capture poses` and `scale` write (SCENE/reconstruction: sparse/, images/, scale.json), or what COLMAP
 does (sparse/0/, images/) with the scale given by hand. Looking at all pictures takes a while, once: localisation.npz keeps it.
+
+SIFT features (Lowe 2004) of a grey picture as RootSIFT (Arandjelovic and Zisserman 2012), at places in our convention.
 """
 
 import hashlib
@@ -14,14 +16,36 @@ from zipfile import BadZipFile
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from mrbokeh.system.atomic_files import atomic_path, read_json
 from mrbokeh.system.console import track
-from mrbokeh.system.errors import InputError
-from viewfinder.tracking.map_pose import require_pycolmap
-from viewfinder.tracking.sift_features import find_features
+from mrbokeh.system.errors import InputError, MissingExtraError
+
+_LENGTH = 128
+
+Grey = UInt8[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Features:
+    """xy_px: the centre of the first pixel is at (0.5, 0.5). descriptors: of length 1."""
+
+    xy_px: Float64[np.ndarray, "features 2"]
+    descriptors: Float32[np.ndarray, "features 128"]
+
+
+def find_features(grey: Grey, most: int) -> Features:
+    """The strongest ones."""
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=most).detectAndCompute(grey, None)
+    if descriptors is None:
+        return Features(np.zeros((0, 2)), np.zeros((0, _LENGTH), np.float32))
+    xy_px = np.array([point.pt for point in keypoints], np.float64) + 0.5
+    # Hellinger's distance: roots of descriptors whose sum is 1.
+    roots = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+    return Features(xy_px, roots.astype(np.float32))
+
 
 CACHE_NAME = "localisation.npz"
 SCALE_NAME = "scale.json"
@@ -174,3 +198,12 @@ def _looks(model: Any, pictures: Path) -> Iterator[tuple[np.ndarray, np.ndarray]
         same = off_px < _SAME_PLACE_PX
         numbers = np.array([point.point3D_id for point in observed], np.int64)
         yield numbers[same], np.round(features.descriptors[nearest[same]] * _STEPS).clip(0, 255).astype(np.uint8)
+
+
+def require_pycolmap() -> Any:
+    """Return the package that reads COLMAP's models."""
+    try:
+        import pycolmap
+    except ImportError:
+        raise MissingExtraError("pycolmap", "capture") from None
+    return pycolmap

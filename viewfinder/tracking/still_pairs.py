@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.lens import MM_PER_M
-from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
-from viewfinder.flow.frames import Pose
+from mrbokeh.tracking.world_axes import inverted, rigid
+from viewfinder.frames import Pose
 from viewfinder.tracking.phone_rig import PosePair
 from viewfinder.tracking.rigid_motion import angle_deg
 

@@ -13,7 +13,7 @@ from mrbokeh.scene import Environment, Light, split_sun, sun
 from mrbokeh.scene.gltf.gltf_loader import GltfAsset
 from mrbokeh.scene.staging.scene_description import Lighting
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import turned
+from mrbokeh.tracking.world_axes import turned
 
 SUN_DIRECTION = (0.45, 1.0, 0.55)
 _GREY, _SUN = 0.45, 1.6

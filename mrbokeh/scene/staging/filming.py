@@ -15,13 +15,13 @@ from mrbokeh.scene.choose import scene_renderer
 from mrbokeh.scene.light_change.light_change import GREY, light_change
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
 from mrbokeh.scene.moving_layers.moving_shadow import ShadowCatcher
-from mrbokeh.scene.shadow_layer import shadow_layer
 from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.picture_box import shadow_box
 from mrbokeh.scene.staging.scene_description import SceneDescription
 from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.scene.virtual_scene import shadow_layer
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import upright_camera
+from mrbokeh.tracking.world_axes import upright_camera
 
 CATCHES = ("shadow", "light")
 

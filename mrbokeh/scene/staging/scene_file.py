@@ -47,7 +47,7 @@ from mrbokeh.renderers.choose import DEFAULT
 from mrbokeh.scene.staging.scene_description import Lighting, PlacedObject, RealThings, SceneDescription, ShadowPlane, Sun
 from mrbokeh.scene.staging.scene_values import SceneValues
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD
+from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD
 
 _TABLES = ("up", "object", "light", "sun", "shadow", "occlusion", "lens", "renderer")
 

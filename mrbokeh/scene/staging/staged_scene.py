@@ -14,7 +14,7 @@ from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.picture_box import drawn_points_m
 from mrbokeh.scene.staging.scene_description import PlacedObject, SceneDescription
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.upright import turned
+from mrbokeh.tracking.world_axes import turned
 
 MOMENT_S = 1 / 120
 """Live, animations are posed at whole multiples of this, so that two frames of one moment share one scene."""

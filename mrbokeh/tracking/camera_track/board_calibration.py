@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.tracked_frame import Distortion
+from mrbokeh.tracking.camera_track.track import Distortion
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from mrbokeh.tracking.charuco.detector import Corners
 

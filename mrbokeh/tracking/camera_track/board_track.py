@@ -1,24 +1,156 @@
-"""The camera track of a clip in which a printed board is seen."""
+"""The camera track of a clip in which a printed board is seen.
 
-from collections.abc import Iterator, Sequence
+Intrinsics for the pictures of a clip: of its size, and turned as its metadata turn the pictures.
+
+Corners of a board in every frame of a clip, read or carried from frames before and after.
+
+Reading is tried in every frame. What cannot be read is carried by flow from the frame before, and where the board is read again
+afterwards, back from there; in either case the whole print is laid over the picture, which keeps what is carried from drifting.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-from mrbokeh.optics.camera import Camera
+import cv2
+import numpy as np
+from jaxtyping import Float64
+
+from mrbokeh.optics.camera import Camera, have_same_shape
 from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import Calibration, calibrated
-from mrbokeh.tracking.camera_track.board_corners import RollingCorners, Undistorting, read_greys
 from mrbokeh.tracking.camera_track.board_smoothing import Observation, residual_px, steadied
-from mrbokeh.tracking.camera_track.clip_intrinsics import Intrinsics, intrinsics_of_clip
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.tracked_frame import Distortion, TrackedFrame
+from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, Distortion, TrackedFrame
 from mrbokeh.tracking.charuco.board import CharucoBoard
-from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
+from mrbokeh.tracking.charuco.board_alignment import aligned_corners
+from mrbokeh.tracking.charuco.corner_flow import flow
+from mrbokeh.tracking.charuco.detector import NO_CORNERS, CharucoDetector, Corners, Grey
 from mrbokeh.tracking.charuco.pose_branches import PoseFit, fits_of_shot
-from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
-from mrbokeh.video.clip import probe
+from mrbokeh.tracking.charuco.pose_from_points import FEWEST_POINTS, opencv_matrix, poses_from_plane
+from mrbokeh.video.clip import probe, read_display_frames
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """camera: its pose says nothing. distortion: None is a pinhole."""
+
+    camera: Camera
+    distortion: Distortion | None = None
+
+    def turned(self, quarter_turns: int) -> "Intrinsics":
+        """For pictures turned counter-clockwise, so often by 90 degrees."""
+        turned = self
+        for _ in range(quarter_turns % 4):
+            turned = turned._turned_once()
+        return turned
+
+    def _turned_once(self) -> "Intrinsics":
+        """A point (x, y) comes to (y, width - x)."""
+        (fx, fy), (cx, cy), width_px = self.camera.focal_px, self.camera.principal_px, self.camera.width_px
+        camera = Camera(self.camera.height_px, width_px, (fy, fx), (cy, width_px - cx), np.eye(4))
+        if self.distortion is None:
+            return Intrinsics(camera)
+        p1, p2 = (self.distortion.get(name, 0.0) for name in ("p1", "p2"))
+        tangential = {"p1": -p2, "p2": p1} if p1 or p2 else {}
+        return Intrinsics(camera, {**{name: value for name, value in self.distortion.items() if name not in ("p1", "p2")}, **tangential})
+
+
+def intrinsics_of_clip(stated: Intrinsics, size_px: tuple[int, int], quarter_turns: int, clip: Path) -> Intrinsics:
+    """size_px: (width, height) of the clip's pictures as they are shown; quarter_turns: counter-clockwise, by which they were turned.
+
+    What was stated for the camera held level holds for upright pictures too, if the clip's metadata turn them. InputError where the
+    pictures have another shape.
+    """
+    for turns in dict.fromkeys((0, quarter_turns)):
+        found = stated.turned(turns)
+        if have_same_shape(size_px, (found.camera.width_px, found.camera.height_px)):
+            return replace(found, camera=replace(found.camera.resized(*size_px), camera_from_world=np.eye(4)))
+    raise InputError(
+        f"expected intrinsics for pictures of the shape of {clip} ({size_px[0]}x{size_px[1]}), got those of "
+        f"{stated.camera.width_px}x{stated.camera.height_px}: state them for all of the picture, or give --calibrate"
+    )
+
+
+_CARRIED_FRAMES = 30
+"""So long may corners be carried that no print confirms; real clips blur for less, and flow has slipped by then."""
+
+_BACK_FRAMES = 60
+
+
+def read_greys(clip: Path, width_px: int, height_px: int) -> Iterator[tuple[Grey, float]]:
+    """(grey picture, its time in seconds) of each frame."""
+    for frame in read_display_frames(clip, width_px, height_px):
+        yield cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), frame.time_s
+
+
+class Undistorting:
+    """Pictures of a lens with distortion as its pinhole would have them; a homography then explains a board."""
+
+    def __init__(self, camera: Camera, distortion: Distortion | None) -> None:
+        told = opencv_coefficients(distortion)
+        self._maps = None
+        if told.any():
+            matrix, size = opencv_matrix(camera), (camera.width_px, camera.height_px)
+            matrix[:2, 2] -= 0.5  # OpenCV's first pixel has its centre at (0, 0)
+            self._maps = cv2.initUndistortRectifyMap(matrix, told, None, matrix, size, cv2.CV_32FC1)
+
+    def __call__(self, grey: Grey) -> Grey:
+        return grey if self._maps is None else cv2.remap(grey, *self._maps, cv2.INTER_CUBIC)
+
+
+def opencv_coefficients(distortion: Distortion | None) -> Float64[np.ndarray, "8"]:
+    return np.array([(distortion or {}).get(name, 0.0) for name in DISTORTION_NAMES])
+
+
+class RollingCorners:
+    """Corners of frame after frame; `all` mends what went before where the board comes back into sight."""
+
+    def __init__(self, board: CharucoBoard) -> None:
+        self._board, self._detector = board, CharucoDetector(board)
+
+    def all(self, greys: Iterable[Grey]) -> list[Corners]:
+        """One for each frame; empty where the board is neither seen nor carried."""
+        found: list[Corners] = []
+        before: Grey | None = None
+        waiting: list[Grey] = []
+        unconfirmed = 0
+        for grey in greys:
+            carried = self._carried(before, grey, found[-1]) if before is not None and unconfirmed < _CARRIED_FRAMES else NO_CORNERS
+            corners, confirmed = self._in_frame(grey, self._detector.detect(grey), carried)
+            found.append(corners)
+            unconfirmed = 0 if confirmed else unconfirmed + 1
+            if len(corners) < FEWEST_POINTS:
+                waiting = [*waiting[-_BACK_FRAMES:], grey]
+            elif waiting:
+                self._go_back(found, [*waiting, grey])
+                waiting = []
+            before = grey
+        return found
+
+    def _in_frame(self, grey: Grey, read: Corners, carried: Corners) -> tuple[Corners, bool]:
+        """(corners, whether reading or the print confirms them)."""
+        start = read.with_more(carried)
+        aligned = aligned_corners(self._board, grey, start)
+        if aligned is not None:
+            return aligned, True
+        return start, len(read) >= FEWEST_POINTS
+
+    def _go_back(self, found: list[Corners], greys: list[Grey]) -> None:
+        """From the last frame, in which the board is seen, to those before, as far as it holds."""
+        for back in range(1, len(greys)):
+            place = len(found) - 1 - back
+            carried = self._carried(greys[-back], greys[-back - 1], found[place + 1])
+            corners, _ = self._in_frame(greys[-back - 1], found[place], carried)
+            if len(corners) < FEWEST_POINTS:
+                return
+            found[place] = corners
+
+    def _carried(self, start: Grey, end: Grey, corners: Corners) -> Corners:
+        places, good = flow(start, end, corners.xy_px)
+        return Corners(corners.ids, places).only(good)
+
 
 _CALIBRATED_FROM = 240
 """Frames at most in which the board is read for calibration."""

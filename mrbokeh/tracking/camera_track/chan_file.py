@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.options import TrackOptions, lost
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.tracking.camera_track.world_axes import from_opengl, rigid, to_opengl, with_up
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
+from mrbokeh.tracking.camera_track.track_file import TrackOptions, lost
+from mrbokeh.tracking.world_axes import from_opengl, rigid, to_opengl
 
 _COLUMNS = "FRAME TX TY TZ RX RY RZ VFOV"
 _UP = "+y"
@@ -44,7 +43,7 @@ def read(path: Path, options: TrackOptions) -> CameraTrack:
 
 def write(path: Path, track: CameraTrack, options: TrackOptions) -> tuple[str, ...]:
     """Numbers with all their digits."""
-    turned = with_up(track, options.up or _UP)
+    turned = track.with_up(options.up or _UP)
     lines = [_line(number, turned.frames[number].camera, options.rotation_order) for number in turned.numbers]
     with atomic_path(path) as temporary:
         temporary.write_text("".join(lines), encoding="utf-8")

@@ -12,8 +12,8 @@ from types import MappingProxyType
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track import chan_file, colmap_file, nerfstudio_file, opentrackio_file, track_file
-from mrbokeh.tracking.camera_track.options import TrackOptions
 from mrbokeh.tracking.camera_track.track import CameraTrack
+from mrbokeh.tracking.camera_track.track_file import TrackOptions
 
 Read = Callable[[Path, TrackOptions], CameraTrack]
 Write = Callable[[Path, CameraTrack, TrackOptions], tuple[str, ...]]

@@ -14,11 +14,9 @@ import numpy as np
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.options import TrackOptions, lost
-from mrbokeh.tracking.camera_track.picture_names import frame_numbers, picture_name
-from mrbokeh.tracking.camera_track.track import CameraTrack, is_rigid
-from mrbokeh.tracking.camera_track.tracked_frame import DISTORTION_NAMES, TrackedFrame
-from mrbokeh.tracking.camera_track.world_axes import from_opengl, to_opengl, with_up
+from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, TrackedFrame, is_rigid
+from mrbokeh.tracking.camera_track.track_file import TrackOptions, frame_numbers, lost, picture_name
+from mrbokeh.tracking.world_axes import from_opengl, to_opengl
 
 _UP = "+z"
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "perspective")
@@ -40,7 +38,7 @@ def read(path: Path, options: TrackOptions) -> CameraTrack:
 
 def write(path: Path, track: CameraTrack, options: TrackOptions) -> tuple[str, ...]:
     """Intrinsics are shared where all frames have the same."""
-    turned = with_up(track, options.up or _UP)
+    turned = track.with_up(options.up or _UP)
     intrinsics = {number: _intrinsics_to_json(turned.frames[number]) for number in turned.numbers}
     first = intrinsics[turned.numbers[0]]
     shared = first if all(each == first for each in intrinsics.values()) else {}

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from mrbokeh.tracking.camera_track.stage_axes import CAMERA_FROM_STAGE_CAMERA, pan_tilt_roll_deg, stage_rotation
-from mrbokeh.tracking.camera_track.world_axes import inverted, rigid
+from mrbokeh.tracking.world_axes import CAMERA_FROM_STAGE_CAMERA, inverted, pan_tilt_roll_deg, rigid, stage_rotation
 
 PROTOCOL = "OpenTrackIO"
 _UNTURNED = {"pan": 0.0, "tilt": 0.0, "roll": 0.0}

@@ -1,4 +1,13 @@
-"""CameraTrack: the camera of each frame of a shot."""
+"""CameraTrack: the camera of each frame of a shot.
+
+TrackedFrame: camera, lens state and distortion at one moment.
+
+What lies between two frames of a track.
+
+Rotations go along the shortest arc (Shoemake 1985), places of the entrance pupil along a line: the last column of
+camera_from_world turns with the camera, and a turning camera on a tripod would leave it. Focus goes linearly in dioptres, as rings
+of lenses and the blur do, the aperture in stops.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -6,12 +15,101 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.between_frames import between
-from mrbokeh.tracking.camera_track.tracked_frame import TrackedFrame
-from mrbokeh.tracking.upright import UPRIGHT_FROM_WORLD
+from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD
+
+Distortion = Mapping[str, float]
+"""Coefficients by their names in OpenCV and COLMAP: k1, k2, k3 (of r^2, r^4, r^6), k4, k5, k6 (the same below the bar), p1, p2."""
+
+DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""In OpenCV's order."""
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """focus_distance_m: from the entrance pupil, inf is allowed. time_s: from the start of the shot. None is not known.
+
+    distortion: from the pinhole's picture to the real one; None or empty is a pinhole.
+    """
+
+    camera: Camera
+    focus_distance_m: float | None = None
+    f_number: float | None = None
+    time_s: float | None = None
+    distortion: Distortion | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("focus distance", self.focus_distance_m), ("f-number", self.f_number)):
+            if value is not None and not value > 0.0:
+                raise InputError(f"the {name} of a frame must be positive, got {value}")
+        if unknown := set(self.distortion or {}) - set(DISTORTION_NAMES):
+            raise InputError(f"lens distortion is given by {', '.join(DISTORTION_NAMES)}, got {', '.join(sorted(unknown))}")
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Those that are not 0."""
+        return {name: float(value) for name, value in (self.distortion or {}).items() if value}
+
+
+Pose = Float64[np.ndarray, "4 4"]
+
+
+def between(one: TrackedFrame, other: TrackedFrame, share: float) -> TrackedFrame:
+    """share 0 is one, 1 is the other; what only one of them knows is not known in between."""
+    return TrackedFrame(
+        camera_between(one.camera, other.camera, share),
+        focus_between_m(one.focus_distance_m, other.focus_distance_m, share),
+        stop_between(one.f_number, other.f_number, share),
+        _linear(one.time_s, other.time_s, share),
+        _distortion(one.distortion, other.distortion, share),
+    )
+
+
+def camera_between(one: Camera, other: Camera, share: float) -> Camera:
+    pose = pose_between(one.camera_from_world, other.camera_from_world, share)
+    focal, principal = (
+        tuple((1.0 - share) * x + share * y for x, y in zip(*pair, strict=True))
+        for pair in ((one.focal_px, other.focal_px), (one.principal_px, other.principal_px))
+    )
+    return Camera(one.width_px, one.height_px, (focal[0], focal[1]), (principal[0], principal[1]), pose)
+
+
+def pose_between(one: Pose, other: Pose, share: float) -> Pose:
+    """Of two camera_from_world."""
+    a, b = np.linalg.inv(one), np.linalg.inv(other)
+    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
+    pose = np.eye(4)
+    pose[:3, :3] = (a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()).T
+    pose[:3, 3] = -pose[:3, :3] @ ((1.0 - share) * a[:3, 3] + share * b[:3, 3])
+    return pose
+
+
+def focus_between_m(one_m: float | None, other_m: float | None, share: float) -> float | None:
+    if one_m is None or other_m is None:
+        return None
+    dioptres = (1.0 - share) / one_m + share / other_m
+    return 1.0 / dioptres if dioptres > 0.0 else float("inf")
+
+
+def stop_between(one: float | None, other: float | None, share: float) -> float | None:
+    if one is None or other is None:
+        return None
+    return float(one ** (1.0 - share) * other**share)
+
+
+def _linear(one: float | None, other: float | None, share: float) -> float | None:
+    return None if one is None or other is None else (1.0 - share) * one + share * other
+
+
+def _distortion(one: Distortion | None, other: Distortion | None, share: float) -> Distortion | None:
+    """A coefficient that is not told is 0."""
+    if one is None and other is None:
+        return None
+    a, b = one or {}, other or {}
+    return {name: (1.0 - share) * a.get(name, 0.0) + share * b.get(name, 0.0) for name in {**a, **b}}
 
 
 @dataclass(frozen=True)
@@ -90,6 +188,17 @@ class CameraTrack:
         """The same views in another number of pixels; distortion does not depend on it."""
         frames = {number: replace(each, camera=each.camera.resized(width_px, height_px)) for number, each in self.frames.items()}
         return replace(self, frames=frames)
+
+    def with_up(self, up: str) -> "CameraTrack":
+        """Return the same cameras in a world turned about its origin, such that `up` is up."""
+        if up == self.up:
+            return self
+        old_from_new = UPRIGHT_FROM_WORLD[self.up].T @ UPRIGHT_FROM_WORLD[up]
+        frames = {
+            number: replace(each, camera=replace(each.camera, camera_from_world=each.camera.camera_from_world @ old_from_new))
+            for number, each in self.frames.items()
+        }
+        return replace(self, frames=frames, up=up)
 
     @cached_property
     def _times_s(self) -> Float64[np.ndarray, " frames"]:

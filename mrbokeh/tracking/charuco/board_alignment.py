@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from mrbokeh.tracking.charuco.board import CharucoBoard
+from mrbokeh.tracking.charuco.board import CharucoBoard, black_rectangles_mm
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
-from mrbokeh.tracking.charuco.drawing import black_rectangles_mm
 
 _FEWEST_CORNERS = 4
 _LEAST_CORRELATION = 0.9
