@@ -1,13 +1,190 @@
-"""Light on shading points: glTF's metallic-roughness BRDF under lights and under a panorama. Compiled with numba."""
+"""Light on shading points: glTF's metallic-roughness BRDF under lights and under a panorama. Compiled with numba.
 
-from math import pi, sqrt
+Panoramas filtered for lighting: cosine convolution, GGX convolution, BRDF integral. Compiled with numba.
+"""
+
+from math import acos, atan2, cos, log2, pi, sin, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.scene._compiled_numba import compiled
-from mrbokeh.scene._environment_numba import PanoramaLevels, look_up, look_up_between
 from mrbokeh.scene._surface_numba import Surfaces
-from mrbokeh.scene._vectors_numba import Vector, cross, dot, row, scaled, sub, unit3
+from mrbokeh.scene._vectors_numba import Vector, compiled, cross, dot, row, scaled, sub, unit3
+
+
+class PanoramaLevels(NamedTuple):
+    """Panoramas of several sizes, one after the other; texel centres at half-integers, as in `Environment`."""
+
+    radiance: np.ndarray  # (N, 3) float32
+    start: np.ndarray  # (L,) int32
+    size: np.ndarray  # (L, 2) int32 height, width
+
+
+@compiled
+def _index(x: int, y: int, height: int, width: int) -> int:
+    """Texel index; over a pole the panorama goes on at the opposite longitude."""
+    if y < 0:
+        y, x = -1 - y, x + width // 2
+    elif y >= height:
+        y, x = 2 * height - 1 - y, x + width // 2
+    return y * width + x % width
+
+
+@compiled
+def look_up(levels: PanoramaLevels, level: int, x: float, y: float, z: float) -> Vector:
+    """Radiance from the unit direction (x, y, z), bilinearly."""
+    u, v = _place(x, y, z)
+    return _bilinear(levels, level, u, v)
+
+
+@compiled
+def _place(x: float, y: float, z: float) -> tuple[float, float]:
+    """Column and row of a direction as shares of the panorama's width and height."""
+    return atan2(x, z) / (2 * pi) + 0.5, acos(min(max(-y, -1.0), 1.0)) / pi
+
+
+@compiled
+def _bilinear(levels: PanoramaLevels, level: int, u: float, v: float) -> Vector:
+    height, width = levels.size[level, 0], levels.size[level, 1]
+    start = levels.start[level]
+    column, row = u * width - 0.5, v * height - 0.5
+    left, top = int(np.floor(column)), int(np.floor(row))
+    right, down = column - left, row - top
+    if left >= 0 and left + 1 < width and top >= 0 and top + 1 < height:
+        a = start + top * width + left
+        b, c, d = a + 1, a + width, a + width + 1
+    else:
+        a, b = start + _index(left, top, height, width), start + _index(left + 1, top, height, width)
+        c, d = start + _index(left, top + 1, height, width), start + _index(left + 1, top + 1, height, width)
+    w_a, w_b, w_c, w_d = (1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down
+    values = levels.radiance
+    i, j, k, m = np.uintp(a), np.uintp(b), np.uintp(c), np.uintp(d)  # unsigned: no index is tried for being negative
+    return (
+        w_a * values[i, 0] + w_b * values[j, 0] + w_c * values[k, 0] + w_d * values[m, 0],
+        w_a * values[i, 1] + w_b * values[j, 1] + w_c * values[k, 1] + w_d * values[m, 1],
+        w_a * values[i, 2] + w_b * values[j, 2] + w_c * values[k, 2] + w_d * values[m, 2],
+    )
+
+
+@compiled
+def look_up_between(levels: PanoramaLevels, level: float, x: float, y: float, z: float) -> Vector:
+    """Radiance between two neighbouring levels (level is fractional)."""
+    level = min(max(level, 0.0), levels.start.size - 1.0)
+    low = int(level)
+    fraction = level - low
+    u, v = _place(x, y, z)
+    fine = _bilinear(levels, low, u, v)
+    if fraction == 0.0:
+        return fine
+    coarse = _bilinear(levels, low + 1, u, v)
+    return (
+        fine[0] + fraction * (coarse[0] - fine[0]),
+        fine[1] + fraction * (coarse[1] - fine[1]),
+        fine[2] + fraction * (coarse[2] - fine[2]),
+    )
+
+
+@compiled
+def cosine_convolved(moments: np.ndarray, normals: np.ndarray, out: np.ndarray) -> None:
+    """Irradiance / pi for each normal: sum over blocks of the panorama of max(0, normal . moment) / pi.
+
+    moments: (B, 3 colours, 3) integral of radiance times direction over each block. For a block wholly above or below the
+    horizon the sum is exact however its light is distributed; only the blocks that the horizon cuts are approximated.
+    """
+    for i in range(normals.shape[0]):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        for channel in range(3):
+            total = 0.0
+            for block in range(moments.shape[0]):
+                cosine = x * moments[block, channel, 0] + y * moments[block, channel, 1] + z * moments[block, channel, 2]
+                total += max(cosine, 0.0)
+            out[i, channel] = total / pi
+
+
+@compiled
+def _radical_inverse(i: int) -> float:
+    """Van der Corput's sequence: the second coordinate of Hammersley points."""
+    result, digit = 0.0, 0.5
+    while i > 0:
+        result += digit * (i & 1)
+        i >>= 1
+        digit *= 0.5
+    return result
+
+
+@compiled
+def ggx_lobe(roughness: float, texel_sr: float, samples: int, lobe: np.ndarray) -> None:
+    """Directions around a mirrored ray in which a rough mirror looks, with normal = view = reflection.
+
+    lobe: (samples, 4), written: across and along the tangent plane, cosine (0 or less: not seen), level of the panorama about as
+    coarse as the sample's share of the sphere. texel_sr: solid angle of a texel of level 0.
+    """
+    alpha2 = max(roughness, 1e-3) ** 4
+    for k in range(samples):
+        u, phi = (k + 0.5) / samples, 2 * pi * _radical_inverse(k)
+        cos2 = (1.0 - u) / (1.0 + (alpha2 - 1.0) * u)
+        n_l = 2.0 * cos2 - 1.0
+        sin_l = sqrt(max(1.0 - n_l * n_l, 0.0))
+        density = alpha2 / (pi * (cos2 * (alpha2 - 1.0) + 1.0) ** 2) / 4.0
+        lobe[k, 0], lobe[k, 1], lobe[k, 2] = sin_l * cos(phi), sin_l * sin(phi), n_l
+        lobe[k, 3] = 0.5 * log2(1.0 / (samples * density * texel_sr)) + 0.5
+
+
+@compiled
+def ggx_convolved(source: PanoramaLevels, directions: np.ndarray, lobe: np.ndarray, out: np.ndarray) -> None:
+    """The panorama as a rough mirror sees it, with normal = view = reflection (Karis 2013, "Real Shading in Unreal Engine 4").
+
+    lobe: of `ggx_lobe`. Each sample reads a level about as coarse as its share of the sphere (filtered importance sampling: Krivanek
+    and Colbert 2008), so that a small bright sun gives no noise.
+    """
+    for i in range(directions.shape[0]):
+        rx, ry, rz = directions[i, 0], directions[i, 1], directions[i, 2]
+        # A frame around the reflection (Duff et al. 2017).
+        sign = 1.0 if rz >= 0 else -1.0
+        a = -1.0 / (sign + rz)
+        b = rx * ry * a
+        tx, ty, tz = 1.0 + sign * rx * rx * a, sign * b, -sign * rx
+        bx, by, bz = b, sign + ry * ry * a, -ry
+        # Turned by a different angle per texel, the pattern's own shape does not show.
+        turn = 2 * pi * _radical_inverse(i * 7 + 1)
+        cosine, sine = cos(turn), sin(turn)
+        red, green, blue, weight = 0.0, 0.0, 0.0, 0.0
+        for k in range(lobe.shape[0]):
+            n_l = lobe[k, 2]
+            if n_l <= 0.0:
+                continue
+            across, along = cosine * lobe[k, 0] - sine * lobe[k, 1], sine * lobe[k, 0] + cosine * lobe[k, 1]
+            x, y, z = across * tx + along * bx + n_l * rx, across * ty + along * by + n_l * ry, across * tz + along * bz + n_l * rz
+            light = look_up_between(source, lobe[k, 3], x, y, z)
+            red, green, blue, weight = red + n_l * light[0], green + n_l * light[1], blue + n_l * light[2], weight + n_l
+        out[i, 0], out[i, 1], out[i, 2] = red / weight, green / weight, blue / weight
+
+
+@compiled
+def brdf_integral(size: int, samples: int, out: np.ndarray) -> None:
+    """(size, size, 2): reflected share of uniform light = f0 * [..., 0] + f90 * [..., 1]; rows roughness, columns cosine.
+
+    The BRDF is the specification's: GGX, height-correlated Smith visibility, Schlick's Fresnel (glTF 2.0, appendix B).
+    """
+    for row in range(size):
+        alpha2 = max(row / (size - 1), 1e-3) ** 4
+        for column in range(size):
+            n_v = max(column / (size - 1), 1e-3)
+            vx = sqrt(1.0 - n_v * n_v)
+            first, second = 0.0, 0.0
+            for k in range(samples):
+                u, phi = (k + 0.5) / samples, 2 * pi * _radical_inverse(k)
+                n_h = sqrt((1.0 - u) / (1.0 + (alpha2 - 1.0) * u))
+                v_h = vx * sqrt(max(1.0 - n_h * n_h, 0.0)) * cos(phi) + n_v * n_h
+                n_l = 2.0 * v_h * n_h - n_v
+                if n_l <= 0.0 or v_h <= 0.0:
+                    continue
+                visibility = 0.5 / (n_l * sqrt(n_v * n_v * (1 - alpha2) + alpha2) + n_v * sqrt(n_l * n_l * (1 - alpha2) + alpha2))
+                share = visibility * n_l * 4.0 * v_h / n_h
+                fresnel = (1.0 - v_h) ** 5
+                first, second = first + (1.0 - fresnel) * share, second + fresnel * share
+            out[row, column, 0], out[row, column, 1] = first / samples, second / samples
+
 
 LOWEST_ROUGHNESS = 0.045
 """A perfect mirror does not show a light without extent at all; this is the usual floor of real-time engines."""

@@ -4,8 +4,7 @@ from math import inf
 
 import numpy as np
 
-from mrbokeh.scene._compiled_numba import compiled
-from mrbokeh.scene._vectors_numba import Vector, corner, cross, dot, row, sub
+from mrbokeh.scene._vectors_numba import Vector, compiled, corner, cross, dot, row, sub
 
 _AT_CENTRE = 16
 

@@ -1,0 +1,189 @@
+"""Compiled kernels, kept for all checkouts of a machine under the contents of their sources.
+
+numba keeps a compiled function beside its file and stamps it with that file alone: a changed callee in another file leaves a stale kernel
+behind, every checkout and installation compiles for itself, and two processes that start together compile everything twice. Here a kernel
+lies in the user's cache folder under the hash of its module and of all modules of ours which that imports, and whoever needs a kernel that
+another process compiles at the moment waits for it.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.compiler_lock import global_compiler_lock
+from numba.misc.appdirs import AppDirs
+
+_config: Any = numba.config
+
+KEPT_UNUSED_DAYS = 60
+"""Kernels of sources that nothing has loaded for so long are removed when new ones are written."""
+
+_DAY_S = 86400.0
+_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]+))", re.MULTILINE)
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile as numba.njit does; with cache=True the machine code is kept as this module describes."""
+    kept = options.pop("cache", False)
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        kernel = numba.njit(**options)(function)
+        folder = None if _config.DISABLE_JIT or not kept else _folder(Path(function.__code__.co_filename), function.__module__)
+        if folder is not None:
+            kernel._cache = _KernelCache(function)
+            kernel.compile = _once_at_a_time(kernel.compile, kernel.overloads, folder / f"{function.__qualname__}.lock")
+        return kernel
+
+    return compiled
+
+
+def fingerprint(file: Path, module: str) -> str | None:
+    """Return the hash of a module, of all of ours that it imports and of the compiler's versions; None where a source is not at hand."""
+    root = file.resolve().parents[module.count(".")]
+    if root / _path_of(module) != file.resolve():
+        return None
+    sources = sorted(_with_imported(root, module))
+    versions = f"{numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version_info[:2]}"
+    hashed = hashlib.sha256(versions.encode())
+    for source in sources:
+        hashed.update(source.encode() + b"\0" + hashlib.sha256(_text_of(root, source).encode()).digest())
+    return hashed.hexdigest()[:32]
+
+
+def forget_unused(folder: Path) -> None:
+    """Remove the folders of kernels in `folder` that have not been loaded for KEPT_UNUSED_DAYS."""
+    for old in folder.iterdir():
+        if old.is_dir() and time.time() - old.stat().st_mtime > KEPT_UNUSED_DAYS * _DAY_S:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+class _KernelLocator(_CacheLocator):  # type: ignore[misc]
+    """Tells numba where the kernels of a module lie; what they depend on is in the name of the folder."""
+
+    def __init__(self, folder: Path, line: int) -> None:
+        self._folder, self._line = folder, line
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        return self._folder.name
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "_KernelLocator | None":
+        folder = _folder(Path(py_file), py_func.__module__)
+        return cls(folder, py_func.__code__.co_firstlineno) if folder else None
+
+
+class _KernelCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = [_KernelLocator]  # type: ignore[assignment]  # noqa: RUF012
+
+
+class _KernelCache(FunctionCache):  # type: ignore[misc]
+    _impl_class = _KernelCacheImpl
+
+
+@cache
+def _folder(file: Path, module: str) -> Path | None:
+    """Return the folder of a module's kernels, marked as used today; None where nothing can be written or the source is not at hand."""
+    base, name = _writable_base(), fingerprint(file, module)
+    if base is None or name is None:
+        return None
+    folder = base / name
+    with suppress(OSError):
+        if not folder.is_dir():
+            folder.mkdir(exist_ok=True)
+            forget_unused(base)
+        elif time.time() - folder.stat().st_mtime > _DAY_S:
+            os.utime(folder)
+    return folder if folder.is_dir() else None
+
+
+@cache
+def _writable_base() -> Path | None:
+    """Return NUMBA_CACHE_DIR where it is set, else the user's cache folder, else __pycache__ here: the first that can be written."""
+    user = Path(AppDirs(appname="mrbokeh", appauthor=False).user_cache_dir)
+    bases = [Path(_config.CACHE_DIR)] if _config.CACHE_DIR else [user / "kernels", Path(__file__).parent / "__pycache__" / "kernels"]
+    for base in bases:
+        with suppress(OSError):
+            base.mkdir(parents=True, exist_ok=True)
+            if os.access(base, os.W_OK | os.X_OK):
+                return base
+    return None
+
+
+def _once_at_a_time(compile_one: Callable[[Any], Any], known: Any, lock: Path) -> Callable[[Any], Any]:
+    """Compile, or load what another process has compiled meanwhile; the lock also keeps numba's index of a kernel's signatures whole."""
+
+    def compile_or_wait(signature: Any) -> Any:
+        # Within numba's own lock, which is taken again inside: threads that held one lock each would wait for one another.
+        with global_compiler_lock:
+            if signature in known:
+                return compile_one(signature)
+            with _locked(lock):
+                return compile_one(signature)
+
+    return compile_or_wait
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a file locked against other processes, where the system and the file system can do that."""
+    try:
+        import fcntl
+
+        with path.open("a") as held:
+            with suppress(OSError):
+                fcntl.flock(held, fcntl.LOCK_EX)
+            yield
+    except (ImportError, FileNotFoundError, PermissionError):
+        yield
+
+
+def _path_of(module: str) -> str:
+    return module.replace(".", "/") + ".py"
+
+
+@cache
+def _text_of(root: Path, module: str) -> str:
+    """Return the source of a module below `root`; empty where it is not one of ours."""
+    for path in (root / _path_of(module), root / module.replace(".", "/") / "__init__.py"):
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    return ""
+
+
+@cache
+def _imported(root: Path, module: str) -> frozenset[str]:
+    """Return our modules that a module imports, wherever in it."""
+    names = set()
+    for source, members, plain in _IMPORT.findall(_text_of(root, module)):
+        words = re.findall(r"[\w.]+", re.sub(r"#[^\n]*|\bas\s+\w+", "", members or plain))
+        names.update([source, *(f"{source}.{word}" for word in words)] if source else words)
+    return frozenset(name for name in names if _text_of(root, name))
+
+
+def _with_imported(root: Path, module: str) -> set[str]:
+    """Return a module and all that it imports, directly or through others."""
+    found, waiting = set(), [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting.extend(_imported(root, name))
+    return found

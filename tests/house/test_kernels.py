@@ -1,0 +1,107 @@
+"""Compiled kernels lie in one folder for all checkouts, under the contents of their sources."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mrbokeh.system import kernels
+
+CALLEE = "from mrbokeh.system.kernels import njit\n\n@njit(cache=True)\ndef factor():\n    return {factor}\n"
+CALLER = (
+    "from mrbokeh.system.kernels import njit\nfrom room import (  # in brackets\n    callee_numba as callee,\n)\nfactor = callee.factor\n"
+)
+CALLER += "\n@njit(cache=True)\ndef scaled(x):\n    return x * factor()\n"
+OTHER = "VALUE = 1\n"
+CALL = """
+import json
+from numba.core import event
+with event.install_recorder("numba:compile") as compiled:
+    from room.caller_numba import scaled
+    value = scaled(2.0)
+ours = [e for _, e in compiled.buffer if e.is_start and e.data["dispatcher"].py_func.__module__.startswith("room")]
+print(json.dumps({"value": value, "compiled": len(ours), "hits": sum(scaled.stats.cache_hits.values())}))
+"""
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def checkout(folder: Path, factor: int = 3) -> Path:
+    room = folder / "room"
+    room.mkdir(parents=True, exist_ok=True)
+    for name, text in {"__init__": "", "callee_numba": CALLEE.format(factor=factor), "caller_numba": CALLER, "other": OTHER}.items():
+        (room / f"{name}.py").write_text(text)
+    return folder
+
+
+def start(folder: Path, cache: Path) -> "subprocess.Popen[str]":
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]),
+        "XDG_CACHE_HOME": str(cache),
+        "NUMBA_CACHE_DIR": "",
+    }
+    return subprocess.Popen([sys.executable, "-c", CALL], env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def answer(process: "subprocess.Popen[str]") -> dict[str, float]:
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == 0
+    return json.loads(out)
+
+
+def test_a_second_checkout_finds_what_the_first_compiled_and_a_changed_callee_is_never_stale(tmp_path: Path) -> None:
+    first, second, cache = checkout(tmp_path / "a"), checkout(tmp_path / "b"), tmp_path / "cache"
+    # Two at once: one compiles both functions, the other waits for it and loads what it called.
+    both = sorted((answer(process) for process in [start(first, cache), start(second, cache)]), key=lambda each: each["compiled"])
+    assert both == [{"value": 6.0, "compiled": 0, "hits": 1}, {"value": 6.0, "compiled": 2, "hits": 0}]
+    checkout(tmp_path / "b", factor=5)
+    assert answer(start(second, cache))["value"] == 10.0
+    assert answer(start(first, cache)) == {"value": 6.0, "compiled": 0, "hits": 1}
+
+
+def test_a_kernel_depends_on_its_module_and_on_what_that_imports_alone(tmp_path: Path) -> None:
+    caller = checkout(tmp_path / "a") / "room/caller_numba.py"
+    other, callee = checkout(tmp_path / "b"), checkout(tmp_path / "c", factor=5)
+    (other / "room/other.py").write_text("VALUE = 2\n")
+    made = kernels.fingerprint(caller, "room.caller_numba")
+    assert made == kernels.fingerprint(other / "room/caller_numba.py", "room.caller_numba")
+    assert made != kernels.fingerprint(callee / "room/caller_numba.py", "room.caller_numba")
+    assert kernels.fingerprint(caller, "elsewhere.caller_numba") is None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="folders that cannot be written are made otherwise there")
+def test_a_kernel_runs_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", str(tmp_path / "file" / "below"))
+    kernels._writable_base.cache_clear()
+    kernels._folder.cache_clear()
+    try:
+        kernel = kernels.njit(cache=True)(_doubled)
+        assert kernel(2) == 4 and kernel.stats.cache_path is None
+    finally:
+        kernels._writable_base.cache_clear()
+        kernels._folder.cache_clear()
+
+
+def _doubled(x: int) -> int:
+    return 2 * x
+
+
+def test_kernels_unused_for_long_are_removed(tmp_path: Path) -> None:
+    for name, days in {"old": kernels.KEPT_UNUSED_DAYS + 1, "new": kernels.KEPT_UNUSED_DAYS - 1}.items():
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (time.time() - 86400 * days,) * 2)
+    kernels.forget_unused(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+
+def test_every_kernel_of_the_product_is_kept_this_way() -> None:
+    sources = [
+        path for name in ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts") for path in (ROOT / name).rglob("*.py")
+    ]
+    direct = [path for path in sources if re.search(r"numba import.*\bn?jit\b|numba\.n?jit\b", path.read_text(encoding="utf-8"))]
+    assert [path.name for path in direct] == ["kernels.py"]
