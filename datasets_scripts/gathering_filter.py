@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Int32
 
 from mrbokeh.renderers.kernels.laplacian_tables import Points
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import cores
 
 _STRIP_ROWS = 16
 

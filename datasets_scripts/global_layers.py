@@ -18,7 +18,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import MOTION
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.bank.tables import Place
-from mrbokeh.stacks.motion_file import taken_from_channels
+from mrbokeh.stacks.exr_layers.render_channels import taken_from_channels
 
 _LEAST = np.float32(1e-6)
 _OPAQUE = 0.999

@@ -42,11 +42,10 @@ def ingest_command(
     from rich.console import Console
 
     from capture.stacks.grouping import Grouping
-    from capture.stacks.ingest import IngestSettings, ingest
-    from capture.stacks.ingest_table import print_report
+    from capture.stacks.ingest import IngestSettings, ingest, print_report
     from capture.stacks.stack_ingest import Development
     from mrbokeh.system.console import kept_when_interrupted
-    from mrbokeh.system.memory import keep_freed_pictures
+    from mrbokeh.system.resources import keep_freed_pictures
 
     if group not in list(Grouping):
         raise InputError(f"--group must be one of {', '.join(Grouping)}, got {group!r}")

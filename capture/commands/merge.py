@@ -48,14 +48,14 @@ def merge_command(
         bool, typer.Option("--overwrite", help="merge again what is merged already; retouches and what was told to `scale` are dropped")
     ] = False,
 ) -> None:
-    from capture.merging.known_metres import told_options
     from capture.merging.merge import merge_scene
-    from capture.merging.preferred_merge import preferred_lines, preferred_side
-    from capture.merging.relative_stack import ORDER
+    from capture.merging.metres.known_metres import told_options
+    from capture.merging.metres.relative_stack import ORDER
+    from capture.merging.preferred_side import preferred_lines, preferred_side
     from capture.merging.retouch import retouched_stacks, stacks_before
     from mrbokeh.stacks.guessed_metres import metres_facts, metres_note
     from mrbokeh.system.console import kept_when_interrupted
-    from mrbokeh.system.memory import keep_freed_pictures
+    from mrbokeh.system.resources import keep_freed_pictures
 
     if from_slice or mask:
         if overwrite or registration is not None or prefer is not None:

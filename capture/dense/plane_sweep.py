@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from capture.dense.sweep_view import Plane, SweepView, neighbour_from_reference, packed_view, rays_of
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import in_bands, workers
+from mrbokeh.system.resources import in_bands, workers
 
 Costs = UInt8[np.ndarray, "height width planes"]
 

@@ -25,8 +25,7 @@ from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.tracking.charuco.board import CharucoBoard
-from mrbokeh.tracking.charuco.corner_flow import flow
-from mrbokeh.tracking.charuco.detector import Grey
+from mrbokeh.tracking.charuco.detector import Grey, flow
 from mrbokeh.video.clip import VideoInfo, probe, read_display_frames
 
 _SEARCH_WIDTH_PX = 480

@@ -11,8 +11,7 @@ from jaxtyping import Float64, Int64
 from capture.poses.sparse_model import Distortion, SparseModel, SparseView, undistorted_px
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.camera_track.track import camera_between
-from mrbokeh.tracking.charuco.corner_flow import flow
-from mrbokeh.tracking.charuco.detector import Grey
+from mrbokeh.tracking.charuco.detector import Grey, flow
 from mrbokeh.tracking.charuco.pose_from_points import Pose, opencv_matrix
 
 FEWEST_POINTS = 12

@@ -18,7 +18,7 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples
+    from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 
 _COVERED = 0.5
 _HIGH_SHARE = 0.25
@@ -89,8 +89,7 @@ class _FileLayers:
 
 
 def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate) -> LayersFor:
-    from mrbokeh.scene.staging.one_object import OneObject
-    from mrbokeh.scene.staging.scene_description import Lighting
+    from mrbokeh.scene.staging.scene_description import Lighting, OneObject
 
     if options.at and options.at_pixel:
         raise InputError("--at and --at-pixel both say where the object stands: give one of them")

@@ -7,8 +7,7 @@ import numpy as np
 
 from mrbokeh.commands._composite_options import ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions
-from mrbokeh.compositing.base import Inserted
-from mrbokeh.compositing.plate import Plate
+from mrbokeh.compositing.plate import Inserted, Plate
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
 from mrbokeh.images.layer import Layer, flatten
@@ -60,7 +59,7 @@ def write_results(
 ) -> None:
     """sharp: the layers that were put in, front first."""
     from mrbokeh.images.image_io import write_layer
-    from mrbokeh.stacks.exr_layers.deep_out import write_deep_exr
+    from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 
     write_picture(out, inserted, plate, sharp, colour)
     if result.save_layer is not None:

@@ -109,7 +109,7 @@ class RenderingOptions:
 
     def filming(self, shutter: "ShutterTiming | None" = None) -> "Filming":
         """shutter: None stands still."""
-        from mrbokeh.distortion.distortion_json import read_distortion
+        from mrbokeh.distortion.distortion import read_distortion
         from mrbokeh.scene.staging.filming import Filming
 
         distortion = read_distortion(self.distortion)

@@ -72,7 +72,7 @@ def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
 def _moving(sharp: dict[str, Layer], sources: Sources) -> dict[str, Layer]:
     """With motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
     from mrbokeh.layering.motion import with_motion
-    from mrbokeh.stacks.motion_file import read_motion, taken_from_channels
+    from mrbokeh.stacks.exr_layers.render_channels import read_motion, taken_from_channels
 
     if sources.motion is not None and sources.rgb is None:
         raise InputError("--motion belongs to --rgb: layers have their motion in their own channels forward.u and forward.v")

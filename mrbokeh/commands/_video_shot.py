@@ -17,7 +17,7 @@ from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
 from mrbokeh.shots.sequence_target import SequenceTarget
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.video_target import VideoTarget
-from mrbokeh.stacks.held_lens import Holding, lens_held
+from mrbokeh.stacks.photograph import Holding, lens_held
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.encodings import with_alpha
 from mrbokeh.video.picture_sources.base import PictureSource

@@ -12,8 +12,7 @@ from mrbokeh.system.errors import InputError
 if TYPE_CHECKING:
     from mrbokeh.optics.camera import Camera
     from mrbokeh.tracking.camera_track.board_track import BoardTrack
-    from mrbokeh.tracking.camera_track.track import CameraTrack, Distortion
-    from mrbokeh.tracking.camera_track.track_file import TrackOptions
+    from mrbokeh.tracking.camera_track.track import CameraTrack, Distortion, TrackOptions
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="The camera of every frame of a clip, and its files.")
 
@@ -97,7 +96,7 @@ def convert(
     Example: mrbokeh track convert track.json track.chan
     """
     from mrbokeh.tracking.camera_track.formats import read_track
-    from mrbokeh.tracking.camera_track.track_file import TrackOptions
+    from mrbokeh.tracking.camera_track.track import TrackOptions
 
     refuse_existing(out, overwrite)
     options = TrackOptions(up, _size_px(size), rotation_order, sensor_width, metric, distortion)

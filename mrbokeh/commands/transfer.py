@@ -67,7 +67,7 @@ def transfer(
     from mrbokeh.refocus.transferring import open_sharp, seen_like, with_recovered_highlights
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.guessed_metres import metres_note, note_of_file
-    from mrbokeh.stacks.held_lens import lens_as_held
+    from mrbokeh.stacks.photograph import lens_as_held
 
     _require_outputs(out, sheet, save_depth, (photo, lens, depth), overwrite)
     settings = DepthSettings(

@@ -17,7 +17,7 @@ from mrbokeh.shots.process_crew import ProcessCrew
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import cores
 from mrbokeh.video.clip import has_alpha_apart
 from mrbokeh.video.picture_sources.base import PictureSource
 from mrbokeh.video.picture_sources.choose import open_source

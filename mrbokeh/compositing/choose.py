@@ -1,12 +1,122 @@
-"""Ways of putting layers into a photograph, by name."""
+"""Ways of putting layers into a photograph, by name.
 
-from mrbokeh.compositing.base import Insertion
-from mrbokeh.compositing.between import Between
-from mrbokeh.compositing.matte import SmoothedMatte
-from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.compositing.rerender import Rerendered
-from mrbokeh.compositing.touched_box import InTouchedBox
+Where virtual light can arrive: any insertion computed in that box alone, so that a small object in a large photograph is quick.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.compositing.between import Between, Rerendered
+from mrbokeh.compositing.near_and_far import shows
+from mrbokeh.compositing.over import OverPhotograph, SmoothedMatte
+from mrbokeh.compositing.plate import Inserted, Insertion, Plate, same_size
+from mrbokeh.images.layer import Layer, clear, flatten
+from mrbokeh.layering.motion import farthest_px
+from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
+from mrbokeh.layering.spreading import reach_px
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
+
+Plane = Float32[np.ndarray, "height width"]
+
+_SPARE_PX = 4
+
+
+@dataclass(frozen=True)
+class InTouchedBox:
+    """An Insertion that lets another one work where light of the layers can arrive, and leaves the rest of the plate as it is.
+
+    The result is that of the whole frame, but that near things which the frame cuts off go on beyond it. Where the blur depends on
+    the place in the frame (tilt, cat-eyes, banks of kernels, networks) the whole frame is taken.
+    """
+
+    insertion: Insertion
+
+    def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
+        lit = _lit_boxes(same_size(plate, layers))
+        if not lit:
+            return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
+        if not (is_same_everywhere(plate.lens) and _blurs_by_aperture(renderer)) or (
+            plate.depth_m is None and plate.near_alpha is not None
+        ):
+            return self.insertion.insert(plate, layers, renderer)
+        box = _touched_box(plate, lit)
+        found = self.insertion.insert(_cut_plate(plate, box), [box.cut_layer(layer) for layer in layers], renderer)
+        photo_rgb = plate.rgb.copy()
+        box.paste(found.photo_rgb, photo_rgb)
+        return Inserted(photo_rgb, box.placed(found.virtual, plate.rgb.shape))
+
+
+def touched_box(plate: Plate, layers: Sequence[Layer]) -> Box:
+    """The box of all pixels that virtual light can reach, grown to all whose light mixes with it there; NOWHERE where there is none.
+
+    For lenses whose blur is the same everywhere (`mrbokeh.layering.pixel_box.is_same_everywhere`).
+    """
+    lit = _lit_boxes(layers)
+    return _touched_box(plate, lit) if lit else NOWHERE
+
+
+def _lit_boxes(layers: Sequence[Layer]) -> list[tuple[Layer, Box]]:
+    """The layers that show something, and where."""
+    boxes = [(layer, lit_box(replace(layer, extra={}))) for layer in layers]
+    return [(layer, box) for layer, box in boxes if shows(layer.rgb[box.where], layer.alpha[box.where]).any()]
+
+
+def _touched_box(plate: Plate, lit: Sequence[tuple[Layer, Box]]) -> Box:
+    reached = [_reached(layer, box, plate.lens) for layer, box in lit]
+    arrival = Box(min(b.top for b in reached), max(b.bottom for b in reached), min(b.left for b in reached), max(b.right for b in reached))
+    return arrival.within(plate.rgb.shape) if plate.depth_m is None else _with_sources(arrival, plate.depth_m, plate.lens)
+
+
+def _reached(layer: Layer, box: Box, lens: Lens) -> Box:
+    depth_m = box.of(layer.depth_m)[shows(box.of(layer.rgb), box.of(layer.alpha))]
+    return box.grown(reach_px(lens.aperture, _most_coc_px(lens, depth_m, layer.width_px)) + farthest_px([layer]) + _SPARE_PX)
+
+
+def _most_coc_px(lens: Lens, depth_m: np.ndarray, width_px: int) -> float:
+    """The largest circle of confusion: it belongs to the nearest or the farthest depth."""
+    return float(np.abs(lens.coc_px(np.array([depth_m.min(), depth_m.max()]), width_px)).max())
+
+
+def _with_sources(arrival: Box, depth_m: Plane, lens: Lens) -> Box:
+    """Grown to every photographed pixel whose own blur reaches into the box; beyond the frame as far as those reach."""
+    height, width = depth_m.shape
+    half = 0.5 * lens.aperture.unit_radius
+    near_by = arrival.grown(int(half * _most_coc_px(lens, depth_m, width)) + 2 * _SPARE_PX).within(depth_m.shape)
+    half_px = half * np.abs(np.asarray(lens.coc_px(near_by.of(depth_m), width), np.float32)) + np.float32(_SPARE_PX)
+    rows, columns = np.arange(near_by.top, near_by.bottom), np.arange(near_by.left, near_by.right)
+    down = np.maximum(np.maximum(arrival.top - rows, rows - arrival.bottom + 1), 0).astype(np.float32)
+    along = np.maximum(np.maximum(arrival.left - columns, columns - arrival.right + 1), 0).astype(np.float32)
+    sends = (half_px >= down[:, None]) & (half_px >= along[None, :])
+    y, x = np.flatnonzero(sends.any(axis=1)), np.flatnonzero(sends.any(axis=0))
+    if len(y) == 0:
+        return arrival
+    top, bottom = min(arrival.top, int(rows[y[0]])), max(arrival.bottom, int(rows[y[-1]]) + 1)
+    left, right = min(arrival.left, int(columns[x[0]])), max(arrival.right, int(columns[x[-1]]) + 1)
+    beyond = arrival.grown(int(np.ceil(half_px.max(initial=0.0, where=sends))))
+    return Box(
+        beyond.top if beyond.top < 0 else top,
+        beyond.bottom if beyond.bottom > height else bottom,
+        beyond.left if beyond.left < 0 else left,
+        beyond.right if beyond.right > width else right,
+    )
+
+
+def _blurs_by_aperture(renderer: Renderer) -> bool:
+    """Whether its kernels are those of the lens's opening: banks and networks may know the place in the frame."""
+    return hasattr(renderer, "layering") and getattr(renderer, "bank", None) is None
+
+
+def _cut_plate(plate: Plate, box: Box) -> Plate:
+    known = {"depth_m": plate.depth_m, "sharp_rgb": plate.sharp_rgb, "near_alpha": plate.near_alpha}
+    cut = {name: box.cut(plane, "edge") for name, plane in known.items() if plane is not None}
+    lens, camera = box.lens_of(plate.lens, plate.rgb.shape[1]), box.camera_of(plate.camera)
+    return Plate(box.cut(plate.rgb, "edge"), cut.get("depth_m"), lens, camera, cut.get("sharp_rgb"), cut.get("near_alpha"))
+
 
 MODES: dict[str, Insertion] = {
     "front": InTouchedBox(OverPhotograph(by_depth=False)),

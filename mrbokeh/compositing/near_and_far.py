@@ -3,6 +3,8 @@
 A pixel on the rim of a near thing holds both colours; they are taken apart as mrbokeh.layering.hidden_background does, but at depth edges
 alone: where the virtual surface cuts through a smooth surface (a table that an object stands on), the cut is hard. Lights are kept
 apart from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
+
+The virtual layers as one surface: where it shows anything, and its depth continued beyond its outline.
 """
 
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import apart
 from mrbokeh.layering.lit_pixels import lights, without_lights
 from mrbokeh.layering.sheets import Sheet
-from mrbokeh.system.workers import workers
+from mrbokeh.system.resources import workers
 
 _TWO_DEEP = 2.0
 _SPECK_PX = 5
@@ -142,3 +144,18 @@ def _brightest_is_near(rgb: Picture, near: Mask, places: Int64[np.ndarray, " lig
         brighter = brightness > brightest
         brightest, is_near = np.where(brighter, brightness, brightest), np.where(brighter, near[y, x], is_near)
     return is_near
+
+
+def virtual_depth_m(sharp: Layer) -> Plane:
+    """Depth of the virtual surface, continued to all places; inf everywhere where there is none."""
+    return continued(sharp.depth_m, shows(sharp.rgb, sharp.alpha) & np.isfinite(sharp.depth_m))
+
+
+def shows_anything(sharp: Layer) -> bool:
+    return bool((sharp.alpha > 0).any() or (sharp.rgb > 0).any())
+
+
+def shows(rgb: Float32[np.ndarray, "height width 3"], alpha: Plane) -> Bool[np.ndarray, "height width"]:
+    """Where a layer covers anything or gives light."""
+    red, green, blue = (rgb[..., channel] > 0 for channel in range(3))
+    return (alpha > 0) | red | green | blue

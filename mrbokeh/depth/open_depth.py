@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.depth.depth_filters import refined_dioptres
 from mrbokeh.depth.depth_map import DepthMap, DepthSettings, with_holes_filled
-from mrbokeh.depth.edge_snapping import refined_dioptres
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.image_io import read_depth
 from mrbokeh.images.picture_codec import stored_pixels

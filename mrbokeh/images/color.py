@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 
-from mrbokeh.system.workers import in_bands, workers
+from mrbokeh.system.resources import in_bands, workers
 
 # Rec.709 / sRGB primaries with D65 white (IEC 61966-2-1); rows give X, Y, Z.
 XYZ_from_rec709 = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])

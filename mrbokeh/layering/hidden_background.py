@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Int32
 
 from mrbokeh.layering.lit_pixels import find_lights
 from mrbokeh.layering.sheets import Pixels, Sheet
-from mrbokeh.system.workers import in_bands
+from mrbokeh.system.resources import in_bands
 
 _STEP_PX = 1.0  # less than this difference of circles of confusion between neighbours is one surface
 _SURFACE_PX = 2.0  # the same, for pixels some way apart

@@ -35,8 +35,7 @@ from mrbokeh.layering.slices import Channels, Slicing, composited
 from mrbokeh.layering.spreading import FIELD_CELLS, Frame, Spread
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.memory import ZeroedMemory
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import ZeroedMemory, cores
 
 _ONE_SURFACE_PX = 1.0
 _NOTHING_TAKEN = np.float32(1e-6)

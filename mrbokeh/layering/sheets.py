@@ -10,7 +10,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.lit_pixels import without_lights
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import in_bands
+from mrbokeh.system.resources import in_bands
 
 _BORDER_PX = 5
 _BAND_ROWS = 32

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int32
 
 from mrbokeh.layering.sheets import Pixels
 from mrbokeh.layering.spreading import Frame
-from mrbokeh.system.workers import bands
+from mrbokeh.system.resources import bands
 
 _BAND_PIXELS = 1 << 14
 

@@ -14,8 +14,7 @@ from mrbokeh.layering.sheets import Pixels
 from mrbokeh.layering.slice_islands import islands
 from mrbokeh.layering.slice_sorting import Part, Shares, Window, sorted_slices, window_of
 from mrbokeh.layering.spreading import Frame
-from mrbokeh.system.memory import ZeroedMemory
-from mrbokeh.system.workers import ahead, cores, in_bands
+from mrbokeh.system.resources import ZeroedMemory, ahead, cores, in_bands
 
 _LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add

@@ -25,7 +25,7 @@ class Lens:
     tilt_rad: (x, y), how far the lens's axis leans from the camera's to the right and downwards, as on a tilt lens or a
       view camera; the sensor stays. With (0, y > 0) what is lower in the picture is in focus nearer to the camera.
     sensor_width_mm: along the rows of the picture; sensor_height_mm: the other side, which nothing is computed from: it says which
-      way up the sensor is meant, for photographs taken the other way up (`mrbokeh.stacks.held_lens`), or None.
+      way up the sensor is meant, for photographs taken the other way up (`mrbokeh.stacks.photograph`), or None.
     petzval_radius_mm: radius of curvature of the surface in focus; positive bends it towards the camera away from the axis
       (as an uncorrected lens does, about 1.5 focal lengths), negative away from it, inf is flat.
     """

@@ -27,7 +27,7 @@ from mrbokeh.optics.psf_bank_file import (
 from mrbokeh.psf_models.base import PsfModel
 from mrbokeh.system.console import flag, track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import cores
 
 
 @dataclass(frozen=True)

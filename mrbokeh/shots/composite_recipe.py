@@ -18,7 +18,7 @@ from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
 from mrbokeh.shots.boxed_insertion import BoxedInsertion
 from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.hooks import CameraSource, DepthSource, Description, Finisher, FocusSource, LayerSource, MatteSource, Moment
-from mrbokeh.stacks.held_lens import Holding, lens_held
+from mrbokeh.stacks.photograph import Holding, lens_held
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

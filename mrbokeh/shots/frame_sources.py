@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.depth.temporal_filter import TemporalDepthFilter
+from mrbokeh.depth.depth_filters import TemporalDepthFilter
 from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.shots.hooks import CameraSource, DepthSource, FocusSource, MatteSource, Moment

@@ -7,10 +7,9 @@ from pathlib import Path
 from mrbokeh.images.layer import Layer
 from mrbokeh.shots.hooks import CameraSource, Description, LayerSource, Moment
 from mrbokeh.shots.kept import Kept
+from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
 from mrbokeh.stacks.exr_layers.deep_interleaved import interleaved
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSurfaces
-from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples
-from mrbokeh.stacks.exr_layers.object_split import ObjectSplit
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
 

@@ -12,7 +12,7 @@ from typing import Any
 from mrbokeh.shots.crew import Progress
 from mrbokeh.shots.segment_task import SegmentTask, make_segment
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import cores
 
 _TRIES = 3
 _POLL_S = 0.25

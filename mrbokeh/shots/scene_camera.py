@@ -6,8 +6,7 @@ from mrbokeh.optics.camera import have_same_shape
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import format_of_file, read_track
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.track_file import TrackOptions
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackOptions
 
 
 def scene_track(path: Path, size_px: tuple[int, int], scene_up: str) -> CameraTrack:

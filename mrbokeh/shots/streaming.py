@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import repeat
 
 from mrbokeh.shots.frame_maker import Picture
-from mrbokeh.system.workers import CallingThread, ahead
+from mrbokeh.system.resources import CallingThread, ahead
 from mrbokeh.video.clip import Frame
 
 Make = Callable[[int, Frame], Picture]

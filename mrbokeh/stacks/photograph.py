@@ -2,10 +2,19 @@
 
 RAW files are developed by the package `capture`, which is found by its name as the command line finds its sub-commands, and needs the
 extra of that name; so does the metadata of JPEG and TIFF. Without it a picture that is no RAW is read, and tells nothing.
+
+The lens of a lens file as the camera was held: in an upright photograph the other side of the sensor lies along the rows.
+
+A lens file speaks of the camera held level, as data sheets do. Where EXIF turned a photograph upright, the lens is turned with it: the
+stated width lies along the columns, and the opening and the tilt turn too. The lens from metadata comes out alike. Where a lens file states
+sensor_height_mm, the longer side lies along the longer side of any photograph, whether EXIF tells a turn or not; one of 24 by 36 mm is
+described for upright photographs, and is left as it is for them. A network's kernels cannot be turned; only its scale is.
+
+The same holds for clips, which videos turn by their metadata and numbered photographs by EXIF.
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -78,3 +87,68 @@ def read_photograph(path: Path | str) -> Photograph:
     Raises InputError where it cannot be read, MissingExtraError for RAW without the extra.
     """
     return import_module(_READER).read_photograph(Path(path))
+
+
+@dataclass(frozen=True)
+class Holding:
+    """How the camera was held, as its picture tells. whole_px: (width, height) of all that it took, upright, of which the picture may be
+    a part. quarter_turns: counter-clockwise, that brought the stored picture upright.
+    """
+
+    whole_px: tuple[int, int]
+    quarter_turns: int = 0
+
+
+def lens_as_held(lens: Lens, photograph: Photograph, path: Path) -> Lens:
+    """The lens for the upright picture of a photograph; says in one line what was taken where that is not plain."""
+    height_px, width_px = photograph.rgb.shape[:2]
+    held = lens_held(lens, Holding(photograph.cut_from_px or (width_px, height_px), photograph.quarter_turns), path)
+    if photograph.cut_from_px is not None:
+        left_mm = held.sensor_width_mm * width_px / photograph.cut_from_px[0]
+        _log.warning(
+            f"{photograph.cut_told(path)}: {held.sensor_width_mm:.3g} mm of the sensor are taken along its width, as --lens says; where "
+            f"that is the whole sensor, --lens has to say {left_mm:.3g} mm instead (or more, if it was made smaller too)"
+        )
+    return held
+
+
+def lens_held(lens: Lens, holding: Holding, path: Path | None = None) -> Lens:
+    """The lens for upright pictures of a camera so held. path: of what it took, about which a line is said where that is not plain."""
+    held = _held(lens, holding)
+    told = _way_told(lens, held, holding)
+    if told and path is not None:
+        _log.warning(f"{path} {told}")
+    return held
+
+
+def _way_told(lens: Lens, held: Lens, holding: Holding) -> str:
+    """Nothing where the lens stays as it is and may well be right."""
+    width_px, height_px = holding.whole_px
+    if held.sensor_width_mm != lens.sensor_width_mm:
+        way = "upright" if height_px > width_px else "level"
+        sides = f"{held.sensor_width_mm:.3g} mm of the sensor are taken along its width, {held.sensor_height_mm:.3g} mm along its height"
+        return f"was taken with the camera held {way}: {sides}"
+    if height_px > width_px and lens.sensor_height_mm is None:
+        return (
+            f"is higher than wide and does not say that it was turned: {lens.sensor_width_mm:g} mm of the sensor are taken along its "
+            f"width; if the camera was held upright, state sensor_height_mm in the lens file too"
+        )
+    return ""
+
+
+def turned_by(lens: Lens, quarters: int) -> Lens:
+    """The opening and the tilt after quarter turns counter-clockwise in the picture; the sensor stays."""
+    right_rad, down_rad = lens.tilt_rad
+    for _ in range(quarters):
+        right_rad, down_rad = down_rad, -right_rad
+    return replace(lens, aperture=lens.aperture.rotated(-quarters * np.pi / 2), tilt_rad=(right_rad, down_rad))
+
+
+def _held(lens: Lens, holding: Holding) -> Lens:
+    width_px, height_px = holding.whole_px
+    is_for_upright = (lens.sensor_height_mm or 0.0) > lens.sensor_width_mm
+    held = lens if is_for_upright else turned_by(lens, holding.quarter_turns)
+    if width_px == height_px or (lens.sensor_height_mm is None and holding.quarter_turns % 2 == 0):
+        return held
+    long_mm, long_px = max(lens.sensor_width_mm, lens.sensor_height_mm or 0.0), max(width_px, height_px)
+    return replace(held, sensor_width_mm=long_mm * (width_px / long_px), sensor_height_mm=long_mm * (height_px / long_px))

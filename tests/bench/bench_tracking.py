@@ -19,16 +19,14 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
-from mrbokeh.tracking.charuco.corner_flow import flow
-from mrbokeh.tracking.charuco.detector import CharucoDetector, Grey
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Grey, flow
 from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from mrbokeh.video.clip import read_display_frames
 from tests.bench.machine import machine_line, memory_line
 from tests.scenes.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.charuco_tracker import CharucoTracker
-from viewfinder.tracking.detection_thread import Detector, ImmediateDetections
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.charuco_tracker import CharucoTracker, Detector, ImmediateDetections
+from viewfinder.tracking.tracker import TrackedPose
 
 FRAMES = 30
 REAL_CLIP = Path(__file__).resolve().parents[3] / "shared" / "data" / "video" / "charuco_handheld.mp4"

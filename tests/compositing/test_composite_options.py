@@ -16,10 +16,8 @@ from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.stacks.exr_layers.composite_exr import read_composite_exr
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSurfaces
-from mrbokeh.stacks.exr_layers.deep_out import write_deep_exr
-from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples
+from mrbokeh.stacks.exr_layers.composite_exr import read_composite_exr, write_deep_exr
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
 

@@ -15,8 +15,7 @@ from mrbokeh.shots.scene_camera import scene_track
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import write_track
-from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
-from mrbokeh.tracking.camera_track.track_file import TrackOptions
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions
 from tests.scenes.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
 
 SIZE = (WIDTH, HEIGHT)

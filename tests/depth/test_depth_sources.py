@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mrbokeh.depth.depth_filters import guided_upsampling, refined_dioptres
 from mrbokeh.depth.depth_map import DepthSettings, StereoCalibration, parse_known, parse_near_far, parse_stereo
-from mrbokeh.depth.edge_snapping import guided_upsampling, refined_dioptres
 from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear

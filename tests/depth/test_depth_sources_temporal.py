@@ -7,7 +7,7 @@ import pytest
 
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
-from mrbokeh.depth.temporal_filter import TemporalDepthFilter
+from mrbokeh.depth.depth_filters import TemporalDepthFilter
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences

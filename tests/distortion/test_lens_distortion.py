@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.distortion import LensDistortion
-from mrbokeh.distortion.distortion import StMap, read_st_map
-from mrbokeh.distortion.distortion_json import colmap_distortion, distortion_from_json, distortion_to_json
+from mrbokeh.distortion.distortion import StMap, colmap_distortion, distortion_from_json, distortion_to_json, read_st_map
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError

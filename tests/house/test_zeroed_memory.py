@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mrbokeh.system.memory import ZeroedMemory
+from mrbokeh.system.resources import ZeroedMemory
 
 
 def test_what_was_given_back_is_taken_again_if_it_is_large_enough() -> None:

@@ -12,7 +12,7 @@ from mrbokeh.layering._hidden_background_numba import nearest_behind, pure_neigh
 from mrbokeh.layering.hidden_background import apart
 from mrbokeh.layering.lit_pixels import lights
 from mrbokeh.layering.sheets import Sheet
-from mrbokeh.system.workers import CallingThread
+from mrbokeh.system.resources import CallingThread
 
 SIZE = (72, 96)
 Parts = tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -102,7 +102,7 @@ def test_behind_objects_at_one_depth_the_nearest_pixel_of_the_ground_is_the_seed
 def test_parting_does_not_depend_on_threads(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     values, coc_px = cluttered(seed)
     alone = parted(values, coc_px)
-    monkeypatch.setattr("mrbokeh.system.workers.cores", lambda: 3)
+    monkeypatch.setattr("mrbokeh.system.resources.cores", lambda: 3)
     with ThreadPoolExecutor(3) as pool:
         front, behind = apart(Sheet(values.copy(), coc_px.copy(), True), pool)
     np.testing.assert_array_equal(front.values, alone[0][0].reshape(-1, 4))

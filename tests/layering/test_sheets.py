@@ -7,7 +7,7 @@ from mrbokeh.images.layer import Layer, clear, opaque
 from mrbokeh.layering.sheets import Pixels, Sheet, coc_px_of, sheet_of
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import CallingThread
+from mrbokeh.system.resources import CallingThread
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=36.0)
 SIZE = (12, 17)

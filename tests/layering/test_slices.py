@@ -19,8 +19,7 @@ from mrbokeh.layering.spreading import Frame, Spread, spread_light
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
-from mrbokeh.system.memory import ZeroedMemory
-from mrbokeh.system.workers import CallingThread
+from mrbokeh.system.resources import CallingThread, ZeroedMemory
 
 SIZE, MARGIN = (40, 52), 7
 FRAME = Frame(SIZE[1] - 2 * MARGIN, SIZE[0] - 2 * MARGIN, -MARGIN, -MARGIN)

@@ -13,14 +13,12 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from mrbokeh.tracking.charuco.corner_flow import FrameHistory, flow
-from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, FrameHistory, Grey, flow
 from mrbokeh.video.clip import read_display_frames
 from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker
-from viewfinder.tracking.detection_thread import DetectionThread, ImmediateDetections
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker, DetectionThread, ImmediateDetections
+from viewfinder.tracking.tracker import TrackedPose
 
 
 class CountingDetector:

@@ -17,8 +17,7 @@ from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens, write_lens
-from mrbokeh.stacks.held_lens import lens_as_held, turned_by
-from mrbokeh.stacks.photograph import Photograph, read_photograph
+from mrbokeh.stacks.photograph import Photograph, lens_as_held, read_photograph, turned_by
 
 LEVEL = Lens(50.0, 2.0, 2.0, 36.0)
 UPRIGHT = Lens(50.0, 2.0, 2.0, 24.0, sensor_height_mm=36.0)

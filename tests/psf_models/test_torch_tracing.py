@@ -32,7 +32,7 @@ from mrbokeh.system.errors import InputError, MissingExtraError
 torch = pytest.importorskip("torch")
 
 from mrbokeh.psf_models.torch_tracing import LandedRays, photons_in_rings, trace_photons  # noqa: E402
-from mrbokeh.psf_models.torch_tracing._lens_points import summed  # noqa: E402
+from mrbokeh.psf_models.torch_tracing._rays import summed  # noqa: E402
 from mrbokeh.psf_models.torch_tracing._volume import first_states, uniform  # noqa: E402
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

@@ -19,7 +19,7 @@ from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.stacks.motion_file import taken_from_channels
+from mrbokeh.stacks.exr_layers.render_channels import taken_from_channels
 from mrbokeh.system.errors import InputError
 
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)

@@ -12,16 +12,15 @@ from mrbokeh.images.image_io import read_layer, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import MOTION, motion_of
 from mrbokeh.optics.camera import Camera, camera_from_json
-from mrbokeh.stacks.exr_layers.flat_render import FlatRender
-from mrbokeh.stacks.exr_layers.object_split import ObjectSplit
-from mrbokeh.stacks.exr_layers.reader import LayerReader
+from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
+from mrbokeh.stacks.exr_layers.flat_render import FlatRender, LayerReader
 from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = 12, 16
 # Rendered by Blender 4.2.23 (Cycles, 80x56 px, pixels 1.2 times as tall as wide) of a red cube in motion before a green ball;
-# exported by mrbokeh/scene/blender/mrbokeh_export.py.
+# exported by mrbokeh/scene/blender_addon.py.
 BLENDER = Path(__file__).parents[1] / "data" / "blender"
 
 

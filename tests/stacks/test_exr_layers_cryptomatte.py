@@ -11,10 +11,8 @@ from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.layer import flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.stacks.exr_layers.cryptomatte import cryptomattes
+from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit, cryptomattes, id_bits, murmur3_32
 from mrbokeh.stacks.exr_layers.flat_render import FlatRender
-from mrbokeh.stacks.exr_layers.murmur_hash import id_bits, murmur3_32
-from mrbokeh.stacks.exr_layers.object_split import ObjectSplit
 from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
 from mrbokeh.system.errors import InputError
 

@@ -12,14 +12,13 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSlices, DeepSurfaces, even_edges_m, peeled, sliced
-from mrbokeh.stacks.exr_layers.deep_out import write_deep_exr
-from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples, is_deep, merged
-from mrbokeh.stacks.exr_layers.deep_tidy import DeepSample, flattened, split, tidied
-from mrbokeh.stacks.exr_layers.deep_tidy import merged as merged_samples
-from mrbokeh.stacks.exr_layers.reader import LayerReader
+from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSlices, DeepSurfaces, even_edges_m, is_deep, merged, peeled, sliced
+from mrbokeh.stacks.exr_layers.flat_render import LayerReader
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
+from tests.scenes.deep_pixels_reference import DeepSample, flattened, split, tidied
+from tests.scenes.deep_pixels_reference import merged as merged_samples
 
 Pixels = dict[tuple[int, int], list[DeepSample]]
 

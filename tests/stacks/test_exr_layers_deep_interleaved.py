@@ -14,10 +14,9 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.hooks import Moment
 from mrbokeh.shots.layer_sources import AmongDeep, LayerFiles, sources_by_depth
 from mrbokeh.stacks.exr_layers.deep_interleaved import cut_at, interleaved
-from mrbokeh.stacks.exr_layers.deep_layers import peeled, sliced
-from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples, merged
-from mrbokeh.stacks.exr_layers.deep_tidy import DeepSample, flattened, tidied
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, merged, peeled, sliced
 from mrbokeh.system.errors import InputError
+from tests.scenes.deep_pixels_reference import DeepSample, flattened, tidied
 from tests.stacks.test_exr_layers_deep import Pixels, fog, point, random_pixels, write_deep
 
 SIZE = (6, 9)

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import FORMATS, read_track, write_track
-from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
-from mrbokeh.tracking.camera_track.track_file import ROTATION_ORDERS, TrackOptions
+from mrbokeh.tracking.camera_track.track import ROTATION_ORDERS, CameraTrack, TrackedFrame, TrackOptions
 
 SIZE_PX = (640, 360)
 NAMES = {

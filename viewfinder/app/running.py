@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.memory import keep_few_arenas
+from mrbokeh.system.resources import keep_few_arenas
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from viewfinder.app.assembly import MakeRenderer
 from viewfinder.app.captures import Captures
@@ -20,22 +20,21 @@ from viewfinder.app.lens_book import LensBook
 from viewfinder.app.live_compositor import LiveCompositor, Moment
 from viewfinder.app.live_controls import LiveControls
 from viewfinder.app.pipeline import FrameSink, Pipeline
-from viewfinder.app.scenery import Scenery
-from viewfinder.flow.frames import OutputFrame
-from viewfinder.focus.base import FocusSource
-from viewfinder.focus.manual_focus import ManualFocus
+from viewfinder.focus.sources import FocusSource, ManualFocus
+from viewfinder.frames import OutputFrame
 from viewfinder.server.access import Access
 from viewfinder.server.jpeg_stream import JpegStream
 from viewfinder.server.site import Part, Site
-from viewfinder.sources.base import FrameSource
+from viewfinder.sources.frame_source import FrameSource
+from viewfinder.stage.overlay_source import Scenery
 from viewfinder.stage.stage import Stage
 from viewfinder.streaming.alpha_stream import AlphaStream, ObsPart
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.recording import Recorder
 from viewfinder.streaming.virtual_webcam import VirtualWebcam
 from viewfinder.streaming.whep import Whep
-from viewfinder.tracking.base import Tracker
-from viewfinder.tracking.smoothed_tracker import SmoothedTracker
+from viewfinder.tracking.smoothing import SmoothedTracker
+from viewfinder.tracking.tracker import Tracker
 
 _MATTE_WIDTH_PX = 320
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.compositing.occlusion import occlusion_matte
+from mrbokeh.compositing.over import occlusion_matte
 from mrbokeh.images.image_io import read_depth
 from mrbokeh.layering.other_view import layer_from_view
 from mrbokeh.optics.camera import Camera, camera_from_json
-from mrbokeh.optics.lens_file_values import read_transmission
+from mrbokeh.optics.lens_file import read_transmission
 from mrbokeh.scene.staging.scene_description import RealThings
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError

@@ -15,8 +15,7 @@ import numpy as np
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector
-from mrbokeh.tracking.charuco.corner_flow import FrameHistory
-from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners, Grey
+from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners, FrameHistory, Grey
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit
 from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from viewfinder.frames import CameraFrame, Newest

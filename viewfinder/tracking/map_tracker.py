@@ -6,14 +6,12 @@ import cv2
 import numpy as np
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.charuco.corner_flow import FrameHistory
-from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners
-from viewfinder.flow.frames import CameraFrame, Pose
-from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.detection_thread import Detections, DetectionThread
-from viewfinder.tracking.map_localiser import MapLocaliser
-from viewfinder.tracking.map_pose import MapPose, pose_in_map, pose_refined
+from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners, FrameHistory
+from viewfinder.frames import CameraFrame, Pose
+from viewfinder.tracking.charuco_tracker import Detections, DetectionThread
+from viewfinder.tracking.map_localiser import MapLocaliser, MapPose, pose_in_map, pose_refined
 from viewfinder.tracking.sparse_map import SparseMap
+from viewfinder.tracking.tracker import TrackedPose
 
 LOCALISE_EVERY_S = 1.0
 GRACE_S = 0.25

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mrbokeh.system.errors import MissingExtraError
-from mrbokeh.tracking.camera_track.opentrackio_sample import (
+from mrbokeh.tracking.camera_track.opentrackio_file import (
     camera_from_stage,
     is_sample,
     is_scaled,

@@ -20,8 +20,7 @@ except ModuleNotFoundError as missing:
 
     raise MissingExtraError("torch", "train") from missing
 
-from mrbokeh.psf_models.torch_tracing._lens_points import trace_capsule, trace_lens, trace_picture
-from mrbokeh.psf_models.torch_tracing._physical_lens import LandedRays
+from mrbokeh.psf_models.torch_tracing._rays import LandedRays, trace_capsule, trace_lens, trace_picture
 from mrbokeh.psf_models.torch_tracing._volume import photons_in_rings, trace_photons
 
 __all__ = ["LandedRays", "photons_in_rings", "trace_capsule", "trace_lens", "trace_photons", "trace_picture"]

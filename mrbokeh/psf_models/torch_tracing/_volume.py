@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from mrbokeh.psf_models.torch_tracing._lens_points import number, on, summed
+from mrbokeh.psf_models.torch_tracing._rays import number, on, summed
 from mrbokeh.system.torch_device import device_named
 
 

@@ -24,7 +24,7 @@ from jaxtyping import Float, Float64
 from scipy import fft
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import workers
+from mrbokeh.system.resources import workers
 
 STENCIL = np.array([[1.0, 4.0, 1.0], [4.0, -20.0, 4.0], [1.0, 4.0, 1.0]]) / 6.0
 _CHUNK_MODES = 128  # columns that a thread solves at a time

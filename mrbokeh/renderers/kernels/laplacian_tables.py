@@ -12,7 +12,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify, whole_laplacian
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import cores, in_bands, workers
+from mrbokeh.system.resources import cores, in_bands, workers
 
 DENSE, SPARSE, WHOLE = 0, 1, 2
 DENSE_PER_PX = 32.0

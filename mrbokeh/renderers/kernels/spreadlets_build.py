@@ -10,7 +10,7 @@ from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, Spre
 from mrbokeh.renderers.kernels.spreadlets_file import fingerprint, read_spreadlets, write_spreadlets
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import cores
 
 
 def build_spreadlets(

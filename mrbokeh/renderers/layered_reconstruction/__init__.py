@@ -29,7 +29,7 @@ from mrbokeh.renderers.layered_reconstruction._pupil_spans import packed_pupil
 from mrbokeh.renderers.layered_reconstruction._settings import SCREEN_FILTERS, Settings, footprint_sigmas
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Choice, Pupil
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import cores
 
 __all__ = ["SCREEN_FILTERS", "LayeredReconstruction", "PartitionCounts", "Settings", "footprint_sigmas"]
 

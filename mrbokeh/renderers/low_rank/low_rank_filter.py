@@ -34,7 +34,7 @@ from mrbokeh.renderers.low_rank.exact import scatter_exactly
 from mrbokeh.renderers.low_rank.highlights import LEAST_RADIUS_PX, exact_share
 from mrbokeh.renderers.low_rank.per_pixel import depth_edge_mask, scatter_per_pixel
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import cores
 
 _PIECE_ROWS, _PIECE_TILES = 192, 4  # fixed pieces of work: the result does not depend on the number of threads
 _MOST_CHANNELS = 16  # at once

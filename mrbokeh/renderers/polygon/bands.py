@@ -16,7 +16,7 @@ from mrbokeh.renderers.polygon.halves import halves_of
 from mrbokeh.renderers.polygon.light import NO_HIGHLIGHTS, SurveyedLight
 from mrbokeh.renderers.polygon.memory import laid_out, ring_elements, ring_of, scratch_of
 from mrbokeh.renderers.polygon.tables import ApertureTables
-from mrbokeh.system.memory import ZeroedMemory
+from mrbokeh.system.resources import ZeroedMemory
 
 BAND_ROWS = 384
 """Least height of a band; two margins where these are larger. Bands do not depend on the number of threads."""

@@ -48,8 +48,7 @@ from mrbokeh.renderers.bank.renderers import BankRenderer, by_polygons
 from mrbokeh.renderers.polygon.directional_differences import Direction
 from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.memory import ZeroedMemory
-from mrbokeh.system.workers import cores, workers
+from mrbokeh.system.resources import ZeroedMemory, cores, workers
 
 if TYPE_CHECKING:
     from mrbokeh.renderers.polygon.tables import ApertureTables

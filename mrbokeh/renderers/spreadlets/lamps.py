@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 
-from mrbokeh.system.workers import workers
+from mrbokeh.system.resources import workers
 
 OUTSHINES_MEAN = 32.0
 _ROWS_AT_ONCE = 64

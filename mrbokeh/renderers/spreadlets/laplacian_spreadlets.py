@@ -35,7 +35,7 @@ from mrbokeh.renderers.spreadlets.lamps import lamps_among
 from mrbokeh.renderers.spreadlets.samples import reconstructed
 from mrbokeh.renderers.spreadlets.sums import add_light
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.memory import ZeroedMemory
+from mrbokeh.system.resources import ZeroedMemory
 
 _MOST_KEPT_BYTES = 1 << 27
 

@@ -14,8 +14,7 @@ from jaxtyping import Float, Float32
 from mrbokeh.renderers.kernels.laplacian_integration import integrate_by_pyramid, modes_to_rows, rows_to_modes, solve_modes
 from mrbokeh.renderers.kernels.laplacian_tables import Points
 from mrbokeh.renderers.spreadlets.layout import FOUR, Cells, Laid, Window, gains_for, window_of
-from mrbokeh.system.memory import ZeroedMemory
-from mrbokeh.system.workers import cores
+from mrbokeh.system.resources import ZeroedMemory, cores
 
 _LEAST_ROWS, _STRIPS_PER_CORE = 64, 2  # pixels beside two strips are looked at by both
 

@@ -1,4 +1,7 @@
-"""FilmedScene: what is filmed, by time."""
+"""FilmedScene: what is filmed, by time.
+
+ShutterTiming: when which row of a frame is exposed.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,7 +11,61 @@ import numpy as np
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene
-from mrbokeh.scene.moving_layers.shutter import ShutterTiming
+from mrbokeh.system.errors import InputError
+
+
+@dataclass(frozen=True)
+class ShutterTiming:
+    """A shutter that turns once per frame, and rows that are read one after the other.
+
+    angle_deg: of 360, for which it is open: 180 at 24 frames per second is 1/48 s.
+    phase_deg: where it opens, from the frame's time; None puts the frame's time into the middle (Nuke's shutter offset "centred"),
+    0 at the beginning ("start").
+    readout_s: how much later the lower edge is exposed than the upper one; negative for a sensor that is read upwards.
+    rows_px: upper and lower edge of the sensor in the rendered picture, where that has overscan (`within`); None is all of it.
+    """
+
+    frame_rate: float
+    angle_deg: float = 180.0
+    phase_deg: float | None = None
+    readout_s: float = 0.0
+    rows_px: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.frame_rate > 0.0 or not 0.0 <= self.angle_deg <= 360.0:
+            raise InputError(
+                f"a shutter needs a frame rate above 0 and an angle from 0 to 360 degrees, got {self.frame_rate} and {self.angle_deg}"
+            )
+
+    @property
+    def exposure_s(self) -> float:
+        """How long each row is open."""
+        return self.angle_deg / 360.0 / self.frame_rate
+
+    @property
+    def is_rolling(self) -> bool:
+        return self.readout_s != 0.0
+
+    def first_row_middle_s(self, time_s: float) -> float:
+        """The middle of the exposure of the upper edge, for a frame of this time."""
+        phase_deg = -0.5 * self.angle_deg if self.phase_deg is None else self.phase_deg
+        return time_s + (phase_deg + 0.5 * self.angle_deg) / 360.0 / self.frame_rate
+
+    def middle_s(self, time_s: float) -> float:
+        """The middle of the exposure of the middle row."""
+        return self.first_row_middle_s(time_s) + 0.5 * self.readout_s
+
+    def row_delay_s(self, y_px: float, height_px: int) -> float:
+        """How much later than the upper edge of the sensor a height in a rendered picture is exposed."""
+        top, bottom = self.rows_px or (0.0, float(height_px))
+        return (y_px - top) / (bottom - top) * self.readout_s
+
+    def within(self, overscan: Camera, plate: Camera) -> "ShutterTiming":
+        """The same shutter for pictures with overscan; that distortion bends the plate's rows is left out."""
+        enlarged = overscan.focal_px[1] / plate.focal_px[1]
+        top = overscan.principal_px[1] - plate.principal_px[1] * enlarged
+        return replace(self, rows_px=(top, top + plate.height_px * enlarged))
+
 
 _KEPT = 8
 

@@ -3,12 +3,21 @@
 Every matte has a header entry "cryptomatte/KEY/name", the prefix of its channels NAME00, NAME01, ... (ranks two by two: R the ID of one
 object, G its coverage, B and A of the next), and mostly a manifest of names. An ID is the hash of the name, kept as a float of the
 same bits; only its bits are compared, for as a float it means nothing.
+
+MurmurHash3_x86_32 with seed 0 (Appleby, public domain), and the float that Cryptomatte 1.2 stores in its place.
+
+One render cut into layers by its objects: those of a Cryptomatte that were chosen, or all but some.
+
+A pixel that objects share has one colour, so each gets the share of it that it covers. Laid over one another again the layers give the
+render: what is behind is divided by what the layers before it leave free, for it is hidden there rather than thin. The depth of a shared
+pixel is that of one of them; so all take theirs from the nearest pixel that is wholly their own.
 """
 
 import difflib
 import json
+import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,9 +25,38 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt32
 
-from mrbokeh.stacks.exr_layers.murmur_hash import id_bits
+from mrbokeh.images.layer import Layer
+from mrbokeh.stacks.exr_layers.flat_render import FlatRender, nearest_depth
 from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
 from mrbokeh.system.errors import InputError
+
+_MASK = 0xFFFFFFFF
+
+
+def murmur3_32(data: bytes) -> int:
+    """The hash of bytes, in 0 to 2^32 - 1."""
+    hashed, whole = 0, len(data) // 4 * 4
+    for (word,) in struct.iter_unpack("<I", data[:whole]):
+        hashed = (_rotated(hashed ^ _mixed(word), 13) * 5 + 0xE6546B64) & _MASK
+    hashed ^= _mixed(int.from_bytes(data[whole:], "little")) ^ len(data)
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        hashed = ((hashed ^ hashed >> shift) * factor) & _MASK
+    return hashed ^ hashed >> 16
+
+
+def id_bits(name: str) -> int:
+    """The bits of a name's ID. An exponent of zeros or ones would be denormal, infinite or NaN: its lowest bit is turned over."""
+    hashed = murmur3_32(name.encode("utf-8"))
+    return hashed ^ 1 << 23 if hashed >> 23 & 255 in (0, 255) else hashed
+
+
+def _mixed(word: int) -> int:
+    return _rotated((word * 0xCC9E2D51) & _MASK, 15) * 0x1B873593 & _MASK
+
+
+def _rotated(word: int, bits: int) -> int:
+    return (word << bits | word >> 32 - bits) & _MASK
+
 
 _CHANNELS = (("R", "G", "B", "A"), ("r", "g", "b", "a"), ("red", "green", "blue", "alpha"))
 _BACKGROUND = 0
@@ -121,3 +159,84 @@ def _manifest(path: Path, entries: Mapping[str, Any]) -> dict[str, int]:
         return {name: int(bits, 16) for name, bits in json.loads(text).items()} if text else {}
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: the manifest of the Cryptomatte {entries['name']} cannot be read ({error})") from None
+
+
+_NOTHING = np.float32(1e-6)
+_WHOLLY = 0.999
+
+
+@dataclass(frozen=True)
+class ObjectSplit:
+    """objects: names, one layer each; empty takes none apart. without: names left out. with_rest: what belongs to neither, as a layer.
+
+    matte: name of the Cryptomatte, such as "CryptoObject", where a file has several; its end is enough.
+    """
+
+    objects: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    with_rest: bool = True
+    matte: str = ""
+    render: FlatRender = field(default_factory=FlatRender)
+
+    def __post_init__(self) -> None:
+        names = (*self.objects, *self.without)
+        if len(set(names)) < len(names):
+            raise InputError(f"every object can be named once, but came {', '.join(names)}")
+        if not self.objects and not self.with_rest:
+            raise InputError("nothing of the render would be left: name objects, or keep the rest")
+
+    def layers(self, path: Path | str) -> list[Layer]:
+        """Front first, by their mean depth in dioptres."""
+        channels = RenderChannels.read(path, self.render.view)
+        picture, matte = self.render.layer_of(channels), self._matte(channels)
+        total = np.maximum(picture.alpha, matte.covered)
+        shares = [_share(matte.matte(name), total) for name in self.objects]
+        if self.with_rest:
+            left_out = [_share(matte.matte(name), total) for name in self.without]
+            shares.append(np.maximum(1.0 - np.sum([np.zeros_like(total), *shares, *left_out], axis=0), 0.0).astype(np.float32))
+        return in_order([part_of(picture, share) for share in shares])
+
+    def _matte(self, channels: RenderChannels) -> Cryptomatte:
+        found = cryptomattes(channels)
+        named = [each for name, each in found.items() if name.endswith(self.matte)]
+        if len(named) != 1:
+            raise InputError(f"{channels.path}: choose one of its Cryptomattes {', '.join(found)}, not {self.matte or 'none'!r}")
+        return named[0]
+
+
+def part_of(picture: Layer, share: Float32[np.ndarray, "height width"]) -> Layer:
+    """What a share of every pixel, in [0, 1], has of a picture, with its own depth; parts add up, and are not yet behind one another."""
+    extra = {name: values * share[..., None] for name, values in picture.extra.items()}
+    is_part = share > 0
+    depth_m = np.where(is_part, _own_depth(picture.depth_m, share), np.float32(np.inf))
+    return Layer(picture.rgb * share[..., None], picture.alpha * share, depth_m, extra)
+
+
+def in_order(parts: Sequence[Layer]) -> list[Layer]:
+    """Layers that "over" puts together as the parts add up: front first, each divided by what those before it leave free."""
+    free, layers = np.ones_like(parts[0].alpha), []
+    for part in sorted(parts, key=_mean_dioptres, reverse=True):
+        scale = (1.0 / np.maximum(free, _NOTHING)).astype(np.float32)
+        extra = {name: values * scale[..., None] for name, values in part.extra.items()}
+        layers.append(replace(part, rgb=part.rgb * scale[..., None], alpha=part.alpha * scale, extra=extra))
+        free = free - part.alpha
+    return layers
+
+
+def _share(
+    coverage: Float32[np.ndarray, "height width"], total: Float32[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width"]:
+    return np.minimum(np.divide(coverage, total, out=np.zeros_like(total), where=total > 0), np.float32(1.0))
+
+
+def _own_depth(
+    depth_m: Float32[np.ndarray, "height width"], share: Float32[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width"]:
+    """Depth of pixels that are wholly a thing's own; those it shares take it from the nearest such pixel, if there is one."""
+    is_own = (share > _WHOLLY) & np.isfinite(depth_m)
+    return nearest_depth(depth_m, is_own)[0] if is_own.any() else depth_m
+
+
+def _mean_dioptres(layer: Layer) -> float:
+    weight = float(layer.alpha.sum())
+    return float((layer.alpha / layer.depth_m).sum()) / weight if weight > 0 else 0.0

@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from mrbokeh.images.layer import Layer, clear
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSurfaces, peeled
-from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples, merged
-from mrbokeh.stacks.exr_layers.nearest_depth import nearest_depth
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, merged, peeled
+from mrbokeh.stacks.exr_layers.flat_render import nearest_depth
 from mrbokeh.system.errors import InputError
 
 _USUAL = DeepSurfaces()

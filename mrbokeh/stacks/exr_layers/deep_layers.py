@@ -6,19 +6,142 @@ blur grows evenly with dioptres.
 - DeepSurfaces: each pixel's first surface is in the first layer, its second in the second. A surface that recedes stays whole.
 - DeepSlices: layers lie between depths. A surface that goes through such a depth is cut in two, and blurred it lets light through along
   the cut (0.21 of it in tests): edges belong into gaps. For fog and for things that stand apart.
+
+A deep EXR picture as flat lists of samples: any number per pixel, each with colour, alpha and a place or range of depth.
 """
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 
+from mrbokeh.images.exr_io import ATTRIBUTE, in_rec709
 from mrbokeh.images.layer import Layer, clear
-from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples
 from mrbokeh.system.errors import InputError
+
+_COLOURS = ("R", "G", "B")
+
+
+@dataclass(frozen=True)
+class DeepSamples:
+    """Samples of pixel (y, x), one row after the other, are those from starts[y * width + x] up to starts[y * width + x + 1].
+
+    rgb: premultiplied, linear Rec.709. front_m, back_m: along the axis in metres, the same for a sample without thickness.
+    Pixels may have their samples in any order, and samples with thickness may overlap (see deep_tidy).
+    """
+
+    height_px: int
+    width_px: int
+    starts: Int64[np.ndarray, " pixels_and_end"]
+    rgb: Float32[np.ndarray, "samples 3"]
+    alpha: Float32[np.ndarray, " samples"]
+    front_m: Float64[np.ndarray, " samples"]
+    back_m: Float64[np.ndarray, " samples"]
+
+    @cached_property
+    def counts(self) -> Int64[np.ndarray, " pixels"]:
+        """Samples per pixel."""
+        return np.diff(self.starts)
+
+    @classmethod
+    def read(cls, path: Path | str, part: str = "", metres_per_unit: float = 1.0) -> "DeepSamples":
+        """part: the name of the deep part, where there are several. Raises InputError without R, G, B, A and Z in a deep part."""
+        import OpenEXR
+
+        if not Path(path).is_file():
+            raise InputError(f"expected a deep EXR file at {path}, but there is none")
+        try:
+            with OpenEXR.File(str(path), separate_channels=True) as file:
+                return _from_part(Path(path), _chosen(Path(path), file.parts, part), metres_per_unit)
+        except (RuntimeError, OSError) as error:
+            raise InputError(f"{path} cannot be read as EXR: {error}") from None
+
+
+def is_deep(path: Path | str) -> bool:
+    """Whether a file has a deep part and no flat one. Raises InputError where it is no EXR file."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            return all(_is_deep_part(part) for part in file.parts)
+    except (RuntimeError, OSError) as error:
+        raise InputError(f"{path} cannot be read as EXR: {error}") from None
+
+
+def merged(pictures: Sequence[DeepSamples]) -> DeepSamples:
+    """The samples of several deep pictures of one size in one: things that were rendered apart hide one another."""
+    sizes = {(each.width_px, each.height_px) for each in pictures}
+    if len(sizes) != 1:
+        raise InputError(f"deep pictures to be merged must be of one size, got {sorted(sizes)}")
+    counts = np.stack([each.counts for each in pictures], axis=1)
+    starts = _starts(counts.sum(axis=1))
+    order = np.argsort(np.concatenate([np.repeat(np.arange(each.counts.size), each.counts) for each in pictures]), kind="stable")
+    joined = [np.concatenate([getattr(each, name) for each in pictures])[order] for name in ("rgb", "alpha", "front_m", "back_m")]
+    return DeepSamples(pictures[0].height_px, pictures[0].width_px, starts, *joined)
+
+
+def _is_deep_part(part: Any) -> bool:
+    import OpenEXR
+
+    return part.type() in (OpenEXR.deepscanline, OpenEXR.deeptile)
+
+
+def _chosen(path: Path, parts: Sequence[Any], name: str) -> Any:
+    deep = [part for part in parts if _is_deep_part(part)]
+    named = [part for part in deep if not name or part.header.get("name") == name]
+    if not named or (len(named) > 1 and not name):
+        told = ", ".join(str(part.header.get("name", "")) for part in deep) or "flat parts only"
+        raise InputError(f"{path}: expected {f'the deep part {name!r}' if name else 'one deep part'}, but it has {told}")
+    return named[0]
+
+
+def _from_part(path: Path, part: Any, metres_per_unit: float) -> DeepSamples:
+    missing = [name for name in (*_COLOURS, "A", "Z") if name not in part.channels]
+    if missing:
+        raise InputError(f"{path}: expected deep R, G, B, A and Z, but {', '.join(missing)} are missing; it has {', '.join(part.channels)}")
+    size, rows, columns = _windows(part.header)
+    values, counts = {}, np.zeros(size, np.int64)
+    for name in (*_COLOURS, "A", "Z", "ZBack"):
+        if name in part.channels:
+            pixels = part.channels[name].pixels[rows[1], columns[1]]
+            values[name] = _listed(pixels)
+    counts[rows[0], columns[0]] = np.frompyfunc(lambda each: 0 if each is None else len(each), 1, 1)(pixels).astype(np.int64)
+    rgb = np.stack([values[name] for name in _COLOURS], axis=1).astype(np.float32)
+    front_m = values["Z"].astype(np.float64) * metres_per_unit
+    back_m = np.maximum(values["ZBack"].astype(np.float64) * metres_per_unit, front_m) if "ZBack" in values else front_m
+    alpha = values["A"].astype(np.float32)
+    _check(path, np.isfinite(rgb).all(axis=1) & np.isfinite(alpha) & (front_m > 0) & ~np.isnan(back_m))
+    return DeepSamples(*size, _starts(counts.ravel()), in_rec709(rgb, part.header.get(ATTRIBUTE), path), alpha, front_m, back_m)
+
+
+def _windows(header: Any) -> tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]:
+    """Size of the display window; for rows and columns, where the data window lies in it and which part of the data lies in it."""
+    (left, top), (right, bottom) = (each.tolist() for each in header["dataWindow"])
+    (x, y), (x_end, y_end) = (each.tolist() for each in header["displayWindow"])
+    first = (max(top, y), max(left, x))
+    last = (max(min(bottom, y_end) + 1, first[0]), max(min(right, x_end) + 1, first[1]))
+    placed = [slice(first[i] - (y, x)[i], last[i] - (y, x)[i]) for i in range(2)]
+    cut = [slice(first[i] - (top, left)[i], last[i] - (top, left)[i]) for i in range(2)]
+    return (y_end - y + 1, x_end - x + 1), (placed[0], cut[0]), (placed[1], cut[1])
+
+
+def _listed(pixels: np.ndarray) -> np.ndarray:
+    """Samples of all pixels in a row; a pixel without any is None."""
+    return np.concatenate([each for each in pixels.ravel() if each is not None] or [np.zeros(0, np.float32)])
+
+
+def _starts(counts: Int64[np.ndarray, " pixels"]) -> Int64[np.ndarray, " pixels_and_end"]:
+    return np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+
+
+def _check(path: Path, is_good: Bool[np.ndarray, " samples"]) -> None:
+    if not is_good.all():
+        raise InputError(f"{path}: {int((~is_good).sum())} deep samples have NaN, infinite colour or a depth not above 0: render it again")
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,86 @@
-"""All channels of an EXR file by their full name, whatever parts and views they are spread over."""
+"""All channels of an EXR file by their full name, whatever parts and views they are spread over.
+
+The names that programs give to colour, depth and motion in EXR files. One table; a name that is not in it has to be stated.
+
+| program | colour | depth along the axis | motion |
+|---|---|---|---|
+| EXR itself, Nuke, mrbokeh | R G B A without a layer | Z or depth.Z | forward.u right, forward.v up |
+| Blender, multilayer | VIEWLAYER.Combined.* | VIEWLAYER.Depth.Z, 1e10 is background | VIEWLAYER.Vector.Z, W: minus forward |
+| Houdini, Mantra and Karma | R G B A, or C.* | Pz (part Pz) | motion.u, motion.v if so named |
+| Arnold, V-Ray, Redshift | R G B A, or beauty.*, RGBA.* in parts | Z, depth.Z | by name |
+
+Blender 4 writes one part, 5 one for each layer if not told otherwise; its File Output node calls depth Depth.V. Its Vector holds X, Y
+from here to the frame before and Z, W from the frame after to here, so that both count against time when something moves evenly
+(Cycles, geom/primitive.h; checked on renders of Blender 4.2 and 5.0); y goes up. Some of these programs write a depth that is not
+along the axis (Nuke 1/z, Arnold and Karma if asked the distance along the ray): nobody can tell from the numbers, so
+`FlatRender.depth_is` says it.
+
+Motion vectors of other programs' renders: EXR channels forward.u (right) and forward.v (up), in pixels of one frame.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from mrbokeh.images.exr_io import Channels, ExrPart, read_exr, stated_primaries
-from mrbokeh.stacks.exr_layers.channel_names import COLOUR_LAYERS, DEPTH_NAMES, MOTION_NAMES, MotionNames, joined
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.motion import with_motion
 from mrbokeh.system.errors import InputError
+
+
+class MotionNames(NamedTuple):
+    """Channels that hold motion to the right and up, and the factor that makes forward motion of them."""
+
+    right: str
+    up: str
+    factor: float
+
+
+COLOUR_LAYERS = ("", "Combined", "C", "RGBA", "rgba", "beauty", "Beauty")
+"""Layers that are taken as the picture where none is stated; the unnamed one goes before all others."""
+DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z", "Depth.V", "depth.z", "Pz", "Pz.Z", "Pz.z", "Pz.Pz", "z")
+MOTION_NAMES = (
+    MotionNames("forward.u", "forward.v", 1.0),
+    MotionNames("motion.u", "motion.v", 1.0),
+    MotionNames("Vector.Z", "Vector.W", -1.0),
+)
+BACKGROUND_FROM = 1e9
+"""Depths from here on are background: Blender writes 1e10 (inf as half)."""
+
+
+def joined(layer: str, channel: str) -> str:
+    """The full name of a channel of a layer; the unnamed layer is ""."""
+    return f"{layer}.{channel}" if layer else channel
+
+
+_NAMES = (("forward.u", "forward.v"), ("motion.u", "motion.v"), ("u", "v"))
+
+
+def read_motion(path: Path | str) -> Float32[np.ndarray, "height width 2"]:
+    """Motion in pixels, right and down, as mrbokeh counts; files count upwards, as Nuke and Blender do.
+
+    Raises InputError where there are no such channels.
+    """
+    channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
+    for right, up in _NAMES:
+        if right in channels and up in channels:
+            return np.stack([channels[right], -channels[up]], axis=2).astype(np.float32)
+    raise InputError(f"{path}: expected motion in the channels forward.u and forward.v, but it has {', '.join(sorted(channels))}")
+
+
+def taken_from_channels(layer: Layer, shutter: float) -> Layer:
+    """The layer with its extra channels forward.u and forward.v, times alpha as all extra channels, as its motion; else unchanged."""
+    if not {"forward.u", "forward.v"} <= layer.extra.keys():
+        return layer
+    alpha = np.maximum(layer.alpha, np.float32(1e-6))[..., None]
+    motion_px = np.concatenate([layer.extra["forward.u"], -layer.extra["forward.v"]], axis=2) / alpha
+    rest = {name: values for name, values in layer.extra.items() if name not in ("forward.u", "forward.v")}
+    return with_motion(replace(layer, extra=rest), motion_px.astype(np.float32), shutter)
+
 
 MULTI_VIEW = "multiView"
 

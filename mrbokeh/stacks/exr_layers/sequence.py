@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSurfaces
-from mrbokeh.stacks.exr_layers.deep_samples import DeepSamples, is_deep
-from mrbokeh.stacks.exr_layers.flat_render import FlatRender
-from mrbokeh.stacks.exr_layers.reader import LayerReader
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, is_deep
+from mrbokeh.stacks.exr_layers.flat_render import FlatRender, LayerReader
 from mrbokeh.system.errors import InputError
 
 Gaps = Literal["error", "hold"]

@@ -25,8 +25,7 @@ from mrbokeh.tracking.camera_track.board_smoothing import Observation, residual_
 from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, Distortion, TrackedFrame
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from mrbokeh.tracking.charuco.board_alignment import aligned_corners
-from mrbokeh.tracking.charuco.corner_flow import flow
-from mrbokeh.tracking.charuco.detector import NO_CORNERS, CharucoDetector, Corners, Grey
+from mrbokeh.tracking.charuco.detector import NO_CORNERS, CharucoDetector, Corners, Grey, flow
 from mrbokeh.tracking.charuco.pose_branches import PoseFit, fits_of_shot
 from mrbokeh.tracking.charuco.pose_from_points import FEWEST_POINTS, opencv_matrix, poses_from_plane
 from mrbokeh.video.clip import probe, read_display_frames

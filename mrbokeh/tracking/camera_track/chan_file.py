@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
-from mrbokeh.tracking.camera_track.track_file import TrackOptions, lost
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions, lost
 from mrbokeh.tracking.world_axes import from_opengl, rigid, to_opengl
 
 _COLUMNS = "FRAME TX TY TZ RX RY RZ VFOV"

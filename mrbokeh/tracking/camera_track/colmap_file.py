@@ -24,8 +24,7 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, TrackedFrame
-from mrbokeh.tracking.camera_track.track_file import TrackOptions, frame_numbers, lost, picture_name
+from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, TrackedFrame, TrackOptions, frame_numbers, lost, picture_name
 from mrbokeh.tracking.world_axes import rigid
 
 MODELS: dict[int, tuple[str, tuple[str, ...]]] = {

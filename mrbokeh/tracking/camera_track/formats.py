@@ -11,16 +11,15 @@ from types import MappingProxyType
 
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track import chan_file, colmap_file, nerfstudio_file, opentrackio_file, track_file
-from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.tracking.camera_track.track_file import TrackOptions
+from mrbokeh.tracking.camera_track import chan_file, colmap_file, nerfstudio_file, opentrackio_file
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackOptions, read_own, write_own
 
 Read = Callable[[Path, TrackOptions], CameraTrack]
 Write = Callable[[Path, CameraTrack, TrackOptions], tuple[str, ...]]
 
 FORMATS: MappingProxyType[str, tuple[Read, Write]] = MappingProxyType(
     {
-        "json": (track_file.read, track_file.write),
+        "json": (read_own, write_own),
         "chan": (chan_file.read, chan_file.write),
         "nerfstudio": (nerfstudio_file.read, nerfstudio_file.write),
         "opentrackio": (opentrackio_file.read, opentrackio_file.write),

@@ -14,8 +14,16 @@ import numpy as np
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, TrackedFrame, is_rigid
-from mrbokeh.tracking.camera_track.track_file import TrackOptions, frame_numbers, lost, picture_name
+from mrbokeh.tracking.camera_track.track import (
+    DISTORTION_NAMES,
+    CameraTrack,
+    TrackedFrame,
+    TrackOptions,
+    frame_numbers,
+    is_rigid,
+    lost,
+    picture_name,
+)
 from mrbokeh.tracking.world_axes import from_opengl, to_opengl
 
 _UP = "+z"
