@@ -1,12 +1,12 @@
-"""Build the gallery: run every example of the README and show what it made.
+"""Build the gallery: run every example of docs/examples.md and show what it made.
 
     python -m datasets_scripts.gallery gallery_out [--demo demo_out] [--only composite,video] [--update]
 
-The README's examples are the only list: a heading, a `sh` block, a picture, and a comment that says which of the files that the block
+They are the only list: a heading, a `sh` block, a picture, and a comment that says which of the files that the block
 made the picture shows (`<!-- shows: out.png -->`), or which page to look at while its last command runs (`<!-- page: http://... -->`).
 They run in OUT, where demo_out leads to a finished demo and repository to this repository. Finished commands and pictures are kept,
 so that an interrupted run goes on; after a command has changed, begin with an empty folder. OUT/gallery.html shows all; --update puts the
-pictures into docs/pictures, where the README looks for them.
+pictures into docs/pictures, where the examples show them.
 """
 
 import os
@@ -27,14 +27,14 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.html_page import inline_figure, write_page
 
 ROOT = Path(__file__).resolve().parent.parent
-README = ROOT / "README.md"
+EXAMPLES = ROOT / "docs" / "examples.md"
 FINISHED = ".finished"
 FINDS = 1
 """`mrbokeh check` ends with it where it found something, which is what its example shows."""
 
 
 def build(out: Path, entries: list[Entry], demo: Path) -> None:
-    """Make what is missing, in the README's order, for examples use one another's results; and the page of all."""
+    """Make what is missing, in the order of the page, for examples use one another's results; and the page of all."""
     if not (demo / "report.html").is_file():
         raise InputError(f"expected a finished demo in {demo}: run `mrbokeh demo --out {demo}` first")
     _link(out / "demo_out", demo)
@@ -102,9 +102,9 @@ def main(
     only: Annotated[str, typer.Option(help="Names of pictures, with commas between; empty for all.")] = "",
     update: Annotated[bool, typer.Option("--update", help="Copy the pictures to docs/pictures.")] = False,
 ) -> None:
-    """Run the examples of the README and show what they made."""
+    """Run the examples of docs/examples.md and show what they made."""
     try:
-        entries = read_entries(README.read_text(encoding="utf-8"))
+        entries = read_entries(EXAMPLES.read_text(encoding="utf-8"))
         chosen = [entry for entry in entries if not only or entry.picture.stem in only.split(",")]
         build(out, chosen, demo)
     except InputError as error:
@@ -112,7 +112,7 @@ def main(
         raise typer.Exit(2) from None
     if update:
         for entry in chosen:
-            shutil.copyfile(out / entry.picture.name, ROOT / entry.picture)
+            shutil.copyfile(out / entry.picture.name, EXAMPLES.parent / entry.picture)
     typer.echo(f"wrote {out / 'gallery.html'}")
 
 

@@ -1,4 +1,4 @@
-"""The examples of the README: what they are called, which commands make them, and the picture of the result."""
+"""The examples of docs/examples.md: what they are called, which commands make them, and the picture of the result."""
 
 import re
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from pathlib import Path
 from mrbokeh.system.errors import InputError
 
 _ENTRY = re.compile(
-    r"^### (?P<title>[^\n]+)\n(?:(?!^##).)*?```sh\n(?P<commands>.*?)```\n+!\[(?P<caption>[^\]]*)\]\((?P<picture>[^)]+)\)\n"
+    r"^## (?P<title>[^\n]+)\n(?:(?!^#).)*?```sh\n(?P<commands>.*?)```\n+!\[(?P<caption>[^\]]*)\]\((?P<picture>[^)]+)\)\n"
     r"<!-- (?P<kind>shows|page): (?P<source>[^\n]+?) -->",
     re.DOTALL | re.MULTILINE,
 )
@@ -15,7 +15,7 @@ _ENTRY = re.compile(
 
 @dataclass(frozen=True)
 class Entry:
-    """picture: where the README looks for it. Either `shows`, files that the commands make (side by side), or `page`, an address."""
+    """picture: its path from the page. Either `shows`, files that the commands make (side by side), or `page`, an address."""
 
     title: str
     commands: tuple[str, ...]
@@ -25,11 +25,13 @@ class Entry:
     page: str = ""
 
 
-def read_entries(readme: str) -> list[Entry]:
+def read_entries(page: str) -> list[Entry]:
     """All examples with a picture, in order. Raises InputError where there is none."""
-    entries = [_entry(found) for found in _ENTRY.finditer(readme)]
+    entries = [_entry(found) for found in _ENTRY.finditer(page)]
     if not entries:
-        raise InputError("expected examples with pictures in the README (### title, sh block, picture, <!-- shows: FILE -->), found none")
+        raise InputError(
+            "expected examples with pictures in docs/examples.md (## title, sh block, picture, <!-- shows: FILE -->), found none"
+        )
     return entries
 
 

@@ -95,7 +95,7 @@ def _as_stored(path: Path) -> UInt8[np.ndarray, "height width 3"]:
 
     stored = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if stored is None:
-        raise InputError(f"expected a picture in {path}, but there is none: see `shows` of its example in the README")
+        raise InputError(f"expected a picture in {path}, but there is none: see `shows` of its example in docs/examples.md")
     return cv2.cvtColor(stored, cv2.COLOR_BGR2RGB)
 
 

@@ -1,4 +1,4 @@
-"""What the README promises: its commands exist with those options, its files exist, its Python runs."""
+"""What README and guides promise: their commands exist with those options, their files exist, the Python runs, pages stay short."""
 
 import re
 from functools import cache
@@ -18,10 +18,13 @@ from mrbokeh.optics.lens_file import write_lens
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+GUIDES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", ROOT / "ARCHITECTURE.md", *GUIDES)}
+LONGEST_PAGE_BYTES = 8000
 
 
 def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+    return [block for page in PAGES.values() for block in re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)]
 
 
 def shell_lines() -> list[str]:
@@ -68,5 +71,11 @@ def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert isinstance(variables["blurred"], Layer)
 
 
-def test_linked_files_exist() -> None:
-    assert all((ROOT / target).exists() for target in re.findall(r"\]\(([\w./]+)\)", README))
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_linked_files_exist(page: Path) -> None:
+    missing = [target for target in re.findall(r"\]\(([\w./]+)\)", PAGES[page]) if not (page.parent / target).exists()]
+    assert not missing
+
+
+def test_the_pages_that_newcomers_read_first_stay_short() -> None:
+    assert all((ROOT / name).stat().st_size <= LONGEST_PAGE_BYTES for name in ("README.md", "ARCHITECTURE.md"))

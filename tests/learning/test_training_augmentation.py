@@ -1,13 +1,12 @@
-"""Depth made worse while training: as wrong as was measured (README, "Capture"), and nothing else touched."""
+"""Depth made worse while training: as wrong as was measured (docs/measured.md, "Capture"), and nothing else touched."""
 
 import time
 
 import numpy as np
 import pytest
 
-from training.augmentation import augmented
-from training.pairs import Pair
-from training.smooth_noise import octaves, smooth_noise
+from training.data.augmentation import augmented, octaves, smooth_noise
+from training.data.pairs import Pair
 
 PX_PER_DIOPTRE, FOCUS_DIOPTRES = 40.0, 1.2
 SEEDS = range(6)

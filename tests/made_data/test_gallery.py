@@ -1,4 +1,4 @@
-"""The README's examples with pictures: every command has one, each picture is there, and the gallery is made by running them."""
+"""The examples of docs/examples.md with pictures: every command has one, each picture is there, and the gallery is made by running them."""
 
 from pathlib import Path
 
@@ -14,8 +14,8 @@ from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[2]
-ENTRIES = read_entries((ROOT / "README.md").read_text(encoding="utf-8"))
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples.md"
+ENTRIES = read_entries(EXAMPLES.read_text(encoding="utf-8"))
 WITHOUT_PICTURE = {
     "doctor",  # it prints a table of what is installed here
     "blender-addon",  # what it writes is to be seen in Blender only
@@ -33,17 +33,17 @@ def test_every_command_has_an_example_with_a_picture() -> None:
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.picture.stem)
 def test_the_picture_is_there(entry: Entry) -> None:
-    picture = decoded((ROOT / entry.picture).read_bytes())
+    picture = decoded((EXAMPLES.parent / entry.picture).read_bytes())
     assert picture.shape[1] <= WIDEST_PX and picture.std() > 5.0, "a picture of something"
-    assert (ROOT / entry.picture).stat().st_size < 300_000
+    assert (EXAMPLES.parent / entry.picture).stat().st_size < 300_000
 
 
 def test_examples_are_read_from_headings_blocks_and_comments() -> None:
-    readme = (
-        "## Use\n### `mrbokeh refocus`: new slices\n\nText.\n\n```sh\nmrbokeh refocus a \\\n    --out b   # new\npython -m x\n```\n\n"
-        "![Three slices](docs/pictures/refocus.jpg)\n<!-- shows: b/sheet.png -->\n### no picture\n```sh\nmrbokeh doctor\n```\n"
+    page = (
+        "# Use\n## `mrbokeh refocus`: new slices\n\nText.\n\n```sh\nmrbokeh refocus a \\\n    --out b   # new\npython -m x\n```\n\n"
+        "![Three slices](docs/pictures/refocus.jpg)\n<!-- shows: b/sheet.png -->\n## no picture\n```sh\nmrbokeh doctor\n```\n"
     )
-    (entry,) = read_entries(readme)
+    (entry,) = read_entries(page)
     assert entry.title == "mrbokeh refocus: new slices" and entry.caption == "Three slices"
     assert [line.split() for line in entry.commands] == [["mrbokeh", "refocus", "a", "--out", "b"], ["python", "-m", "x"]]
     assert (entry.picture, entry.shows, entry.page) == (Path("docs/pictures/refocus.jpg"), "b/sheet.png", "")
