@@ -1,4 +1,9 @@
-"""What the stated exposure says about brightness: how bright the photograph shows a given luminance, or the light of another photograph."""
+"""What the stated exposure says about brightness: how bright the photograph shows a given luminance, or the light of another photograph.
+
+The exposure that a picture states: Exif of JPEG, TIFF and PNG, or the standard attributes of an EXR header.
+
+White balance by colour temperature: how a picture that was balanced for one white looks when it is balanced for another.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +11,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from mrbokeh.compositing.plate_look.colour_match import ColourMatch
+import numpy as np
+
+from mrbokeh.compositing.plate_look.colour_match import ColourMatch, Triple, triple_of
+from mrbokeh.images.color import rec709_from_XYZ
 from mrbokeh.lens_measuring.matching.photo_facts import exif_tags, positive_rational
 from mrbokeh.system.errors import InputError
 
@@ -80,3 +88,86 @@ def exposure_of_metadata(metadata: Mapping[str, Any], where: str = "the slice", 
     return Exposure(
         **{name: value for name, value in found.items() if value is not None}, gain=positive_rational(metadata.get("exposure_gain")) or 1.0
     )
+
+
+_OF_EXR = {"exposure_time_s": "expTime", "iso": "isoSpeed", "f_number": "aperture"}
+"""Names of OpenEXR's standard attributes (OpenEXR, "Standard Optional Attributes"); times in seconds."""
+
+
+def stated_exposure(path: Path) -> Exposure:
+    """Raises InputError where something is missing."""
+    if path.suffix.lower() != ".exr":
+        return exposure_of_photo(path)
+    import OpenEXR
+
+    if not path.is_file():
+        raise InputError(f"expected an EXR file at {path}, but there is none")
+    try:
+        header = OpenEXR.File(str(path), header_only=True).header()
+    except (RuntimeError, OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as EXR: {error}") from None
+    return exposure_of_metadata({name: header.get(attribute) for name, attribute in _OF_EXR.items()}, str(path))
+
+
+_LIGHT_SOURCE = 0x9208
+KELVIN_OF_LIGHT_SOURCE = {1: 5500.0, 3: 2856.0, 4: 5500.0, 9: 5500.0, 10: 6500.0, 11: 7500.0, 17: 2856.0, 20: 5503.0, 21: 6504.0} | {
+    22: 7504.0,
+    23: 5003.0,
+    24: 3200.0,
+}
+"""Exif's LightSource, where it names one temperature: daylight, tungsten, flash, fine, cloudy, shade, A, D55, D65, D75, D50, studio."""
+COLDEST_K, WARMEST_K, BLACK_BODY_TO_K, DAYLIGHT_FROM_K = 25000.0, 2000.0, 4000.0, 5000.0
+
+
+def white_of_kelvin(kelvin: float) -> Triple:
+    """Linear Rec.709 of a light of that temperature, green being 1.
+
+    It is a black body up to 4000 K, daylight (CIE D) from 5000 K on, and a mixture between.
+    6504 K is (1, 1, 1), the white of Rec.709. Raises InputError outside 2000 to 25000 K.
+    """
+    if not WARMEST_K <= kelvin <= COLDEST_K:
+        raise InputError(f"expected a colour temperature of {WARMEST_K:g} to {COLDEST_K:g} K, got {kelvin:g}")
+    of_daylight = float(np.clip((kelvin - BLACK_BODY_TO_K) / (DAYLIGHT_FROM_K - BLACK_BODY_TO_K), 0.0, 1.0))
+    daylight, black_body = (
+        np.array(each(max(kelvin, least_k))) for each, least_k in ((_daylight_xy, BLACK_BODY_TO_K), (_black_body_xy, 0.0))
+    )
+    x, y = of_daylight * daylight + (1.0 - of_daylight) * black_body
+    rgb = rec709_from_XYZ @ np.array([x / y, 1.0, (1.0 - x - y) / y])
+    return triple_of(rgb / rgb[1])
+
+
+def white_balance_gain(plate_k: float, reference_k: float = 6504.0) -> Triple:
+    """Gain per channel for light balanced for reference_k that shall look balanced for plate_k (von Kries in linear Rec.709).
+
+    A camera set to tungsten shows daylight bluish: red below 1, blue above.
+    """
+    reference, plate = white_of_kelvin(reference_k), white_of_kelvin(plate_k)
+    return triple_of(np.array(reference) / np.array(plate))
+
+
+def kelvin_of_photo(path: Path | str) -> float | None:
+    """What the Exif of a photograph says it was balanced for; None where it names no temperature (automatic)."""
+    source = exif_tags(Path(path)).get(_LIGHT_SOURCE)
+    return KELVIN_OF_LIGHT_SOURCE.get(source) if isinstance(source, int) else None
+
+
+def _daylight_xy(kelvin: float) -> tuple[float, float]:
+    """CIE 15, equations 3.3 and 3.4."""
+    t = 1e3 / kelvin
+    x = 0.244063 + t * (0.09911 + t * (2.9678 - 4.6070 * t)) if kelvin <= 7000.0 else 0.237040 + t * (0.24748 + t * (1.9018 - 2.0064 * t))
+    return x, -3.0 * x * x + 2.870 * x - 0.275
+
+
+def _black_body_xy(kelvin: float) -> tuple[float, float]:
+    """The cubic of Kim et al. (US patent 7024034, 2006) for 1667 to 25000 K."""
+    t = 1e3 / kelvin
+    x = (
+        0.179910 + t * (0.8776956 + t * (-0.2343589 - 0.2661239 * t))
+        if kelvin <= 4000.0
+        else 0.240390 + t * (0.2226347 + t * (2.1070379 - 3.0258469 * t))
+    )
+    if kelvin <= 2222.0:
+        return x, -0.20219683 + x * (2.18555832 + x * (-1.34811020 - 1.1063814 * x))
+    if kelvin <= 4000.0:
+        return x, -0.16748867 + x * (2.09137015 + x * (-1.37418593 - 0.9549476 * x))
+    return x, -0.37001483 + x * (3.75112997 + x * (-5.87338670 + 3.0817580 * x))

@@ -1,17 +1,84 @@
-"""Grain: the noise of a camera as it stands in its linear pictures, and how it is measured in them."""
+"""Grain: the noise of a camera as it stands in its linear pictures, and how it is measured in them.
+
+A periodic texture of normal noise with a given correlation between neighbours and channels.
+
+Grain as a JSON file, so that one measurement serves all frames of a camera and setting.
+
+Grain on the virtual part: as much as the sensor would have given the finished picture, less what the photograph has kept.
+
+Noise belongs to the light that reaches the sensor, object and scene together. With P the photograph, V the premultiplied virtual
+light and a its coverage, the picture is M = K + V with K = (1 - a) P. A sensor would give it the variance s(M) = shot M + read. The
+photograph's own noise is in it already, scaled by 1 - a like the photograph, so with the variance (1 - a)^2 s(P). Independent
+variances add, therefore the virtual part gets
+
+    s(M) - (1 - a)^2 s(P) = shot (V + a (1 - a) P) + read a (2 - a)       (the right side for K = (1 - a) P),
+
+which is never negative, s(V) where the object is opaque and 0 where it is not. A shadow (V = 0) gets grain too: what is left of the
+photograph has lost more noise than light.
+"""
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Complex128, Float32
 
-from mrbokeh.compositing.plate_look.colour_match import triple_of
-from mrbokeh.compositing.plate_look.grain_texture import grain_texture
-from mrbokeh.compositing.plate_look.noise_blocks import NoiseBlocks, noise_blocks, noise_blocks_of_pair
-from mrbokeh.compositing.plate_look.noise_correlation import LAGS, Correlation, measured_correlation, white
-from mrbokeh.compositing.plate_look.noise_level import NoiseLevel, fit_noise_level
+from mrbokeh.compositing.plate_look.colour_match import Triple, triple_of
+from mrbokeh.compositing.plate_look.noise_measurement import (
+    LAGS,
+    REACH_PX,
+    Correlation,
+    NoiseBlocks,
+    NoiseLevel,
+    fit_noise_level,
+    measured_correlation,
+    noise_blocks,
+    noise_blocks_of_pair,
+    white,
+)
+from mrbokeh.images.layer import Layer
+from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
+
+SIDE_PX = 1024
+_GRID_PX = 32
+
+
+def grain_texture(correlation: Correlation, seed: int) -> Float32[np.ndarray, "side side 3"]:
+    """White noise, filtered by the root of the spectrum that belongs to the correlation (Wiener-Khinchin); mean 0, variance 1."""
+    kernels = np.fft.irfft2(_root_of_spectrum(correlation), (_GRID_PX, _GRID_PX), axes=(0, 1))
+    noise = np.random.default_rng(seed).standard_normal((SIDE_PX, SIDE_PX, 3), np.float32)
+    drawn = np.fft.rfft2(noise, axes=(0, 1))
+    mixed = np.zeros_like(drawn)
+    for i, j in np.ndindex(3, 3):
+        mixed[..., i] += np.fft.rfft2(_placed(kernels[..., i, j])) * drawn[..., j]
+    texture = np.fft.irfft2(mixed, (SIDE_PX, SIDE_PX), axes=(0, 1))
+    texture -= texture.mean(axis=(0, 1))
+    deviation = texture.std(axis=(0, 1))
+    return (texture / np.where(deviation > 0.0, deviation, 1.0)).astype(np.float32)
+
+
+def _root_of_spectrum(correlation: Correlation) -> Complex128[np.ndarray, "rows columns 3 3"]:
+    """The Hermitian root per frequency. Cutting a correlation off may make a spectrum slightly negative: there it is taken as 0."""
+    grid = np.zeros((_GRID_PX, _GRID_PX, 3, 3))
+    places = np.arange(-REACH_PX, REACH_PX + 1)
+    grid[np.ix_(places, places)] = correlation
+    # n_i(p) n_j(p + d) summed with exp(-i f d) has conj(N_i) N_j; the filter's spectrum is N_i conj(N_j).
+    spectrum = np.fft.rfft2(grid, axes=(0, 1)).conj()
+    values, vectors = np.linalg.eigh(0.5 * (spectrum + spectrum.conj().swapaxes(2, 3)))
+    return (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ vectors.conj().swapaxes(2, 3)
+
+
+def _placed(kernel: np.ndarray) -> np.ndarray:
+    """A kernel about pixel (0, 0), on the side of the texture."""
+    half = _GRID_PX // 2
+    places = np.arange(-half, half)
+    whole = np.zeros((SIDE_PX, SIDE_PX))
+    whole[np.ix_(places, places)] = kernel[np.ix_(places, places)]
+    return whole
+
 
 Picture = Float32[np.ndarray, "height width 3"]
 
@@ -58,3 +125,73 @@ def _grain_of(blocks: NoiseBlocks, seed: int) -> Grain:
     correlation, variance = measured_correlation(blocks.only(accepted), level)
     shot, read = (triple_of(np.array(each) * variance) for each in (level.shot, level.read))
     return Grain(NoiseLevel(shot, read), correlation, seed)
+
+
+FORMAT, VERSION = "mrbokeh-grain", 1
+
+
+def write_grain(path: Path | str, grain: Grain) -> None:
+    document = {"format": FORMAT, "version": VERSION, "shot": grain.level.shot, "read": grain.level.read, "seed": grain.seed}
+    write_json(path, document | {"correlation": np.round(grain.correlation, 6).tolist()})
+
+
+def read_grain(path: Path | str) -> Grain:
+    """Raises InputError where the file is not a grain file."""
+    document = read_json(path, "a grain file")
+    if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
+        raise InputError(f'{path}: expected a grain file with "format": "{FORMAT}" and "version": {VERSION}: measure the grain again')
+    level = NoiseLevel(_three(document, "shot", path), _three(document, "read", path))
+    seed = document.get("seed", 0)
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"{path}: expected seed as a whole number not below 0, got {seed!r}")
+    return Grain(level, _numbers(document, "correlation", (LAGS, LAGS, 3, 3), path), seed)
+
+
+def _three(document: dict[str, Any], key: str, path: Path | str) -> Triple:
+    return triple_of(_numbers(document, key, (3,), path))
+
+
+def _numbers(document: dict[str, Any], key: str, shape: tuple[int, ...], path: Path | str) -> np.ndarray:
+    try:
+        values = np.array(document.get(key), np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.shape != shape or not np.isfinite(values).all():
+        raise InputError(f"{path}: expected {key} as numbers of shape {shape}, got something else: measure the grain again")
+    return values
+
+
+def added_variance(virtual: Layer, photo_rgb: Picture, plate_rgb: Picture, level: NoiseLevel) -> Float32[np.ndarray, "height width 3"]:
+    """Variance that grain adds to each value; 0 where nothing virtual is. The plain twin of the compiled loop."""
+    kept = (1.0 - virtual.alpha[..., None]) ** 2
+    missing = level.variance(photo_rgb + virtual.rgb) - kept * level.variance(plate_rgb)
+    touched = (virtual.alpha != 0.0) | (virtual.rgb != 0.0).any(axis=2)
+    return np.where(touched[..., None], np.maximum(missing, 0.0), 0.0).astype(np.float32)
+
+
+def add_grain_to(
+    light: Picture, alpha: Float32[np.ndarray, "height width"], photo_rgb: Picture, plate_rgb: Picture, draw: "GrainDraw"
+) -> None:
+    """In place on light (h, w, 3), a part of the frame like the others."""
+    from mrbokeh.compositing._pixel_light_numba import add_grain
+
+    shot, read = (np.array(each, np.float32) for each in (draw.grain.level.shot, draw.grain.level.read))
+    alpha, photo_rgb, plate_rgb = (np.ascontiguousarray(each) for each in (alpha, photo_rgb, plate_rgb))
+    add_grain(light, alpha, photo_rgb, plate_rgb, draw.grain.texture, draw.start, draw.sign, shot, read)
+
+
+class GrainDraw:
+    """Which part of the texture a frame takes: drawn from seed and frame alone, so that neither the box nor the order of frames matters."""
+
+    def __init__(self, grain: Grain, frame: int, origin_px: tuple[int, int] = (0, 0)) -> None:
+        rng = np.random.default_rng((grain.seed, frame))
+        side = grain.texture.shape[0]
+        self.grain, self.sign = grain, np.float32(rng.choice((-1.0, 1.0)))
+        row, column = (int(each) for each in rng.integers(0, side, 2))
+        self.start = (row + origin_px[0]) % side, (column + origin_px[1]) % side
+
+    def values(self, size_px: tuple[int, int]) -> Picture:
+        """(h, w, 3) of variance 1: the plain twin of what the compiled loop looks up."""
+        side = self.grain.texture.shape[0]
+        rows, columns = ((np.arange(length) + start) % side for length, start in zip(size_px, self.start, strict=True))
+        return self.sign * self.grain.texture[np.ix_(rows, columns)]

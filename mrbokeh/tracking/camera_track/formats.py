@@ -3,16 +3,85 @@
 json            our own, or a single camera            opentrackio     JSON samples of SMPTE's OpenTrackIO 1.0.1
 chan            Nuke                                   colmap          a folder with cameras.txt and images.txt
 nerfstudio      transforms.json                        colmap-binary   the same as .bin
+
+Our own JSON: everything a CameraTrack holds.
+
+    {"format": "mrbokeh-camera-track", "version": 1, "up": "-z", "metric": true, "fixed": false,
+     "frames": [{"frame": 0, "time_s": 0.0, "camera": {...}, "focus_distance_m": 1.2, "f_number": 2.8, "distortion": {"k1": -0.1}}]}
+
+camera is that of `mrbokeh.optics.camera`. What is not known is left out; focus_distance_m null is infinity. A file with one camera
+and nothing else is a camera on a tripod.
+
+What a file of cameras does not say of itself, and what it cannot hold.
+
+Frame numbers from the names of pictures.
 """
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
-from mrbokeh.system.atomic_files import read_json
+from mrbokeh.optics.camera import camera_from_json, camera_to_json
+from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track import chan_file, colmap_file, nerfstudio_file, opentrackio_file
-from mrbokeh.tracking.camera_track.track import CameraTrack, TrackOptions, read_own, write_own
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions, fixed_track
+
+FORMAT = "mrbokeh-camera-track"
+VERSION = 1
+
+
+def read_own(path: Path, options: TrackOptions) -> CameraTrack:
+    """Raises InputError where it is of another version or incomplete."""
+    document = read_json(path, "a camera track")
+    if isinstance(document, dict) and "camera_from_world" in document:
+        return fixed_track(camera_from_json(document, str(path)), options.up or "-z")
+    if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
+        raise InputError(f"{path}: expected a camera track (format {FORMAT!r}, version {VERSION}) or a single camera; see `mrbokeh track`")
+    try:
+        frames = {int(each["frame"]): _frame(each, f"{path}, frame {each['frame']}") for each in document["frames"]}
+        if len(frames) < len(document["frames"]):
+            raise InputError(f"{path}: two of its frames have the same number")
+        metric = options.is_metric(bool(document.get("metric", True)))
+        return CameraTrack(frames, options.up or document["up"], metric, bool(document.get("fixed", False)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise error if isinstance(error, InputError) else InputError(f"{path}: not a whole camera track ({error!r})") from None
+
+
+def write_own(path: Path, track: CameraTrack, options: TrackOptions) -> tuple[str, ...]:
+    write_json(path, track_to_json(track.with_up(options.up or track.up)))
+    return ()
+
+
+def track_to_json(track: CameraTrack) -> dict[str, Any]:
+    frames = [{"frame": number, **_frame_to_json(track.frames[number])} for number in track.numbers]
+    return {"format": FORMAT, "version": VERSION, "up": track.up, "metric": track.metric, "fixed": track.fixed, "frames": frames}
+
+
+def _frame_to_json(frame: TrackedFrame) -> dict[str, Any]:
+    document: dict[str, Any] = {"camera": camera_to_json(frame.camera)}
+    if frame.time_s is not None:
+        document["time_s"] = frame.time_s
+    if frame.focus_distance_m is not None:
+        document["focus_distance_m"] = frame.focus_distance_m if math.isfinite(frame.focus_distance_m) else None
+    if frame.f_number is not None:
+        document["f_number"] = frame.f_number
+    if frame.distortion is not None:
+        document["distortion"] = dict(frame.distortion)
+    return document
+
+
+def _frame(document: dict[str, Any], where: str) -> TrackedFrame:
+    focus_m = document.get("focus_distance_m", math.inf) if "focus_distance_m" in document else None
+    if "focus_distance_m" in document and document["focus_distance_m"] is None:
+        focus_m = math.inf
+    numbers = {name: float(document[name]) for name in ("f_number", "time_s") if name in document}
+    distortion = {str(name): float(value) for name, value in document["distortion"].items()} if "distortion" in document else None
+    camera = camera_from_json(document["camera"], where)
+    return TrackedFrame(camera, None if focus_m is None else float(focus_m), distortion=distortion, **numbers)
+
 
 Read = Callable[[Path, TrackOptions], CameraTrack]
 Write = Callable[[Path, CameraTrack, TrackOptions], tuple[str, ...]]
