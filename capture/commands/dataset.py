@@ -43,7 +43,7 @@ def dataset_command(
         return
     from capture.dataset.stack_writer import StackWriting
     from capture.dataset.writer import DatasetPlan, write_dataset
-    from capture.report.reblur import reblur_by
+    from capture.report.stack_view import reblur_by
     from mrbokeh.stacks.guessed_metres import metres_notes
     from mrbokeh.system.console import kept_when_interrupted
 
@@ -81,7 +81,7 @@ def licence_text(text_or_file: str) -> str:
 
 
 def _verify(out: Path) -> None:
-    from capture.dataset.verification import verify
+    from capture.dataset.writer import verify
     from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
 
     dataset = read_focal_stack_dataset(out)

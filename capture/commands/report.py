@@ -35,11 +35,9 @@ def report_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
     from capture.report import HTML_NAME
-    from capture.report.gates import tally, verdict_lines
-    from capture.report.reblur import reblur_by
-    from capture.report.scene_report import report_scene
-    from capture.report.stack_rules import picture_verdict
-    from capture.report.strictness import require_gates, unmet
+    from capture.report.gates import picture_verdict, tally, verdict_lines
+    from capture.report.scene_report import report_scene, require_gates, unmet
+    from capture.report.stack_view import reblur_by
     from mrbokeh.system.console import kept_when_interrupted
 
     allowed = require_gates(allow_absent or [], strict)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from capture.merging.focus_volume import Blocks, FocusVolume, block_detail
-from capture.stacks.block_detail import BLOCK_PX
+from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.system.console import track
 
 Rgb = Float32[np.ndarray, "height width 3"]

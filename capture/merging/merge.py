@@ -9,25 +9,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from capture.merging.alignment import Registration, register_stack
 from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
 from capture.merging.depth_from_focus import focus_map, vetoed
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights
-from capture.merging.merged_pictures import write_readable_pictures
-from capture.merging.preferred_merge import PREFERRED, Seen, with_preferred
-from capture.merging.preferred_side import Side
-from capture.merging.registered_slices import IngestedSlices, RegisteredSlices, newer, source_path
-from capture.merging.registration_file import FILE_NAME as REGISTRATION_NAME
-from capture.merging.registration_file import read_registration, write_registration
-from capture.merging.relative_stack import as_stated, in_focus_order, with_solved_blur
-from capture.merging.replaced_places import depth_m_of
+from capture.merging.merged_pictures import depth_m_of, write_readable_pictures
+from capture.merging.metres.relative_stack import as_stated, in_focus_order, with_solved_blur
+from capture.merging.preferred_side import PREFERRED, Seen, Side, with_preferred
+from capture.merging.registration.alignment import register_stack
+from capture.merging.registration.registered_slices import IngestedSlices, RegisteredSlices, newer, source_path
+from capture.merging.registration.registration_file import FILE_NAME as REGISTRATION_NAME
+from capture.merging.registration.registration_file import Registration, read_registration, write_registration
 from capture.merging.restored_lights import RestoredLight, restored_lights, with_restored_lights
 from capture.merging.retouch import RETOUCHES
-from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS
-from capture.merging.slice_optics import SliceOptics
-from capture.stacks.disk_space import told_when_full
-from capture.stacks.sentinel_focus import stated_by_sentinel
+from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS, SliceOptics
+from capture.stacks.slice_files import stated_by_sentinel, told_when_full
 from mrbokeh.figures.stack_pictures import depth_codes, write_merge_sheet
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.camera import Camera

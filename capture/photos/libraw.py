@@ -6,6 +6,13 @@ back out, else a white-balanced red clips at half its range; no auto-brightening
 demosaicing, then one median over the colour differences, which takes the coloured fringes off small bright lights (0.4 dB
 for the merged picture of a traced desk with lamps). LibRaw cuts off below the black level, so the noise of black areas is
 one-sided. Files without a mosaic (linear DNG, sRAW) are not filtered.
+
+Which pixels hold light from full photosites: found before any processing, spread as far as demosaicing spreads it.
+
+Colour of pixels in which some channels of the sensor are full: neutral instead of the tint of the white balance.
+
+A full channel reads its white balance multiplier, whatever light there was: a white lamp turns magenta, because green has
+the smallest multiplier. The light was at least as bright as the brightest channel says, and most lights are near white.
 """
 
 from collections.abc import Iterator
@@ -14,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32
 
 from mrbokeh.images.color import XYZ_from_rec709
 from mrbokeh.system.errors import InputError, MissingExtraError
@@ -102,3 +109,73 @@ def matrix_used_by_libraw(raw: "rawpy.RawPy") -> Float[np.ndarray, "3 3"]:
         return np.eye(3)
     matrix = np.linalg.lstsq(camera[unclipped], srgb[unclipped], rcond=None)[0].T
     return matrix / matrix.sum(axis=1, keepdims=True)
+
+
+if TYPE_CHECKING:
+    import rawpy
+
+DEMOSAICING_REACH_PX = 2
+_SAME_SHAPE = 0.02
+_FULL_IN_PICTURE = 0.99
+
+
+def full_photosites(raw: "rawpy.RawPy") -> Bool[np.ndarray, "sensor_height sensor_width"]:
+    """Where the raw number stands at the white level (of its channel, where the camera states one). Call after unpack()."""
+    values, white = raw.raw_image_visible, int(raw.white_level)
+    stated = [int(each) for each in (raw.camera_white_level_per_channel or []) if 0 < int(each) < white]
+    full: np.ndarray = np.asarray(values >= min([white, *stated]))
+    return full if full.ndim == 2 else np.any(full[..., :3], axis=-1)
+
+
+def saturated_share(
+    full: Bool[np.ndarray, "sensor_height sensor_width"],
+    camera_rgb: Float32[np.ndarray, "height width 3"],
+    ceilings: WhiteBalance | tuple[float, float, float],
+) -> Float32[np.ndarray, "height width"]:
+    """The share of each pixel of a picture that full photosites reach, 0 to 1: dilated by 2 px, then averaged onto its grid.
+
+    Sensors whose grid LibRaw turns (Fuji's Super CCD) have another shape than their picture: there the picture's own
+    channels tell, from 99 % of what a full one reads (ceilings).
+    """
+    height, width = camera_rgb.shape[:2]
+    # Half-size pictures and square pixels made of others keep the shape of the frame only along one axis or both.
+    if abs(full.shape[0] / height - 1.0) > _SAME_SHAPE and abs(full.shape[0] / height / 2.0 - 1.0) > _SAME_SHAPE:
+        full = np.any(camera_rgb >= _FULL_IN_PICTURE * np.asarray(ceilings, np.float32), axis=-1)
+    return resized_share(dilated(full).astype(np.float32), width, height)
+
+
+def dilated(mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """A mask grown by as many pixels as demosaicing reaches, in all directions."""
+    import cv2
+
+    side = 2 * DEMOSAICING_REACH_PX + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool) if mask.any() else mask
+
+
+def resized_share(share: Float32[np.ndarray, "height width"], width: int, height: int) -> Float32[np.ndarray, "new_height new_width"]:
+    """Area averages on another grid."""
+    import cv2
+
+    same = share.shape == (height, width)
+    return share if same else np.clip(cv2.resize(share, (width, height), interpolation=cv2.INTER_AREA), 0.0, 1.0)
+
+
+NEARLY_FULL = 0.95
+_ROWS_AT_ONCE = 256
+
+
+def neutral_where_full(
+    camera_rgb: Float32[np.ndarray, "height width 3"], ceilings: tuple[float, float, float]
+) -> Float32[np.ndarray, "height width 3"]:
+    """White-balanced camera RGB with full channels raised to the brightest channel of their pixel.
+
+    ceilings: what a full red, green and blue read (the white balance multipliers). From 95 % of its ceiling on a channel
+    moves over smoothly, so that demosaicing leaves no seam. Coloured lights, whose other channels are not full, keep their hue.
+    """
+    result = np.empty_like(camera_rgb)
+    # Strips, because the steps between take several times the memory of what they are made from.
+    for first in range(0, len(camera_rgb), _ROWS_AT_ONCE):
+        rows = camera_rgb[first : first + _ROWS_AT_ONCE]
+        fullness = np.clip((rows / np.asarray(ceilings, np.float32) - NEARLY_FULL) / (1.0 - NEARLY_FULL), 0.0, 1.0)
+        result[first : first + _ROWS_AT_ONCE] = rows + fullness * (rows.max(axis=2, keepdims=True) - rows)
+    return result

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.photos.focus_csv import FILE_NAME as FOCUS_FILE
 from capture.photos.raw import RAW_SUFFIXES
-from capture.photos.sidecar import FILE_NAME as LENS_FILE
+from capture.photos.sidecar import FOCUS_FILE, LENS_FILE
 from mrbokeh.images.image_io import ENCODED_SUFFIXES, HEIF_ADVICE, HEIF_SUFFIXES, LINEAR_SUFFIXES
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE_NAME
 from mrbokeh.system.errors import InputError

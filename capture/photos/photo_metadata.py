@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 from datetime import datetime
 
 from capture.photos.focus_metadata import FocusReading
-from capture.photos.sensor_reading import SensorReading
+from capture.photos.sensor_metadata import SensorReading
 
 
 @dataclass(frozen=True)

@@ -16,23 +16,153 @@ or, instead of the list,
     [focus_distances_m]
     "IMG_0001.NEF" = 0.5
 
-or a focus.csv (capture.photos.focus_csv).
+or a focus.csv.
+
+StatedFocus: a focus distance that the user gives, with the interval it stands for.
+
+The values of a lens.toml in their types, or a sentence that says what is wrong with one.
+
+focus.csv beside the photographs: focus distances by file name, for those who measured or logged them.
+
+    file,focus_distance_m,nearest_m,farthest_m
+    IMG_0001.NEF,0.50,0.48,0.52
+    IMG_0002.NEF,0.60
+    IMG_0003.NEF,inf
+
+nearest_m and farthest_m say between which distances the true one lies; without them it is taken as exact. Where
+distances count from is said in lens.toml (focus_origin).
 """
 
+import csv
+import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
-from capture.photos import focus_csv
 from capture.photos.focus_metadata import FocusReading
 from capture.photos.photo_metadata import PhotoMetadata
-from capture.photos.sidecar_values import checked
-from capture.photos.stated_focus import StatedFocus
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.system.errors import InputError
 
-FILE_NAME = "lens.toml"
+
+@dataclass(frozen=True)
+class StatedFocus:
+    """0 < nearest_m <= distance_m <= farthest_m, inf allowed; all equal where it is exact."""
+
+    distance_m: float
+    nearest_m: float
+    farthest_m: float
+
+    @classmethod
+    def checked(cls, values: Sequence[object], where: str) -> "StatedFocus":
+        """From a distance, or a distance with its nearest and farthest (None: exact); InputError where they cannot be."""
+        given = [*values, None, None][:3]
+        numbers = [given[0], *(given[0] if each is None else each for each in given[1:])]
+        if any(isinstance(each, bool) or not isinstance(each, (int, float)) or math.isnan(each) for each in numbers):
+            raise InputError(f"{where} must be a number of metres, or a distance with its nearest and farthest, got {_listed(values)}")
+        distance_m, nearest_m, farthest_m = (float(each) for each in numbers if isinstance(each, (int, float)))
+        if min(distance_m, nearest_m, farthest_m) <= 0:
+            raise InputError(f"{where} must be positive (inf is allowed), got {_listed(values)}")
+        if not nearest_m <= distance_m <= farthest_m:
+            raise InputError(f"{where}: the distance must lie between its nearest and farthest, got {_listed(values)}")
+        return cls(distance_m, nearest_m, farthest_m)
+
+    def reading(self, origin: str, source: str) -> FocusReading:
+        return FocusReading(self.distance_m, self.nearest_m, self.farthest_m, origin, f"{source} = {self.distance_m:g} m")
+
+
+def _listed(values: Sequence[object]) -> str:
+    return ", ".join(str(each) for each in values if each is not None) or "nothing"
+
+
+_ORIGINS = ("lens", "film_plane")
+
+
+def checked(key: str, value: Any, path: Path) -> Any:
+    """One value in its type, or InputError."""
+    if key == "focus_origin":
+        if value not in _ORIGINS:
+            raise InputError(f"{path}: focus_origin must be one of {', '.join(_ORIGINS)}, got {value!r}")
+        return value
+    if key == "blades":
+        if not isinstance(value, int) or isinstance(value, bool) or value < 3:
+            raise InputError(f"{path}: blades must be a whole number of at least 3, got {value!r}")
+        return value
+    if key == "focus_distances_m":
+        if isinstance(value, dict):
+            return {name: _stated(each, f"{path}: {key}.{name}") for name, each in value.items()}
+        if isinstance(value, list):
+            return tuple(_stated(each, f"{path}: {key}") for each in value)
+        raise InputError(f"{path}: focus_distances_m must be a list of metres or a table of file names, got {value!r}")
+    if key == "blade_rotation_rad":
+        return _number(key, value, path)
+    if key == "hiatus_mm":
+        return _number(key, value, path)
+    if key == "obstruction":
+        share = _number(key, value, path)
+        if not 0.0 <= share < 1.0:
+            raise InputError(f"{path}: obstruction must be from 0 to below 1, got {value!r}")
+        return share
+    return _positive(key, value, path)
+
+
+def _stated(value: Any, where: str) -> StatedFocus:
+    return StatedFocus.checked(value if isinstance(value, list) and value else [value], where)
+
+
+def _number(key: str, value: Any, path: Path) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise InputError(f"{path}: {key} must be a number, got {value!r}")
+    return float(value)
+
+
+def _positive(key: str, value: Any, path: Path) -> float:
+    result = _number(key, value, path)
+    if result <= 0 or math.isinf(result):
+        raise InputError(f"{path}: {key} must be positive, got {value!r}")
+    return result
+
+
+FOCUS_FILE = "focus.csv"
+_NEEDED = ("file", "focus_distance_m")
+_COLUMNS = (*_NEEDED, "nearest_m", "farthest_m")
+
+
+def read_focus_csv(path: Path) -> dict[str, StatedFocus]:
+    """The distances of a focus.csv by file name. Raises InputError naming the line that is wrong."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"expected focus distances in {path}, but there is no such file") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not text in UTF-8: {error}") from None
+    rows = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    names = [name.strip() for name in rows.fieldnames or []]
+    rows.fieldnames = names
+    if not set(_NEEDED) <= set(names) or not set(names) <= set(_COLUMNS):
+        raise InputError(f"{path}: expected a first line {','.join(_COLUMNS)} (the last two may be left out), got {','.join(names)!r}")
+    result: dict[str, StatedFocus] = {}
+    for row in rows:
+        where = f"{path}, line {rows.line_num}"
+        name = (row["file"] or "").strip()
+        if not name or name in result:
+            raise InputError(f"{where}: expected the name of a file that was not named before, got {name!r}")
+        result[name] = StatedFocus.checked([_cell(row.get(column)) for column in _COLUMNS[1:]], where)
+    return result
+
+
+def _cell(text: str | None) -> str | float | None:
+    """A number where it is one, else the text for the message; None for an empty cell."""
+    stripped = (text or "").strip()
+    try:
+        return float(stripped) if stripped else None
+    except ValueError:
+        return stripped
+
+
+LENS_FILE = "lens.toml"
 
 
 @dataclass(frozen=True)
@@ -96,16 +226,16 @@ def sidecar_of(folder: Path, top: Path, given: Path | None = None) -> Sidecar:
     """
     is_csv = given is not None and given.suffix.lower() == ".csv"
     toml_path = given if given is not None and not is_csv else find_sidecar(folder, top)
-    csv_path = given if is_csv else find_sidecar(folder, top, focus_csv.FILE_NAME) if given is None else None
+    csv_path = given if is_csv else find_sidecar(folder, top, FOCUS_FILE) if given is None else None
     sidecar = read_sidecar(toml_path) if toml_path is not None else Sidecar()
     if csv_path is None:
         return sidecar
     if sidecar.focus_distances_m:
         raise InputError(f"both {sidecar.where} and {csv_path} state focus distances: delete them from one of the two")
-    return replace(sidecar, focus_distances_m=focus_csv.read_focus_csv(csv_path), focus_where=str(csv_path))
+    return replace(sidecar, focus_distances_m=read_focus_csv(csv_path), focus_where=str(csv_path))
 
 
-def find_sidecar(folder: Path, top: Path, file_name: str = FILE_NAME) -> Path | None:
+def find_sidecar(folder: Path, top: Path, file_name: str = LENS_FILE) -> Path | None:
     """The nearest lens.toml from the folder of the photographs upwards to `top`, the folder that the user named."""
     folder, top = folder.resolve(), top.resolve()
     searched = [folder, *(parent for parent in folder.parents if parent == top or top in parent.parents)]

@@ -8,17 +8,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.report.depth_check import DepthCheck, DepthEvidence
-from capture.report.exposure_drift import low_frequency_gain
-from capture.report.findings import SliceFindings, StackFindings
-from capture.report.focus_curve import focus_curve
-from capture.report.moving_objects import Disagreement, moving
-from capture.report.neighbour_places import PlaceEvidence
-from capture.report.picture_evidence import PictureEvidence, PictureLook
-from capture.report.reblur import Reblur
-from capture.report.slice_fit import Prediction, fit_slice
-from capture.report.stack_rules import DEPTH_OFF_PX
-from capture.report.stack_view import StackView
+from capture.report.exclusion import Disagreement, moving
+from capture.report.findings import SliceFindings, StackFindings, focus_curve
+from capture.report.gates import DEPTH_OFF_PX
+from capture.report.picture_sharpness import PictureEvidence, PictureLook
+from capture.report.registration_check import PlaceEvidence
+from capture.report.slice_fit import DepthCheck, DepthEvidence, Prediction, fit_slice, low_frequency_gain
+from capture.report.stack_view import Reblur, StackView
 from mrbokeh.images.color import luminance
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.system.console import track

@@ -1,19 +1,119 @@
-"""What was found of a stack, in numbers: all that gates, charts and report.json need."""
+"""What was found of a stack, in numbers: all that gates, charts and report.json need.
 
+Where in the stack things are sharp: whether the slices reach from the nearest to the farthest thing.
+
+Whether slices follow one another as they should: in order, none missing, none twice, close enough in dioptres.
+
+Findings of a stack as JSON: with numbers that are read back exactly, or as `report.json` shows them.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32
 
-from capture.report.focus_curve import FocusCurve
-from capture.report.focus_spacing import FocusSpacing, focus_spacing
-from capture.report.neighbour_places import NeighbourPlace
-from capture.report.picture_evidence import PictureFindings
-from capture.report.registration_drift import RegistrationDrift, registration_drift
-from capture.report.slice_fit import SliceFit
-from capture.stacks.sentinel_focus import stated_by_sentinel
+from capture.report.gates import exact
+from capture.report.picture_sharpness import PictureFindings
+from capture.report.registration_check import NeighbourPlace, RegistrationDrift, registration_drift
+from capture.report.slice_fit import NAMES, Change, SliceFit
+from capture.stacks.slice_files import stated_by_sentinel
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.guessed_metres import STATED_DISTANCE
+
+Plane = Float32[np.ndarray, "height width"]
+
+_TRUSTED = 0.3
+
+
+@dataclass(frozen=True)
+class FocusCurve:
+    """shares: of the pixels whose focus can be trusted, how many are sharpest in each slice. trusted: share of pixels that can be.
+    beyond_near, beyond_far: shares of them whose focus lies at the very first and last slice, so that the true one may lie beyond.
+    """
+
+    shares: Float[np.ndarray, " slices"]
+    trusted: float
+    beyond_near: float
+    beyond_far: float
+
+
+_AT_THE_END = 0.1
+
+
+def focus_curve(focus_index: Plane, confidence: Plane, slices: int, least_confidence: float = _TRUSTED) -> FocusCurve:
+    trusted = confidence >= least_confidence
+    index = focus_index[trusted]
+    if index.size == 0:
+        return FocusCurve(np.zeros(slices), 0.0, 0.0, 0.0)
+    counts = np.bincount(np.clip(np.round(index), 0, slices - 1).astype(int), minlength=slices)
+    return FocusCurve(
+        counts / index.size,
+        float(trusted.mean()),
+        float((index <= _AT_THE_END).mean()),
+        float((index >= slices - 1 - _AT_THE_END).mean()),
+    )
+
+
+GAP = 1.6
+"""A step larger than this many usual ones means that a slice is missing; a rail or a lens motor steps evenly to a few percent."""
+_SAME = 0.2
+
+
+@dataclass(frozen=True)
+class FocusSpacing:
+    """focus_dioptres: in the order of the slices. usual_step: in dioptres. largest_step: in steps of its neighbours.
+
+    gaps: indices of the slices after which one or more are missing. out_of_order: slices that go back. doubled: slices at the focus of
+    the one before.
+    """
+
+    focus_dioptres: tuple[float, ...]
+    usual_step: float
+    largest_step: float
+    gaps: tuple[int, ...]
+    out_of_order: tuple[int, ...]
+    doubled: tuple[int, ...]
+
+    @property
+    def is_even(self) -> bool:
+        return not (self.gaps or self.out_of_order or self.doubled)
+
+
+def focus_spacing(focus_distances_m: Sequence[float], known: Bool[np.ndarray, " slices"] | None = None) -> FocusSpacing:
+    """inf is allowed. A stack whose steps grow or shrink steadily is even too: each step is held against its neighbours.
+
+    known: where distances are; steps from and to the others are not judged. None: all of them.
+    """
+    dioptres = 1.0 / np.asarray(focus_distances_m, np.float64)
+    told = np.ones(len(dioptres), bool) if known is None else known
+    steps = np.where(told[1:] & told[:-1], np.diff(dioptres), np.nan)
+    direction = np.sign(_median(steps)) or 1.0
+    sizes = np.abs(steps)
+    usual = _median(sizes)
+    local = np.array([_around(sizes, i, usual) for i in range(len(sizes))])
+    return FocusSpacing(
+        tuple(float(each) for each in dioptres),
+        usual,
+        float(np.nanmax(sizes / np.maximum(local, 1e-12), initial=1.0)),
+        tuple(int(i) for i in np.flatnonzero(sizes > GAP * local)),
+        tuple(int(i) + 1 for i in np.flatnonzero((steps * direction < 0) & (sizes >= _SAME * local))),
+        tuple(int(i) + 1 for i in np.flatnonzero(sizes < _SAME * local)),
+    )
+
+
+def _around(sizes: np.ndarray, index: int, usual: float) -> float:
+    """The median step of up to two neighbours on either side, without the step itself."""
+    near = [sizes[i] for i in range(max(0, index - 2), min(len(sizes), index + 3)) if i != index]
+    return _median(near) if np.isfinite(near).any() else usual
+
+
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    """Return the median of those that are known; 0 where none is."""
+    known = np.asarray(values, np.float64)[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 @dataclass(frozen=True)
@@ -69,3 +169,102 @@ class StackFindings:
     def drift(self) -> RegistrationDrift | None:
         """None where the stack does not say how it was registered."""
         return registration_drift(self.stack, *self.full_size_px)
+
+
+Number = Callable[[float | None], float | str | None]
+
+
+def slice_document(found: SliceFindings, number: Number) -> dict[str, Any]:
+    changes = None if found.fit is None else {name: _change_document(change, number) for name, change in found.fit.changes.items()}
+    return {
+        "index": found.index,
+        "gain": number(found.gain),
+        "saturated_share": found.saturated,
+        "counted_share": found.counted,
+        "largest_coc_px": found.largest_coc_px,
+        "psnr_db": number(found.psnr_db),
+        "unblurred_psnr_db": number(found.unblurred_db),
+        "changes": changes,
+    }
+
+
+def findings_document(findings: StackFindings) -> dict[str, Any]:
+    """All but the stack itself."""
+    curve = findings.curve
+    return {
+        "size_px": list(findings.size_px),
+        "full_size_px": list(findings.full_size_px),
+        "slices": [slice_document(each, exact) for each in findings.slices],
+        "curve": vars(curve) | {"shares": curve.shares.tolist()},
+        "depth_off_share": findings.depth_off_share,
+        "moving_share": findings.moving_share,
+        "picture": picture_document(findings.picture, exact),
+        "pairs": [pair_document(each, exact) for each in findings.pairs],
+    }
+
+
+def findings_from(document: dict[str, Any], stack: FocalStack) -> StackFindings:
+    """What `findings_document` wrote; KeyError, TypeError or ValueError where it did not."""
+    curve, size_px, full_size_px = document["curve"], document["size_px"], document["full_size_px"]
+    return StackFindings(
+        stack,
+        (int(size_px[0]), int(size_px[1])),
+        (int(full_size_px[0]), int(full_size_px[1])),
+        tuple(_slice_from(each) for each in document["slices"]),
+        FocusCurve(**curve | {"shares": np.asarray(curve["shares"], np.float64)}),
+        document["depth_off_share"],
+        document["moving_share"],
+        _picture_from(document["picture"]),
+        tuple(_pair_from(each) for each in document["pairs"]),
+    )
+
+
+def picture_document(found: PictureFindings, number: Number) -> dict[str, Any]:
+    return {
+        "lost_share": number(found.lost),
+        "flat_detail": number(found.flat),
+        "largest": number(found.top),
+        "largest_of_slices": number(found.slices_top),
+        "seen_px": list(found.seen_px),
+    }
+
+
+def _picture_from(document: dict[str, Any]) -> PictureFindings:
+    width, height = document["seen_px"]
+    lost, flat = _number(document["lost_share"]), _number(document["flat_detail"])
+    return PictureFindings(lost, flat, float(document["largest"]), float(document["largest_of_slices"]), (int(width), int(height)))
+
+
+def pair_document(found: NeighbourPlace, number: Number) -> dict[str, Any]:
+    return {"first": found.first, "off_px": number(found.off_px), "error_px": number(found.error_px), "place_px": list(found.place_px)}
+
+
+def _pair_from(document: dict[str, Any]) -> NeighbourPlace:
+    x, y = document["place_px"]
+    return NeighbourPlace(int(document["first"]), _number(document["off_px"]), float(document["error_px"]), (int(x), int(y)))
+
+
+def _change_document(change: Change, number: Number) -> dict[str, Any]:
+    return {"value": number(change.value), "error": number(change.error)}
+
+
+def _slice_from(document: dict[str, Any]) -> SliceFindings:
+    changes = document["changes"]
+    return SliceFindings(
+        document["index"],
+        float(document["gain"]),
+        document["saturated_share"],
+        document["counted_share"],
+        document["largest_coc_px"],
+        _number(document["psnr_db"]),
+        _number(document["unblurred_psnr_db"]),
+        None if changes is None else SliceFit(**{name: _change_from(changes[name]) for name in NAMES}),
+    )
+
+
+def _change_from(document: dict[str, Any]) -> Change:
+    return Change(float(document["value"]), float(document["error"]))
+
+
+def _number(value: float | str | None) -> float | None:
+    return None if value is None else float(value)

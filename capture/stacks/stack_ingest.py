@@ -10,20 +10,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.developing import develop, is_raw
 from capture.photos.libraw import WhiteBalance
 from capture.photos.photo_files import SkippedFile
-from capture.stacks.disk_space import DiskFullError
-from capture.stacks.exposure import ExposureGain, evened_out
-from capture.stacks.gain_fit import LowFrequency
+from capture.photos.raw import DecodedPhoto
+from capture.stacks.exposure import ExposureGain, LowFrequency, evened_out, gain_to_session, stated_gain
 from capture.stacks.grouping import Photo
 from capture.stacks.odd_slices import Candidate, Odd, blown, duplicates, odd_sizes, strangers
 from capture.stacks.session import CameraChoice
-from capture.stacks.session_exposure import gain_to_session, stated_gain
-from capture.stacks.slice_files import FOLDER, find_slices, source_record, write_slice
+from capture.stacks.slice_files import FOLDER, DiskFullError, find_slices, slice_metadata, source_record, write_slice
 from capture.stacks.slice_looks import SliceLook, look_at, look_of
-from capture.stacks.slice_metadata import slice_metadata
 from mrbokeh.images.camera_rgb import Matrix3x3, matrix3x3, read_slice
 from mrbokeh.images.color import convert
 from mrbokeh.system.errors import InputError

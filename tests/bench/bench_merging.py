@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.merging.second_pass import second_pass
-from capture.merging.slice_optics import SliceOptics
+from capture.merging.second_pass import SliceOptics, second_pass
 from datasets_scripts.make_raw_stack import make_raw_stack
 from datasets_scripts.raw_stack_truth import StackPlan
 from datasets_scripts.sensor_model import SensorModel

@@ -14,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from capture.merging.alignment import register_stack, warp
-from capture.merging.plane_transforms import (
+from capture.merging.registration.alignment import register_stack
+from capture.merging.registration.plane_transforms import (
     Transform,
     about_centre,
     as_similarity,
@@ -23,6 +23,7 @@ from capture.merging.plane_transforms import (
     from_opencv_centres,
     inverse,
     to_opencv_centres,
+    warp,
 )
 from mrbokeh.images.image_io import read_image
 from tests.bench.machine import machine_line, memory_line

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.report.detail import Blocks, SharpestSlices, Sharpness, border_blocks
-from capture.stacks.block_detail import BLOCK_PX
+from capture.report.picture_sharpness import Blocks, SharpestSlices, Sharpness, border_blocks
+from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.images.color import display_rgb8
 from tests.bench.real_stack import Rgb
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.report.detail import SharpestSlices
+from capture.report.picture_sharpness import SharpestSlices
 from mrbokeh.images.image_io import write_image
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.atomic_files import read_json, write_json
@@ -162,7 +162,7 @@ def _focus(stack: RealStack, made: FocalStack) -> Focus | None:
 
 
 def _left_out(made: FocalStack) -> LeaveOneOut:
-    from mrbokeh.refocus.refocusing import leave_one_out
+    from mrbokeh.refocus import leave_one_out
     from mrbokeh.renderers.choose import lens_and_renderer
 
     started = time.process_time()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.report.detail import SharpestSlices, Sharpness, inner_blocks
+from capture.report.picture_sharpness import SharpestSlices, Sharpness, inner_blocks
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
 from mrbokeh.system.atomic_files import read_json
 from tests.bench.process_cost import Cost, attempted, mrbokeh_command
@@ -25,7 +25,7 @@ STAGES = ("ingest", "merge", "process")
 
 @dataclass(frozen=True)
 class Figures:
-    """The measures of capture.report.detail of one picture, and what it cost to make. said: why there are none."""
+    """The measures of capture.report.picture_sharpness of one picture, and what it cost to make. said: why there are none."""
 
     lost: float | None = None
     flat: float | None = None

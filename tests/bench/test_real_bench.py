@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.report.detail import SharpestSlices, block_detail
-from capture.stacks.block_detail import BLOCK_PX
+from capture.report.picture_sharpness import SharpestSlices, block_detail
+from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
 from tests.bench.fusion_measures import FusionScores
 from tests.bench.process_cost import attempted

@@ -10,7 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from capture.dataset.split import slices_of_a_single_stack
+from capture.dataset.writer import slices_of_a_single_stack
 from mrbokeh.images.image_io import write_image
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.renderers.network.facts import facts_from_json
@@ -18,18 +18,16 @@ from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, wri
 from mrbokeh.stacks.focal_stack_dataset import slices_to_hold_out
 from mrbokeh.system.errors import InputError
 from tests.learning.test_train import DEMO_LIKE, LENS
-from training import held_out, train
-from training.blur_functions import blur_of
-from training.classical_blur import scatter_reference
 from training.cli import app
-from training.dataset import PairSet
+from training.data.dataset import PairSet
+from training.data.stacks import Seen, stack_name
+from training.data.training_data import training_data
 from training.evaluation.comparison import unseen_of
-from training.export_onnx import network_facts_of
-from training.run import Run
-from training.run_folder import load_run, read_facts
-from training.stacks import Seen, stack_name
-from training.time_budget import LEAST_STEPS, is_rate_known, steps_within, too_few_words
-from training.training_data import training_data
+from training.evaluation.methods import blur_of, scatter_reference
+from training.export.onnx_export import network_facts_of
+from training.fitting import record, train
+from training.fitting.run import LEAST_STEPS, Run, is_rate_known, steps_within, too_few_words
+from training.fitting.run_folder import load_run, read_facts
 
 SIZE = (40, 56)
 SHORT = dataclasses.replace(DEMO_LIKE, epochs=2, sheets=False)
@@ -228,7 +226,7 @@ def test_crops_are_wider_than_the_rim_that_does_not_count(scene: Path, tmp_path:
 def test_looks_are_at_the_middle_of_large_pictures(monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
     """Of 40 x 56 px the middle 24 x 24 where that is the most, without the 3 px that get light from outside; a network that gives the
     sharp picture has the score of that part."""
-    monkeypatch.setattr(held_out, "SIDE_PX", 24)
+    monkeypatch.setattr(record, "SIDE_PX", 24)
     stacks, shapes = training_data([scene]).stacks, []
 
     class Sharp(torch.nn.Module):
@@ -237,7 +235,7 @@ def test_looks_are_at_the_middle_of_large_pictures(monkeypatch: pytest.MonkeyPat
             return rgb
 
     slices = {stack_name(stacks[0]): (2,)}
-    look = held_out.HeldOutSlices(stacks, slices).look(Sharp(), torch.device("cpu"))
+    look = record.HeldOutSlices(stacks, slices).look(Sharp(), torch.device("cpu"))
     pair = PairSet(stacks, slices=slices)[0]
     halo_px = int(np.ceil(np.abs(pair.coc_px).max() / 2.0))
     inside = np.s_[8 + halo_px : 32 - halo_px, 16 + halo_px : 40 - halo_px]

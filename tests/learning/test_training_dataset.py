@@ -13,23 +13,21 @@ import torch
 from typer.testing import CliRunner
 
 from capture.dataset.writer import DatasetPlan, write_dataset
-from capture.report.exclusion_masks import REASONS, write_exclusions
+from capture.report.exclusion import REASONS, write_exclusions
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
 from tests.scenes import traced_focal_stack
-from training import train
 from training.cli import app
-from training.data_facts import common_lens
-from training.dataset import PairSet
-from training.export_onnx import export_run
-from training.network_settings import NetworkSettings
-from training.presets import demo_settings
-from training.run_folder import load_run, read_facts
-from training.settings import TrainSettings, settings_to_json
-from training.training_data import training_data
+from training.data.dataset import PairSet
+from training.data.training_data import common_lens, training_data
+from training.export.onnx_export import export_run
+from training.fitting import train
+from training.fitting.run_folder import load_run, read_facts
+from training.fitting.settings import TrainSettings, demo_settings, settings_to_json
+from training.networks.network_settings import NetworkSettings
 
 SIZE = (24, 32)
 LENS = Lens(50.0, 1.4, 1.0, 36.0)

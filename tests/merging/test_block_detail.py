@@ -6,8 +6,8 @@ import pytest
 from jaxtyping import Float32
 
 from capture.merging import focus_volume
-from capture.report import detail
-from capture.stacks.block_detail import BLOCK_PX, DETAIL_SIGMA_PX, block_means, detail_of_blocks
+from capture.report import picture_sharpness
+from capture.stacks.slice_looks import BLOCK_PX, DETAIL_SIGMA_PX, block_means, detail_of_blocks
 from mrbokeh.images.color import srgb_to_linear
 
 PERIOD_PX, AMPLITUDE = 8.0, 0.1
@@ -33,8 +33,8 @@ def test_callers_choose_encoding_and_border() -> None:
     """Merging takes square roots of light and all blocks, the report sRGB and no blocks at the border: one plane, one answer."""
     plain, grey = detail_of_blocks(wave()), np.repeat(wave()[..., None], 3, axis=2)
     np.testing.assert_allclose(focus_volume.block_detail(grey), plain, rtol=1e-5)
-    border = detail.BORDER_BLOCKS
-    np.testing.assert_allclose(detail.block_detail(srgb_to_linear(grey)), plain[border:-border, border:-border], rtol=1e-4)
+    border = picture_sharpness.BORDER_BLOCKS
+    np.testing.assert_allclose(picture_sharpness.block_detail(srgb_to_linear(grey)), plain[border:-border, border:-border], rtol=1e-4)
 
 
 @pytest.mark.parametrize(("height", "width", "blocks"), [(BLOCK_PX, BLOCK_PX, (1, 1)), (2 * BLOCK_PX - 1, 49, (1, 2)), (10, 5, (1, 1))])
@@ -44,4 +44,4 @@ def test_what_does_not_fill_a_block_is_cut_off(height: int, width: int, blocks: 
     found = block_means(plane)
     assert found.shape == blocks
     assert found[0, 0] == pytest.approx(plane[:BLOCK_PX, :BLOCK_PX].mean(), rel=1e-5)
-    assert detail.block_detail(cv2.merge([plane] * 3)).shape == (height // BLOCK_PX, width // BLOCK_PX)
+    assert picture_sharpness.block_detail(cv2.merge([plane] * 3)).shape == (height // BLOCK_PX, width // BLOCK_PX)

@@ -4,15 +4,14 @@ import cv2
 import numpy as np
 
 from capture.merging.all_in_focus import all_in_focus, sharp_all_in_focus, slice_weight
-from capture.merging.blur_evidence import disc_kernel
-from capture.merging.depth_from_focus import FocusMap, focus_map, peak_parabola
+from capture.merging.depth_from_focus import FocusMap, aggregate_costs, focus_map, peak_parabola
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import find_lights, no_lights
-from capture.merging.semi_global import aggregate_costs
+from capture.merging.metres.blur_evidence import disc_kernel
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.scatter.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter_reference import blur_layer
 
 SLICES = 5
 COC_STEP_PX = 2.5

@@ -10,9 +10,8 @@ import pytest
 
 import mrbokeh.images.camera_rgb
 import mrbokeh.images.exr_io
-from capture.stacks.disk_space import DiskFullError, told_when_full
 from capture.stacks.ingest import ingest
-from capture.stacks.slice_files import find_slices
+from capture.stacks.slice_files import DiskFullError, find_slices, told_when_full
 from mrbokeh.images.exr_io import ExrPart
 from mrbokeh.images.image_io import write_image
 from mrbokeh.system.atomic_files import atomic_path

@@ -11,10 +11,10 @@ from capture.merging.all_in_focus import BANDS, BandBlend, all_in_focus, crossov
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import FocusVolume, focus_energy, focus_volume
 from capture.merging.lights import no_lights
-from capture.merging.replaced_places import depth_m_of
+from capture.merging.merged_pictures import depth_m_of
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.scatter.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 
 SIZE = (96, 128)

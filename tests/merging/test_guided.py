@@ -6,15 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.guided_all_in_focus import all_in_focus_from_depth
-from capture.merging.nearer_blur import nearer_blur
 from capture.merging.restored_lights import restored_lights, with_restored_lights
-from capture.merging.slice_optics import SliceOptics
+from capture.merging.second_pass import SliceOptics, all_in_focus_from_depth, nearer_blur
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.errors import InputError
 
@@ -75,7 +73,7 @@ def test_the_blur_of_nearer_surfaces_is_that_of_the_scatter_reference(aperture: 
 
 
 def test_large_blur_is_gathered_on_a_coarser_grid(monkeypatch: pytest.MonkeyPatch) -> None:
-    import capture.merging.nearer_blur as module
+    import capture.merging.second_pass as module
 
     fine = nearer_blur(2, dioptres(), truth(), optics(), np.ones(SIZE, bool))
     monkeypatch.setattr(module, "LARGEST_GATHERED_PX", 6.0)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from capture.merging.merge import merge_scene
-from capture.merging.registration_file import read_registration, write_registration
-from capture.merging.second_pass import DEPTH_SOURCE, FROM_FOCUS, first_pass_path, keep_first_pass, second_pass
-from capture.merging.slice_optics import SliceOptics
+from capture.merging.registration.registration_file import read_registration, write_registration
+from capture.merging.second_pass import DEPTH_SOURCE, FROM_FOCUS, SliceOptics, first_pass_path, keep_first_pass, second_pass
 from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
@@ -117,7 +116,7 @@ def test_a_registration_is_used_again(desk: FocalStack, tmp_path: Path) -> None:
 
 def test_a_stack_too_large_to_be_held_is_read_again(desk: FocalStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Streaming from files gives what holding in memory gives: both hold half floats."""
-    monkeypatch.setattr("capture.merging.registered_slices.LARGEST_HELD_BYTES", 0.0)
+    monkeypatch.setattr("capture.merging.registration.registered_slices.LARGEST_HELD_BYTES", 0.0)
     scene = tmp_path / "streamed"
     shutil.copytree(desk.folder, scene)
     np.testing.assert_array_equal(merge_scene(scene, overwrite=True)[0].all_in_focus(), desk.all_in_focus())

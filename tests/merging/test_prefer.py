@@ -12,8 +12,16 @@ from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import no_lights
 from capture.merging.merge import merge_scene
-from capture.merging.preferred_merge import PREFERRED, nearest_end, preferred_lines
-from capture.merging.preferred_side import Preferred, Side, blended, first_of_two_peaks, preferred_places
+from capture.merging.preferred_side import (
+    PREFERRED,
+    Preferred,
+    Side,
+    blended,
+    first_of_two_peaks,
+    nearest_end,
+    preferred_lines,
+    preferred_places,
+)
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from tests.scenes.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, THREAD, crossing_slices, crossing_stack, threads, unmoved, wall

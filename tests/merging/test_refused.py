@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from capture.cli import app
-from capture.stacks.begun_scene import taken_away_when_refused
-from capture.stacks.disk_space import DiskFullError
 from capture.stacks.ingest import ingest
+from capture.stacks.session import taken_away_when_refused
+from capture.stacks.slice_files import DiskFullError
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb

@@ -6,8 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.alignment import Registration, register_stack, warp
-from capture.merging.plane_transforms import about_centre, chained, farthest_corner_px, inverse, is_perspective, scale_of
+from capture.merging.registration.alignment import register_stack
+from capture.merging.registration.plane_transforms import (
+    about_centre,
+    chained,
+    farthest_corner_px,
+    inverse,
+    is_perspective,
+    scale_of,
+    warp,
+)
+from capture.merging.registration.registration_file import Registration
 from mrbokeh.images.image_io import read_image
 from mrbokeh.system.errors import InputError
 from tests.scenes.crossing_stack import crossing_slices

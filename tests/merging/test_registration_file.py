@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.merging.breathing import Breathing
-from capture.merging.registration import Registration
-from capture.merging.registration_file import read_registration, write_registration
+from capture.merging.registration.registration_file import Breathing, Registration, read_registration, write_registration
 from mrbokeh.system.errors import InputError
 
 REGISTRATION = Registration(

@@ -4,15 +4,19 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.breathing import breathing_of
-from capture.merging.corner_tracks import CornerTracks, track_corners
-from capture.merging.joint_transforms import joint_transforms
-from capture.merging.masked_ecc import match_coarsely
-from capture.merging.pair_matching import match_neighbours
-from capture.merging.plane_transforms import Transform, about_centre, chained, farthest_corner_px, inverse, moved, scale_of
-from capture.merging.slice_structure import structure_of
-from capture.merging.track_fit import similarity_of_tracks
-from capture.merging.warping import warp
+from capture.merging.registration.corner_tracks import CornerTracks, similarity_of_tracks, structure_of, track_corners
+from capture.merging.registration.pair_matching import joint_transforms, match_coarsely, match_neighbours
+from capture.merging.registration.plane_transforms import (
+    Transform,
+    about_centre,
+    chained,
+    farthest_corner_px,
+    inverse,
+    moved,
+    scale_of,
+    warp,
+)
+from capture.merging.registration.registration_file import breathing_of
 
 HEIGHT_PX, WIDTH_PX = 300, 400
 

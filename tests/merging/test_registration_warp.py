@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.alignment import warp, warped_validity
-from capture.merging.plane_transforms import (
+from capture.merging.registration.plane_transforms import (
     Transform,
     about_centre,
     as_similarity,
@@ -15,6 +14,8 @@ from capture.merging.plane_transforms import (
     moved,
     scale_of,
     to_opencv_centres,
+    warp,
+    warped_validity,
 )
 
 TURNED = np.array([[1.03, -0.05, 6.4], [0.05, 1.03, -9.7]])

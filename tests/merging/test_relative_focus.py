@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from capture.merging.all_in_focus import all_in_focus
-from capture.merging.blur_evidence import DIAMETERS_PX, DRAWN_PX, disc_kernel
-from capture.merging.focus_direction import Contours, Direction
-from capture.merging.focus_order import focus_order
 from capture.merging.merge import merge_scene
-from capture.merging.relative_focus import RelativeFocus, _Places, solve_relative_focus
-from capture.merging.relative_stack import FROM_DISTANCES, gauge_of, told_direction
+from capture.merging.metres.blur_evidence import DIAMETERS_PX, DRAWN_PX, disc_kernel
+from capture.merging.metres.focus_order import Contours, Direction, focus_order
+from capture.merging.metres.relative_focus import RelativeFocus, _Places, solve_relative_focus
+from capture.merging.metres.relative_stack import FROM_DISTANCES, gauge_of, told_direction
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.layer import opaque

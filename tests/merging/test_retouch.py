@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 from capture.cli import app
 from capture.merging.all_in_focus import painted
 from capture.merging.merge import merge_scene
-from capture.merging.retouch import PAINTED_CONFIDENCE, RETOUCHES, bands_of, retouch_scene
-from capture.merging.retouch_mask import read_mask
+from capture.merging.retouch import PAINTED_CONFIDENCE, RETOUCHES, bands_of, read_mask, retouch_scene
 from mrbokeh.images.exif import upright
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.picture_codec import stored_rgb, write_stored

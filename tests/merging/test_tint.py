@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from capture.merging.merge import merge_stack
-from capture.merging.plane_transforms import about_centre, inverse
-from capture.merging.tint import SmallSlice, tint_gains, with_gain
+from capture.merging.registration.plane_transforms import about_centre, inverse
+from capture.merging.registration.registered_slices import SmallSlice, tint_gains, with_gain
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from capture.report.examination import STEP_PX
-from capture.report.reblur import Reblur
 from capture.report.slice_fit import Prediction, SliceFit, fit_slice
+from capture.report.stack_view import Reblur
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.renderers.choose import make_renderer
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 
 FINER = 5
 HEIGHT_PX, WIDTH_PX = 64, 96

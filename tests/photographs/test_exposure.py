@@ -8,8 +8,7 @@ import pytest
 from scipy.ndimage import affine_transform, gaussian_filter
 
 from capture.photos.photo_metadata import StatedExposure
-from capture.stacks.exposure import ExposureGain, evened_out, measure_gain, overlap_gain
-from capture.stacks.gain_fit import low_frequency
+from capture.stacks.exposure import ExposureGain, evened_out, low_frequency, measure_gain, overlap_gain
 from capture.stacks.ingest import ingest
 from tests.scenes.made_photographs import Picture, make_raw_photo, only_stack, scene_rgb
 

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from capture.photos.focus_metadata import FocusReading
-from capture.photos.focus_tags import read_focus
+from capture.photos.focus_metadata import FocusReading, read_focus
 from mrbokeh.optics.lens import Lens, lens_distance_m
 
 

@@ -7,9 +7,8 @@ import pytest
 from jaxtyping import Float
 
 import capture
-from capture.photos.decoded_photo import DecodedPhoto
 from capture.photos.developing import develop
-from capture.photos.raw import camera_white_balance, decode_raw, read_raw_metadata
+from capture.photos.raw import DecodedPhoto, camera_white_balance, decode_raw, read_raw_metadata
 from datasets_scripts.dng_writer import ShotMetadata, write_dng
 from datasets_scripts.sensor_model import SensorModel
 from mrbokeh.images.color import convert, rec709_from_XYZ

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from capture.photos.decoded_photo import DecodedPhoto
-from capture.photos.raw import decode_raw
+from capture.photos.raw import DecodedPhoto, decode_raw
 from mrbokeh.images.color import convert
 from mrbokeh.system.errors import InputError
 

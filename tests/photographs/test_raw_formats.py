@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.photos.raw import decode_raw
-from capture.photos.x_trans import decode_in_one_thread
+from capture.photos.raw import decode_in_one_thread, decode_raw
 from mrbokeh.images.color import rec709_from_XYZ
 from mrbokeh.system.errors import InputError
 

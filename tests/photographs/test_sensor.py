@@ -2,9 +2,7 @@
 
 import pytest
 
-from capture.photos.sensor_metadata import read_sensor
-from capture.photos.sensor_reading import SensorReading
-from capture.photos.sensor_table import sensor_of_model
+from capture.photos.sensor_metadata import SensorReading, read_sensor, sensor_of_model
 
 
 @pytest.mark.parametrize(

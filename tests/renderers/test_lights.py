@@ -8,10 +8,10 @@ from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Lights, find_lights, no_lights
 from capture.merging.restored_lights import restored_lights, with_restored_lights
-from capture.photos.clipped_highlights import neutral_where_full
+from capture.photos.libraw import neutral_where_full
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.scatter.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter_reference import blur_layer
 
 SIZE = (80, 400)
 LIGHT_AT = (40, 60)

@@ -5,8 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from capture.merging.registration import Registration
-from capture.merging.registration_file import write_registration
+from capture.merging.registration.registration_file import Registration, write_registration
 from capture.stacks.ingest import ingest
 from mrbokeh.images.image_io import write_image
 from mrbokeh.stacks.focal_stack import FocalStack

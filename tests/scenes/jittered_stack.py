@@ -5,7 +5,14 @@ from functools import cache
 
 import numpy as np
 
-from capture.merging.plane_transforms import Transform, about_centre, chained, farthest_corner_px, inverse, moved
+from capture.merging.registration.plane_transforms import (
+    Transform,
+    about_centre,
+    chained,
+    farthest_corner_px,
+    inverse,
+    moved,
+)
 from datasets_scripts.desk_scene import desk_camera
 from datasets_scripts.thin_lens_tracer import trace
 from mrbokeh.optics.camera import Camera

@@ -14,13 +14,9 @@ import typer
 from typer.testing import CliRunner
 
 from capture.commands.dataset import dataset_command
-from capture.dataset.coc_maps import coc_maps, largest_coc_px
-from capture.dataset.radiance_histogram import RadianceHistogram
-from capture.dataset.split import split_by_viewpoint
-from capture.dataset.stack_writer import StackWriting
-from capture.dataset.verification import verify
-from capture.dataset.writer import DatasetPlan, write_dataset
-from capture.report.exclusion_masks import write_exclusions
+from capture.dataset.stack_writer import RadianceHistogram, StackWriting, coc_maps, largest_coc_px
+from capture.dataset.writer import DatasetPlan, split_by_viewpoint, verify, write_dataset
+from capture.report.exclusion import write_exclusions
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.optics.lens import Lens

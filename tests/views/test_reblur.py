@@ -8,21 +8,19 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.report.depth_check import DepthEvidence
 from capture.report.examination import Examination, _lit_by, examine, predict
+from capture.report.exclusion import noise_deviation
 from capture.report.findings import StackFindings
-from capture.report.moving_objects import noise_deviation
-from capture.report.reblur import Reblur
-from capture.report.slice_fit import NAMES, Prediction, fit_slice, normal_equations
+from capture.report.gates import BLUR, DEPTH, EXPOSURE, FOCUS, MOTION, PLACE, RESIDUAL, SPACING
+from capture.report.slice_fit import NAMES, DepthEvidence, Prediction, fit_slice, normal_equations
 from capture.report.stack_gates import stack_gates
-from capture.report.stack_rules import BLUR, DEPTH, EXPOSURE, FOCUS, MOTION, PLACE, RESIDUAL, SPACING
-from capture.report.stack_view import StackView
+from capture.report.stack_view import Reblur, StackView
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack
 from tests.scenes.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
 

@@ -11,16 +11,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from capture.report import kept_examination, stack_view
+from capture.report import report_cache, stack_view
 from capture.report.examination import examine
-from capture.report.findings import SliceFindings, StackFindings
-from capture.report.findings_json import findings_document, findings_from
-from capture.report.focus_curve import FocusCurve
-from capture.report.neighbour_places import NeighbourPlace
-from capture.report.picture_evidence import PictureFindings
-from capture.report.reblur import Reblur
+from capture.report.findings import FocusCurve, SliceFindings, StackFindings, findings_document, findings_from
+from capture.report.picture_sharpness import PictureFindings
+from capture.report.registration_check import NeighbourPlace
 from capture.report.scene_report import examine_stack, report_scene
 from capture.report.slice_fit import Change, SliceFit
+from capture.report.stack_view import Reblur
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
@@ -158,7 +156,7 @@ def test_whatever_findings_depend_on_is_looked_at(change: Callable[[Path], None]
 def test_another_width_renderer_or_version_finds_anew(reported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert report(reported, width=80) == 2 * OF_STACK
     assert report(reported, width=80, name="other") == 2 * OF_STACK
-    monkeypatch.setattr(kept_examination, "VERSION", kept_examination.VERSION + 1)
+    monkeypatch.setattr(report_cache, "VERSION", report_cache.VERSION + 1)
     assert report(reported, width=80, name="other") == 2 * OF_STACK
 
 

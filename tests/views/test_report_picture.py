@@ -15,18 +15,14 @@ from typer.testing import CliRunner
 
 from capture.commands.process import process_command
 from capture.commands.report import report_command
-from capture.report.findings import SliceFindings, StackFindings
-from capture.report.focus_curve import FocusCurve
-from capture.report.gates import Gate
-from capture.report.kept_examination import KeptPlace
-from capture.report.neighbour_places import NeighbourPlace, PlaceEvidence
-from capture.report.picture_evidence import PictureFindings
-from capture.report.picture_gates import picture_gates
-from capture.report.scene_page import SceneReport
-from capture.report.scene_report import report_scene
-from capture.report.stack_rules import LIGHT, PLACES, SEAMS, SHARP
-from capture.report.strictness import GATE_NAMES
-from capture.stacks.block_detail import BLOCK_PX
+from capture.report.findings import FocusCurve, SliceFindings, StackFindings
+from capture.report.gates import LIGHT, PLACES, SEAMS, SHARP, Gate
+from capture.report.picture_sharpness import PictureFindings
+from capture.report.registration_check import NeighbourPlace, PlaceEvidence
+from capture.report.report_cache import KeptPlace
+from capture.report.scene_report import GATE_NAMES, SceneReport, report_scene
+from capture.report.stack_gates import picture_gates
+from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.image_io import read_image
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged

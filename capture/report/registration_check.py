@@ -1,0 +1,267 @@
+"""How far neighbouring slices lie off one another, measured in the registered pictures themselves.
+
+Patches that are sharp in both slices are found again by normalised cross-correlation, which blur by an even kernel leaves in place, and
+one similarity is fitted to their displacements (Cauchy's weights). Patches that are blurred in one of the two are left out: where the
+opening is cut off, blurred things move with the focus, and no registration could help that.
+
+How the slices of a stack moved against one another, as registration found it.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64
+
+from capture.merging.registration.plane_transforms import Transform, middle_of, moved, scale_of
+from capture.report.picture_sharpness import display_luminance
+from mrbokeh.stacks.focal_stack import FocalStack
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Displacements = Float64[np.ndarray, "patches 2"]
+
+HALF_PX, SEARCH_PX = 24, 8
+_BAND_PX = (0.8, 3.0)
+_CELLS = (10, 15)
+_LEAST_ENERGY = 0.004
+"""Fine detail of a patch, display white being 1: about the noise of a photograph of 8 bits."""
+_LEAST_CORRELATION = 0.6
+_SHARP_IN_BOTH = 0.5
+FEWEST_PATCHES = 8
+_ROUNDS = 20
+_LEAST_SCATTER_PX = 0.05
+_SURELY = 3.0
+"""Standard errors by which nothing lies apart by chance."""
+
+
+@dataclass(frozen=True)
+class NeighbourPlace:
+    """The place of slice first + 1 against slice first.
+
+    off_px: root mean square of the fitted displacements, in pixels of the stored pictures; None where too few patches are sharp in both.
+    error_px: its standard error. place_px: x, y of the middle of the patch to look at, in pixels of the stored pictures.
+    """
+
+    first: int
+    off_px: float | None
+    error_px: float
+    place_px: tuple[int, int]
+
+    def exceeds(self, limit_px: float) -> bool:
+        """Whether they lie farther apart than the limit, and not by chance."""
+        return self.off_px is not None and self.off_px > max(limit_px, _SURELY * self.error_px)
+
+    def rank(self) -> tuple[bool, float]:
+        """Larger for a pair that is farther apart, above all where that is no chance."""
+        return self.exceeds(0.0), -1.0 if self.off_px is None else self.off_px
+
+
+@dataclass
+class PlaceEvidence:
+    """Takes the slices one after the other, all at one size, and holds two of them at a time."""
+
+    _last: tuple[Plane, Mask, Plane] | None = None
+    _sharpest: Plane | None = None
+    _pairs: list["_Patches"] = field(default_factory=list)
+
+    def add(self, rgb: Rgb, usable: Mask) -> None:
+        luminance = display_luminance(rgb)
+        fine = cv2.GaussianBlur(luminance, (0, 0), _BAND_PX[0]) - cv2.GaussianBlur(luminance, (0, 0), _BAND_PX[1])
+        energy = np.sqrt(cv2.boxFilter(fine * fine, -1, (2 * HALF_PX, 2 * HALF_PX)))
+        if self._last is not None:
+            before, usable_before, energy_before = self._last
+            allowed = _whole_patches(usable & usable_before)
+            self._pairs.append(_matched(before, fine, np.where(allowed, np.minimum(energy, energy_before), 0.0)))
+        self._sharpest = energy if self._sharpest is None else np.maximum(self._sharpest, energy)
+        self._last = (fine, usable, energy)
+
+    def places(self, stored_per_px: float = 1.0) -> tuple[NeighbourPlace, ...]:
+        """Every pair of neighbours. stored_per_px: how many pixels of the stored pictures a pixel of those added is."""
+        if self._sharpest is None:
+            return ()
+        return tuple(_place(index, each, self._sharpest, stored_per_px) for index, each in enumerate(self._pairs))
+
+
+@dataclass(frozen=True)
+class _Patches:
+    """Patches found again. at: x, y of their middles. moved: to the right and down. energy: of the less sharp of the two slices."""
+
+    at: Displacements
+    moved: Displacements
+    energy: Float64[np.ndarray, " patches"]
+    size_px: tuple[int, int]
+
+    def kept(self, chosen: Bool[np.ndarray, " patches"]) -> "_Patches":
+        return _Patches(self.at[chosen], self.moved[chosen], self.energy[chosen], self.size_px)
+
+
+def _whole_patches(usable: Mask) -> Mask:
+    """Middles of patches that lie within the picture with room to search, and on usable pixels alone."""
+    reach = HALF_PX + SEARCH_PX
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return cv2.erode(usable.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+
+
+def _matched(before: Plane, after: Plane, energy: Plane) -> _Patches:
+    """Find the patch with the most energy of each cell of the picture again."""
+    at, moved, energies = [], [], []
+    rows, columns = (np.linspace(0, size, cells + 1).astype(int) for size, cells in zip(energy.shape, _CELLS, strict=True))
+    for top, bottom in pairwise(rows):
+        for left, right in pairwise(columns):
+            cell = energy[top:bottom, left:right]
+            if not cell.size or cell.max() < _LEAST_ENERGY:
+                continue
+            row, column = divmod(int(cell.argmax()), cell.shape[1])
+            x, y = int(left) + column, int(top) + row
+            found = _displacement(before, after, x, y)
+            if found is not None:
+                at.append((x + 0.5, y + 0.5))
+                moved.append(found)
+                energies.append(float(energy[y, x]))
+    return _Patches(_pairs_of(at), _pairs_of(moved), np.array(energies, np.float64), energy.shape[::-1])
+
+
+def _pairs_of(values: Sequence[tuple[float, float]]) -> Displacements:
+    return np.array(values, np.float64).reshape(-1, 2)
+
+
+def _displacement(before: Plane, after: Plane, x: int, y: int) -> tuple[float, float] | None:
+    """Return by how much the patch around a pixel went right and down; None where it is not found within SEARCH_PX."""
+    patch = before[y - HALF_PX : y + HALF_PX, x - HALF_PX : x + HALF_PX]
+    reach = HALF_PX + SEARCH_PX
+    likeness = cv2.matchTemplate(after[y - reach : y + reach, x - reach : x + reach], patch, cv2.TM_CCOEFF_NORMED)
+    _, best, _, (column, row) = cv2.minMaxLoc(likeness)
+    inside = 0 < column < 2 * SEARCH_PX and 0 < row < 2 * SEARCH_PX
+    if best < _LEAST_CORRELATION or not inside:
+        return None
+    across, down = likeness[row, column - 1 : column + 2], likeness[row - 1 : row + 2, column]
+    return column - SEARCH_PX + _peak(across), row - SEARCH_PX + _peak(down)
+
+
+def _peak(three: Float32[np.ndarray, "3"]) -> float:
+    """Return where a parabola through three values has its peak, counted from the middle one."""
+    left, middle, right = (float(each) for each in three)
+    bend = left - 2.0 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+
+
+def _place(first: int, patches: _Patches, sharpest: Plane, stored_per_px: float) -> NeighbourPlace:
+    x, y = patches.at.astype(int).T
+    sharp = patches.kept(patches.energy >= _SHARP_IN_BOTH * sharpest[y, x]) if len(x) else patches
+    if len(sharp.at) < FEWEST_PATCHES:
+        return NeighbourPlace(first, None, float("inf"), _best_place(sharp if len(sharp.at) else patches, stored_per_px))
+    fitted, error_px = _fitted(sharp)
+    sizes = np.hypot(*fitted.T)
+    off_px = float(np.sqrt(np.mean(sizes**2)))
+    farthest = sharp.at[int(sizes.argmax())]
+    return NeighbourPlace(first, off_px * stored_per_px, error_px * stored_per_px, _stored(farthest, stored_per_px))
+
+
+def _best_place(patches: _Patches, stored_per_px: float) -> tuple[int, int]:
+    """Return the middle of the patch that can be seen best, or of the picture where there is none."""
+    at = patches.at[int(patches.energy.argmax())] if len(patches.at) else 0.5 * np.array(patches.size_px)
+    return _stored(at, stored_per_px)
+
+
+def _stored(at: Float64[np.ndarray, "2"], stored_per_px: float) -> tuple[int, int]:
+    return int(at[0] * stored_per_px), int(at[1] * stored_per_px)
+
+
+def _fitted(patches: _Patches) -> tuple[Displacements, float]:
+    """The displacements of the similarity that fits the patches best, and the standard error of their root mean square."""
+    count = len(patches.at)
+    x, y = ((patches.at - 0.5 * np.array(patches.size_px)) / (0.5 * np.hypot(*patches.size_px))).T
+    one, none = np.ones(count), np.zeros(count)
+    columns = np.concatenate([np.stack([one, none, x, -y], axis=1), np.stack([none, one, y, x], axis=1)])
+    side, weight, scatter_px = patches.moved.T.ravel(), np.ones(2 * count), 0.0
+    ridge = 1e-6 * np.eye(4)
+    for _ in range(_ROUNDS):
+        weighted = columns.T * weight
+        change = np.linalg.solve(weighted @ columns + ridge, weighted @ side)
+        off = np.hypot(*(side - columns @ change).reshape(2, count))
+        # The median length of a vector whose two parts have the deviation 1 is 1.18.
+        scatter_px = max(float(np.median(off)) / 1.18, _LEAST_SCATTER_PX)
+        weight = np.tile(1.0 / (1.0 + (off / scatter_px) ** 2), 2)
+    covariance = np.linalg.inv((columns.T * weight) @ columns + ridge) * scatter_px**2
+    variance = np.einsum("ik,kl,il->i", columns, covariance, columns)
+    return (columns @ change).reshape(2, count).T, float(np.sqrt(2.0 * variance.mean()))
+
+
+FILE_NAME = "registration.json"
+
+
+@dataclass(frozen=True)
+class RegistrationDrift:
+    """Per slice, against the reference. shift_px: (N, 2) of the picture's middle, right and down. rotation_rad, magnification: (N,).
+
+    correlations: of each pair of neighbours, () where they are not known. width_px: of the pictures.
+    residuals_px: how far a corner lies off by the worst pair that a slice was registered with; None where no pair held, () if not known.
+    """
+
+    shift_px: Float[np.ndarray, "slices 2"]
+    rotation_rad: Float[np.ndarray, " slices"]
+    magnification: Float[np.ndarray, " slices"]
+    correlations: tuple[float, ...]
+    width_px: int
+    residuals_px: tuple[float | None, ...] = ()
+
+    @property
+    def largest_jump_px(self) -> float:
+        """The largest move between neighbours that a steady drift does not explain: half the second difference of the shift."""
+        if len(self.shift_px) < 3:
+            return 0.0
+        bends = self.shift_px[1:-1] - 0.5 * (self.shift_px[:-2] + self.shift_px[2:])
+        return float(np.hypot(*bends.T).max())
+
+    @property
+    def least_correlation(self) -> float | None:
+        return min(self.correlations) if self.correlations else None
+
+
+def registration_drift(stack: FocalStack, width_px: int, height_px: int) -> RegistrationDrift | None:
+    """None where the stack is not registered or does not say how."""
+    found = [each.metadata.get("reference_from_slice") for each in stack.slices]
+    if not stack.registered or any(each is None for each in found):
+        return None
+    document = _document(stack)
+    transforms = [np.asarray(each, np.float64) for each in found]
+    return drift_of(transforms, width_px, height_px, _numbers(document, "correlations"), _numbers(document, "residuals_px"))
+
+
+def drift_of(
+    reference_from_slice: Sequence[Transform],
+    width_px: int,
+    height_px: int,
+    correlations: Sequence[float | None] = (),
+    residuals_px: Sequence[float | None] = (),
+) -> RegistrationDrift:
+    middle = np.array([[0.5 * width_px, 0.5 * height_px], [0.5 * width_px + 1.0, 0.5 * height_px]])
+    ends = np.stack([moved(each, middle) for each in reference_from_slice])
+    shift_px, along = ends[:, 0] - middle[0], ends[:, 1] - ends[:, 0]
+    magnification = np.array([scale_of(each, middle_of((width_px, height_px))) for each in reference_from_slice])
+    rotation_rad = np.arctan2(along[:, 1], along[:, 0])
+    known = [float(each) for each in correlations if each is not None]
+    all_known = tuple(known) if len(known) == len(correlations) else ()
+    return RegistrationDrift(shift_px, rotation_rad, magnification, all_known, width_px, tuple(residuals_px))
+
+
+def _document(stack: FocalStack) -> dict[str, Any]:
+    try:
+        document = json.loads((stack.folder / FILE_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _numbers(document: dict[str, Any], name: str) -> list[float | None]:
+    """A list of numbers or null; empty where the document has none."""
+    values = document.get(name)
+    if not isinstance(values, list) or not all(each is None or isinstance(each, int | float) for each in values):
+        return []
+    return [None if each is None else float(each) for each in values]
