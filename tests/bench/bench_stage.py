@@ -22,15 +22,14 @@ from mrbokeh.scene import Environment, Scene
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.environment_filter import lighting_maps
 from mrbokeh.scene.gltf.gltf_loader import GltfAsset
-from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.scene_description import PlacedObject, SceneDescription, ShadowPlane
-from mrbokeh.scene.staging.staged_scene import StagedObject, StagedScene
+from mrbokeh.scene.staging.staged_scene import Assets, StagedObject, StagedScene
 from mrbokeh.tracking.world_axes import upright_camera
 from tests.bench.machine import machine_line, memory_line
 from tests.scenes.stage_scenes import looking
-from viewfinder.stage.drawn_layer import Brushes, Drawing, DrawRequest, draw
-from viewfinder.stage.layer_depth import LayerDepth
-from viewfinder.stage.resolution import RESOLUTIONS
+from viewfinder.stage.drawing import Brushes, Drawing, DrawRequest, draw
+from viewfinder.stage.drawing_thread import RESOLUTIONS
+from viewfinder.stage.reprojection import LayerDepth
 from viewfinder.stage.stage import Stage
 from viewfinder.stage.stage_setup import live_backend, live_renderer
 from viewfinder.tracking.tracker import TrackedPose

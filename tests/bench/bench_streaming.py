@@ -21,10 +21,7 @@ from aiortc.jitterbuffer import JitterFrame
 from tests.bench.machine import machine_line, memory_line
 from tests.live.test_streaming_encoding import plain_i420, planes_of
 from tests.scenes.streaming_viewers import Feed, Viewer, serving, streaming, watching
-from viewfinder.streaming.encoder import StreamQuality
-from viewfinder.streaming.h264 import h264_encoder
-from viewfinder.streaming.i420 import STREAM_COLOR, i420_frame
-from viewfinder.streaming.vp8 import vp8_encoder
+from viewfinder.streaming.encoders import STREAM_COLOR, StreamQuality, h264_encoder, i420_frame, vp8_encoder
 from viewfinder.streaming.whep import Whep
 
 SIZES = ((640, 360), (1280, 720))

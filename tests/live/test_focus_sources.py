@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import CameraFrame, LensState
-from viewfinder.focus.first_known import FirstKnown
-from viewfinder.focus.frame_focus import FrameFocus
-from viewfinder.focus.manual_focus import ManualFocus
-from viewfinder.tracking.base import TrackedPose
+from viewfinder.focus.sources import FirstKnown, FrameFocus, ManualFocus
+from viewfinder.frames import CameraFrame, LensState
+from viewfinder.tracking.tracker import TrackedPose
 
 POSE = TrackedPose(np.eye(4), 1.0, 0.0)
 

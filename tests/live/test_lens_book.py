@@ -6,8 +6,8 @@ import pytest
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from viewfinder.app.lens_book import LensBook
-from viewfinder.flow.frames import LensState
+from viewfinder.app.live_compositor import LensBook
+from viewfinder.frames import LensState
 
 FIFTY = Lens(50.0, 1.8, 2.0, 36.0)
 BOOK = {"fifty": FIFTY, "eighty": Lens(85.0, 1.4, 3.0, 36.0)}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from viewfinder.streaming.mdns_candidates import with_address
+from viewfinder.streaming.session_description import with_address
 
 NAMED = "a=candidate:383979905 1 udp 2113937151 05002700-30d8-431e-98c5-8a90d07e5099.local 42153 typ host generation 0 network-cost 999\r\n"
 """As headless Chromium writes it."""

@@ -41,7 +41,7 @@ def test_the_page_loads_nothing_from_elsewhere() -> None:
 
 def test_every_file_that_the_page_names_is_served_to_everybody() -> None:
     from viewfinder.server.access import needed_role
-    from viewfinder.server.page_files import PAGE
+    from viewfinder.server.site import PAGE
 
     assert {name for name, _ in PAGE.values()} == {path.name for path in BUILT.iterdir()}
     assert all(needed_role(path) is None for path in PAGE)

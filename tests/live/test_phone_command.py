@@ -41,15 +41,13 @@ from viewfinder.commands.serve import opened
 from viewfinder.commands.serve_options import ServeOptions
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.server.access import Access, needed_role
-from viewfinder.server.app import serving_site
+from viewfinder.server.endpoint import serving_site
 from viewfinder.server.sessions import Role
 from viewfinder.sources.browser_camera import BrowserCameraSource
-from viewfinder.sources.pattern import PatternSource
-from viewfinder.tracking.phone_calibration import Calibration
-from viewfinder.tracking.phone_rig import PhoneRig, read_phone_rig, write_phone_rig
+from viewfinder.sources.playback import PatternSource
+from viewfinder.tracking.phone_calibration import Calibration, StillPairs
+from viewfinder.tracking.phone_rig import PhoneRig, angle_deg, read_phone_rig, rigid_of, write_phone_rig
 from viewfinder.tracking.phone_tracker import PhoneTracker
-from viewfinder.tracking.rigid_motion import angle_deg, rigid_of
-from viewfinder.tracking.still_pairs import StillPairs
 from viewfinder.tracking.tracker import TrackedPose
 
 app = typer.Typer()

@@ -9,10 +9,8 @@ import aiohttp
 import pytest
 
 from tests.scenes.made_viewfinder import Made, in_time, made_viewfinder
-from viewfinder.server.access import Access, needed_role
-from viewfinder.server.origins import host_name, is_loopback, objection
-from viewfinder.server.rate_limit import RateLimit
-from viewfinder.server.sessions import Role, Sessions
+from viewfinder.server.access import Access, host_name, is_loopback, needed_role, objection
+from viewfinder.server.sessions import RateLimit, Role, Sessions
 
 FOCUS = {"focus": {"distance_m": 1.0}}
 
@@ -281,7 +279,7 @@ def test_the_oldest_guest_leaves_when_too_many_came() -> None:
 
 def test_a_taken_port_is_named() -> None:
     from mrbokeh.system.errors import InputError
-    from viewfinder.server.app import serving_site
+    from viewfinder.server.endpoint import serving_site
     from viewfinder.server.site import Site
 
     async def work() -> None:

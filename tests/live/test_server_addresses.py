@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.system.errors import InputError
-from viewfinder.server.addresses import Interface, choose, interfaces, page_url, qr_text
+from viewfinder.server.endpoint import Interface, choose, interfaces, page_url, qr_text
 
 LOOPBACK = Interface("lo", "127.0.0.1")
 WIFI = Interface("wlan0", "192.168.1.7")

@@ -22,7 +22,7 @@ from viewfinder.server.control_messages import (
     Switch,
     control_message,
 )
-from viewfinder.server.dispatcher import Dispatcher
+from viewfinder.server.controls import Dispatcher
 from viewfinder.server.sessions import Role
 
 GOOD = [

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.scenes.made_viewfinder import LENS_RGB, SQUARE, MadeControls, in_time, made_frame, made_viewfinder
-from viewfinder.flow.frame_header import frame_header
+from viewfinder.frames import frame_header
 from viewfinder.server import jpeg_stream
 from viewfinder.server.jpeg_stream import JpegStream, jpeg_message
 

@@ -11,10 +11,9 @@ import pytest
 
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_viewfinder import in_time, made_viewfinder
-from viewfinder.server.access import Access
-from viewfinder.server.origins import LOOPBACK_NAMES
+from viewfinder.server.access import LOOPBACK_NAMES, Access
+from viewfinder.server.endpoint import load_tls
 from viewfinder.server.sessions import Role, Sessions
-from viewfinder.server.tls import load_tls
 
 x509 = pytest.importorskip("cryptography.x509")
 

@@ -19,7 +19,7 @@ import pytest
 from aiohttp import web
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import CameraFrame
+from viewfinder.frames import CameraFrame
 from viewfinder.sources.browser_camera import LONGEST_OFFER_BYTES, BrowserCameraSource
 from viewfinder.sources.camera_message import LONGEST_MESSAGE, CameraKnowledge
 

@@ -20,9 +20,9 @@ import pytest
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
-from viewfinder.flow.frames import LensState
-from viewfinder.sources.newest_of import newest_of
-from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
+from viewfinder.frames import LensState
+from viewfinder.sources.frame_source import CameraAwayError, reconnecting
+from viewfinder.sources.network_stream import newest_of
 from viewfinder.sources.webcam import WebcamSource
 
 WIDTH, HEIGHT = 160, 112
@@ -148,7 +148,7 @@ import json, sys, threading, warnings
 warnings.simplefilter("error")
 from mrbokeh.system.errors import InputError
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.gphoto2_lens import lens_state
+from viewfinder.sources.gphoto2_preview import lens_state
 
 def sentence(what):
     try:

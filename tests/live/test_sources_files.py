@@ -17,13 +17,11 @@ from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.video.clip import VideoWriter, probe
 from mrbokeh.video.color import linear_from_code
-from viewfinder.flow.frames import CameraFrame, LensState
-from viewfinder.sources.base import FrameSource
+from viewfinder.frames import CameraFrame, LensState
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.rhythm import Rhythm
-from viewfinder.sources.size_limit import SizeLimit
-from viewfinder.sources.tethered_picture import NotWholeError, read_tethered
-from viewfinder.sources.watched_folder import WatchedFolderSource
+from viewfinder.sources.frame_source import FrameSource, SizeLimit
+from viewfinder.sources.playback import Rhythm
+from viewfinder.sources.watched_folder import NotWholeError, WatchedFolderSource, read_tethered
 
 WIDTH, HEIGHT = 96, 64
 RNG = np.random.default_rng(3)

@@ -9,9 +9,8 @@ import pytest
 from aiortc.jitterbuffer import JitterBuffer
 from aiortc.rtp import RtpPacket
 
-from viewfinder.sources import marker_release
-from viewfinder.sources.marker_buffer import PATIENCE_S, MarkerJitterBuffer, is_key_start
-from viewfinder.sources.marker_release import BurstQueue, release_on_marker
+from viewfinder.sources import marker_buffer
+from viewfinder.sources.marker_buffer import PATIENCE_S, BurstQueue, MarkerJitterBuffer, is_key_start, release_on_marker
 
 KEY_START = b"\0\0\0\1\x67"
 
@@ -180,7 +179,7 @@ def test_the_decoder_gets_followers_with_their_own_times() -> None:
 
 
 def test_another_aiortc_keeps_its_own_buffer(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO", logger=marker_release.__name__)
+    caplog.set_level("INFO", logger=marker_buffer.__name__)
 
     class Receiver:
         def __init__(self, stock: Any, waiting: Any) -> None:
@@ -192,7 +191,7 @@ def test_another_aiortc_keeps_its_own_buffer(monkeypatch: pytest.MonkeyPatch, ca
     for receiver in (object(), Receiver(object(), Queue()), Receiver(used, Queue()), Receiver(fresh, object())):
         assert not release_on_marker(receiver)
     good = Receiver(fresh, Queue())
-    monkeypatch.setattr(marker_release, "works", lambda: False)
+    monkeypatch.setattr(marker_buffer, "works", lambda: False)
     assert not release_on_marker(good)
     assert type(good._RTCRtpReceiver__jitter_buffer) is JitterBuffer and type(good._RTCRtpReceiver__decoder_queue) is Queue
     assert len(caplog.records) == 5
@@ -204,11 +203,11 @@ def test_another_aiortc_keeps_its_own_buffer(monkeypatch: pytest.MonkeyPatch, ca
 def test_a_stock_buffer_that_works_otherwise_fails_the_trial(monkeypatch: pytest.MonkeyPatch, change: str) -> None:
     """The installed aiortc passes. One that calls other methods, or gives other answers, does not."""
     try:
-        marker_release.works.cache_clear()
-        assert marker_release.works()
-        marker_release.works.cache_clear()
+        marker_buffer.works.cache_clear()
+        assert marker_buffer.works()
+        marker_buffer.works.cache_clear()
         owner = MarkerJitterBuffer if change == "_remove_frame" else JitterBuffer
         monkeypatch.setattr(owner, change, lambda *_: None)
-        assert not marker_release.works()
+        assert not marker_buffer.works()
     finally:
-        marker_release.works.cache_clear()
+        marker_buffer.works.cache_clear()

@@ -19,7 +19,7 @@ import pytest
 from aiortc.codecs.h264 import H264Encoder
 from aiortc.rtp import RtpPacket
 
-from viewfinder.flow.frames import CameraFrame
+from viewfinder.frames import CameraFrame
 from viewfinder.sources.network_stream import NetworkStreamSource
 
 WIDTH, HEIGHT, FPS = 160, 112, 25
@@ -324,8 +324,7 @@ def test_a_recording_behind_a_url_plays_in_its_own_time(tmp_path: Path) -> None:
 def test_turned_and_untagged_pictures_are_upright() -> None:
     """What a stream says by its display matrix: a quarter turn, within a limit that counts for the upright picture."""
     from mrbokeh.video.color import color_of
-    from viewfinder.sources.received_frame import upright_bgr
-    from viewfinder.sources.size_limit import SizeLimit
+    from viewfinder.sources.frame_source import SizeLimit, upright_bgr
 
     picture = np.zeros((64, 96, 3), np.uint8)
     picture[:32, :48] = 255

@@ -20,10 +20,9 @@ from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.system.errors import InputError
 from tests.objects.test_scene_gltf import GlbWriter
 from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, scene_file
-from viewfinder.stage.fade import Fade
-from viewfinder.stage.resolution import AdaptiveResolution
-from viewfinder.stage.stage import Stage
-from viewfinder.tracking.base import TrackedPose
+from viewfinder.stage.drawing_thread import AdaptiveResolution
+from viewfinder.stage.stage import Fade, Stage
+from viewfinder.tracking.tracker import TrackedPose
 
 BLACK = np.zeros((HEIGHT, WIDTH, 3), np.float32)
 PATIENCE_S = 60.0

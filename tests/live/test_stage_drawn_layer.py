@@ -17,10 +17,9 @@ from mrbokeh.scene.staging.scene_description import RealThings
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
 from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
-from viewfinder.stage.drawn_layer import Drawing, DrawRequest, draw
-from viewfinder.stage.layer_depth import LayerDepth
+from viewfinder.stage.drawing import Drawing, DrawRequest, draw, is_outdated, moved_px
 from viewfinder.stage.occlusion import Mask, Occlusion, RealDepth, read_occlusion
-from viewfinder.stage.redraw import is_outdated, moved_px
+from viewfinder.stage.reprojection import LayerDepth
 
 BLACK = np.zeros((HEIGHT, WIDTH, 3), np.float32)
 

@@ -12,12 +12,12 @@ from mrbokeh.scene import split_sun
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.light import Environment
 from mrbokeh.scene.mesh import rigid_motion
-from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.picture_box import drawn_points_m
 from mrbokeh.scene.staging.scene_description import Lighting, Sun
+from mrbokeh.scene.staging.staged_scene import Assets
 from mrbokeh.tracking.world_axes import upright_camera
 from tests.scenes.stage_scenes import LENS, ONE_CARD, brushes, camera, scene_file, staged
-from viewfinder.stage.drawn_layer import DrawRequest, draw, sharp_layers
+from viewfinder.stage.drawing import DrawRequest, draw, sharp_layers
 from viewfinder.stage.stage_setup import SetupLoader, live_backend
 
 SHADOW = ONE_CARD + "[[sun]]\ndirection = [0, -1, 1]\nirradiance = 3\n[shadow]\nstrength = 0.75\n"

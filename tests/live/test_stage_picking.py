@@ -11,12 +11,10 @@ from mrbokeh.optics.camera import level_plane_dioptres
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
 from tests.scenes.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
-from viewfinder.stage.drawn_layer import DrawRequest, draw
+from viewfinder.stage.drawing import DrawRequest, draw
 from viewfinder.stage.occlusion import Occlusion, RealDepth
-from viewfinder.stage.picking import depth_at_m, object_at, table_point_m
 from viewfinder.stage.reprojection import MovableLayer
-from viewfinder.stage.seen import Seen
-from viewfinder.stage.views import VIEWS, view_picture
+from viewfinder.stage.shown_scene import VIEWS, Seen, depth_at_m, object_at, table_point_m, view_picture
 
 TWO_CARDS = ONE_CARD + ONE_CARD.replace('"card"', '"far"') + "position_m = [0.3, -0.5, 0]\n"
 TABLES = code_tables("srgb")

@@ -8,8 +8,7 @@ import pytest
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
 from tests.scenes.stage_scenes import looking
-from viewfinder.stage.layer_depth import GRID_PX, filled_outwards
-from viewfinder.stage.reprojection import NODE_PX, MovableLayer
+from viewfinder.stage.reprojection import GRID_PX, NODE_PX, MovableLayer, filled_outwards
 
 FRAME = Camera(160, 112, (150.0, 150.0), (80.0, 56.0))
 LEFT, TOP, WIDTH, HEIGHT = 48, 32, 64, 48

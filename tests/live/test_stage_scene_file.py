@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.scene_file import read_scene_file
-from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.scene.staging.staged_scene import Assets, StagedScene
 from mrbokeh.system.errors import InputError
 from tests.scenes.stage_scenes import ONE_CARD, card, described, scene_file, staged
-from viewfinder.stage.scene_watch import SceneWatch
+from viewfinder.stage.stage_setup import SceneWatch
 
 ROOT = Path(__file__).resolve().parents[2]
 

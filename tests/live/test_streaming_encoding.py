@@ -10,10 +10,7 @@ import pytest
 from mrbokeh.video.color import BT709, LIMITED, VideoColor
 from mrbokeh.video.frames import display_bgr
 from tests.scenes.streaming_viewers import BARS, HEIGHT, WIDTH, bar_centres, bars, noise
-from viewfinder.streaming.encoder import StreamQuality, VideoEncoder
-from viewfinder.streaming.h264 import h264_encoder
-from viewfinder.streaming.i420 import STREAM_COLOR, i420_frame
-from viewfinder.streaming.vp8 import vp8_encoder
+from viewfinder.streaming.encoders import STREAM_COLOR, StreamQuality, VideoEncoder, h264_encoder, i420_frame, vp8_encoder
 
 FULL_709 = VideoColor(matrix=1, code_range=2, transfer=1, primaries=1)
 MAKERS = {"h264": h264_encoder, "libvpx": vp8_encoder}

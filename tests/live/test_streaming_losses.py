@@ -10,7 +10,7 @@ import pytest
 from tests.scenes.streaming_viewers import Feed, Viewer, in_time, noise, streaming, watching
 from tests.scenes.whep_viewers import PATIENT, Line, whep_of
 from viewfinder.streaming import viewer_connection
-from viewfinder.streaming.encoder import StreamQuality
+from viewfinder.streaming.encoders import StreamQuality
 
 
 def test_a_request_for_a_keyframe_reaches_the_encoder() -> None:

@@ -11,7 +11,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import probe, read_frames
 from mrbokeh.video.color import code_from_linear
 from tests.scenes.streaming_viewers import BARS, HEIGHT, WIDTH, bar_centres, bars, output
-from viewfinder.flow.frames import OutputFrame
+from viewfinder.frames import OutputFrame
 from viewfinder.streaming.recording import Recorder, Recording, recording_path
 
 # As a camera gives them: not evenly.

@@ -17,7 +17,7 @@ from mrbokeh.system.errors import InputError
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, write_plate
 from viewfinder.commands.serve import opened as serving
 from viewfinder.commands.serve_options import ServeOptions
-from viewfinder.flow.frames import FrameStatus, OutputFrame
+from viewfinder.frames import FrameStatus, OutputFrame
 from viewfinder.server.access import Access
 from viewfinder.streaming.virtual_webcam import VirtualWebcam, fitted
 

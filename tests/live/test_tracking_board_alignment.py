@@ -11,9 +11,8 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
 from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.tracking.charuco_tracker import CharucoTracker
-from viewfinder.tracking.detection_thread import ImmediateDetections
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.charuco_tracker import CharucoTracker, ImmediateDetections
 
 
 @cache

@@ -8,8 +8,8 @@ import pytest
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.tracking.fixed_pose import read_fixed_pose
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.tracker import read_fixed_pose
 
 POSE = np.array([[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 0.9], [0.0, 0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 360, (600.0, 600.0), (320.0, 180.0), POSE)

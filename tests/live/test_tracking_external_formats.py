@@ -27,8 +27,8 @@ from viewfinder.tracking.opentrackio import (
     packets,
     read_packet,
 )
+from viewfinder.tracking.phone_rig import rigid_of
 from viewfinder.tracking.pose_history import MalformedMessageError, TrackingSample, lens_between
-from viewfinder.tracking.rigid_motion import rigid_of
 
 IDENTITY = {"pan": 0.0, "tilt": 0.0, "roll": 0.0}
 

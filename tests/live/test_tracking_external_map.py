@@ -19,7 +19,7 @@ from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.charuco_tracker import ImmediateDetections
 from viewfinder.tracking.map_localiser import MapLocaliser, matches, pose_in_map, pose_refined
 from viewfinder.tracking.map_tracker import MapTracker
-from viewfinder.tracking.rigid_motion import angle_deg
+from viewfinder.tracking.phone_rig import angle_deg
 from viewfinder.tracking.sparse_map import CACHE_NAME, SparseMap, read_sparse_map
 
 INTRINSICS = Camera(WIDTH_PX, HEIGHT_PX, (FOCAL_PX, FOCAL_PX), (WIDTH_PX / 2, HEIGHT_PX / 2))

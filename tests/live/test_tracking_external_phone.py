@@ -16,13 +16,14 @@ from viewfinder.frames import CameraFrame
 from viewfinder.tracking.phone_rig import (
     PhoneRig,
     PosePair,
+    angle_deg,
     calibrate_across_worlds,
     calibrate_in_one_world,
     read_phone_rig,
+    rigid_of,
     write_phone_rig,
 )
 from viewfinder.tracking.phone_tracker import PhoneTracker
-from viewfinder.tracking.rigid_motion import angle_deg, rigid_of
 from viewfinder.tracking.tracker import TrackedPose
 
 # The phone 8 cm above the lens, 3 cm to its left, a little askew.

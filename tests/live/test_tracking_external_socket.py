@@ -10,16 +10,13 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import CameraFrame, LensState
-from viewfinder.focus.tracked_lens_focus import TrackedLensFocus
+from viewfinder.focus.sources import TrackedLensFocus
+from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, write_freed
-from viewfinder.tracking.opentrackio import encode_opentrackio, opentrackio_document
-from viewfinder.tracking.opentrackio_packets import CBOR, JSON, packets
-from viewfinder.tracking.pose_history import PoseHistory
-from viewfinder.tracking.rigid_motion import rigid_of
-from viewfinder.tracking.sender_clock import SenderClock
-from viewfinder.tracking.tracking_sample import TrackingSample
-from viewfinder.tracking.tracking_socket import Decoder, SocketTracker, TrackingAddress, freed_decoder, opentrackio_decoder
+from viewfinder.tracking.opentrackio import CBOR, JSON, encode_opentrackio, opentrackio_document, packets
+from viewfinder.tracking.phone_rig import rigid_of
+from viewfinder.tracking.pose_history import PoseHistory, SenderClock, TrackingSample
+from viewfinder.tracking.socket_tracker import Decoder, SocketTracker, TrackingAddress, freed_decoder, opentrackio_decoder
 
 CAMERA = Camera(64, 48, (60.0, 60.0), (32.0, 24.0))
 PATIENCE_S = 5.0

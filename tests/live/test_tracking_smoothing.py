@@ -5,10 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.one_euro import OneEuroPose
-from viewfinder.tracking.smoothed_tracker import SmoothedTracker
+from viewfinder.frames import CameraFrame
+from viewfinder.tracking.smoothing import OneEuroPose, SmoothedTracker
+from viewfinder.tracking.tracker import TrackedPose
 
 FPS, FOCAL_PX = 30.0, 1000.0
 

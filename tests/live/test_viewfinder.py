@@ -16,7 +16,7 @@ import pytest
 from mrbokeh.compositing.overlay import Overlay, code_tables
 from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import code_from_linear, linear_from_code
 from tests.scenes.layer_viewfinder import (
@@ -33,11 +33,9 @@ from tests.scenes.layer_viewfinder import (
     write_plate,
 )
 from viewfinder.app.pipeline import Pipeline
-from viewfinder.flow.frames import CameraFrame, FrameStatus, OutputFrame
-from viewfinder.flow.newest import Newest
-from viewfinder.sources.pattern import PatternSource
-from viewfinder.sources.video_file import VideoFileSource
-from viewfinder.stage.still_layer import StillLayer
+from viewfinder.frames import CameraFrame, FrameStatus, Newest, OutputFrame
+from viewfinder.sources.playback import PatternSource, VideoFileSource
+from viewfinder.stage.static_layer import StillLayer
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from datasets_scripts.headless_chromium import CHROMIUM, chromium_page
 from tests.scenes.layer_viewfinder import HEIGHT, WIDTH, in_time, running, write_plate
-from viewfinder.sources.video_file import VideoFileSource
+from viewfinder.sources.playback import VideoFileSource
 
 
 @pytest.fixture

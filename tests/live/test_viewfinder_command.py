@@ -19,8 +19,8 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, in_time, watching, write_plate
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.exact_size import ExactSize
-from viewfinder.sources.video_file import VideoFileSource
+from viewfinder.sources.frame_source import ExactSize
+from viewfinder.sources.playback import VideoFileSource
 
 
 @pytest.fixture

@@ -10,23 +10,20 @@ import pytest
 
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square
 from tests.scenes.stage_scenes import LENS as SCENE_LENS
 from tests.scenes.stage_scenes import ONE_CARD, backend, camera, scene_file
-from viewfinder.app.captures import Captures
-from viewfinder.app.lens_book import LensBook
-from viewfinder.app.live_compositor import LiveCompositor
-from viewfinder.flow.frame_header import frame_header
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.focus.manual_focus import ManualFocus
-from viewfinder.sources.pattern import PatternSource
-from viewfinder.stage.fade import FADE_S
-from viewfinder.stage.stage import Stage
-from viewfinder.stage.still_layer import StillLayer
-from viewfinder.tracking.base import TrackedPose
-from viewfinder.tracking.smoothed_tracker import SmoothedTracker
+from viewfinder.app.live_compositor import LensBook, LiveCompositor
+from viewfinder.app.live_controls import Captures
+from viewfinder.focus.sources import ManualFocus
+from viewfinder.frames import CameraFrame, frame_header
+from viewfinder.sources.playback import PatternSource
+from viewfinder.stage.stage import FADE_S, Stage
+from viewfinder.stage.static_layer import StillLayer
+from viewfinder.tracking.smoothing import SmoothedTracker
+from viewfinder.tracking.tracker import TrackedPose
 
 
 class Saying:

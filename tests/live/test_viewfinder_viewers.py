@@ -21,9 +21,8 @@ from tests.scenes.layer_viewfinder import (
     watching,
     write_plate,
 )
-from viewfinder.server.app import serving_site
-from viewfinder.sources.pattern import PatternSource
-from viewfinder.sources.video_file import VideoFileSource
+from viewfinder.server.endpoint import serving_site
+from viewfinder.sources.playback import PatternSource, VideoFileSource
 
 
 @pytest.fixture

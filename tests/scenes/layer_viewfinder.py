@@ -17,14 +17,14 @@ import numpy as np
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
-from viewfinder.app.lens_book import LensBook
+from viewfinder.app.live_compositor import LensBook
 from viewfinder.app.running import Parts, Viewfinder
 from viewfinder.app.running import running as parts_running
-from viewfinder.server.app import serving_site
-from viewfinder.stage.still_layer import StillLayer
+from viewfinder.server.endpoint import serving_site
+from viewfinder.stage.static_layer import StillLayer
 
 WIDTH, HEIGHT = 160, 90
 # Half a dioptre out of focus blurs over 13.7 px here: 160 / 6 px per mm, 20 mm aperture, 51.3 mm to the sensor.

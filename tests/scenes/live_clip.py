@@ -15,7 +15,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter, read_display_frames
 from tests.scenes.stage_scenes import card
 from tests.scenes.traced_board_clip import BOARD, clip_of
-from viewfinder.flow.frames import CameraFrame
+from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 
 FPS = 30

@@ -12,7 +12,7 @@ import numpy as np
 
 from tests.scenes.live_viewfinder import Watcher
 from tests.scenes.streaming_viewers import Viewer
-from viewfinder.sources.marker_release import release_on_marker
+from viewfinder.sources.marker_buffer import release_on_marker
 
 _WARM_UP_S = 3.0
 

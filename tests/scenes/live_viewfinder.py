@@ -22,12 +22,11 @@ from tests.scenes.live_clip import LiveClip, board_tracker
 from tests.scenes.streaming_viewers import Viewer, watching
 from tests.scenes.traced_board_clip import LENS
 from viewfinder.app.assembly import open_scenery, renderers_of
-from viewfinder.app.lens_book import LensBook
-from viewfinder.app.live_compositor import Moment
+from viewfinder.app.live_compositor import LensBook, Moment
 from viewfinder.app.running import Parts, Viewfinder, running
-from viewfinder.server.app import serving_site
-from viewfinder.sources.base import FrameSource
-from viewfinder.sources.video_file import VideoFileSource
+from viewfinder.server.endpoint import serving_site
+from viewfinder.sources.frame_source import FrameSource
+from viewfinder.sources.playback import VideoFileSource
 
 WIDE = Lens(22.0, 2.0, 0.6, 24.0)
 """The clip's lens opened to f/2."""

@@ -12,14 +12,12 @@ import cv2
 import numpy as np
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frame_header import finite
-from viewfinder.flow.frames import FrameStatus, OutputFrame
+from viewfinder.frames import FrameStatus, OutputFrame, finite
 from viewfinder.server.access import Access
-from viewfinder.server.app import serving_site
 from viewfinder.server.controls import VIEWS, State
+from viewfinder.server.endpoint import Tls, serving_site
 from viewfinder.server.jpeg_stream import JpegStream
 from viewfinder.server.site import Site
-from viewfinder.server.tls import Tls
 
 WIDTH, HEIGHT = 160, 96
 # Red, green, blue of the whole picture in each view, and of the square in its middle with each lens.

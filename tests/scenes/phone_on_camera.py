@@ -17,7 +17,7 @@ from mrbokeh.tracking.charuco.board import write_board
 from mrbokeh.tracking.world_axes import inverted, rigid
 from tests.scenes.traced_board_clip import BOARD, clip_of
 from viewfinder.frames import Pose
-from viewfinder.tracking.rigid_motion import rigid_of
+from viewfinder.tracking.phone_rig import rigid_of
 
 CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.06, 0.02]))
 """The phone 6 cm above the lens, 3 cm to its left, a little askew."""

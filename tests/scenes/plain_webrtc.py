@@ -14,8 +14,8 @@ from aiohttp import web
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpSender, RTCSessionDescription
 from aiortc.mediastreams import MediaStreamTrack
 
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.sources.video_file import VideoFileSource
+from viewfinder.frames import CameraFrame
+from viewfinder.sources.playback import VideoFileSource
 
 _TICKS_PER_S = 90_000
 

@@ -10,13 +10,12 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.scene_description import SceneDescription
 from mrbokeh.scene.staging.scene_file import read_scene_file
-from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.scene.staging.staged_scene import Assets, StagedScene
 from tests.objects.test_scene_gltf import GlbWriter
-from viewfinder.stage.drawn_layer import Brushes
-from viewfinder.stage.layer_depth import LayerDepth
+from viewfinder.stage.drawing import Brushes
+from viewfinder.stage.reprojection import LayerDepth
 
 WIDTH, HEIGHT = 160, 112
 FOCAL_PX = 150.0

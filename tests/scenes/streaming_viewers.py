@@ -13,9 +13,9 @@ import numpy as np
 from aiohttp import web
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpReceiver, RTCSessionDescription
 
-from viewfinder.flow.frames import FrameStatus, OutputFrame
+from viewfinder.frames import FrameStatus, OutputFrame
 from viewfinder.streaming.encoded_stream import EncodedStream
-from viewfinder.streaming.encoder import StreamQuality
+from viewfinder.streaming.encoders import StreamQuality
 from viewfinder.streaming.whep import Whep
 
 WIDTH, HEIGHT = 320, 180

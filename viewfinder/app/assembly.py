@@ -9,11 +9,11 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT, WITH_BANKS
 from mrbokeh.system.errors import InputError
-from viewfinder.app.lens_book import LensBook
-from viewfinder.app.scenery import Scenery
+from viewfinder.app.live_compositor import LensBook
+from viewfinder.stage.overlay_source import Scenery
 from viewfinder.stage.stage import Stage
 from viewfinder.stage.stage_setup import LIVE_LAYERING, live_renderer
-from viewfinder.stage.still_layer import StillLayer
+from viewfinder.stage.static_layer import StillLayer
 
 MakeRenderer = Callable[[], Renderer]
 
@@ -24,7 +24,7 @@ def read_lenses(paths: Sequence[Path], of_scene: Lens | None) -> tuple[LensBook,
     networks: dict[str, MakeRenderer] = {}
     for path in paths:
         if path.suffix.lower() == ".onnx":
-            from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+            from mrbokeh.renderers.onnx_network import OnnxNetwork
 
             network = OnnxNetwork(path)
             lenses[path.stem], networks[path.stem] = network.lens, partial(_same, network)
@@ -75,7 +75,7 @@ def _plain(name: str) -> MakeRenderer:
 
 
 def _with_bank(name: str, bank: Path) -> MakeRenderer:
-    from mrbokeh.renderers.choose_bank import chosen_renderer
+    from mrbokeh.renderers.choose import chosen_renderer
 
     return lambda: chosen_renderer(name, bank, threads=1, layering=LIVE_LAYERING)
 

@@ -5,15 +5,10 @@ from collections.abc import Callable, Sequence
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard
-from viewfinder.focus.base import FocusSource
-from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus
-from viewfinder.focus.first_known import FirstKnown
-from viewfinder.focus.following_optics import FollowingOptics
-from viewfinder.focus.frame_focus import FrameFocus
-from viewfinder.focus.manual_focus import ManualFocus
-from viewfinder.focus.tracked_lens_focus import TrackedLensFocus
-from viewfinder.tracking.base import Tracker
-from viewfinder.tracking.tracking_socket import SocketTracker
+from viewfinder.focus.board_focus import BlurOfBoardFocus, FollowingOptics
+from viewfinder.focus.sources import FirstKnown, FocusSource, FrameFocus, ManualFocus, TrackedLensFocus
+from viewfinder.tracking.socket_tracker import SocketTracker
+from viewfinder.tracking.tracker import Tracker
 
 BY_DEFAULT = ("hand", "tracking", "source")
 FOCUS_SOURCES = (*BY_DEFAULT, "board")

@@ -7,9 +7,8 @@ from threading import Event, Lock, Thread
 from typing import Protocol, runtime_checkable
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import CameraFrame, OutputFrame
-from viewfinder.flow.newest import Newest
-from viewfinder.sources.base import FrameSource
+from viewfinder.frames import CameraFrame, Newest, OutputFrame
+from viewfinder.sources.frame_source import FrameSource
 
 _POLL_S = 0.01
 _REPEAT_S = 0.1  # a camera that stands still is shown again so often, for what lies over it may have changed

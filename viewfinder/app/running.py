@@ -14,11 +14,9 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.resources import keep_few_arenas
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from viewfinder.app.assembly import MakeRenderer
-from viewfinder.app.captures import Captures
 from viewfinder.app.focus_choice import blur_of_board, open_focus
-from viewfinder.app.lens_book import LensBook
-from viewfinder.app.live_compositor import LiveCompositor, Moment
-from viewfinder.app.live_controls import LiveControls
+from viewfinder.app.live_compositor import LensBook, LiveCompositor, Moment
+from viewfinder.app.live_controls import Captures, LiveControls
 from viewfinder.app.pipeline import FrameSink, Pipeline
 from viewfinder.focus.sources import FocusSource, ManualFocus
 from viewfinder.frames import OutputFrame

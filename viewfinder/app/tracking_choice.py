@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from viewfinder.sources.base import FrameSource
 from viewfinder.sources.choose import open_source
+from viewfinder.sources.frame_source import FrameSource
 from viewfinder.tracking.phone_tracker import PhoneTracker
 from viewfinder.tracking.socket_tracker import SocketTracker, TrackingAddress
 from viewfinder.tracking.tracker import Tracker

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from aiohttp import web
 
 from viewfinder.server.site import Part
-from viewfinder.sources.base import FrameSource
 from viewfinder.sources.browser_camera import BrowserCameraSource
+from viewfinder.sources.frame_source import FrameSource
 from viewfinder.tracking.phone_tracker import PhoneFrames
 
 CAMERA_PAGE = "camera"

@@ -10,11 +10,9 @@ from pathlib import Path
 import typer
 
 from mrbokeh.system.errors import InputError
-from viewfinder.server.access import Access
-from viewfinder.server.addresses import lan_address, qr_text
-from viewfinder.server.origins import LOOPBACK_NAMES
+from viewfinder.server.access import LOOPBACK_NAMES, Access
+from viewfinder.server.endpoint import Tls, lan_address, load_tls, qr_text
 from viewfinder.server.sessions import Role, Sessions
-from viewfinder.server.tls import Tls, load_tls
 
 
 @dataclass(frozen=True)

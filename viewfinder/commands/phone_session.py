@@ -20,9 +20,8 @@ from viewfinder.app.tracking_choice import open_phone
 from viewfinder.commands.browser_cameras import CAMERA_PAGE, browser_cameras
 from viewfinder.commands.listening import Door, ListeningOptions, on_stop, open_door
 from viewfinder.server.access import Access
-from viewfinder.server.app import serving_site
-from viewfinder.server.page_files import page_routes
-from viewfinder.server.site import Part, Site
+from viewfinder.server.endpoint import serving_site
+from viewfinder.server.site import Part, Site, page_routes
 from viewfinder.sources.choose import open_source
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.phone_calibration import Calibration

@@ -18,10 +18,10 @@ from viewfinder.commands.browser_cameras import CAMERA_PAGE, browser_cameras
 from viewfinder.commands.listening import Door, on_stop, open_door
 from viewfinder.commands.serve_options import ServeOptions, refuse_contradictions
 from viewfinder.server.access import Access
-from viewfinder.server.app import serving_site
+from viewfinder.server.endpoint import serving_site
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.exact_size import ExactSize
-from viewfinder.stage.still_layer import StillLayer
+from viewfinder.sources.frame_source import ExactSize
+from viewfinder.stage.static_layer import StillLayer
 from viewfinder.streaming.virtual_webcam import VirtualWebcam
 from viewfinder.tracking.phone_tracker import PhoneTracker
 from viewfinder.tracking.tracker import FixedPose, Tracker, read_fixed_pose

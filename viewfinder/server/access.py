@@ -1,14 +1,97 @@
-"""Access: who may ask for what; the middleware that every request of the viewfinder passes, and the exchange of a token for a cookie."""
+"""Access: who may ask for what; the middleware that every request of the viewfinder passes, and the exchange of a token for a cookie.
 
-from collections.abc import Awaitable, Callable
+Who a request says it is for and from: against pages of other sites, and against names that turn into our address (DNS rebinding).
+
+Reading what a page sends: at most so many bytes, and JSON without the numbers that JSON does not have.
+"""
+
+import json
+import re
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
+from ipaddress import ip_address
+from typing import Any
+from urllib.parse import urlsplit
 
 from aiohttp import web
 
-from viewfinder.server.bounded import json_value, message_body
-from viewfinder.server.origins import LOOPBACK_NAMES, objection
-from viewfinder.server.rate_limit import RateLimit
-from viewfinder.server.sessions import Role, Sessions
+from viewfinder.server.sessions import RateLimit, Role, Sessions
+
+# A name or an address and a port, without the rest that URLs allow there.
+_HOST = re.compile(r"[\w.-]+(:\d{1,5})?|\[[0-9A-Fa-f:.]+\](:\d{1,5})?", re.ASCII)
+LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches an address."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def host_name(host_header: str | None) -> str | None:
+    """The name in a Host header, without port, in lower case; None if there is none or it is malformed."""
+    if host_header is None or not _HOST.fullmatch(host_header):
+        return None
+    try:
+        return urlsplit(f"//{host_header}").hostname
+    except ValueError:
+        return None
+
+
+def objection(headers: Mapping[str, str], names: frozenset[str], *, opens_page: bool) -> str | None:
+    """Why a request is refused, as a sentence; None if it is for us (`names`) and from our own page, or from no page at all.
+
+    opens_page: the request only loads the page, which a link of another site may do.
+    """
+    host = headers.get("Host")
+    if host_name(host) not in names:
+        return f"this viewfinder does not answer to the name {host!r}: open the address that it printed"
+    origin = headers.get("Origin")
+    if origin is not None and _netloc(origin) != str(host).lower():
+        return "this viewfinder answers only to its own page"
+    if not opens_page and headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+        return "this viewfinder answers only to its own page"
+    return None
+
+
+def _netloc(origin: str) -> str | None:
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return None
+
+
+# Messages of the page are a few numbers and names; anything larger is not from the page.
+LARGEST_MESSAGE = 1024
+# Offers of WebRTC list codecs and addresses: Chromium's are 6 to 10 kB.
+LARGEST_BODY = 65536
+
+
+async def message_body(request: web.Request) -> bytes:
+    """The body of a request; one beyond LARGEST_MESSAGE is refused (413) before it is read whole."""
+    if (request.content_length or 0) > LARGEST_MESSAGE:
+        raise web.HTTPRequestEntityTooLarge(max_size=LARGEST_MESSAGE, actual_size=request.content_length or 0)
+    body = bytearray()
+    async for chunk in request.content.iter_any():
+        body += chunk
+        if len(body) > LARGEST_MESSAGE:
+            raise web.HTTPRequestEntityTooLarge(max_size=LARGEST_MESSAGE, actual_size=len(body))
+    return bytes(body)
+
+
+def json_value(text: str | bytes) -> Any:
+    """A JSON text of a page, None if it is none (or null). NaN and Infinity are no JSON; deep nesting is no message of ours."""
+    try:
+        return json.loads(text, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _refuse(word: str) -> None:
+    raise ValueError(word)
+
 
 _PAGE_PATHS = frozenset({"/", "/viewfinder.js", "/style.css", "/camera", "/camera.js", "/obs"})
 # The page for OBS is one file, with its script in it.

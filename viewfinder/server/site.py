@@ -1,21 +1,43 @@
-"""Site: everything that one viewfinder shows to browsers, and its routes; each part but the controls may be missing."""
+"""Site: everything that one viewfinder shows to browsers, and its routes; each part but the controls may be missing.
 
-from collections.abc import Callable, Sequence
+The page: a few files of the package, read once; a request names one of them or nothing at all.
+"""
+
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from aiohttp import web
 from jaxtyping import UInt8
 
-from viewfinder.server.access import Access, error
-from viewfinder.server.bounded import LARGEST_BODY, message_body
-from viewfinder.server.controls import Controls
-from viewfinder.server.dispatcher import Dispatcher
-from viewfinder.server.jpeg_socket import JpegSocket
-from viewfinder.server.page_files import page_routes
+from viewfinder.server.access import LARGEST_BODY, Access, error, message_body
+from viewfinder.server.controls import Controls, Dispatcher
+from viewfinder.server.jpeg_stream import JpegSocket, WaitingRoom
 from viewfinder.server.sessions import Role
-from viewfinder.server.waiting_room import WaitingRoom
+
+PAGE = {
+    "/": ("index.html", "text/html"),
+    "/camera": ("camera.html", "text/html"),
+    "/viewfinder.js": ("viewfinder.js", "text/javascript"),
+    "/camera.js": ("camera.js", "text/javascript"),
+    "/style.css": ("style.css", "text/css"),
+}
+
+
+def page_routes() -> list[web.RouteDef]:
+    return [web.get(path, _handler(name, content_type)) for path, (name, content_type) in PAGE.items()]
+
+
+def _handler(name: str, content_type: str) -> Callable[[web.Request], Awaitable[web.Response]]:
+    text = files("viewfinder").joinpath("page", name).read_text(encoding="utf-8")
+
+    async def page(_request: web.Request) -> web.Response:
+        return web.Response(text=text, content_type=content_type)
+
+    return page
+
 
 Matte = UInt8[np.ndarray, "height width"]
 

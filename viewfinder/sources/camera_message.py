@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import UNKNOWN_LENS, LensState, Pose
+from viewfinder.frames import UNKNOWN_LENS, LensState, Pose
 
 LONGEST_MESSAGE = 4096
 _KNOWN = ("focusDistance", "pose", "orientation")

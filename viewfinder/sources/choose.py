@@ -5,8 +5,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from mrbokeh.system.errors import InputError, MissingExtraError
-from viewfinder.sources.base import FrameSource
-from viewfinder.sources.size_limit import SizeLimit
+from viewfinder.sources.frame_source import FrameSource, SizeLimit
 
 _PATTERN_SIZE_PX = (640, 360)
 _THROUGH_MEDIAMTX = ("srt", "rtmp", "rtmps")
@@ -35,14 +34,14 @@ def open_source(text: str, max_width_px: int | None = None, max_height_px: int |
             "--source: expected a video file, the number of a camera, an rtsp, http or udp URL, folder:PATH, gphoto2, whip or test, "
             f"got {text!r}, which is none of them"
         )
-    from viewfinder.sources.video_file import VideoFileSource
+    from viewfinder.sources.playback import VideoFileSource
 
     return VideoFileSource(Path(text), max_width_px, max_height_px, fps)
 
 
 def _named(kind: str, rest: str | None, limit: SizeLimit, fps: float | None) -> FrameSource:
     if kind == "test":
-        from viewfinder.sources.pattern import DEFAULT_FPS, PatternSource
+        from viewfinder.sources.playback import DEFAULT_FPS, PatternSource
 
         return PatternSource(limit.width_px or _PATTERN_SIZE_PX[0], limit.height_px or _PATTERN_SIZE_PX[1], fps or DEFAULT_FPS)
     if kind == "gphoto2":

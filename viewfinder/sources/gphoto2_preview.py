@@ -1,6 +1,10 @@
-"""The live view of a DSLR or mirrorless camera on a cable, through libgphoto2."""
+"""The live view of a DSLR or mirrorless camera on a cable, through libgphoto2.
+
+What a tethered camera tells about its lens, by libgphoto2's names.
+"""
 
 import itertools
+import re
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
@@ -11,10 +15,38 @@ import numpy as np
 
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, detected, explanation, library, opened
-from viewfinder.flow.frames import UNKNOWN_LENS, Bgr, CameraFrame
-from viewfinder.sources.gphoto2_lens import lens_state
-from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
-from viewfinder.sources.size_limit import SizeLimit
+from viewfinder.frames import UNKNOWN_LENS, Bgr, CameraFrame, LensState
+from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting
+
+_F_NUMBER = ("f-number", "aperture")
+# Properties of PTP itself (PIMA 15740, 13.3.8 and 13.3.9), which libgphoto2 lists by number: 1/100 mm, and mm with all ones beyond.
+_FOCAL_LENGTH, _FOCUS_DISTANCE, _BEYOND = "5008", "5009", 0xFFFF
+
+
+def lens_state(camera: Any) -> LensState:
+    """camera: an initialised gphoto2.Camera. Most cameras tell the f-number; few the rest.
+
+    PTP does not say where the distance counts from; it is taken as it is.
+    """
+    f_number = next((number for name in _F_NUMBER if (number := _number(camera, name)) is not None), None)
+    hundredths, distance_mm = _number(camera, _FOCAL_LENGTH), _number(camera, _FOCUS_DISTANCE)
+    if distance_mm is not None:
+        distance_mm = float("inf") if distance_mm >= _BEYOND else distance_mm / 1000
+    return LensState(distance_mm, f_number, None if hundredths is None else hundredths / 100)
+
+
+def _number(camera: Any, name: str) -> float | None:
+    """The number above 0 in a setting such as "f/5.6"; None where the camera has no such setting or it says a word."""
+    gp = library()
+    try:
+        text = str(camera.get_single_config(name).get_value())
+    except gp.GPhoto2Error as error:
+        if error.code in (gp.GP_ERROR_BAD_PARAMETERS, gp.GP_ERROR_NOT_SUPPORTED):
+            return None
+        raise
+    found = re.search(r"\d+(?:\.\d+)?", text)
+    return (float(found[0]) or None) if found else None
+
 
 _LENS_EVERY_S = 1.0
 _BUSY, _BUSY_WAIT_S, _MOST_BUSY = -110, 0.1, 30

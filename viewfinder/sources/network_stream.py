@@ -1,20 +1,60 @@
-"""A stream over the network (RTSP, HTTP, MPEG-TS over UDP) through FFmpeg, with as little delay as it allows."""
+"""A stream over the network (RTSP, HTTP, MPEG-TS over UDP) through FFmpeg, with as little delay as it allows.
+
+A thread that empties a stream as fast as it comes, and hands over only the newest of it.
+"""
 
 import itertools
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from functools import partial
-from threading import Event
-from typing import Any
+from threading import Event, Thread
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from mrbokeh.video.color import color_of
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.sources.newest_of import newest_of
-from viewfinder.sources.received_frame import upright_bgr
-from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
-from viewfinder.sources.rhythm import Rhythm
-from viewfinder.sources.size_limit import SizeLimit
+from viewfinder.frames import CameraFrame, Newest
+from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting, upright_bgr
+from viewfinder.sources.playback import Rhythm
+
+_POLL_S = 0.05
+
+Item = TypeVar("Item")
+
+
+def newest_of(produce: Callable[[Event], Iterator[Item]], stopping: Event, *, name: str, leave_s: float = 5.0) -> Iterator[Item]:
+    """The newest item each time one is asked for; what came in between is dropped, so that no queue grows anywhere.
+
+    produce: runs in the thread until the event that it gets is set, which is when `stopping` is, or when nobody asks any more. Its
+    exception is raised here. leave_s: how long the end waits for the thread.
+    """
+    slot: Newest[Item] = Newest()
+    leaving, ended, failures = Event(), Event(), list[BaseException]()
+
+    def drain() -> None:
+        try:
+            for item in produce(leaving):
+                slot.put(item)
+        except Exception as error:
+            failures.append(error)
+        finally:
+            ended.set()
+
+    thread = Thread(target=drain, name=name, daemon=True)
+    thread.start()
+    try:
+        while not stopping.is_set():
+            finished = ended.is_set()
+            item = slot.take(_POLL_S)
+            if item is not None:
+                yield item
+            elif finished:
+                break
+    finally:
+        leaving.set()
+        thread.join(leave_s)
+    if failures:
+        raise failures[0]
+
 
 SCHEMES = ("rtsp", "rtsps", "http", "https", "udp")
 OPEN_TIMEOUT_S, READ_TIMEOUT_S = 4.0, 2.0

@@ -9,9 +9,8 @@ from threading import Event
 from typing import Any
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import CameraFrame
-from viewfinder.sources.reconnecting import CameraAwayError, reconnecting
-from viewfinder.sources.size_limit import SizeLimit
+from viewfinder.frames import CameraFrame
+from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting
 
 
 class WebcamSource:

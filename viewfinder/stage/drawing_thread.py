@@ -1,4 +1,7 @@
-"""DrawingThread: draws the newest request at its own rate, beside the stream, and reloads the scene when its files change."""
+"""DrawingThread: draws the newest request at its own rate, beside the stream, and reloads the scene when its files change.
+
+How finely to draw: coarser where a drawing takes too long, finer again where there is time.
+"""
 
 import logging
 import time
@@ -8,12 +11,32 @@ from dataclasses import dataclass, replace
 from threading import Event, Lock, Thread
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.newest import Newest
-from viewfinder.stage.drawn_layer import Drawing, DrawRequest, draw
-from viewfinder.stage.redraw import is_outdated
-from viewfinder.stage.resolution import AdaptiveResolution
-from viewfinder.stage.scene_watch import SceneWatch
-from viewfinder.stage.stage_setup import SetupLoader, StageSetup
+from viewfinder.frames import Newest
+from viewfinder.stage.drawing import Drawing, DrawRequest, draw, is_outdated
+from viewfinder.stage.stage_setup import SceneWatch, SetupLoader, StageSetup
+
+RESOLUTIONS = (1.0, 0.75, 0.5)
+LONGEST_S = 1 / 8
+_SPARE = 0.8
+
+
+class AdaptiveResolution:
+    """now: what the next drawing should have. The time of a drawing grows with its pixels."""
+
+    def __init__(self) -> None:
+        self.now = 1.0
+
+    def took(self, resolution: float, seconds: float) -> None:
+        """A drawing at this resolution took so long."""
+        place = RESOLUTIONS.index(resolution)
+        if seconds > LONGEST_S:
+            self.now = RESOLUTIONS[min(place + 1, len(RESOLUTIONS) - 1)]
+        elif place == 0:
+            self.now = resolution
+        else:
+            finer = RESOLUTIONS[place - 1]
+            self.now = finer if seconds * (finer / resolution) ** 2 < _SPARE * LONGEST_S else resolution
+
 
 _POLL_S = 0.1
 _WATCH_S = 0.25

@@ -10,7 +10,7 @@ from jaxtyping import Float32
 
 from mrbokeh.compositing.over import occlusion_matte
 from mrbokeh.images.image_io import read_depth
-from mrbokeh.layering.other_view import layer_from_view
+from mrbokeh.layering.hidden_background import layer_from_view
 from mrbokeh.optics.camera import Camera, camera_from_json
 from mrbokeh.optics.lens_file import read_transmission
 from mrbokeh.scene.staging.scene_description import RealThings

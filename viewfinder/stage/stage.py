@@ -1,11 +1,15 @@
-"""Stage: the virtual scene for every frame of the stream, at its newest pose, however long a drawing takes."""
+"""Stage: the virtual scene for every frame of the stream, at its newest pose, however long a drawing takes.
 
+Fade: an object whose track is lost goes away over half a second and comes back as slowly, so that neither startles.
+"""
+
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.compositing.occlusion import covered_by
+from mrbokeh.compositing.over import covered_by
 from mrbokeh.compositing.overlay import CodeTables, Overlay
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
@@ -16,16 +20,30 @@ from mrbokeh.scene.staging.scene_description import PlacedObject, Triple
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
 from viewfinder.frames import Bgr
-from viewfinder.stage.drawing_thread import DrawingThread
-from viewfinder.stage.drawn_layer import DrawRequest, sharp_layers
-from viewfinder.stage.fade import Fade
-from viewfinder.stage.picking import depth_at_m
-from viewfinder.stage.redraw import is_outdated
-from viewfinder.stage.seen import Seen
+from viewfinder.stage.drawing import DrawRequest, blur_changed, is_outdated, sharp_layers
+from viewfinder.stage.drawing_thread import DrawingThread, Drawn
+from viewfinder.stage.overlay_source import StageStatus
+from viewfinder.stage.shown_scene import VIEWS, Seen, depth_at_m, view_picture
 from viewfinder.stage.stage_setup import SetupLoader, live_renderer
-from viewfinder.stage.stage_status import StageStatus, status_of
-from viewfinder.stage.views import VIEWS, view_picture
 from viewfinder.tracking.tracker import TrackedPose
+
+FADE_S = 0.5
+
+
+class Fade:
+    """opacity: 0 to 1; it begins with 1, for a scene that appears for the first time has nothing to come back from."""
+
+    def __init__(self) -> None:
+        self.opacity = 1.0
+        self._last_s: float | None = None
+
+    def at(self, is_tracked: bool, time_s: float) -> float:
+        """The opacity at a time; times that go back count as no time at all."""
+        step = 0.0 if self._last_s is None else max(time_s - self._last_s, 0.0) / FADE_S
+        self._last_s = time_s
+        self.opacity = min(self.opacity + step, 1.0) if is_tracked else max(self.opacity - step, 0.0)
+        return self.opacity
+
 
 _STILL_S = 0.4
 """After so long without movement a drawing of reduced resolution is drawn again at every pixel."""
@@ -143,3 +161,24 @@ class Stage:
 
 def _nothing() -> Overlay:
     return Overlay(0, 0, np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.float32))
+
+
+def status_of(thread: DrawingThread, wanted: DrawRequest | None, opacity: float) -> StageStatus:
+    """wanted: what was asked for last, None before the first frame."""
+    drawn, setup = thread.newest, thread.setup
+    return StageStatus(
+        layer_age_ms=None if drawn is None else 1e3 * (time.monotonic() - drawn.started_s),
+        lens=None if drawn is None else drawn.drawing.request.lens,
+        focus_pending=wanted is not None and (drawn is None or _blurred_otherwise(drawn, wanted)),
+        draws_per_s=thread.draws_per_s,
+        busy=thread.busy,
+        resolution=1.0 if drawn is None else drawn.drawing.request.resolution,
+        opacity=opacity,
+        triangles=sum(each.triangle_count for each in setup.staged.objects),
+        renderer=setup.renderer_name,
+        problem=thread.problem,
+    )
+
+
+def _blurred_otherwise(drawn: Drawn, wanted: DrawRequest) -> bool:
+    return blur_changed(drawn.drawing.request.lens, wanted.lens, drawn.drawing)

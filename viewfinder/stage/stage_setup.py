@@ -1,5 +1,9 @@
-"""StageSetup: one version of everything a drawing depends on beside pose, lens and time; and how it is loaded from the scene file."""
+"""StageSetup: one version of everything a drawing depends on beside pose, lens and time; and how it is loaded from the scene file.
 
+SceneWatch: whether the scene file or a file that it names was written since it was read; asks the file system, waits for nothing.
+"""
+
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,12 +13,32 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene import SceneRenderer
-from mrbokeh.scene.staging.assets import Assets
 from mrbokeh.scene.staging.scene_file import read_scene_file
-from mrbokeh.scene.staging.staged_scene import StagedScene
-from viewfinder.stage.drawn_layer import Brushes
-from viewfinder.stage.layer_depth import LayerDepth
+from mrbokeh.scene.staging.staged_scene import Assets, StagedScene, modified_s
+from viewfinder.stage.drawing import Brushes
 from viewfinder.stage.occlusion import read_occlusion
+from viewfinder.stage.reprojection import LayerDepth
+
+
+class SceneWatch:
+    """A file that is being written changes again and again: `changed` says so only once it has kept still between two calls."""
+
+    def __init__(self, files: Iterable[Path]) -> None:
+        self._read = self._seen = _state(files)
+
+    def changed(self) -> bool:
+        now = _state(self._seen)
+        is_still, self._seen = now == self._seen, now
+        return is_still and now != self._read
+
+    def follow(self, files: Iterable[Path]) -> None:
+        """What `changed` saw has been read, or refused; watch these files from here on."""
+        # Of a file that was watched already it is the state before the reading: what was written during it is not missed.
+        self._read = self._seen = {path: self._seen.get(path, modified_s(path)) for path in files}
+
+
+def _state(files: Iterable[Path]) -> dict[Path, float]:
+    return {path: modified_s(path) for path in files}
 
 
 @dataclass(frozen=True, eq=False)

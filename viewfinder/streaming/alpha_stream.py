@@ -14,8 +14,7 @@ from jaxtyping import Float32, UInt8
 
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.video.color import code_from_linear
-from viewfinder.flow.frames import OutputFrame
-from viewfinder.flow.newest import Newest
+from viewfinder.frames import Newest, OutputFrame
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.whep import Whep
 

@@ -9,19 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from viewfinder.flow.frame_header import frame_header
-from viewfinder.flow.frames import OutputFrame
-from viewfinder.flow.newest import Newest
-from viewfinder.streaming.audience import Audience
-from viewfinder.streaming.encoder import StreamQuality, VideoEncoder
-from viewfinder.streaming.h264 import h264_encoder
-from viewfinder.streaming.i420 import even_size, i420_frame
-from viewfinder.streaming.rtp_clock import RtpClock
-from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
-from viewfinder.streaming.vp8 import vp8_encoder
+from viewfinder.frames import Newest, OutputFrame, frame_header
+from viewfinder.streaming.encoders import ENCODERS, RtpClock, StreamQuality, VideoEncoder, even_size, i420_frame
+from viewfinder.streaming.viewer_queue import Audience, EncodedFrame, ViewerQueue
 
-# In the order in which they are preferred.
-ENCODERS: dict[str, Callable[[int, int, StreamQuality], VideoEncoder]] = {"H264": h264_encoder, "VP8": vp8_encoder}
 _POLL_S = 0.1
 
 log = logging.getLogger(__name__)

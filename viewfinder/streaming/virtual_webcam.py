@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import Bgr, OutputFrame
-from viewfinder.flow.newest import Newest
+from viewfinder.frames import Bgr, Newest, OutputFrame
 
 ANY_DEVICE = "auto"
 _FPS = 30.0

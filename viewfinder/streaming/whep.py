@@ -9,7 +9,7 @@ from aiohttp import web
 
 from mrbokeh.system.errors import InputError
 from viewfinder.streaming.encoded_stream import EncodedStream
-from viewfinder.streaming.mdns_candidates import with_address
+from viewfinder.streaming.session_description import with_address
 
 if TYPE_CHECKING:
     from viewfinder.streaming.viewer_connection import ViewerConnection

@@ -5,6 +5,8 @@ Where each has a world of its own (the phone a map, the camera a board), relativ
 the rotation aligns the axes of the turns, the rest is linear (Park and Martin 1994). Both are refined by least squares on SE(3).
 
 phone_rig.json: {"format": "mrbokeh-phone-rig", "version": 1, "camera_from_phone": 4x4, "residual_deg", "residual_mm", "pairs"}
+
+Rigid motions as (4, 4) matrices: made from an axis-angle vector, taken apart, and how far they turn.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +23,22 @@ from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import inverted, rigid
 from viewfinder.frames import Pose
-from viewfinder.tracking.rigid_motion import angle_deg, parameters_of, rigid_of
+
+
+def rigid_of(parameters: Float[np.ndarray, "6"]) -> Pose:
+    """From an axis-angle vector (radians) followed by a translation."""
+    return rigid(Rotation.from_rotvec(parameters[:3]).as_matrix(), parameters[3:])
+
+
+def parameters_of(motion: Pose) -> Float[np.ndarray, "6"]:
+    """The inverse of `rigid_of`."""
+    return np.concatenate([Rotation.from_matrix(motion[:3, :3]).as_rotvec(), motion[:3, 3]])
+
+
+def angle_deg(motion: Pose) -> float:
+    """How far a motion turns."""
+    return float(np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude()))
+
 
 FORMAT = "mrbokeh-phone-rig"
 VERSION = 1

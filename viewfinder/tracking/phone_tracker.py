@@ -7,11 +7,10 @@ from typing import Protocol, runtime_checkable
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from viewfinder.flow.frames import CameraFrame, Pose
-from viewfinder.tracking.base import TrackedPose, Tracker
+from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.phone_rig import PhoneRig
-from viewfinder.tracking.pose_history import PoseHistory
-from viewfinder.tracking.tracking_sample import TrackingSample
+from viewfinder.tracking.pose_history import PoseHistory, TrackingSample
+from viewfinder.tracking.tracker import TrackedPose, Tracker
 
 _LEAVE_S = 3.0
 _ASPECT_TOLERANCE = 0.01

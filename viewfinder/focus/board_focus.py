@@ -1,0 +1,155 @@
+"""BlurOfBoardFocus: the focus of a lens that tells nobody, solved about once a second from how blurred the tracked board is.
+
+FollowingOptics: the focus from the blur of the board, with the lens and the f-number that the page was told last.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Event, Lock, Thread
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.tracking.charuco.board import CharucoBoard
+from viewfinder.focus.edge_blur import EdgeBlurs, board_edges, edge_blurs
+from viewfinder.focus.focus_from_blur import Evidence, FocusCandidate, focus_candidates, settled
+from viewfinder.frames import CameraFrame, LensState, Newest
+from viewfinder.tracking.tracker import TrackedPose
+
+_POLL_S = 0.1
+_LEAVE_S = 3.0
+_REMEMBERED = 6
+_REMEMBERED_S = 5.0
+_GREEN = 1
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class BlurSettings:
+    """every_s: between two answers. hold_s: an answer holds so long without a new one. sharpest_px: sigma of the blur that this camera
+    leaves at its best focus, in the pixels of its frames. least_quality: poses below it are not used.
+    """
+
+    every_s: float = 0.7
+    hold_s: float = 5.0
+    sharpest_px: float = 0.5
+    least_quality: float = 0.3
+
+
+class BlurOfBoardFocus:
+    """A FocusSource. lens: the focal length, f-number and sensor; its focus is what is looked for. `follow` tells when one changes.
+
+    intrinsics: of the camera, in any size of its frames. answer: the last one, with its standard deviation; candidates: what it was
+    chosen from (both sides of the board, where its tilt does not tell them apart).
+    """
+
+    name = "blur of the board"
+
+    def __init__(self, board: CharucoBoard, lens: Lens, intrinsics: Camera, settings: BlurSettings | None = None) -> None:
+        self.lens, self._intrinsics, self._settings = lens, intrinsics, settings or BlurSettings()
+        self._changing = Lock()
+        self._edges = board_edges(board)
+        self.answer: FocusCandidate | None = None
+        self.candidates: tuple[FocusCandidate, ...] = ()
+        self._answered_s, self._asked_s = -np.inf, -np.inf
+        self._before: deque[tuple[float, EdgeBlurs]] = deque(maxlen=_REMEMBERED)
+        self._frames: Newest[tuple[CameraFrame, TrackedPose]] = Newest()
+        self._stopping = Event()
+        self._thread = Thread(target=self._run, name="focus from blur", daemon=True)
+        self._thread.start()
+
+    def follow(self, lens: Lens, intrinsics: Camera) -> None:
+        """The lens and the camera as they are now. What was learned with others is forgotten: their blurs mean another focus."""
+        if _optics(lens, intrinsics) == _optics(self.lens, self._intrinsics):
+            return
+        with self._changing:
+            self.lens, self._intrinsics = lens, intrinsics
+            self.answer, self._answered_s, self._asked_s = None, -np.inf, -np.inf
+            self._before.clear()
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:
+        """Hands the frame to the thread now and then; says what it found last."""
+        usable = pose is not None and pose.captured_s == frame.captured_s and pose.quality >= self._settings.least_quality
+        if pose is not None and usable and frame.captured_s - self._asked_s >= self._settings.every_s:
+            self._asked_s = frame.captured_s
+            self._frames.put((frame, pose))
+        answer, age_s = self.answer, frame.captured_s - self._answered_s
+        return LensState(answer.focus_distance_m if answer is not None and age_s <= self._settings.hold_s else None)
+
+    def solve(self, frame: CameraFrame, pose: TrackedPose) -> FocusCandidate | None:
+        """From one frame and those before, while the caller waits; the thread does the same."""
+        height_px, width_px = frame.bgr.shape[:2]
+        with self._changing:
+            lens, intrinsics, before = self.lens, self._intrinsics, tuple(self._before)
+            last = self.answer.dioptres if self.answer is not None and frame.captured_s - self._answered_s <= _REMEMBERED_S else None
+        resized = intrinsics.resized(width_px, height_px)
+        camera = Camera(width_px, height_px, resized.focal_px, resized.principal_px, pose.camera_from_world)
+        blurs = edge_blurs(_linear_green(frame.bgr), camera, self._edges, self._settings.sharpest_px)
+        self.candidates = focus_candidates(blurs, lens, width_px)
+        if not self.candidates:
+            return None
+        recent = [each for when_s, each in before if 0.0 <= frame.captured_s - when_s <= _REMEMBERED_S]
+        found = settled(self.candidates, Evidence(blurs, recent, lens, width_px, last))
+        with self._changing:
+            if self.lens is not lens:
+                return None
+            self._before.append((frame.captured_s, blurs))
+            if found is not None:
+                self.answer, self._answered_s = found, frame.captured_s
+        return found
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join(_LEAVE_S)
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            waiting: Any = self._frames.take(_POLL_S)
+            if waiting is None:
+                continue
+            try:
+                self.solve(*waiting)
+            except Exception:
+                # One odd frame must not end this for good.
+                log.exception("the focus could not be solved from the blur of the board")
+
+
+def _optics(lens: Lens, intrinsics: Camera) -> tuple[float, ...]:
+    """What the size of a blur at a known focus depends on, whatever the size of the frames."""
+    (fx, fy), (cx, cy) = intrinsics.focal_px, intrinsics.principal_px
+    width, height = intrinsics.width_px, intrinsics.height_px
+    of_camera = (round(each, 6) for each in (fx / width, fy / height, cx / width, cy / height))
+    return lens.focal_length_mm, lens.f_number, lens.sensor_width_mm, *of_camera
+
+
+def _linear_green(bgr: np.ndarray) -> Float32[np.ndarray, "height width"]:
+    """One colour, for colours are focused and placed a little apart; green is most of what is seen."""
+    return cv2.LUT(np.ascontiguousarray(bgr[..., _GREEN]), _LINEAR_OF_CODE).reshape(bgr.shape[:2])
+
+
+_LINEAR_OF_CODE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0)
+
+
+class FollowingOptics:
+    """A FocusSource. optics: the lens and the intrinsics of the last picture, None before the first; asked with every frame."""
+
+    def __init__(self, blur: BlurOfBoardFocus, optics: Callable[[], tuple[Lens, Camera] | None]) -> None:
+        self.blur, self.name, self._optics = blur, blur.name, optics
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:
+        now = self._optics()
+        if now is None:
+            return LensState()
+        self.blur.follow(*now)
+        return self.blur.state(frame, pose)
+
+    def close(self) -> None:
+        self.blur.close()

@@ -1,0 +1,120 @@
+"""The protocol of everything that knows where the lens is focused.
+
+FirstKnown: several sources of the focus in order; each value comes from the first that knows it.
+
+FrameFocus: what came with the frame itself: Exif, gphoto2, the browser's focusDistance.
+
+ManualFocus: the focus that a person sets, with the slider or by a tap on something at a known depth.
+
+TrackedLensFocus: the lens as an external tracking system tells it (OpenTrackIO; FreeD through a lens table).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
+
+from mrbokeh.system.errors import InputError
+from viewfinder.frames import CameraFrame, LensState
+from viewfinder.tracking.socket_tracker import SocketTracker
+from viewfinder.tracking.tracker import TrackedPose
+
+
+@runtime_checkable
+class FocusSource(Protocol):
+    """Called with every frame that is composited; says what it knows of the lens, None for the rest. Must be fast."""
+
+    name: str
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState: ...
+
+    def close(self) -> None: ...
+
+
+class FirstKnown:
+    """A FocusSource over others (`focus.base.FocusSource`).
+
+    focus_from: the name of the source that the focus distance of the last frame came from, None if nobody knew.
+    """
+
+    def __init__(self, sources: Sequence[FocusSource]) -> None:
+        self._sources = tuple(sources)
+        self.name = ", else ".join(source.name for source in sources)
+        self.focus_from: str | None = None
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:
+        """All are asked, so that those which learn from every frame see it."""
+        known = LensState()
+        focus_from = None
+        for source in self._sources:
+            told = source.state(frame, pose)
+            if known.focus_distance_m is None and told.focus_distance_m is not None:
+                focus_from = source.name
+            known = known.completed_by(told)
+        self.focus_from = focus_from
+        return known
+
+    def close(self) -> None:
+        for source in self._sources:
+            source.close()
+
+
+class FrameFocus:
+    """A FocusSource. hold_s: many cameras tell the focus with few frames; what was told last holds so long, then it is not known."""
+
+    name = "the camera"
+
+    def __init__(self, hold_s: float = 5.0) -> None:
+        self._hold_s = hold_s
+        self._told, self._told_s = LensState(), 0.0
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:  # noqa: ARG002
+        if frame.lens != LensState():
+            self._told, self._told_s = frame.lens.completed_by(self._held(frame)), frame.captured_s
+        return self._held(frame)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def _held(self, frame: CameraFrame) -> LensState:
+        return self._told if 0.0 <= frame.captured_s - self._told_s <= self._hold_s else LensState()
+
+
+class ManualFocus:
+    """A FocusSource. What nobody has set (None) is not known here, and comes from who else knows it."""
+
+    name = "by hand"
+
+    def __init__(self, lens: LensState | None = None) -> None:
+        self._lens = lens or LensState()
+
+    def focus(self, distance_m: float | None) -> None:
+        """Metres from the entrance pupil, inf is allowed; None hands the focus back to the other sources."""
+        if distance_m is not None and not distance_m > 0.0:
+            raise InputError(f"expected a focus distance of more than 0 m, got {distance_m} m")
+        self._lens = replace(self._lens, focus_distance_m=distance_m)
+
+    def set_f_number(self, f_number: float | None) -> None:
+        """None hands it back to the other sources."""
+        if f_number is not None and not 0.3 <= f_number <= 256.0:
+            raise InputError(f"expected an f-number between 0.3 and 256, got {f_number}")
+        self._lens = replace(self._lens, f_number=f_number)
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:  # noqa: ARG002
+        return self._lens
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+class TrackedLensFocus:
+    """A FocusSource; the time of the frame finds the state of the lens as it finds the pose. The tracker is closed as a tracker."""
+
+    def __init__(self, tracker: SocketTracker) -> None:
+        self.name = f"lens of {tracker.name}"
+        self._tracker = tracker
+
+    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:  # noqa: ARG002
+        return self._tracker.lens(frame)
+
+    def close(self) -> None:
+        """Nothing of its own to close."""

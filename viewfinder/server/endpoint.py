@@ -1,0 +1,184 @@
+"""Which one address the viewfinder listens on for `--lan`, and its URL as text and as a QR code for the phone.
+
+TLS with the user's own certificate: loading it, and the names it is good for.
+
+Serving a site: listening on one address, with or without TLS, until the block ends.
+"""
+
+import io
+import socket
+import ssl
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from datetime import UTC, datetime
+from ipaddress import IPv4Address
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from aiohttp import web
+
+from mrbokeh.system.errors import InputError, MissingExtraError
+from viewfinder.server.access import is_loopback
+from viewfinder.server.site import Site
+
+# Routers of mobile networks and Tailscale use 100.64.0.0/10, which is neither private nor public.
+_SHARED = (IPv4Address("100.64.0.0"), IPv4Address("100.127.255.255"))
+_WHITE_ON_BLACK, _RESET = "\x1b[97;40m", "\x1b[0m"
+# Never answers (RFC 5737); asking for the way there sends nothing.
+_ELSEWHERE = ("198.51.100.1", 9)
+
+
+class Interface(NamedTuple):
+    """A network interface of this machine and one of its IPv4 addresses."""
+
+    name: str
+    address: str
+
+
+def lan_address(wanted: str | None = None) -> str:
+    """The address of ONE interface: the one wanted (a name or an address), else the private one through which the way out leads."""
+    return choose(interfaces(), wanted, _way_out())
+
+
+def choose(present: Sequence[Interface], wanted: str | None, way_out: str | None) -> str:
+    """The choice among interfaces; InputError where nothing or several fit."""
+    offered = [each for each in present if not is_loopback(each.address)]
+    listed = ", ".join(f"{each.name} ({each.address})" for each in offered) or "none"
+    if wanted is not None:
+        fitting = [each.address for each in offered if wanted in each]
+        if not fitting:
+            raise InputError(f"there is no interface {wanted!r} on this machine: choose one of {listed}")
+        return fitting[0]
+    private = [each.address for each in offered if _is_private(each.address)]
+    if way_out in private:
+        return str(way_out)
+    if len(private) != 1:
+        raise InputError(f"expected one interface of a private network to listen on, found {len(private)}: name one of {listed}")
+    return private[0]
+
+
+def interfaces() -> list[Interface]:
+    """Those of this machine with an IPv4 address."""
+    try:
+        import ifaddr
+    except ImportError:
+        raise MissingExtraError("ifaddr", "viewfinder") from None
+    return [Interface(adapter.nice_name, str(ip.ip)) for adapter in ifaddr.get_adapters() for ip in adapter.ips if ip.is_IPv4]
+
+
+def page_url(host: str, port: int, *, secure: bool, token: str | None = None, path: str = "/") -> str:
+    """Of the page; the token goes into the fragment, which browsers keep to themselves."""
+    name = f"[{host}]" if ":" in host else host
+    return f"{'https' if secure else 'http'}://{name}:{port}{path}{f'#token={token}' if token else ''}"
+
+
+def qr_text(text: str, *, colored: bool = True) -> str:
+    """A QR code of half blocks for a terminal; colored: white on black also where the terminal is dark on light."""
+    try:
+        import segno
+    except ImportError:
+        raise MissingExtraError("segno", "viewfinder") from None
+    out = io.StringIO()
+    segno.make(text, error="l", micro=False).terminal(out, border=2, compact=True)
+    lines = out.getvalue().splitlines()
+    return "\n".join(f"{_WHITE_ON_BLACK}{line}{_RESET}" for line in lines) if colored else "\n".join(lines)
+
+
+def _is_private(address: str) -> bool:
+    ip = IPv4Address(address)
+    return (ip.is_private and not ip.is_link_local) or _SHARED[0] <= ip <= _SHARED[1]
+
+
+def _way_out() -> str | None:
+    """The address from which this machine would send to the internet; None without a way there."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(_ELSEWHERE)
+        except OSError:
+            return None
+        return str(probe.getsockname()[0])
+
+
+class Tls(NamedTuple):
+    """context: for the server. names: host names and addresses that the certificate covers, in lower case, without wildcards."""
+
+    context: ssl.SSLContext
+    names: tuple[str, ...]
+
+
+def load_tls(certificate: Path, key: Path | None = None) -> Tls:
+    """A certificate chain in PEM and its key, which may be in the same file; InputError says what is wrong with them."""
+    key = key or certificate
+    for path, what in ((certificate, "certificate"), (key, "key")):
+        if not path.is_file():
+            raise InputError(f"there is no {what} file {path}: make one with `mkcert`, or give the {what} you have")
+    names = _names(certificate)
+    if b"ENCRYPTED" in key.read_bytes():
+        # A pass phrase would be asked for in the middle of a shoot.
+        raise InputError(f"the key {key} has a pass phrase: remove it with `openssl pkey -in {key} -out PLAIN.pem`")
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, key)
+    except ssl.SSLError as error:
+        raise InputError(_refused(certificate, key, error)) from None
+    except OSError as error:
+        raise InputError(f"the certificate {certificate} or its key {key} cannot be read ({error.strerror})") from None
+    return Tls(context, names)
+
+
+def _names(certificate: Path) -> tuple[str, ...]:
+    try:
+        from cryptography import x509
+    except ImportError:
+        raise MissingExtraError("cryptography", "viewfinder") from None
+    try:
+        loaded = x509.load_pem_x509_certificates(certificate.read_bytes())[0]
+    except (ValueError, OSError):
+        raise InputError(f"{certificate} holds no certificate in PEM (-----BEGIN CERTIFICATE-----): convert it with openssl") from None
+    if loaded.not_valid_after_utc < datetime.now(UTC):
+        raise InputError(f"the certificate {certificate} expired on {loaded.not_valid_after_utc:%Y-%m-%d}: make a new one")
+    try:
+        alternative = loaded.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        raise InputError(
+            f"the certificate {certificate} names no host (no subjectAltName), so no browser accepts it: make it anew"
+        ) from None
+    names: list[Any] = [*alternative.get_values_for_type(x509.DNSName), *alternative.get_values_for_type(x509.IPAddress)]
+    return tuple(str(name).lower() for name in names if "*" not in str(name))
+
+
+def _refused(certificate: Path, key: Path, error: ssl.SSLError) -> str:
+    if error.reason == "KEY_VALUES_MISMATCH":
+        return f"the key {key} does not belong to the certificate {certificate}: give the key that was made with it"
+    return f"the certificate {certificate} and the key {key} cannot be used ({error.reason or error}): expected a key in PEM"
+
+
+_SHUTDOWN_S = 1.0
+
+
+@asynccontextmanager
+async def serving_site(site: Site, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
+    """Serve a site inside the block; gives the address of the page, without a token. Port 0 takes a free one.
+
+    With TLS the address has a name that the certificate covers; that it leads to this machine is the user's care.
+    """
+    runner = web.AppRunner(site.application(), shutdown_timeout=_SHUTDOWN_S, access_log=None)
+    await runner.setup()
+    try:
+        await _bind(runner, host, port, tls)
+        yield page_url(_spoken_name(host, tls), runner.addresses[0][1], secure=tls is not None)
+    finally:
+        await runner.cleanup()
+
+
+def _spoken_name(host: str, tls: Tls | None) -> str:
+    """The name in the URL: browsers accept a certificate only under a name that it covers."""
+    return host if tls is None or not tls.names or host.lower() in tls.names else tls.names[0]
+
+
+async def _bind(runner: web.AppRunner, host: str, port: int, tls: Tls | None) -> None:
+    try:
+        await web.TCPSite(runner, host, port, ssl_context=None if tls is None else tls.context).start()
+    except (OSError, OverflowError) as error:
+        raise InputError(f"cannot listen on {host} port {port} ({error}): choose another one with --port, or stop what uses it") from None

@@ -1,0 +1,73 @@
+"""How a stage is doing: what the page shows beside the picture.
+
+The protocol of what lies over the camera's picture.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from mrbokeh.compositing.overlay import CodeTables, Overlay
+from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.scene.staging.scene_description import Triple
+from viewfinder.frames import Bgr
+from viewfinder.tracking.tracker import TrackedPose
+
+
+@dataclass(frozen=True)
+class StageStatus:
+    """layer_age_ms: since the drawing that is shown was begun, None before the first. lens: that blurred it.
+
+    focus_pending: another blur was asked for and is not shown yet. draws_per_s: over the last two seconds. busy: drawing now.
+    resolution: of the drawing, 1 is every pixel. opacity: 0 where the track is lost. problem: a sentence for the page, or None.
+    """
+
+    layer_age_ms: float | None
+    lens: Lens | None
+    focus_pending: bool
+    draws_per_s: float
+    busy: bool
+    resolution: float
+    opacity: float
+    triangles: int
+    renderer: str
+    problem: str | None
+
+
+@runtime_checkable
+class Scenery(Protocol):
+    """`overlay` and `picture` belong to the compositing thread; everything else may be called from any. Points are in pixels of the frame.
+
+    views: that `picture` can show.
+    """
+
+    views: tuple[str, ...]
+
+    @property
+    def status(self) -> StageStatus: ...
+
+    def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:
+        """What lies over the frame now; must be fast, the drawing of it happens elsewhere."""
+        ...
+
+    def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
+        """One of `views`, of the frame for which `overlay` was asked last."""
+        ...
+
+    def depth_at_m(self, x_px: float, y_px: float) -> float:
+        """What is seen there; InputError where nothing is known."""
+        ...
+
+    def sharp_layers(self, camera: Camera) -> list[Layer]:
+        """Everything virtual in focus as a camera (with pose) sees it now, front first; may take its time."""
+        ...
+
+    def move_object(self, name: str, position_m: Triple) -> None: ...
+
+    def show_object(self, name: str, visible: bool) -> None: ...
+
+    def set_renderer(self, name: str, renderer: Renderer | None = None) -> None: ...
+
+    def close(self) -> None: ...

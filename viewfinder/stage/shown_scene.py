@@ -1,0 +1,227 @@
+"""Seen: what the newest frame shows of the scene, for those who ask about it: picking and views.
+
+The views of the page: plate, virtual, matte, depth, coc and final, as pictures of the size of the plate.
+
+What lies under a point of the picture: which object, which place of the table, at which depth.
+
+Where a point of the picture lies on the ground: the homography that the page drags objects with.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from mrbokeh.compositing.overlay import CodeTables, Overlay
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene import Scene
+from mrbokeh.scene.staging.scene_description import Triple
+from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.system.errors import InputError
+from mrbokeh.tracking.world_axes import rays, turned_back, upright_camera
+from viewfinder.frames import Bgr
+from viewfinder.stage.drawing import Drawing
+from viewfinder.stage.occlusion import Occlusion
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """camera: of the newest frame, upright. drawing: the one that was moved to it to become the overlay."""
+
+    overlay: Overlay
+    camera: Camera
+    drawing: Drawing
+    staged: StagedScene
+    occlusion: Occlusion | None = None
+
+
+Plane = Float32[np.ndarray, "height width"]
+_LEAST = 1e-3
+_SAME_DIOPTRES = 1e-3
+
+
+def view_picture(view: str, plate_bgr: Bgr, seen: Seen | None, tables: CodeTables) -> Bgr:
+    """One of VIEWS. seen: None before the first drawing, when only the plate shows anything. InputError for an unknown name.
+
+    matte: white is all virtual, a shadow counts by how dark it is. depth: red is near, blue far, by 1 / depth over what is seen.
+    coc: white is in focus, red behind, blue in front; full colour is the largest circle of confusion that is seen, 1 px at least.
+    """
+    if view not in _PAINTERS:
+        raise InputError(f"expected a view ({', '.join(VIEWS)}), got {view!r}")
+    if seen is None:
+        return plate_bgr if view in ("plate", "final") else np.zeros_like(plate_bgr)
+    return _PAINTERS[view](plate_bgr, seen, tables)
+
+
+def _plate(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+    return plate_bgr
+
+
+def _final(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:
+    return seen.overlay.over_codes(plate_bgr, tables)
+
+
+def _virtual(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:
+    return seen.overlay.over_codes(np.zeros_like(plate_bgr), tables)
+
+
+def _matte(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+    alpha = np.rint(255.0 * np.clip(1.0 - seen.overlay.shines_through, 0.0, 1.0)).astype(np.uint8)
+    return _placed(np.repeat(alpha[..., None], 3, axis=2), seen.overlay, plate_bgr)
+
+
+def _depth(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+    if seen.drawing.depth_m is None:
+        return np.zeros_like(plate_bgr)
+    overlay, dioptres, there = _moved((1.0 / seen.drawing.depth_m).astype(np.float32), seen)
+    known = dioptres[there]
+    far, near = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    nearness = np.clip((dioptres - far) / max(near - far, _SAME_DIOPTRES), 0.0, 1.0)
+    colours = cv2.applyColorMap(np.rint(255.0 * nearness).astype(np.uint8), cv2.COLORMAP_JET)
+    return _placed(np.where(there[..., None], colours, 0).astype(np.uint8), overlay, plate_bgr)
+
+
+def _coc(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+    drawing = seen.drawing
+    if drawing.sharp is None or drawing.depth_m is None or drawing.lens is None:
+        return np.zeros_like(plate_bgr)
+    coc_px = drawing.lens.coc_px(drawing.depth_m, drawing.depth_m.shape[1]) / drawing.request.resolution
+    overlay, coc_px, there = _moved(np.where(np.isfinite(drawing.depth_m), coc_px, 0.0).astype(np.float32), seen)
+    share = np.clip(coc_px / max(float(np.abs(coc_px[there]).max(initial=0.0)), 1.0), -1.0, 1.0)
+    blue, red = 1.0 - np.maximum(share, 0.0), 1.0 + np.minimum(share, 0.0)
+    colours = np.rint(255.0 * np.stack([blue, np.minimum(blue, red), red], axis=2))
+    return _placed(np.where(there[..., None], colours, 0).astype(np.uint8), overlay, plate_bgr)
+
+
+def _moved(values: Plane, seen: Seen) -> tuple[Overlay, Float32[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
+    """Values of the sharp picture in the newest one: (where, the values, whether there is anything)."""
+    sharp = seen.drawing.sharp
+    assert sharp is not None, "a drawing with depth has a sharp layer"
+    alpha = sharp.rgba[..., 3]
+    weighted = np.stack([values * alpha, np.zeros_like(alpha), np.zeros_like(alpha), alpha], axis=2)
+    overlay = replace(sharp, rgba=np.ascontiguousarray(weighted)).moved_to(seen.camera)
+    weight = 1.0 - overlay.shines_through
+    there = weight > _LEAST
+    mean = np.zeros_like(weight)
+    np.divide(overlay.rgb[..., 0], weight, out=mean, where=there)
+    return overlay, mean, there
+
+
+def _placed(colours: UInt8[np.ndarray, "rows columns 3"], overlay: Overlay, plate_bgr: Bgr) -> Bgr:
+    """A picture as large as the plate, black outside the overlay's box."""
+    result = np.zeros_like(plate_bgr)
+    height, width = overlay.shines_through.shape
+    result[overlay.top_px : overlay.top_px + height, overlay.left_px : overlay.left_px + width] = colours
+    return result
+
+
+_PAINTERS: dict[str, Callable[[Bgr, Seen, CodeTables], Bgr]] = {
+    "final": _final,
+    "plate": _plate,
+    "virtual": _virtual,
+    "matte": _matte,
+    "depth": _depth,
+    "coc": _coc,
+}
+VIEWS = tuple(_PAINTERS)
+
+
+_FARTHEST_M = 100.0
+_PARALLEL = 1e-12
+
+
+def object_at(seen: Seen, x_px: float, y_px: float) -> tuple[str, float] | None:
+    """Name and depth (metres, along the optical axis) of the virtual object at a point of the newest picture; None where there is none."""
+    eye_m, ray = _ray(seen.camera, x_px, y_px)
+    parts = seen.staged.parts_at(seen.drawing.request.time_s)
+    met = [(_nearest_m(scene, eye_m, ray), name) for name, scene in parts.items()]
+    depth_m, name = min(met, default=(float("inf"), ""))
+    real_m = _real_depth_m(seen.occlusion, seen.camera, x_px, y_px)
+    return (name, depth_m) if depth_m < min(real_m, _FARTHEST_M) else None
+
+
+def table_point_m(seen: Seen, x_px: float, y_px: float, height_m: float = 0.0) -> Triple | None:
+    """Where the ray through a point of the picture meets the table, in the tracker's world; None where it does not within 100 m.
+
+    height_m: of the plane above the table: dragging an object that floats moves it in the plane in which it is.
+    """
+    eye_m, ray = _ray(seen.camera, x_px, y_px)
+    depth_m = _table_depth_m(eye_m, ray, height_m)
+    if not depth_m < _FARTHEST_M:
+        return None
+    x, y, z = (eye_m + depth_m * ray).tolist()
+    return turned_back((x, y, z), seen.staged.description.up)
+
+
+def depth_at_m(seen: Seen, x_px: float, y_px: float) -> float:
+    """What a tap there focuses on: the virtual object, else the depth that was measured, else the table. InputError for none of them."""
+    picked = object_at(seen, x_px, y_px)
+    if picked is not None:
+        return picked[1]
+    eye_m, ray = _ray(seen.camera, x_px, y_px)
+    known_m = _real_depth_m(seen.occlusion, seen.camera, x_px, y_px), _table_depth_m(eye_m, ray)
+    depth_m = next((each for each in known_m if each < _FARTHEST_M), None)
+    if depth_m is None:
+        raise InputError(f"cannot focus at ({x_px:g}, {y_px:g}): expected an object or the table there, found neither; tap on one of them")
+    return depth_m
+
+
+def _ray(camera: Camera, x_px: float, y_px: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    if not (0.0 <= x_px <= camera.width_px and 0.0 <= y_px <= camera.height_px):
+        raise InputError(f"expected a point in the picture of {camera.width_px}x{camera.height_px} px, got ({x_px:g}, {y_px:g})")
+    return camera.world_from_camera[:3, 3], rays(camera, np.array([[x_px, y_px]]))[0]
+
+
+def _table_depth_m(eye_m: Float[np.ndarray, "3"], ray: Float[np.ndarray, "3"], height_m: float = 0.0) -> float:
+    """inf where the ray does not fall onto the level plane (up is -y)."""
+    if abs(ray[1]) < _PARALLEL:
+        return float("inf")
+    depth_m = float((-height_m - eye_m[1]) / ray[1])
+    return depth_m if depth_m > 0 else float("inf")
+
+
+def _real_depth_m(occlusion: Occlusion | None, camera: Camera, x_px: float, y_px: float) -> float:
+    """Depth measured at the pixel; inf where nothing was."""
+    column, row = min(int(x_px), camera.width_px - 1), min(int(y_px), camera.height_px - 1)
+    one_pixel = Camera(1, 1, camera.focal_px, (camera.principal_px[0] - column, camera.principal_px[1] - row), camera.camera_from_world)
+    depth_m = None if occlusion is None else occlusion.depth_m(one_pixel)
+    return float("inf") if depth_m is None else float(depth_m[0, 0])
+
+
+def _nearest_m(scene: Scene, eye_m: Float[np.ndarray, "3"], ray: Float[np.ndarray, "3"]) -> float:
+    """First crossing of a ray with any triangle, from either side (Moeller and Trumbore 1997); in units of the ray's length."""
+    corners = [mesh.positions_m[mesh.triangles] for mesh in scene.meshes if len(mesh.triangles)]
+    if not corners:
+        return float("inf")
+    a, b, c = np.concatenate(corners).transpose(1, 0, 2)
+    across, along, from_eye = np.cross(ray, c - a), b - a, eye_m - a
+    determinant = np.einsum("tk,tk->t", along, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = np.einsum("tk,tk->t", from_eye, across) / determinant
+        q = np.cross(from_eye, along)
+        v = q @ ray / determinant
+        depth_m = np.einsum("tk,tk->t", c - a, q) / determinant
+    hit = (np.abs(determinant) > _PARALLEL * np.abs(along).max()) & (u >= 0) & (v >= 0) & (u + v <= 1) & (depth_m > 0)
+    return float(depth_m[hit].min()) if hit.any() else float("inf")
+
+
+_LEAST_DETERMINANT = 1e-12
+
+
+def ground_from_picture(camera: Camera, up: str) -> Float[np.ndarray, "3 3"] | None:
+    """(x, y, 1), right and down from 0 to 1 in the picture, to (x, z) in metres on the table, times their third component.
+
+    camera: with its pose in the tracker's world; up: which of its directions is up. A ground point (x, 0, z) is seen at
+    K [r_1 r_3 t] (x, z, 1) for a camera with the pose [r_1 r_2 r_3 | t] (Hartley and Zisserman 2004, 8.1.1). None where the eye is
+    in the table.
+    """
+    pose = upright_camera(camera, up).camera_from_world
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
+    intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    share_from_px = np.diag([1.0 / camera.width_px, 1.0 / camera.height_px, 1.0])
+    picture_from_ground = share_from_px @ intrinsics @ pose[:3, [0, 2, 3]]
+    if abs(np.linalg.det(picture_from_ground)) < _LEAST_DETERMINANT:
+        return None
+    return np.asarray(np.linalg.inv(picture_from_ground))
