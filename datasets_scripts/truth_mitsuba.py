@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int
 
-from mrbokeh.scene.mitsuba.variant import find_llvm
+from mrbokeh.scene.mitsuba.mitsuba_tracer import find_llvm
 from mrbokeh.system.errors import InputError, MissingExtraError
 
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"

@@ -116,7 +116,7 @@ def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
 def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) -> LayersFor:
     """Without a camera file the world of the scene is the plate's camera."""
     from mrbokeh.scene.staging.scene_file import read_scene_file
-    from mrbokeh.shots.scene_camera import scene_track
+    from mrbokeh.shots.frame_sources import scene_track
 
     description = read_scene_file(path)
 

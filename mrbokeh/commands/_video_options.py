@@ -9,7 +9,7 @@ import typer
 from mrbokeh.commands import _insertion_options as shared
 from mrbokeh.commands._insertion_options import LENS, PLATE, RESULT, VIRTUAL
 from mrbokeh.renderers.choose import DEFAULT
-from mrbokeh.shots.segment import SEGMENT_S
+from mrbokeh.shots.shot import SEGMENT_S
 
 WORK = "Who works"
 

@@ -26,7 +26,7 @@ def blender_addon(
 
     if out.exists() and not out.is_dir():
         raise InputError(f"expected a folder for the add-on, but {out} is a file: name a folder")
-    source, target = files("mrbokeh.scene.blender") / "mrbokeh_export.py", out / "mrbokeh_export.py"
+    source, target = files("mrbokeh.scene") / "blender_addon.py", out / "mrbokeh_export.py"
     refuse_existing(target, overwrite)
     with atomic_path(target) as temporary:
         temporary.write_bytes(source.read_bytes())

@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 import typer
 
 from mrbokeh.commands import _composite_options as options
-from mrbokeh.commands._insertion_options import ColourOptions, VirtualOptions
-from mrbokeh.commands._look_options import LookGroup
+from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
 from mrbokeh.commands._option_groups import grouped
 
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_layers import LayersFor
-    from mrbokeh.compositing.base import Insertion
+    from mrbokeh.compositing.plate import Insertion
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.base import Renderer
 
@@ -44,11 +43,9 @@ def composite(
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
     from mrbokeh.commands._composite_layers import layers_by
-    from mrbokeh.commands._composite_outputs import alpha_lost, blur_told, check_outputs, write_results
-    from mrbokeh.commands._composite_plate import best_mode, plate_by
+    from mrbokeh.commands._composite_outputs import alpha_lost, best_mode, blur_told, check_outputs, plate_by, write_results
     from mrbokeh.compositing.choose import insertion_of
-    from mrbokeh.compositing.plate_look.finishing import finished
-    from mrbokeh.compositing.plate_look.look_options import finishing_of
+    from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
     from mrbokeh.system.console import working

@@ -23,8 +23,8 @@ def demo(
     from rich.console import Console
 
     from mrbokeh.demo.plan import demo_stages
+    from mrbokeh.demo.report import write_story
     from mrbokeh.demo.stages import run_stages
-    from mrbokeh.demo.story import write_story
 
     console = Console()
     out.mkdir(parents=True, exist_ok=True)

@@ -47,6 +47,8 @@ PROGRAMS = (
     ("exiftool", "metadata of more cameras (49 of 54 files are read without it)", "install exiftool with your system's package manager"),
     ("nvidia-smi", "training and rendering on an NVIDIA GPU", "install the GPU driver; everything works without one, slower"),
 )
+OPENCV = "opencv-contrib-python-headless"
+OTHER_OPENCV = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
 
 
 @app.command()
@@ -67,7 +69,7 @@ def findings() -> list[Finding]:
     """Every optional thing with its version or path, None where it is missing."""
     packages = [Finding(name, _version(name), enables, remedy) for name, enables, remedy in PACKAGES]
     programs = [Finding(name, shutil.which(name), enables, remedy) for name, enables, remedy in PROGRAMS]
-    return [*packages, _cuda(), _graphics_device(), _llvm(), *programs]
+    return [*packages, _opencv(), _cuda(), _graphics_device(), _llvm(), *programs]
 
 
 def _version(package: str) -> str | None:
@@ -75,6 +77,13 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def _opencv() -> Finding:
+    """Find other packages of OpenCV beside ours: all write into one folder `cv2`, the last one installed wins."""
+    others = [name for name in OTHER_OPENCV if _version(name)]
+    remedy = f"pip uninstall -y {' '.join(others)} {OPENCV} && pip install {OPENCV}" if others else "pip install mrbokeh"
+    return Finding(OPENCV, None if others else _version(OPENCV), "picture files, registration, filters", remedy)
 
 
 def _cuda() -> Finding:
@@ -88,7 +97,7 @@ def _graphics_device() -> Finding:
 
 
 def _llvm() -> Finding:
-    from mrbokeh.scene.mitsuba.variant import find_llvm
+    from mrbokeh.scene.mitsuba.mitsuba_tracer import find_llvm
 
     found = find_llvm()
     return Finding("LLVM library", None if found is None else str(found), "Mitsuba's compiler", "Debian: apt install libllvm19")

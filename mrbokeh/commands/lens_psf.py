@@ -116,8 +116,8 @@ def spreadlets(
     import numpy as np
 
     from mrbokeh.optics.psf_bank_file import SPREADLETS
+    from mrbokeh.renderers.bank.kernel_files import build_spreadlets
     from mrbokeh.renderers.kernels.spreadlets import Sparsification
-    from mrbokeh.renderers.kernels.spreadlets_build import build_spreadlets
     from mrbokeh.system.console import kept_when_interrupted
 
     settings = Sparsification(points_per_px=points_per_px, lloyd_steps=lloyd_steps, annealing_steps=annealing_steps, seed=seed)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.refocus.refocusing import Refocusing
+from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.errors import InputError
 

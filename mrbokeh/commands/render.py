@@ -55,12 +55,11 @@ def render(
 
     Example: mrbokeh render --rgb aif.exr --depth z.exr --lens lens.json --focus-at 640,360 --out blurred.exr
     """
-    from mrbokeh.commands._render_method import focused, reconstructed
-    from mrbokeh.commands._render_sharp import Sources, read_sharp
+    from mrbokeh.commands._render_inputs import Sources, focused, read_sharp, reconstructed
     from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
     from mrbokeh.layering.layering import Layering
     from mrbokeh.optics.lens_file import read_lens
-    from mrbokeh.renderers.choose_bank import chosen_renderer
+    from mrbokeh.renderers.choose import chosen_renderer
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import working
 

@@ -1,26 +1,156 @@
-"""`mrbokeh video`: virtual objects in every frame of a clip, blurred by its lens."""
+"""`mrbokeh video`: virtual objects in every frame of a clip, blurred by its lens.
+
+The shot of `mrbokeh video`, as options say: what makes its frames, where they go, and which of the clip they are.
+"""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from mrbokeh.commands import _video_options as options
-from mrbokeh.commands._insertion_options import ColourOptions, VirtualOptions
-from mrbokeh.commands._look_options import LookGroup
+from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
 from mrbokeh.commands._option_groups import grouped
-from mrbokeh.commands._video_shot import parse_frames as parse_frames
-from mrbokeh.commands._video_shot import recipe_of, shot_of, target_of
-from mrbokeh.shots.crew import Crew, OneProcess
-from mrbokeh.shots.dask_crew import DaskCrew
-from mrbokeh.shots.making import make_shot
-from mrbokeh.shots.process_crew import ProcessCrew
+from mrbokeh.compositing.choose import DEFAULT_MODE
+from mrbokeh.compositing.plate_look.finishing import LookOptions
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.renderers.choose import BY_NAME
+from mrbokeh.shots.composite_recipe import CompositeRecipe
+from mrbokeh.shots.executors import Crew, DaskCrew, OneProcess, ProcessCrew
+from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
+from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
+from mrbokeh.shots.render_shot import make_shot
 from mrbokeh.shots.shot import Shot, Target
+from mrbokeh.shots.targets import SequenceTarget, VideoTarget
+from mrbokeh.stacks.photograph import Holding, lens_held
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
+from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
 from mrbokeh.video.clip import has_alpha_apart
-from mrbokeh.video.picture_sources.base import PictureSource
-from mrbokeh.video.picture_sources.choose import open_source
+from mrbokeh.video.encodings import with_alpha
+from mrbokeh.video.image_sequence import is_pattern
+from mrbokeh.video.picture_source import PictureSource, open_source, parse_rate
+
+if TYPE_CHECKING:
+    from mrbokeh.shots.layer_sources import SceneLayers
+
+
+def recipe_of(
+    source: PictureSource,
+    lens: Path,
+    taken: options.ClipOptions,
+    virtual: VirtualOptions,
+    rendering: options.RenderingOptions,
+    look: LookGroup,
+    blur: options.BlurOptions,
+    *,
+    virtual_only: bool,
+) -> CompositeRecipe:
+    """How every frame is made. Raises InputError where options do not go together."""
+    _check_virtual(virtual, rendering)
+    objects = virtual.object_names
+    files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
+    return CompositeRecipe(
+        lens=lens.resolve(),
+        layers=sources_by_depth(files, _scene_layers(source, virtual, rendering)),
+        renderer=_renderer(blur.renderer),
+        mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
+        camera=_camera(source, virtual),
+        focus=None if blur.focus_pull is None else FocusPulled.of(blur.focus_pull),
+        depth=None if taken.depth is None else DepthFiles(taken.depth.resolve(), taken.steady_depth),
+        matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
+        near_m=taken.near_distance,
+        look=_look(look, source, taken),
+        first_number=_first_number(source, taken),
+        virtual_only=virtual_only,
+        holding=_holding(source, lens),
+    )
+
+
+def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour: ColourOptions, result: options.ResultOptions) -> Target:
+    if is_pattern(out):
+        for name, value in (("--encoding", result.encoding), ("--constant-rate", result.constant_rate)):
+            if value is not None:
+                raise InputError(f"{name} {value} is for videos, but {out} are pictures: leave it out")
+        return SequenceTarget(out.resolve(), recipe.first_number, result.virtual_only, colour.of_result)
+    keeping = with_alpha(out) if result.virtual_only or source.info.has_alpha else None
+    encoding = result.encoding or keeping or ("prores4444-alpha" if result.virtual_only else None)
+    sound = None if is_pattern(source.path) else source.path
+    even_rate = None if result.constant_rate is None else parse_rate(result.constant_rate)
+    return VideoTarget(out.resolve(), encoding, sound, colour.of_result, even_rate)
+
+
+def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, frames: str, segment_s: float) -> Shot:
+    """frames: START:STOP as typed."""
+    (start, stop), count = parse_frames(frames), len(source.times_s)
+    if start >= count:
+        raise InputError(f"--frames {frames} leaves nothing of {source.path}: expected a range within its {count} frames")
+    last = min(count, count if stop is None else stop)
+    return Shot(source, recipe, target, start, last, max(1, round(segment_s * source.info.frame_rate)))
+
+
+def parse_frames(text: str) -> tuple[int, int | None]:
+    """START:STOP, either of which may be missing, as (first frame, first one left out or None)."""
+    start, colon, stop = text.partition(":")
+    try:
+        parsed = int(start or 0), int(stop) if stop else None
+    except ValueError:
+        parsed = (-1, None)
+    if not colon or parsed[0] < 0 or (parsed[1] is not None and parsed[1] <= parsed[0]):
+        raise InputError(f"--frames: expected START:STOP with START below STOP, such as 0:50 or 100:, got {text!r}")
+    return parsed
+
+
+def _check_virtual(virtual: VirtualOptions, rendering: options.RenderingOptions) -> None:
+    if not virtual.layer and virtual.scene is None:
+        raise InputError("nothing to put into the clip: give --layer RGBAZ.exr or --scene SCENE.toml")
+    for_scenes = (rendering.shutter, rendering.distortion, virtual.camera)
+    if virtual.scene is None and any(each is not None for each in for_scenes):
+        raise InputError("--camera, --shutter and --distortion are for what --scene renders: layers in files have theirs in them")
+
+
+def _scene_layers(source: PictureSource, virtual: VirtualOptions, rendering: options.RenderingOptions) -> "tuple[SceneLayers, ...]":
+    if virtual.scene is None:
+        return ()
+    from mrbokeh.scene.moving_layers import ShutterTiming
+    from mrbokeh.shots.layer_sources import SceneLayers
+
+    rate, shutter = float(source.info.frame_rate), rendering.shutter
+    timing = None if shutter is None else ShutterTiming(rate, shutter, readout_s=rendering.readout)
+    return (SceneLayers(virtual.scene.resolve(), rendering.filming(timing), rendering.scene_begin),)
+
+
+def _camera(source: PictureSource, virtual: VirtualOptions) -> CameraFile | None:
+    if virtual.camera is None or virtual.scene is None:
+        return None
+    from mrbokeh.scene.staging.scene_file import read_scene_file
+
+    return CameraFile.of_clip(virtual.camera.resolve(), source.info, read_scene_file(virtual.scene).up)
+
+
+def _look(look: LookGroup, source: PictureSource, taken: options.ClipOptions) -> ClipLook | None:
+    if look.wanted == LookOptions(seed=look.seed):
+        return None
+    start, _ = parse_frames(taken.frames)
+    return ClipLook(look.wanted, source.path, taken.rate, start, _first_number(source, taken), source.space)
+
+
+def _holding(source: PictureSource, lens: Path) -> Holding:
+    """Told here and once, for every worker turns the lens alike."""
+    holding = Holding((source.info.width_px, source.info.height_px), source.info.quarter_turns)
+    lens_held(read_lens(lens), holding, source.path)
+    return holding
+
+
+def _first_number(source: PictureSource, taken: options.ClipOptions) -> int:
+    return source.first_number if taken.first_number is None else taken.first_number
+
+
+def _renderer(name: str) -> str:
+    """A network as an absolute path, for workers may stand elsewhere."""
+    return str(Path(name).resolve()) if name not in BY_NAME and name.endswith(".onnx") else name
+
 
 app = typer.Typer(add_completion=False)
 

@@ -16,7 +16,7 @@ from mrbokeh.compositing.plate import Inserted, Insertion, Plate, same_size
 from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.layering.motion import farthest_px
 from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
-from mrbokeh.layering.spreading import reach_px
+from mrbokeh.layering.psf_over_field import reach_px
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError

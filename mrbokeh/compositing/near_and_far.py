@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float32, Int64
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import apart
-from mrbokeh.layering.lit_pixels import lights, without_lights
-from mrbokeh.layering.sheets import Sheet
+from mrbokeh.layering.highlights import lights, without_lights
+from mrbokeh.layering.padded_layers import Sheet
 from mrbokeh.system.resources import workers
 
 _TWO_DEEP = 2.0

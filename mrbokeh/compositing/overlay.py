@@ -61,7 +61,7 @@ class Overlay:
 
     def over_codes(self, frame_bgr: UInt8[np.ndarray, "height width 3"], tables: CodeTables) -> UInt8[np.ndarray, "height width 3"]:
         """The same on 8-bit codes, blue first, in linear light through the tables; light above 1 is clipped."""
-        from mrbokeh.compositing._overlay_numba import over_codes
+        from mrbokeh.compositing._pixel_light_numba import over_codes
 
         result = frame_bgr.copy()
         over_codes(result, self.top_px, self.left_px, self.rgb, self.shines_through, *tables)

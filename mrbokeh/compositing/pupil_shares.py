@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from mrbokeh.compositing.near_and_far import NearAndFar
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.lit_pixels import without_lights
-from mrbokeh.layering.spreading import FIELD_CELLS, Frame
+from mrbokeh.layering.highlights import without_lights
+from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.resources import in_bands, workers

@@ -1,19 +1,62 @@
-"""Stages of the demo: commands of `mrbokeh` run one after the other, each skipped when it is done already."""
+"""Stages of the demo: commands of `mrbokeh` run one after the other, each skipped when it is done already.
+
+What a stage of the demo was last run with: whether it can be skipped, goes on where it stopped, or has to be made anew.
+"""
 
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from uuid import uuid4
 
 from rich.console import Console
 
-from mrbokeh.demo.records import Record, must_be_anew, read_record, write_record
+from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run of a stage.
+
+    run: its own name. inputs: the run of every stage that fed it, by the stage's name.
+    anew: whether it was told to replace what was there. seconds: how long it took; None while it is not finished.
+    """
+
+    run: str
+    arguments: tuple[str, ...]
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    anew: bool = False
+    seconds: float | None = None
+
+    def still_holds(self, arguments: Sequence[str], inputs: Mapping[str, str]) -> bool:
+        """Whether the stage would do the same today; a feeding stage that ran since has another name of its run."""
+        return self.arguments == tuple(arguments) and dict(self.inputs) == dict(inputs)
+
+
+def read_record(path: Path) -> Record | None:
+    """None where the stage never began. Records of earlier versions hold for nothing."""
+    if not path.is_file():
+        return None
+    document = read_json(path, "the record of a stage")
+    known = {name: document[name] for name in ("inputs", "anew", "seconds") if name in document}
+    return Record(str(document.get("run", "")), tuple(document["arguments"]), **known)
+
+
+def write_record(path: Path, record: Record) -> None:
+    write_json(path, vars(record) | {"arguments": list(record.arguments), "inputs": dict(record.inputs)})
+
+
+def must_be_anew(record: Record | None, arguments: Sequence[str], inputs: Mapping[str, str]) -> bool:
+    """Of a stage that has to run: whether what it left behind must be replaced. What an interrupted run has of today's goes on;
+    one that was interrupted while it replaced may have left older parts."""
+    if record is None:
+        return False
+    return record.anew or record.seconds is not None or not record.still_holds(arguments, inputs)
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,10 @@ What lies where:
 Only light modules are imported here; the loader and the backends are imported by their own names.
 """
 
-from mrbokeh.scene.base import SceneRenderer
-from mrbokeh.scene.environment import NEUTRAL_RADIANCE, Environment, neutral_environment, split_sun
-from mrbokeh.scene.light import Light, sun
+from mrbokeh.scene.light import NEUTRAL_RADIANCE, Environment, Light, neutral_environment, split_sun, sun
 from mrbokeh.scene.material import Material, Texture, emitter, matte
-from mrbokeh.scene.mesh import Mesh
-from mrbokeh.scene.shapes import rectangle, shadow_catcher, sphere
-from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF, Scene, world_from_scene_placing
+from mrbokeh.scene.mesh import Mesh, rectangle, shadow_catcher, sphere
+from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF, Scene, SceneRenderer, world_from_scene_placing
 
 __all__ = [
     "NEUTRAL_RADIANCE",

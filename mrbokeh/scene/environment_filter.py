@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.scene._environment_numba import PanoramaLevels, brdf_integral, cosine_convolved, ggx_convolved, ggx_lobe
-from mrbokeh.scene.environment import Environment, directions, solid_angles_sr
+from mrbokeh.scene._lighting_numba import PanoramaLevels, brdf_integral, cosine_convolved, ggx_convolved, ggx_lobe
+from mrbokeh.scene.light import Environment, directions, solid_angles_sr
 
 _LARGEST_WIDTH_PX = 2048
 _MATTE_SIZE_PX = (32, 64)

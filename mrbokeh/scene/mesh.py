@@ -1,11 +1,17 @@
-"""Mesh: triangles with normals, texture coordinates and one material; the tangents that normal maps need."""
+"""Mesh: triangles with normals, texture coordinates and one material; the tangents that normal maps need.
 
+Simple meshes with exact normals: the sphere, the rectangle and the box of tests, demonstrations and shadow catchers.
+
+Whether meshes are others moved as one rigid body: then what was prepared for those serves for these.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Float64, Int32
 
-from mrbokeh.scene.material import Material
+from mrbokeh.scene.material import Material, Triple
 from mrbokeh.system.errors import InputError
 
 
@@ -96,3 +102,118 @@ def with_tangents(mesh: Mesh) -> Mesh:
     total -= normals * (total * normals).sum(-1, keepdims=True)
     tangents = np.concatenate([unit(total), np.where(sign < 0, -1.0, 1.0)[:, None]], axis=1)
     return replace(mesh, tangents=tangents.astype(np.float32))
+
+
+def sphere(centre_m: Triple, radius_m: float, material: Material, rows: int = 64) -> Mesh:
+    """A sphere of `rows` rings and twice as many meridians, vertices on the sphere (faces therefore a little inside).
+
+    The largest distance between face and sphere is about radius * (pi / rows)**2 / 4.
+    """
+    polar, longitude = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, 2 * rows + 1), indexing="ij")
+    normals = np.stack([np.sin(polar) * np.sin(longitude), -np.cos(polar), -np.sin(polar) * np.cos(longitude)], axis=-1).reshape(-1, 3)
+    uvs = np.stack([longitude / (2 * np.pi), polar / np.pi], axis=-1).reshape(1, -1, 2)
+    row, column = (index.ravel() for index in np.meshgrid(np.arange(rows), np.arange(2 * rows), indexing="ij"))
+    corner = row * (2 * rows + 1) + column
+    below = corner + 2 * rows + 1
+    quads = np.stack([corner, below + 1, corner + 1, corner, below, below + 1], axis=-1).reshape(-1, 3)
+    degenerate = np.stack([row == 0, row == rows - 1], axis=-1).ravel()
+    return Mesh(
+        positions_m=np.asarray(centre_m) + radius_m * normals,
+        triangles=quads[~degenerate].astype(np.int32),
+        normals=normals.astype(np.float32),
+        uvs=uvs.astype(np.float32),
+        material=material,
+        name="sphere",
+    )
+
+
+def rectangle(
+    corner_m: Triple,
+    side_u_m: Triple,
+    side_v_m: Triple,
+    material: Material,
+    catches_shadow: bool = False,
+) -> Mesh:
+    """The parallelogram corner + u * side_u + v * side_v, u and v from 0 to 1, which are also its texture coordinates.
+
+    Its front is where side_v x side_u points: with u to the right and v down as seen, it faces the viewer.
+    """
+    corner, side_u, side_v = np.asarray(corner_m, float), np.asarray(side_u_m, float), np.asarray(side_v_m, float)
+    uvs = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    normal = np.cross(side_v, side_u)
+    return Mesh(
+        positions_m=corner + uvs[:, :1] * side_u + uvs[:, 1:] * side_v,
+        triangles=np.array([[0, 2, 1], [0, 3, 2]], np.int32),
+        normals=np.repeat((normal / np.linalg.norm(normal))[None], 4, axis=0).astype(np.float32),
+        uvs=uvs[None],
+        material=material,
+        name="rectangle",
+        catches_shadow=catches_shadow,
+    )
+
+
+def shadow_catcher(height_y_m: float, centre_xz_m: tuple[float, float], half_size_m: float) -> Mesh:
+    """A level square at y = height_y_m (up is -y) that is not drawn but receives shadows."""
+    x, z = centre_xz_m
+    return rectangle(
+        (x - half_size_m, height_y_m, z + half_size_m), (2 * half_size_m, 0, 0), (0, 0, -2 * half_size_m), Material(), catches_shadow=True
+    )
+
+
+_SAMPLES = 256
+_PLACE_TOLERANCE = 2.0**-24
+"""Of the extent: half of what rounding to float32, the precision of the ray tracer, changes at most."""
+_NORMAL_TOLERANCE = 1e-5
+
+
+def rigid_motion(before: Sequence[Mesh], after: Sequence[Mesh]) -> Float64[np.ndarray, "4 4"] | None:
+    """(4, 4) after_from_before, or None where anything but a common motion without scaling changed.
+
+    Meshes count as the same where they share triangles, texture coordinates, colours and material as objects, as
+    `Mesh.transformed` leaves them; then every vertex, normal and tangent is checked.
+    """
+    if len(before) != len(after) or not all(map(_shares_all_but_place, before, after)):
+        return None
+    if all(one is other for one, other in zip(before, after, strict=True)):
+        return np.eye(4)
+    motion = _fitted(_sampled(before), _sampled(after))
+    return motion if all(_is_moved(one, other, motion) for one, other in zip(before, after, strict=True)) else None
+
+
+def _shares_all_but_place(one: Mesh, other: Mesh) -> bool:
+    shared = one.triangles is other.triangles and one.uvs is other.uvs and one.colors is other.colors and one.material is other.material
+    same_tangents = (one.tangents is None) == (other.tangents is None)
+    return shared and same_tangents and len(one.positions_m) == len(other.positions_m)
+
+
+def _sampled(meshes: Sequence[Mesh]) -> Float64[np.ndarray, "points 3"]:
+    points_m = [mesh.positions_m[:: max(1, len(mesh.positions_m) * len(meshes) // _SAMPLES)] for mesh in meshes]
+    return np.concatenate(points_m).astype(np.float64)
+
+
+def _fitted(before_m: Float64[np.ndarray, "points 3"], after_m: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "4 4"]:
+    """The rotation and shift of least squares (Kabsch 1976)."""
+    middle_before, middle_after = before_m.mean(0), after_m.mean(0)
+    left, _, right = np.linalg.svd((after_m - middle_after).T @ (before_m - middle_before))
+    keeps_hands = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    motion = np.eye(4)
+    motion[:3, :3] = left @ keeps_hands @ right
+    motion[:3, 3] = middle_after - motion[:3, :3] @ middle_before
+    return motion
+
+
+def _is_moved(one: Mesh, other: Mesh, motion: Float64[np.ndarray, "4 4"]) -> bool:
+    """Whether `other` is `one` under this motion, in all that shading looks at."""
+    turn = motion[:3, :3]
+    tolerance_m = _PLACE_TOLERANCE * float(np.ptp(one.positions_m, axis=0).max(initial=0.0))
+    if np.abs(one.positions_m @ turn.T + motion[:3, 3] - other.positions_m).max(initial=0.0) > tolerance_m:
+        return False
+    if not _is_turned(one.normals, other.normals, turn):
+        return False
+    if one.tangents is None or other.tangents is None:
+        return True
+    return _is_turned(one.tangents[:, :3], other.tangents[:, :3], turn) and np.array_equal(one.tangents[:, 3], other.tangents[:, 3])
+
+
+def _is_turned(one: Float32[np.ndarray, "n 3"], other: Float32[np.ndarray, "n 3"], turn: Float64[np.ndarray, "3 3"]) -> bool:
+    return float(np.abs(one @ turn.T.astype(np.float32) - other).max(initial=0.0)) < _NORMAL_TOLERANCE

@@ -1,24 +1,71 @@
-"""Camera, focus and depth of each frame, from files."""
+"""Camera, focus and depth of each frame, from files.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+The camera of a scene file: a track whose world points up as the scene's does.
+
+ClipLook: what makes virtual light look as if the clip's camera had taken it, measured in the first frames.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.compositing.plate import Inserted, Plate
+from mrbokeh.compositing.plate_look.colour_match import ColourMatch, triple_of
+from mrbokeh.compositing.plate_look.exposure_match import stated_exposure
+from mrbokeh.compositing.plate_look.finishing import Finishing, LookOptions, finished, finishing_of
 from mrbokeh.depth.depth_filters import TemporalDepthFilter
+from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.image_io import read_depth, read_image
-from mrbokeh.optics.camera import Camera
-from mrbokeh.shots.hooks import CameraSource, DepthSource, FocusSource, MatteSource, Moment
-from mrbokeh.shots.kept import Kept
-from mrbokeh.shots.scene_camera import scene_track
+from mrbokeh.optics.camera import Camera, have_same_shape
+from mrbokeh.shots.hooks import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
+from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys, read_focus_pull
-from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
+from mrbokeh.tracking.camera_track.formats import format_of_file, read_track
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions
 from mrbokeh.video.clip import VideoInfo
-from mrbokeh.video.picture_sources.numbered_files import is_pattern, numbered
+from mrbokeh.video.image_sequence import is_pattern, numbered
+from mrbokeh.video.picture_source import PictureSource, open_source
+
+
+def scene_track(path: Path, size_px: tuple[int, int], scene_up: str) -> CameraTrack:
+    """size_px: (width, height) of the plate. scene_up: what points up in the world of the scene, in which its objects are placed.
+
+    A file of one camera does not say what is up, so it is the scene's. Any other track has an axis of its own; where that is another
+    one, places of objects and poses of the camera are not of one world, and no turn can tell which of them is meant: InputError. So it is
+    where the track's pictures have another shape than the plate.
+    """
+    is_single = _is_single_camera(path)
+    track = read_track(path, TrackOptions(up=scene_up, size_px=size_px) if is_single else TrackOptions(size_px=size_px))
+    if not have_same_shape(track.size_px, size_px):
+        raise InputError(
+            f"{path}: expected a camera for pictures of the plate's shape ({size_px[0]}x{size_px[1]}), got one for "
+            f"{track.size_px[0]}x{track.size_px[1]}: was it made for another clip, or for one that is turned or cropped?"
+        )
+    if not is_single and track.up != scene_up:
+        raise InputError(
+            f"{path}: {track.up} points up in this track{_remark(path)}, but {scene_up} in the scene: where the scene's places are the "
+            f"track's, write up = {track.up!r} into the scene file, else turn the track: "
+            f"mrbokeh track convert {path.name} turned.json --out-up={scene_up}"
+        )
+    return track
+
+
+def _is_single_camera(path: Path) -> bool:
+    if not path.exists() or format_of_file(path) != "json":
+        return False
+    document = read_json(path, "a camera track")
+    return isinstance(document, dict) and "camera_from_world" in document
+
+
+def _remark(path: Path) -> str:
+    """What is no more than usual may be stated otherwise."""
+    return " (as in most of COLMAP's maps; state another by --up in that conversion)" if format_of_file(path) == "colmap" else ""
+
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -27,7 +74,7 @@ Plane = Float32[np.ndarray, "height width"]
 class CameraFile:
     """Description of a fixed camera (JSON) or a track, in any form that mrbokeh.tracking.camera_track reads.
 
-    size_px, frame_rate: of the clip. up: what points up in the world of the scene that it looks at (mrbokeh.shots.scene_camera).
+    size_px, frame_rate: of the clip. up: what points up in the world of the scene that it looks at (mrbokeh.shots.frame_sources).
     """
 
     path: Path
@@ -166,3 +213,64 @@ def _of_size(plane: Plane, moment: Moment, path: Path) -> Plane:
     if plane.shape != (height, width):
         raise InputError(f"{path} is {plane.shape[1]}x{plane.shape[0]} px but the clip is {width}x{height} px: resize it to that size")
     return plane
+
+
+@dataclass(frozen=True)
+class ClipLook:
+    """Description of a Finisher: options as typed, and the clip whose frames `start` and the next are measured, by every worker alike.
+
+    Exposures are those that numbered pictures state, each its own: a camera that steps its exposure from frame to frame takes the
+    virtual light with it. One that the user states is that of all frames. first_number: of the clip's frame 0. space: of its numbers.
+    """
+
+    options: LookOptions
+    clip: Path
+    rate: str | None
+    start: int
+    first_number: int = 0
+    space: NamedSpace | None = None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        texts = (self.options.grain, self.options.vignetting, self.options.match_exposure)
+        return tuple(path for path in (Path(text) for text in texts if text) if path.is_file())
+
+    def opened(self, threads: int) -> Finisher:
+        source = open_source(self.clip, self.rate, self.space)
+        stop = min(self.start + 2, len(source.times_s))
+        first, *rest = (frame.rgb for frame in source.frames(self.start, stop, threads))
+        finishing = finishing_of(self.options, first, source.file_of(self.start), rest[0] if rest else None)
+        if self.options.match_exposure is None or self.options.plate_exposure is not None:
+            return _Look(finishing)
+        return _ExposedLook(finishing, self._exposures(source))
+
+    def _exposures(self, source: PictureSource) -> Callable[[int], float]:
+        """How much brighter a frame shows the same light than the frame `start`, by the frame's number."""
+
+        def brightness(index: int) -> float:
+            path = source.file_of(index)
+            assert path is not None  # or the Finishing would have been refused
+            return stated_exposure(path).brightness
+
+        measured = brightness(self.start)
+        return lambda number: brightness(number - self.first_number) / measured
+
+
+class _Look:
+    def __init__(self, finishing: Finishing) -> None:
+        self._finishing = finishing
+
+    def finished(self, inserted: Inserted, plate: Plate, number: int) -> Inserted:
+        return finished(inserted, plate, self._finishing, number)
+
+
+class _ExposedLook:
+    """With a gain for every frame."""
+
+    def __init__(self, finishing: Finishing, change: Callable[[int], float]) -> None:
+        self._finishing, self._change = finishing, change
+
+    def finished(self, inserted: Inserted, plate: Plate, number: int) -> Inserted:
+        colour = self._finishing.colour or ColourMatch()
+        gained = replace(colour, gain=triple_of(np.array(colour.gain) * self._change(number)))
+        return finished(inserted, plate, replace(self._finishing, colour=gained), number)

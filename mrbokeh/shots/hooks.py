@@ -3,20 +3,51 @@
 Descriptions travel to the workers: frozen dataclasses of absolute paths, names and numbers, which say what files they read and are
 opened there once. What they open is asked frame by frame, by the number of the frame. Whatever gives the very same object for two
 frames says that nothing changed between them; what was made from it is then kept.
+
+Kept: a function that is not called again while it is given the very same things.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.compositing.base import Inserted
-from mrbokeh.compositing.plate import Plate
+from mrbokeh.compositing.plate import Inserted, Plate
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
+
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
+
+
+class Kept(Generic[_Given, _Result]):
+    """Keeps the last result only. Things count as the same when they are one object (numbers and texts: when they are equal)."""
+
+    def __init__(self, function: Callable[_Given, _Result]) -> None:
+        self._function = function
+        self._given: tuple[object, ...] = ()
+        self._result: list[_Result] = []
+
+    def __call__(self, *given: _Given.args, **named: _Given.kwargs) -> _Result:
+        all_given = (*_flat(given), *_flat(tuple(named.values())))
+        if not self._result or len(all_given) != len(self._given) or not all(map(_same, all_given, self._given)):
+            self._result.clear()
+            self._result.append(self._function(*given, **named))
+            self._given = all_given
+        return self._result[0]
+
+
+def _flat(given: tuple[object, ...]) -> tuple[object, ...]:
+    """Sequences by what is in them, for they are often made anew."""
+    return tuple(each for one in given for each in ((len(one), *one) if isinstance(one, (tuple, list)) else (one,)))
+
+
+def _same(one: object, other: object) -> bool:
+    return one is other or (isinstance(one, (int, float, str)) and type(one) is type(other) and one == other)
+
 
 Opened = TypeVar("Opened", covariant=True)
 

@@ -10,13 +10,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.over import behind
-from mrbokeh.compositing.plate import plate_of
+from mrbokeh.compositing.plate import Inserted, plate_of
 from mrbokeh.compositing.plate_look.colour_match import ColourMatch
-from mrbokeh.compositing.plate_look.finishing import Finishing, finished
+from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, finished
 from mrbokeh.compositing.plate_look.grain import measured_grain, measured_grain_of_pair
-from mrbokeh.compositing.plate_look.light_wrap import LightWrap
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens

@@ -16,7 +16,7 @@ import trimesh
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Material, Scene, Texture, matte, rectangle, shadow_catcher, sphere, sun
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.environment import directions
+from mrbokeh.scene.light import directions
 from mrbokeh.scene.wgpu.device import gpu
 from mrbokeh.scene.wgpu.wgpu_rasterizer import WgpuRasterizer
 from mrbokeh.system.errors import InputError

@@ -13,7 +13,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Scene, shadow_catcher, sun, world_from_scene_placing
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf.gltf_loader import load_glb
-from mrbokeh.scene.light_change.light_change import light_change
+from mrbokeh.scene.light_change import light_change
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
 from tests.bench.bench_scene import sky
 from tests.bench.machine import machine_line, memory_line

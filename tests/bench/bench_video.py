@@ -22,16 +22,13 @@ import numpy as np
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.composite_recipe import CompositeRecipe
-from mrbokeh.shots.crew import Crew, OneProcess
-from mrbokeh.shots.frame_maker import MakerRecipe
+from mrbokeh.shots.executors import Crew, OneProcess, ProcessCrew
 from mrbokeh.shots.frame_sources import FocusPulled
-from mrbokeh.shots.making import make_shot
-from mrbokeh.shots.process_crew import ProcessCrew
-from mrbokeh.shots.segment import SEGMENT_S
-from mrbokeh.shots.shot import Shot
-from mrbokeh.shots.video_target import VideoTarget
+from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.shot import SEGMENT_S, MakerRecipe, Shot
+from mrbokeh.shots.targets import VideoTarget
 from mrbokeh.video.clip import VideoWriter, probe
-from mrbokeh.video.picture_sources.choose import open_source
+from mrbokeh.video.picture_source import open_source
 from tests.bench.machine import machine_line
 from tests.scenes.shot_makers import Brighter, MovingDisc
 

@@ -1,13 +1,11 @@
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.base import Inserted
-from mrbokeh.compositing.occlusion import occlusion_matte
-from mrbokeh.compositing.over import OverPhotograph, behind
-from mrbokeh.compositing.plate import plate_of
+from mrbokeh.compositing.over import OverPhotograph, behind, occlusion_matte
+from mrbokeh.compositing.plate import Inserted, plate_of
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 LENS = Lens(50.0, 2.0, 1.0, 36.0)

@@ -1,4 +1,4 @@
-"""The laws that every way of putting layers into a photograph keeps (mrbokeh.compositing.base), and what each mode adds to them."""
+"""The laws that every way of putting layers into a photograph keeps (mrbokeh.compositing.plate), and what each mode adds to them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -6,19 +6,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.base import Inserted
-from mrbokeh.compositing.between import Between
-from mrbokeh.compositing.choose import DEFAULT_MODE, MODES, insertion_of
-from mrbokeh.compositing.matte import SmoothedMatte
-from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.compositing.plate import Plate, plate_of
-from mrbokeh.compositing.rerender import Rerendered
-from mrbokeh.compositing.touched_box import InTouchedBox, touched_box
+from mrbokeh.compositing.between import Between, Rerendered
+from mrbokeh.compositing.choose import DEFAULT_MODE, MODES, InTouchedBox, insertion_of, touched_box
+from mrbokeh.compositing.over import OverPhotograph, SmoothedMatte
+from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 LENS = Lens(100.0, 1.0, 1.0, 36.0)  # 20 px of blur per dioptre at 64 px

@@ -7,12 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.between import Between
+from mrbokeh.compositing.between import Between, Rerendered
 from mrbokeh.compositing.choose import insertion_of
+from mrbokeh.compositing.edge_refinement import RimColours, moved
 from mrbokeh.compositing.plate import Plate, plate_of
-from mrbokeh.compositing.rerender import Rerendered
-from mrbokeh.compositing.rim_colours import RimColours
-from mrbokeh.compositing.true_rims import moved
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
@@ -150,7 +148,7 @@ def test_it_can_be_switched_off(mode: str) -> None:
 
 def test_large_pictures_are_compared_at_half_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
     exact, wrong, mended = (Between(true_rims=rims).insert(strip(by_px)[0], [virtual_wall()], RENDERER).rgb for by_px, rims in STRIPS)
-    monkeypatch.setattr("mrbokeh.compositing.true_rims._LARGE_PX", 100)
+    monkeypatch.setattr("mrbokeh.compositing.edge_refinement._LARGE_PX", 100)
     halved = Between().insert(strip(2)[0], [virtual_wall()], RENDERER).rgb
     assert not np.array_equal(halved, mended)  # it is another comparison
     assert np.abs(halved - exact).mean() < 0.5 * np.abs(wrong - exact).mean()

@@ -6,11 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.plate_look.black_level import darkest_black, picked_black
-from mrbokeh.compositing.plate_look.colour_match import ColourMatch
-from mrbokeh.compositing.plate_look.exposure_match import Exposure, exposure_of_metadata, exposure_of_photo, matched_exposure
-from mrbokeh.compositing.plate_look.grey_card import PixelBox, grey_card_match, patch_colour
-from mrbokeh.compositing.plate_look.white_balance import kelvin_of_photo, white_balance_gain, white_of_kelvin
+from mrbokeh.compositing.plate_look.colour_match import ColourMatch, PixelBox, darkest_black, grey_card_match, patch_colour, picked_black
+from mrbokeh.compositing.plate_look.exposure_match import (
+    Exposure,
+    exposure_of_metadata,
+    exposure_of_photo,
+    kelvin_of_photo,
+    matched_exposure,
+    white_balance_gain,
+    white_of_kelvin,
+)
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.errors import InputError

@@ -7,21 +7,18 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.over import OverPhotograph, behind
-from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.compositing.plate_look.colour_match import ColourMatch
-from mrbokeh.compositing.plate_look.finishing import Finishing, finished
-from mrbokeh.compositing.plate_look.grain import Grain, measured_grain
-from mrbokeh.compositing.plate_look.grain_light import GrainDraw, add_grain_to, added_variance
-from mrbokeh.compositing.plate_look.light_wrap import LightWrap
-from mrbokeh.compositing.plate_look.noise_level import NoiseLevel
+from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, finished
+from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, added_variance, measured_grain
+from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import lit_box
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_plate_look_grain import READ, SHOT, smooth_scene, unit_noise
 

@@ -8,11 +8,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import ks_2samp
 
-from mrbokeh.compositing.plate_look.grain import Grain, measured_grain, measured_grain_of_pair
-from mrbokeh.compositing.plate_look.grain_file import read_grain, write_grain
-from mrbokeh.compositing.plate_look.noise_blocks import noise_blocks
-from mrbokeh.compositing.plate_look.noise_correlation import REACH_PX, white
-from mrbokeh.compositing.plate_look.noise_level import NoiseLevel, fit_noise_level
+from mrbokeh.compositing.plate_look.grain import Grain, measured_grain, measured_grain_of_pair, read_grain, write_grain
+from mrbokeh.compositing.plate_look.noise_measurement import REACH_PX, NoiseLevel, fit_noise_level, noise_blocks, white
 from mrbokeh.images.image_io import read_image
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError

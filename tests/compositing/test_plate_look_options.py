@@ -6,13 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.plate_look.finishing import Finishing
-from mrbokeh.compositing.plate_look.grain import measured_grain
-from mrbokeh.compositing.plate_look.grain_file import write_grain
-from mrbokeh.compositing.plate_look.lensfun_falloff import CameraAndLens, lensfun_falloff
-from mrbokeh.compositing.plate_look.light_wrap import LightWrap
-from mrbokeh.compositing.plate_look.look_options import LookOptions, finishing_of
-from mrbokeh.compositing.plate_look.vignetting import FlatField, RadialFalloff
+from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, LookOptions, finishing_of
+from mrbokeh.compositing.plate_look.grain import measured_grain, write_grain
+from mrbokeh.compositing.plate_look.vignetting import CameraAndLens, FlatField, RadialFalloff, lensfun_falloff
 from mrbokeh.images.image_io import write_image
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_plate_look_grain import plate, smooth_scene

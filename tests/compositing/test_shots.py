@@ -18,18 +18,14 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_io import read_image, read_layer, write_image
-from mrbokeh.shots.crew import Crew, OneProcess
-from mrbokeh.shots.frame_maker import FrameMaker, MakerRecipe
-from mrbokeh.shots.making import make_shot
-from mrbokeh.shots.parts_folder import PartsFolder
-from mrbokeh.shots.process_crew import ProcessCrew
+from mrbokeh.shots.executors import Crew, OneProcess, ProcessCrew
+from mrbokeh.shots.render_shot import PartsFolder, make_shot
 from mrbokeh.shots.segment_task import SegmentTask, make_segment
-from mrbokeh.shots.sequence_target import SequenceTarget
-from mrbokeh.shots.shot import Shot, Target
-from mrbokeh.shots.video_target import VideoTarget
+from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Shot, Target
+from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter, probe, read_frames
-from mrbokeh.video.picture_sources.choose import open_source
+from mrbokeh.video.picture_source import open_source
 from tests.scenes.shot_makers import Brighter, wait_for
 
 INTRA = [
@@ -326,8 +322,8 @@ def held_shot(folder: Path) -> Shot:
 PROGRAM = """
 import sys
 from pathlib import Path
-from mrbokeh.shots.making import make_shot
-from mrbokeh.shots.process_crew import ProcessCrew
+from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.executors import ProcessCrew
 if __name__ == "__main__":
     from tests.compositing.test_shots import held_shot
     make_shot(held_shot(Path(sys.argv[1])), ProcessCrew(2))

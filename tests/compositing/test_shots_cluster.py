@@ -13,10 +13,9 @@ from typing import Any
 import pytest
 
 from mrbokeh import __version__
-from mrbokeh.shots.crew import Crew, OneProcess
-from mrbokeh.shots.dask_crew import DaskCrew, require_same_files
-from mrbokeh.shots.making import make_shot
-from mrbokeh.shots.video_target import VideoTarget
+from mrbokeh.shots.executors import Crew, DaskCrew, OneProcess, require_same_files
+from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.targets import VideoTarget
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_shots import COUNT, clip_of_blobs, opened_once_two_work, shot_of
 from tests.scenes.shot_makers import Brighter, wait_for

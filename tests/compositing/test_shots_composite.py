@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.distortion import LensDistortion
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import write_layer
@@ -19,15 +18,12 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.scene.staging.filming import Filming
-from mrbokeh.shots.boxed_insertion import BoxedInsertion
-from mrbokeh.shots.composite_recipe import CompositeRecipe
+from mrbokeh.shots.composite_recipe import BoxedInsertion, CompositeRecipe
 from mrbokeh.shots.frame_sources import DepthFiles, FocusPulled
-from mrbokeh.shots.hooks import Description, LayerSource, Moment
-from mrbokeh.shots.kept import Kept
-from mrbokeh.shots.layer_sources import LayerFiles
-from mrbokeh.shots.scene_layers import SceneLayers
+from mrbokeh.shots.hooks import Description, Kept, LayerSource, Moment
+from mrbokeh.shots.layer_sources import LayerFiles, SceneLayers
 from mrbokeh.system.errors import InputError
 from tests.scenes.stage_scenes import ONE_CARD, camera, scene_file
 

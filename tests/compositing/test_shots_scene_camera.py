@@ -11,7 +11,7 @@ from mrbokeh.images.image_io import read_layer, write_image
 from mrbokeh.optics.camera import camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.shots.scene_camera import scene_track
+from mrbokeh.shots.frame_sources import scene_track
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import write_track

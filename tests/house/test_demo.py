@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mrbokeh.demo.measurements import camera_measurements, depth_error, merge_measurements, placement_measurement
-from mrbokeh.demo.pictures import write_depth_pictures
+from mrbokeh.demo.measurements import camera_measurements, depth_error, merge_measurements, placement_measurement, read_truth
 from mrbokeh.demo.plan import VIEWS, demo_stages
-from mrbokeh.demo.records import Record, must_be_anew, read_record, write_record
-from mrbokeh.demo.stages import Stage, run_stages
-from mrbokeh.demo.truth import read_truth
+from mrbokeh.demo.report import write_depth_pictures
+from mrbokeh.demo.stages import Record, Stage, must_be_anew, read_record, run_stages, write_record
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer

@@ -9,8 +9,8 @@ import typer
 from scipy.ndimage import convolve
 from typer.testing import CliRunner
 
+from mrbokeh.commands.lens import export, show
 from mrbokeh.commands.lens_fit import fit as fit_command
-from mrbokeh.commands.lens_pictures import export, show
 from mrbokeh.images.image_io import write_image
 from mrbokeh.images.layer import opaque
 from mrbokeh.layering.layering import Layering
@@ -26,7 +26,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.optics.psf_bank_file import read_bank
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference, scatter
+from mrbokeh.renderers.scatter_reference import ScatterReference, scatter
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError

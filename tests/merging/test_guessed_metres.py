@@ -14,8 +14,8 @@ from mrbokeh.images.image_io import read_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.lens_measuring.fitting.stack_equations import StackSlices
 from mrbokeh.optics.lens_file import lens_to_json, write_lens
-from mrbokeh.refocus.refocusing import leave_one_out
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.refocus import leave_one_out
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
 from mrbokeh.stacks.focus_places import Seen, parse_focus, slice_names
@@ -33,8 +33,8 @@ from tests.compositing.test_composite_command import CAKE
 from tests.house.test_user_mistakes import said
 from tests.scenes.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.scenes.guessed_stack import guessed_twin
-from training.export_onnx import network_facts_of
-from training.run_folder import load_run
+from training.export.onnx_export import network_facts_of
+from training.fitting.run_folder import load_run
 
 Run = Callable[..., str]
 ON_CARD, ON_WALL = "10,24", "60,24"

@@ -10,8 +10,8 @@ from mrbokeh.images.layer import Layer, opaque, over
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.environment import neutral_environment
-from mrbokeh.scene.light_change.light_change import LEAST_CHANGE, LightChange, light_change
+from mrbokeh.scene.light import neutral_environment
+from mrbokeh.scene.light_change import LEAST_CHANGE, LightChange, light_change
 from mrbokeh.system.errors import InputError
 from tests.objects.test_scene_backends import DARK, rays
 

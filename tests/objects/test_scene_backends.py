@@ -9,7 +9,7 @@ import pytest
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.environment import directions, neutral_environment, solid_angles_sr
+from mrbokeh.scene.light import directions, neutral_environment, solid_angles_sr
 from mrbokeh.system.errors import InputError
 
 

@@ -30,8 +30,8 @@ from mrbokeh.scene import (
 )
 from mrbokeh.scene.choose import scene_renderer
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.environment import directions, neutral_environment, solid_angles_sr
 from mrbokeh.scene.gltf.gltf_loader import load_glb
+from mrbokeh.scene.light import directions, neutral_environment, solid_angles_sr
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
 from mrbokeh.system.errors import InputError, MissingExtraError
 from tests.objects import test_scene_backends as laws
@@ -264,7 +264,7 @@ class TestSettings:
     def test_many_samples_go_in_parts(self, monkeypatch: pytest.MonkeyPatch) -> None:
         scene = Scene((laws.facing_square(matte(0.5, 0.5, 0.5)),))
         whole = MitsubaTracer(samples=16).render(scene, SMALL).rgb
-        monkeypatch.setattr("mrbokeh.scene.mitsuba.camera._RAYS_AT_ONCE", 1 << 13)
+        monkeypatch.setattr("mrbokeh.scene.mitsuba.paths._RAYS_AT_ONCE", 1 << 13)
         parts = MitsubaTracer(samples=16).render(scene, SMALL).rgb
         assert parts.mean() == pytest.approx(whole.mean(), rel=5e-3)
         assert parts.std() == pytest.approx(whole.std(), rel=0.1)

@@ -7,7 +7,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera, level_plane_dioptres
 from mrbokeh.scene import Mesh, Scene, SceneRenderer, shadow_catcher
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.shadow_layer import shadow_layer
+from mrbokeh.scene.virtual_scene import shadow_layer
 
 GROUND_Y_M = 0.4
 

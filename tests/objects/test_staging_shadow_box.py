@@ -7,8 +7,8 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.staging.filming import FilmedLayers, Filming
-from mrbokeh.scene.staging.one_object import OneObject
 from mrbokeh.scene.staging.picture_box import shadow_box
+from mrbokeh.scene.staging.scene_description import OneObject
 from mrbokeh.scene.virtual_scene import shadow_layer
 from mrbokeh.tracking.world_axes import upright_camera
 

@@ -14,15 +14,14 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Light, Material, Scene, Texture, matte, rectangle, sphere, sun
 from mrbokeh.scene.choose import described_device, has_graphics_card, scene_renderer
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.environment import directions
+from mrbokeh.scene.light import directions
 from mrbokeh.system.errors import InputError
 
 pytest.importorskip("wgpu", reason="wgpu is not installed: pip install 'mrbokeh[viewfinder]'")
 
-from mrbokeh.scene.wgpu import textures as wgpu_textures
+from mrbokeh.scene.wgpu import geometry as wgpu_textures
 from mrbokeh.scene.wgpu.device import Gpu, gpu
-from mrbokeh.scene.wgpu.views import light_views
-from mrbokeh.scene.wgpu.visibility import sample_places, tiles
+from mrbokeh.scene.wgpu.visibility import light_views, sample_places, tiles
 from mrbokeh.scene.wgpu.wgpu_rasterizer import WgpuRasterizer
 
 FOX = Path(__file__).resolve().parents[3] / "shared/data/objects/Fox.glb"

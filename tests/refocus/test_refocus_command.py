@@ -15,9 +15,9 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.refocus.refocusing import Refocusing, leave_one_out, lens_at
+from mrbokeh.refocus import Refocusing, leave_one_out, lens_at
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focus_places import Seen, parse_focus
 from mrbokeh.system.errors import InputError

@@ -16,8 +16,8 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.refocus.transferring import seen_like, with_recovered_highlights
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.refocus import seen_like, with_recovered_highlights
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.photograph import Photograph
 from mrbokeh.system.errors import InputError

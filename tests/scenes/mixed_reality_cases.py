@@ -11,11 +11,10 @@ import numpy as np
 from datasets_scripts.card_scene import lens_of_radius, truth
 from datasets_scripts.mixed_reality_cards import mixed_cards
 from datasets_scripts.truth_shapes import lens_shape
-from mrbokeh.compositing.base import Inserted
 from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.near_and_far import continued
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image, read_layer
 from mrbokeh.images.image_metrics import psnr

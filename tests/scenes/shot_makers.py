@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.shots.frame_maker import Picture, Rgba
 from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
+from mrbokeh.shots.shot import Picture, Rgba
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter
-from mrbokeh.video.picture_sources.choose import open_source
+from mrbokeh.video.picture_source import open_source
 from tests.scenes.video_files import turned_clip
 
 WIDTH, HEIGHT = 96, 64

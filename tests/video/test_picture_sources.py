@@ -11,11 +11,9 @@ import pytest
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter, read_frames
-from mrbokeh.video.picture_sources.base import PictureSource
-from mrbokeh.video.picture_sources.choose import open_source, parse_rate
-from mrbokeh.video.picture_sources.frame_index import FrameIndex
-from mrbokeh.video.picture_sources.numbered_files import NumberedFiles, is_pattern, numbered, pattern_of_folder
-from mrbokeh.video.picture_sources.video_source import VideoSource
+from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered, pattern_of_folder
+from mrbokeh.video.picture_source import PictureSource, open_source, parse_rate
+from mrbokeh.video.video_source import FrameIndex, VideoSource
 
 CLIPS = ("iphone_xr_chart.mov", "ducks_720p.mp4", "nikon_d90_chart.avi")
 

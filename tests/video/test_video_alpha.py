@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import mrbokeh.video.picture_sources.image_sequence as image_sequence
-import mrbokeh.video.picture_sources.video_source as video_source
+import mrbokeh.video.image_sequence as image_sequence
+import mrbokeh.video.video_source as video_source
 from mrbokeh.commands.video import app
 from mrbokeh.images.alpha_io import write_finished
 from mrbokeh.images.color_management import NamedSpace
@@ -20,18 +20,14 @@ from mrbokeh.images.image_io import read_image, read_layer, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.shots.crew import OneProcess
-from mrbokeh.shots.making import make_shot
-from mrbokeh.shots.process_crew import ProcessCrew
-from mrbokeh.shots.sequence_target import SequenceTarget
+from mrbokeh.shots.executors import OneProcess, ProcessCrew
+from mrbokeh.shots.render_shot import make_shot
 from mrbokeh.shots.shot import Shot
-from mrbokeh.shots.video_target import VideoTarget
-from mrbokeh.video.alpha import has_alpha, stored_alpha
+from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.video.clip import VideoWriter, read_frames
 from mrbokeh.video.color import color_of
-from mrbokeh.video.frames import linear_rgb
-from mrbokeh.video.picture_sources.base import PictureSource
-from mrbokeh.video.picture_sources.choose import open_source
+from mrbokeh.video.frames import has_alpha, linear_rgb, stored_alpha
+from mrbokeh.video.picture_source import PictureSource, open_source
 from tests.scenes.shot_makers import Brighter
 from tests.scenes.video_files import turned_clip
 

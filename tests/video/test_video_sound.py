@@ -7,12 +7,12 @@ import av
 import numpy as np
 import pytest
 
-from mrbokeh.shots.crew import OneProcess
-from mrbokeh.shots.making import make_shot
+from mrbokeh.shots.executors import OneProcess
+from mrbokeh.shots.render_shot import make_shot
 from mrbokeh.shots.shot import Shot
-from mrbokeh.shots.video_target import VideoTarget, held_pictures
+from mrbokeh.shots.targets import VideoTarget, held_pictures
 from mrbokeh.video.clip import VideoWriter, read_frames
-from mrbokeh.video.picture_sources.choose import open_source
+from mrbokeh.video.picture_source import open_source
 from tests.scenes.shot_makers import Brighter
 
 BEGINS_S = 0.5

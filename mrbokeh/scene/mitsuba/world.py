@@ -6,16 +6,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
-from mrbokeh.scene.environment import Environment
-from mrbokeh.scene.light import Light
+from mrbokeh.scene.light import Environment, Light
 from mrbokeh.scene.mesh import Mesh
-from mrbokeh.scene.mitsuba.environment import EnvironmentTables
-from mrbokeh.scene.mitsuba.lights import PointLights, ShiningTriangles
+from mrbokeh.scene.mitsuba.light_sources import EnvironmentTables, PointLights, ShiningTriangles
 from mrbokeh.scene.mitsuba.reflection import Reflection, ShareTable
 from mrbokeh.scene.mitsuba.surfaces import Point, SurfaceTables
-from mrbokeh.scene.mitsuba.variant import triangle_scene
 from mrbokeh.scene.packed_scene import OPAQUE, KeptTextures, packed
 from mrbokeh.scene.virtual_scene import Scene
 
@@ -128,3 +125,13 @@ class World:
         emitted = self.surfaces.surface(at, towards, active).emissive
         density = self.shining.density(triangle, distance, dr.dot(at.face, towards), active)
         return dr.select(active & at.seen, emitted * at.alpha, 0.0), towards, distance, density
+
+
+def triangle_scene(corners_m: Float[np.ndarray, "triangles 3 3"]) -> Any:
+    """Mitsuba's scene of these triangles alone, in their order; it is asked for intersections only."""
+    mesh = mi.Mesh("triangles", 3 * len(corners_m), len(corners_m))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = corners_m.astype(np.float32).ravel()
+    parameters["faces"] = np.arange(3 * len(corners_m), dtype=np.uint32)
+    parameters.update()
+    return mi.load_dict({"type": "scene", "triangles": mesh})

@@ -15,10 +15,7 @@ What lies where:
     moving_shadow   moving_shadow_layer: the shadow on a catcher
 """
 
-from mrbokeh.scene.moving_layers.accumulation import accumulated
-from mrbokeh.scene.moving_layers.filmed_scene import FilmedScene
-from mrbokeh.scene.moving_layers.moving_layer import moving_layer
-from mrbokeh.scene.moving_layers.moving_shadow import moving_shadow_layer
-from mrbokeh.scene.moving_layers.shutter import ShutterTiming
+from mrbokeh.scene.moving_layers.filmed_scene import FilmedScene, ShutterTiming
+from mrbokeh.scene.moving_layers.moving_layer import accumulated, moving_layer, moving_shadow_layer
 
 __all__ = ["FilmedScene", "ShutterTiming", "accumulated", "moving_layer", "moving_shadow_layer"]

@@ -12,13 +12,12 @@ from mrbokeh.layering.pixel_box import Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, SceneRenderer
 from mrbokeh.scene.choose import scene_renderer
-from mrbokeh.scene.light_change.light_change import GREY, light_change
+from mrbokeh.scene.light_change import GREY, light_change
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
-from mrbokeh.scene.moving_layers.moving_shadow import ShadowCatcher
-from mrbokeh.scene.staging.assets import Assets
+from mrbokeh.scene.moving_layers.moving_layer import ShadowCatcher
 from mrbokeh.scene.staging.picture_box import shadow_box
 from mrbokeh.scene.staging.scene_description import SceneDescription
-from mrbokeh.scene.staging.staged_scene import StagedScene
+from mrbokeh.scene.staging.staged_scene import Assets, StagedScene
 from mrbokeh.scene.virtual_scene import shadow_layer
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
@@ -33,7 +32,7 @@ class Filming:
     """backend: a name of `mrbokeh.scene.choose`; samples: paths per pixel of "mitsuba". distortion: of the plate's lens.
 
     catches: "shadow", of the scene's lights as dark as the scene says, or "light": all that the objects change on the ground
-    (`mrbokeh.scene.light_change.light_change`). shutter: blurs by motion; None stands still.
+    (`mrbokeh.scene.light_change`). shutter: blurs by motion; None stands still.
     """
 
     backend: str = "auto"

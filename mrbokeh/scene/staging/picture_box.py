@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere
-from mrbokeh.layering.spreading import reach_px
+from mrbokeh.layering.psf_over_field import reach_px
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.scene import Light, Mesh, Scene

@@ -11,19 +11,16 @@ from jaxtyping import Float32, Float64, UInt32
 
 from mrbokeh.images.layer import Layer, clear
 from mrbokeh.optics.camera import Camera
-from mrbokeh.scene.environment import Environment
 from mrbokeh.scene.environment_filter import lighting_maps
+from mrbokeh.scene.light import Environment
 from mrbokeh.scene.material import Material, Texture
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.virtual_scene import Scene
 from mrbokeh.scene.wgpu._depth_numba import fill_depth
 from mrbokeh.scene.wgpu.device import gpu
-from mrbokeh.scene.wgpu.geometry import GpuGeometry, uploaded
-from mrbokeh.scene.wgpu.lighting import GpuPanorama, lights_with_shadows, no_panorama, panorama
-from mrbokeh.scene.wgpu.shading import Canvas, Job, Lighting, Shading
-from mrbokeh.scene.wgpu.textures import TexelPool, texel_pool
-from mrbokeh.scene.wgpu.views import nearest_m
-from mrbokeh.scene.wgpu.visibility import Visibility, sample_places, targets, tiles
+from mrbokeh.scene.wgpu.geometry import GpuGeometry, TexelPool, texel_pool, uploaded
+from mrbokeh.scene.wgpu.shading import Canvas, GpuPanorama, Job, Lighting, Shading, lights_with_shadows, no_panorama, panorama
+from mrbokeh.scene.wgpu.visibility import Visibility, nearest_m, sample_places, targets, tiles
 from mrbokeh.system.errors import InputError
 
 _TILE_PX = (2048, 512)

@@ -1,0 +1,122 @@
+"""How `mrbokeh render` blurs: the renderer with its bank of PSFs, and the lens with its focus.
+
+What `mrbokeh render` blurs: a picture with depth and motion, layers in front of it and behind it, from their files.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mrbokeh.images.layer import Layer, flatten
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.system.errors import InputError
+
+
+def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) -> Layer:
+    """A picture from noisy samples, by a renderer that takes them."""
+    from mrbokeh.stacks.light_field_samples_file import read_samples
+
+    if not hasattr(renderer, "reconstruct"):
+        raise InputError(f"--samples are for --method lrdm or laplacian, got --method {method}")
+    return renderer.reconstruct(read_samples(samples), lens)
+
+
+def focused(lens: Lens, sharp: dict[str, Layer], focus_distance_m: float | None, focus_at: str | None) -> Lens:
+    """The lens at the distance that was asked for, or focused on what is frontmost at a pixel."""
+    if focus_distance_m is not None and focus_at is not None:
+        raise InputError("give either --focus or --focus-at, not both")
+    if focus_distance_m is not None:
+        return lens.focused_at(focus_distance_m)
+    if focus_at is None:
+        return lens
+    try:
+        x_px, y_px, radius_px = (*map(int, focus_at.split(",")), 0)[:3]
+    except ValueError:
+        raise InputError(f"--focus-at: expected X,Y or X,Y,RADIUS in whole pixels, got {focus_at!r}") from None
+    return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files. depth and motion are those of rgb; srgb: its numbers are encoded. layers and behind come front first.
+
+    shutter: part of a frame's time for which it is open.
+    """
+
+    rgb: Path | None
+    depth: Path | None
+    layers: tuple[Path, ...] = ()
+    behind: tuple[Path, ...] = ()
+    motion: Path | None = None
+    shutter: float = 0.5
+    srgb: bool = False
+
+    @property
+    def are_given(self) -> bool:
+        return any((self.rgb, self.depth, self.layers, self.behind, self.motion))
+
+
+def read_sharp(sources: Sources) -> dict[str, Layer]:
+    """Layers by the file that they came from, front first, all with the same extra channels, motion among them."""
+    return _with_all_extras(_moving(_read(sources), sources))
+
+
+def _read(sources: Sources) -> dict[str, Layer]:
+    rgb, depth = sources.rgb, sources.depth
+    sharp = {str(path): _whole_layer(path) for path in sources.layers}
+    if (rgb is None) != (depth is None):
+        raise InputError("--rgb and --depth belong together: give both, or only --layer")
+    if rgb is not None and depth is not None:
+        sharp[str(rgb)] = _picture(rgb, depth, sources.srgb)
+    if sources.behind and rgb is None:
+        raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
+    sharp |= {str(path): _whole_layer(path) for path in sources.behind}
+    if not sharp:
+        raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
+    if len({each.alpha.shape for each in sharp.values()}) > 1:
+        raise InputError("what is to be blurred differs in size: " + ", ".join(f"{p} {s.width_px}x{s.height_px}" for p, s in sharp.items()))
+    return sharp
+
+
+def _whole_layer(path: Path) -> Layer:
+    from mrbokeh.images.image_io import read_layer, require_numbers
+
+    layer = read_layer(path, extra=True)
+    require_numbers(path, {"colour": layer.rgb, "alpha": layer.alpha})
+    return layer
+
+
+def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
+    from mrbokeh.images.image_io import read_depth, read_image, read_linear
+    from mrbokeh.images.layer import opaque
+
+    linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
+    colour, depth_m = read_image(rgb) if srgb else read_linear(rgb, linear_or), read_depth(depth)
+    if colour.shape[:2] != depth_m.shape:
+        sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
+        raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
+    return opaque(colour, depth_m)
+
+
+def _moving(sharp: dict[str, Layer], sources: Sources) -> dict[str, Layer]:
+    """With motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
+    from mrbokeh.layering.motion import with_motion
+    from mrbokeh.stacks.exr_layers.render_channels import read_motion, taken_from_channels
+
+    if sources.motion is not None and sources.rgb is None:
+        raise InputError("--motion belongs to --rgb: layers have their motion in their own channels forward.u and forward.v")
+    moving = {path: taken_from_channels(each, sources.shutter) for path, each in sharp.items()}
+    if sources.motion is not None:
+        moving[str(sources.rgb)] = with_motion(moving[str(sources.rgb)], read_motion(sources.motion), sources.shutter)
+    return moving
+
+
+def _with_all_extras(sharp: dict[str, Layer]) -> dict[str, Layer]:
+    """Every layer with the extra channels of all, 0 where a layer has none of that name."""
+    import numpy as np
+
+    shapes = {name: values.shape for each in sharp.values() for name, values in each.extra.items()}
+    return {
+        path: replace(each, extra={name: each.extra.get(name, np.zeros(shapes[name], np.float32)) for name in sorted(shapes)})
+        for path, each in sharp.items()
+    }

@@ -1,0 +1,178 @@
+"""The change of light on a real surface by the ray caster alone: shadows of lamps, and what objects hide of the environment.
+
+For machines without Mitsuba. The surface is matte; nothing is added. See `light_change`. What is hidden of the environment is drawn
+evenly, so a small sun in a panorama has to be split off first (`split_sun`), as the ray caster needs it anyway.
+
+How virtual objects change the light on a real surface: their shadow, their reflection and the light that they send there.
+
+Differential rendering (Debevec 1998, "Rendering Synthetic Objects into Real Scenes"), with the two directions of change apart: light
+that objects take away is a share of what there was, so it multiplies the photograph; light that they send is added. So the
+surface's texture comes from the photograph alone, and a rough guess of its material does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from scipy.stats.qmc import Sobol
+
+from mrbokeh.optics.camera import Camera
+from mrbokeh.scene._lighting_numba import add_environment
+from mrbokeh.scene._surface_numba import Surfaces, empty_surfaces, fill_surfaces
+from mrbokeh.scene.changed_light import LEAST_CHANGE, LightChange, changed, seen_surface
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.embree.prepared_scenes import prepared
+from mrbokeh.scene.embree.shading import visible
+from mrbokeh.scene.environment_filter import lighting_maps, reflected_share_table
+from mrbokeh.scene.light import Environment, Light
+from mrbokeh.scene.material import Material, matte
+from mrbokeh.scene.mesh import Mesh, unit
+from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
+from mrbokeh.scene.virtual_scene import Scene, SceneRenderer
+
+_RAYS_AT_ONCE = 1 << 18
+_WIDEST_CONE_COSINE = 0.5
+"""Wider cones around the objects are given up for the whole sky above the surface."""
+_NO_EFFECT = LEAST_CHANGE / 8
+
+
+def cast_light_change(
+    renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, samples: int = 64, seed: int = 0
+) -> LightChange:
+    """samples: rays per pixel towards the environment, where objects may hide it."""
+    seen = seen_surface(EmbreeRaycaster(), camera, catcher)
+    surfaces, centre_m, pixels = _met_surfaces(camera, catcher)
+    nothing = np.zeros((len(pixels), 3), np.float32)
+    drawn = [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
+    if not drawn or not len(pixels):
+        return changed(seen, pixels, (nothing, nothing, nothing))
+    lights, environment = scene.lighting
+    total, taken = nothing.copy(), nothing.copy()
+    if lights:
+        shadow = 1.0 - renderer.render_shadow_mask(scene, camera, catcher).reshape(-1)[pixels]
+        total += _lamp_light(lights, surfaces, centre_m)
+        taken += total * shadow[:, None]
+    if environment is not None:
+        maps = lighting_maps(environment)
+        table = reflected_share_table()
+        add_environment(surfaces, maps.peaks, maps.irradiance, maps.reflections, table, maps.environment_from_world, total)
+        taken += _hidden_sky(_Objects(drawn), environment, surfaces, centre_m, samples, seed)
+    return changed(seen, pixels, (total, taken, nothing))
+
+
+def _met_surfaces(camera: Camera, catcher: Mesh) -> tuple[Surfaces, Float64[np.ndarray, "3"], np.ndarray]:
+    """(white surfaces where the centres of pixels see the catcher, the point that they are relative to, those pixels)."""
+    white = replace(catcher, material=replace(matte(1.0, 1.0, 1.0), double_sided=True))
+    ground = prepared([white])
+    eye_m = camera.world_from_camera[:3, 3]
+    ones = np.ones((camera.height_px, camera.width_px))
+    directions = (camera.unproject(camera.pixel_centres_px(), ones) - eye_m).reshape(-1, 3)
+    eye = eye_m - ground.centre_m
+    origins = np.broadcast_to(eye.astype(np.float32), directions.shape)
+    hits = ground.all_rays.run(np.ascontiguousarray(origins), directions.astype(np.float32), query="INTERSECT")
+    pixels = np.flatnonzero(hits >= 0)
+    surfaces = empty_surfaces(len(pixels))
+    fill_surfaces(ground.triangles, ground.materials, ground.textures, eye[None], directions[pixels], hits[pixels], 0.0, False, surfaces)
+    return surfaces, ground.centre_m, pixels
+
+
+def _lamp_light(lights: Sequence[Light], surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "points 3"]:
+    """Radiance of a white surface under the lamps alone."""
+    rgb = np.zeros((len(surfaces.alpha), 3))
+    for light in lights:
+        towards, _distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + centre_m)
+        rgb += np.maximum((surfaces.normal * towards).sum(-1, keepdims=True), 0.0) * irradiance / np.pi
+    return rgb.astype(np.float32)
+
+
+class _Objects:
+    """What hides the sky, and the ball around it."""
+
+    def __init__(self, drawn: list[Mesh]) -> None:
+        self._rays = prepared(drawn)
+        points_m = self._rays.triangles.corners_m.reshape(-1, 3)
+        middle_m = (points_m.min(0) + points_m.max(0)) / 2
+        self.radius_m = float(np.linalg.norm(points_m - middle_m, axis=1).max())
+        self.middle_m = middle_m + self._rays.centre_m
+
+    def hidden(self, points_m: Float[np.ndarray, "points 3"], towards: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, " points"]:
+        """How much of the light from infinitely far the objects keep from points."""
+        far_m = np.full(len(points_m), np.inf)
+        return 1.0 - visible(self._rays, points_m - self._rays.centre_m, towards, far_m)
+
+
+def _hidden_sky(
+    objects: _Objects, environment: Environment, surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"], samples: int, seed: int
+) -> Float32[np.ndarray, "points 3"]:
+    """Radiance that white surfaces lose as objects stand before the environment."""
+    lost = np.zeros((len(surfaces.alpha), 3), np.float32)
+    points_m = surfaces.shadow_origin + centre_m
+    sine2 = (objects.radius_m / np.maximum(np.linalg.norm(objects.middle_m - points_m, axis=1), 1e-12)) ** 2
+    near = np.flatnonzero(sine2 > _NO_EFFECT)
+    rng, at_once = np.random.default_rng(seed), max(1, _RAYS_AT_ONCE // samples)
+    grid = Sobol(2, scramble=True, rng=rng).random(1 << (samples - 1).bit_length())
+    for start in range(0, len(near), at_once):
+        some = near[start : start + at_once]
+        uv = (grid + rng.random((len(some), 1, 2))) % 1.0
+        normals = surfaces.normal[some].astype(np.float64)
+        towards, weight = _drawn(objects, points_m[some], normals, sine2[some], uv)
+        weight *= np.maximum(np.einsum("psk,pk->ps", towards, normals), 0.0) / np.pi
+        useful = weight > 0
+        origins_m = np.broadcast_to(points_m[some][:, None], towards.shape)[useful]
+        light = weight[useful][:, None] * _radiance(environment, towards[useful]) * objects.hidden(origins_m, towards[useful])[:, None]
+        for channel in range(3):
+            lost[some, channel] = np.bincount(np.nonzero(useful)[0], light[:, channel], len(some)) / uv.shape[1]
+    return lost
+
+
+def _drawn(
+    objects: _Objects,
+    points_m: Float[np.ndarray, "points 3"],
+    normals: Float[np.ndarray, "points 3"],
+    sine2: Float[np.ndarray, " points"],
+    uv: Float[np.ndarray, "points samples 2"],
+) -> tuple[Float[np.ndarray, "points samples 3"], Float[np.ndarray, "points samples"]]:
+    """(directions, 1 / density): in the cone around the objects, or by the cosine where that is wide."""
+    narrow = sine2 < 1.0 - _WIDEST_CONE_COSINE**2
+    off = np.where(narrow, sine2 / (1.0 + np.sqrt(np.maximum(1.0 - sine2, 0.0))), 1.0)[:, None] * uv[..., 0]
+    rising = np.where(narrow[:, None], 1.0 - off, np.sqrt(1.0 - uv[..., 0]))
+    level = np.where(narrow[:, None], np.sqrt(off * (2.0 - off)), np.sqrt(uv[..., 0]))
+    axis = np.where(narrow[:, None], unit(objects.middle_m - points_m), normals)
+    sideways = unit(np.cross(axis, np.where(np.abs(axis[:, :1]) < 0.5, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])))
+    across, turn = np.cross(axis, sideways), 2 * np.pi * uv[..., 1]
+    towards = level[..., None] * (np.cos(turn)[..., None] * sideways[:, None] + np.sin(turn)[..., None] * across[:, None])
+    versine = sine2 / (1.0 + np.sqrt(np.maximum(1.0 - sine2, 0.0)))
+    weight = np.where(narrow[:, None], 2 * np.pi * versine[:, None], np.pi / np.maximum(rising, 1e-6))
+    return towards + rising[..., None] * axis[:, None], weight
+
+
+def _radiance(environment: Environment, towards: Float[np.ndarray, "rays 3"]) -> Float32[np.ndarray, "rays 3"]:
+    """The panorama's nearest pixel in directions of the world."""
+    x, y, z = (towards @ environment.world_from_environment).T
+    height, width = environment.radiance.shape[:2]
+    column = ((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width).astype(int) % width
+    row = np.minimum((np.arccos(np.clip(-y, -1.0, 1.0)) / np.pi * height).astype(int), height - 1)
+    return environment.radiance[row, column]
+
+
+__all__ = ["GREY", "LEAST_CHANGE", "LightChange", "light_change"]
+
+GREY = matte(0.5, 0.5, 0.5)
+
+
+def light_change(
+    renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, surface: Material = GREY, samples: int = 64
+) -> LightChange:
+    """What a scene's objects change on a real surface that the scene's lights and environment light.
+
+    catcher: its shape (also one that catches shadows); surface: about what it is made of; only light that comes from the objects
+    depends on its albedo. With a MitsubaTracer everything counts: shadows of lamps and of the environment, mirror images, colour
+    that bleeds, emissive objects; its own number of samples is taken. With any other renderer the surface is matte, and only
+    light that is taken away is counted: the renderer's shadow mask of the lamps, and what of the environment is hidden.
+    """
+    if isinstance(renderer, MitsubaTracer):
+        from mrbokeh.scene.mitsuba.traced_light_change import traced_light_change
+
+        return traced_light_change(renderer, scene, camera, catcher, surface)
+    return cast_light_change(renderer, scene, camera, catcher, samples)
