@@ -72,17 +72,16 @@ class CheckedPicture:
     time_s: float | None = None
 
 
-def read_picture(path: Path, name: str = "") -> CheckedPicture:
+def read_picture(path: Path) -> CheckedPicture:
     """EXR with its layers, or any other picture. Raises InputError where it cannot be read."""
-    name = name or path.name
     if path.suffix.lower() != ".exr":
-        return CheckedPicture(name, read_image(path), _integer_storage(path))
+        return CheckedPicture(path.name, read_image(path), _integer_storage(path))
     parts = read_exr(path)
     layer = read_layer(path)
     has_alpha = any("A" in part.channels for part in parts)
     is_half = any(part.channels.get("R", np.empty(0)).dtype == np.float16 for part in parts)
     return CheckedPicture(
-        name, layer.rgb, Storage(True, _HALF_STEP if is_half else 0.0), layer.alpha if has_alpha else None, _layers(parts)
+        path.name, layer.rgb, Storage(True, _HALF_STEP if is_half else 0.0), layer.alpha if has_alpha else None, _layers(parts)
     )
 
 

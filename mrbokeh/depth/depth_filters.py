@@ -23,31 +23,26 @@ Plane = Float32[np.ndarray, "height width"]
 Picture = Float32[np.ndarray, "rows columns 3"]
 
 
-def guided_upsampling(
-    values: Plane, guide: Picture, radius_px: int, epsilon: float, weight: Plane | None = None
-) -> Float32[np.ndarray, "rows columns"]:
-    """Values (h, w) as a linear function of the guide's colour (H, W, 3) in every window, at the guide's size.
+def guided_upsampling(values: Plane, guide: Picture, radius_px: int, epsilon: float) -> Float32[np.ndarray, "rows columns"]:
+    """Return values (h, w) as a linear function of the guide's colour (H, W, 3) in every window, at the guide's size.
 
     radius_px: of the window, in pixels of the small map. epsilon: variance of the guide (in its own unit, squared) below which it is
-    taken as even. weight: (h, w), 0 where values are unknown.
+    taken as even.
     """
     import cv2
 
     small = cv2.resize(guide, values.shape[::-1], interpolation=cv2.INTER_AREA) if guide.shape[:2] != values.shape else guide
-    slope, offset = _coefficients(values, small, radius_px, epsilon, np.ones_like(values) if weight is None else weight)
+    slope, offset = _coefficients(values, small, radius_px, epsilon)
     size = guide.shape[1::-1]
     slope, offset = (cv2.resize(each, size, interpolation=cv2.INTER_LINEAR) for each in (slope, offset))
     return np.einsum("ijc,ijc->ij", slope, guide) + offset
 
 
-def _coefficients(values: Plane, guide: Float32[np.ndarray, "height width 3"], radius_px: int, epsilon: float, weight: Plane) -> tuple:
-    """Slope (H, W, 3) and offset (H, W), Eqs. 19 to 21 of the paper, each averaged over the windows that hold the pixel."""
-    known = np.maximum(_box(weight, radius_px), 1e-6)
+def _coefficients(values: Plane, guide: Float32[np.ndarray, "height width 3"], radius_px: int, epsilon: float) -> tuple:
+    """Return slope (H, W, 3) and offset (H, W), Eqs. 19 to 21 of the paper, each averaged over the windows that hold the pixel."""
 
     def mean(picture: np.ndarray) -> np.ndarray:
-        return _box(picture * (weight if picture.ndim == 2 else weight[..., None]), radius_px) / (
-            known if picture.ndim == 2 else known[..., None]
-        )
+        return _box(picture, radius_px)
 
     mean_guide, mean_values = mean(guide), mean(values)
     products = mean((guide[..., :, None] * guide[..., None, :]).reshape(*values.shape, 9))
@@ -55,7 +50,7 @@ def _coefficients(values: Plane, guide: Float32[np.ndarray, "height width 3"], r
     shared = mean(guide * values[..., None]) - mean_guide * mean_values[..., None]
     slope = np.linalg.solve(covariance + np.float32(epsilon) * np.eye(3, dtype=np.float32), shared[..., None])[..., 0]
     offset = mean_values - (slope * mean_guide).sum(axis=2)
-    return np.ascontiguousarray(_box(slope.astype(np.float32), radius_px)), _box(offset.astype(np.float32), radius_px)
+    return mean(np.ascontiguousarray(slope.astype(np.float32))), mean(offset.astype(np.float32))
 
 
 def _box(picture: np.ndarray, radius_px: int) -> np.ndarray:

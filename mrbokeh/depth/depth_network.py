@@ -98,7 +98,7 @@ def _fitted(given: Given, photo_rgb: Rgb, settings: DepthSettings) -> Given:
 
 def predicted(model: Path, photo_rgb: Rgb, wants: NetworkInput) -> Given:
     """What the network gives for a photograph (linear), at the size in which it saw the picture."""
-    from mrbokeh.renderers.network.onnx_sessions import open_session
+    from mrbokeh.renderers.onnx_sessions import open_session
 
     session = open_session(model)
     socket = session.get_inputs()[0]

@@ -14,6 +14,8 @@ from mrbokeh.system.resources import in_bands, workers
 XYZ_from_rec709 = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])
 rec709_from_XYZ = np.linalg.inv(XYZ_from_rec709)
 
+_SHOULDER = 0.8
+
 
 def srgb_to_linear(encoded: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
     """sRGB-encoded values in [0, 1] to linear light (IEC 61966-2-1)."""
@@ -37,12 +39,12 @@ def convert(rgb: Float[np.ndarray, "*batch 3"], target_from_source: Float[np.nda
     return (rgb @ np.asarray(target_from_source, rgb.dtype).T).astype(np.float32)
 
 
-def tone_map(rgb: Float32[np.ndarray, "*shape"], exposure_stops: float = 0.0, shoulder: float = 0.8) -> Float32[np.ndarray, "*shape"]:
-    """Scene-linear to displayable linear in [0, 1]: identity up to `shoulder`, then highlights roll off towards 1."""
+def tone_map(rgb: Float32[np.ndarray, "*shape"], exposure_stops: float = 0.0) -> Float32[np.ndarray, "*shape"]:
+    """Scene-linear to displayable linear in [0, 1]: identity up to 0.8, then highlights roll off towards 1."""
     exposed = np.maximum(rgb * np.float32(2.0**exposure_stops), 0.0)
-    room = 1.0 - shoulder
-    rolled_off = 1.0 - room * np.exp(-(exposed - shoulder) / room)
-    return np.where(exposed <= shoulder, exposed, rolled_off).astype(np.float32)
+    room = 1.0 - _SHOULDER
+    rolled_off = 1.0 - room * np.exp(-(exposed - _SHOULDER) / room)
+    return np.where(exposed <= _SHOULDER, exposed, rolled_off).astype(np.float32)
 
 
 def display_rgb8(rgb: Float32[np.ndarray, "*batch 3"], exposure_stops: float = 0.0) -> UInt8[np.ndarray, "*batch 3"]:

@@ -35,25 +35,16 @@ class ColorConversion:
     processor: Any
 
     @classmethod
-    def of(cls, config: Path | str | None, source: str, target: str, view: str = "") -> "ColorConversion":
-        """config: "aces" (studio) or "aces-cg", both built in; a file (.ocio, .ocioz); None is the file that $OCIO names.
+    def of(cls, config: Path | str | None, source: str, target: str) -> "ColorConversion":
+        """Open a conversion from one colour space to another.
 
-        source, target: colour spaces, aliases or roles ("scene_linear"). view: with it target is a display, such as "sRGB - Display",
-        and the view its rendering, such as "Un-tone-mapped". Raises InputError with the nearest names where one is unknown.
+        config: "aces" (studio) or "aces-cg", both built in; a file (.ocio, .ocioz); None is the file that $OCIO names.
+        source, target: colour spaces, aliases or roles ("scene_linear"). Raises InputError with the nearest names if one is unknown.
         """
         opened = open_config(config)
-        import PyOpenColorIO as ocio  # noqa: N813
-
-        _known(opened, source)
-        if view:
-            _one_of("display", target, list(opened.getDisplays()))
-            _one_of(f"view of {target}", view, list(opened.getViews(target)))
-            transform: Any = ocio.DisplayViewTransform(src=source, display=target, view=view)
-            processor = opened.getProcessor(transform)
-        else:
-            _known(opened, target)
-            processor = opened.getProcessor(source, target)
-        return cls(source, f"{target}, {view}" if view else target, processor.getDefaultCPUProcessor())
+        _require_known(opened, source)
+        _require_known(opened, target)
+        return cls(source, target, opened.getProcessor(source, target).getDefaultCPUProcessor())
 
     @classmethod
     def to_rec709(cls, config: Path | str | None, source: str) -> "ColorConversion":
@@ -61,9 +52,9 @@ class ColorConversion:
         return cls.of(config, source, rec709_name(open_config(config)))
 
     @classmethod
-    def from_rec709(cls, config: Path | str | None, target: str, view: str = "") -> "ColorConversion":
-        """From ours, linear Rec.709, to a space of the configuration, or a view of a display."""
-        return cls.of(config, rec709_name(open_config(config)), target, view)
+    def from_rec709(cls, config: Path | str | None, target: str) -> "ColorConversion":
+        """Open the conversion from linear Rec.709 to a space of the configuration."""
+        return cls.of(config, rec709_name(open_config(config)), target)
 
     def applied(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
         """A converted copy; the picture itself stays. Premultiplied pictures have to be divided by alpha before a curve, not a matrix."""
@@ -94,7 +85,7 @@ class NamedSpace:
         """Raises InputError where there is no such configuration, or none of its spaces has that name."""
         is_file = str(config) not in BUILT_IN and not str(config).startswith("ocio://")
         space = cls(name, str(Path(config).resolve()) if is_file else str(config))
-        _known(open_config(space.config), name)
+        _require_known(open_config(space.config), name)
         return space
 
     @property
@@ -166,19 +157,14 @@ def _opened(config: str) -> Any:
         raise InputError(f"expected an OpenColorIO configuration, {' or '.join(BUILT_IN)} or a file, at {config}: {told}") from None
 
 
-def _known(opened: Any, name: str) -> None:
-    """Colour spaces, roles and aliases are all good."""
-    if opened.getColorSpace(name) is None:
-        aliases = {alias: each.getName() for each in opened.getColorSpaces() for alias in each.getAliases()}
-        _one_of("colour space", name, list(opened.getColorSpaceNames()), aliases)
-
-
-def _one_of(what: str, name: str, names: list[str], aliases: dict[str, str] | None = None) -> None:
-    """Raises InputError with names like the one that is not there; aliases: other names of some of them."""
-    if name in names:
+def _require_known(opened: Any, name: str) -> None:
+    """Raise InputError with similar names unless the configuration has this colour space, role or alias."""
+    if opened.getColorSpace(name) is not None:
         return
-    folded = {each.lower(): told for each, told in [*(aliases or {}).items(), *((each, each) for each in names)]}
+    names = list(opened.getColorSpaceNames())
+    aliases = [(alias, each.getName()) for each in opened.getColorSpaces() for alias in each.getAliases()]
+    folded = {each.lower(): told for each, told in [*aliases, *((each, each) for each in names)]}
     near = [folded[each] for each in difflib.get_close_matches(name.lower(), folded, n=_NAMED, cutoff=0.4)]
     near += [each for each in names if name and name.lower() in each.lower()][:_NAMED]
     told = f"did you mean {', '.join(dict.fromkeys(near))}?" if near else f"there are {', '.join(names)}"
-    raise InputError(f"the colour configuration has no {what} {name!r}: {told}")
+    raise InputError(f"the colour configuration has no colour space {name!r}: {told}")

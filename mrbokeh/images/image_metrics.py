@@ -57,25 +57,20 @@ def depth_edge_mask(
     return binary_dilation(jump, iterations=reach_px) if reach_px > 0 else jump
 
 
-def edge_psnr(result: Image, truth: Image, depth_m: Float[np.ndarray, "height width"], reach_px: int, peak: float = 1.0) -> float:
-    """PSNR over the pixels within `reach_px` of a depth edge."""
-    return psnr(result, truth, peak, depth_edge_mask(depth_m, reach_px))
-
-
 def energy_ratio(result: Image, truth: Image) -> float:
     """Light of the result over light of the truth, unclipped: 1 where nothing was lost or made."""
     _require_same_shape(result, truth)
     return float(result.astype(np.float64).sum() / truth.astype(np.float64).sum())
 
 
-def leak(result: Image, truth: Image, band: Bool[np.ndarray, "height width"], peak: float = 1.0) -> float:
-    """Light that the result has too much within `band`, over the light of the truth there; both are clipped to [0, peak].
+def leak(result: Image, truth: Image, band: Bool[np.ndarray, "height width"]) -> float:
+    """Light that the result has too much within `band`, over the light of the truth there; both are clipped to [0, 1].
 
     0 where nothing leaked; what is missing does not make up for it. With a band on the sharp side of depth edges this is the
     blur of one side that runs over the other. nan where the band is empty or black.
     """
     _require_same_shape(result, truth)
-    shown, expected = np.clip(result[band], 0, peak).astype(np.float64), np.clip(truth[band], 0, peak)
+    shown, expected = np.clip(result[band], 0, 1).astype(np.float64), np.clip(truth[band], 0, 1)
     light = float(expected.sum(dtype=np.float64))
     return float(np.maximum(shown - expected, 0.0).sum()) / light if light > 0 else float("nan")
 
@@ -95,24 +90,24 @@ def light_error(
     return float(np.abs(shown - expected).sum()) / light if light > 0 else float("nan")
 
 
-def flicker(frames: Sequence[Image], truth: Sequence[Image], peak: float = 1.0) -> float:
+def flicker(frames: Sequence[Image], truth: Sequence[Image]) -> float:
     """How much a film jumps that the true one does not: root mean square of the error of second differences in time, over 4.
 
     An error that stays, or that grows evenly, scores 0; one that alternates by +a and -a from frame to frame scores a. All is
-    clipped to [0, peak]. Raises InputError for fewer than three frames.
+    clipped to [0, 1]. Raises InputError for fewer than three frames.
     """
     if len(frames) != len(truth) or len(frames) < 3:
         raise InputError(f"flicker needs as many frames as the true film, at least three, got {len(frames)} and {len(truth)}")
     squared, count = 0.0, 0
     for middle in range(1, len(frames) - 1):
         around = slice(middle - 1, middle + 2)
-        jump = _second_difference(frames[around], peak) - _second_difference(truth[around], peak)
+        jump = _second_difference(frames[around]) - _second_difference(truth[around])
         squared, count = squared + float((jump**2).sum()), count + jump.size
     return float(np.sqrt(squared / count)) / 4.0
 
 
-def _second_difference(three: Sequence[Image], peak: float) -> Image:
-    before, now, after = (np.clip(each, 0, peak).astype(np.float64) for each in three)
+def _second_difference(three: Sequence[Image]) -> Image:
+    before, now, after = (np.clip(each, 0, 1).astype(np.float64) for each in three)
     _require_same_shape(before, after)
     return before - 2.0 * now + after
 

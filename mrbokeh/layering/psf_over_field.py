@@ -3,10 +3,17 @@
 Renderers that differ in how they sum the kernels of an opening give a `Spread` alone; `ThroughAperture` does the rest for all
 of them. Kernels that come from elsewhere may be wide where the opening's are points, hold motion themselves, or lose light:
 a renderer that has such kernels brings an Optics of its own.
+
+Spreading: every pixel throws its light over its own PSF, the one step in which the classical renderers differ.
+
+A `Spread` knows plain apertures only, weighted polygons that hold for every pixel and colour. What varies with the side
+of the focus, with the place in the frame or with the colour is resolved here, once for all of them: the pixels are
+sorted by side and by field cell, and each group goes through the plain aperture that it sees.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -14,10 +21,128 @@ from jaxtyping import Float32
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import farthest_px, motion_channels, moved
-from mrbokeh.layering.slice_sorting import Part
-from mrbokeh.layering.spreading import FIELD_CELLS, Frame, Spread, reach_px, spread_light
+from mrbokeh.layering.padded_layers import Part
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
+from mrbokeh.optics.psf import kernel_radius_px
+
+FIELD_CELLS = (16, 9)
+"""Columns and rows of field cells: within one, every pixel sees the opening as the cell's centre does."""
+
+
+@runtime_checkable
+class Spread(Protocol):
+    """The sum over all pixels of value times PSF, same size out; light that leaves the frame is lost.
+
+    values: (H, W, C), HDR; a pixel whose values are all 0 has no say, whatever its circle of confusion.
+    coc_px: (H, W) signed diameters. aperture: plain. Same bits for any number of threads.
+    """
+
+    def __call__(
+        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+    ) -> Float32[np.ndarray, "height width channels"]: ...
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where an array of pixels lies in the picture that the lens sees: its top left corner and the picture's size."""
+
+    width_px: int
+    height_px: int
+    left_px: int = 0
+    top_px: int = 0
+
+    def moved(self, right_px: int, down_px: int) -> "Frame":
+        """The frame of a part of the array that begins so much farther right and down."""
+        return Frame(self.width_px, self.height_px, self.left_px + right_px, self.top_px + down_px)
+
+    def field_at(self, x_px: float, y_px: float) -> tuple[float, float]:
+        """Field position of a place in the array: 0 in the middle of the picture, 1 half a diagonal away; x right, y down."""
+        half_diagonal_px = 0.5 * float(np.hypot(self.width_px, self.height_px))
+        right_px, down_px = x_px + self.left_px - 0.5 * self.width_px, y_px + self.top_px - 0.5 * self.height_px
+        return right_px / half_diagonal_px, down_px / half_diagonal_px
+
+
+def reach_px(aperture: Aperture, largest_coc_px: float) -> int:
+    """How many whole pixels light may travel at this diameter, whatever the colour and the place."""
+    if largest_coc_px == 0.0:
+        return 0
+    drift = max(map(abs, aperture.lateral_chromatic))
+    growth = max(max(aperture.channel_scale(side)) for side in (-1, 1)) if aperture.is_chromatic else 1.0
+    return kernel_radius_px(largest_coc_px * growth, aperture.unit_radius + drift)
+
+
+def spread_light(
+    spread: Spread,
+    values: Float32[np.ndarray, "height width channels"],
+    coc_px: Float32[np.ndarray, "height width"],
+    aperture: Aperture,
+    frame: Frame,
+    field_cells: tuple[int, int] = FIELD_CELLS,
+) -> Float32[np.ndarray, "height width channels_out"]:
+    """Premultiplied R, G, B, then coverage, then any other channels, through the aperture with all that varies.
+
+    For a chromatic aperture the coverage differs by colour: three channels of coverage come back in place of one, so
+    that the result has R, G, B, three coverages and the others (which spread as green does).
+    """
+    if aperture.is_plain:
+        return spread(values, coc_px, aperture)
+    if not aperture.is_chromatic:
+        return _spread_groups(spread, values, coc_px, aperture, frame, field_cells, None)
+    rest = list(range(4, values.shape[2]))
+    spreads = []
+    for channel, also in ((0, []), (1, rest), (2, [])):
+        scale = np.where(coc_px > 0, aperture.channel_scale(1)[channel], aperture.channel_scale(-1)[channel]).astype(np.float32)
+        picked = np.ascontiguousarray(values[..., [channel, 3, *also]])
+        spreads.append(_spread_groups(spread, picked, coc_px * scale, aperture, frame, field_cells, channel))
+    colours, coverages = [each[..., :1] for each in spreads], [each[..., 1:2] for each in spreads]
+    return np.concatenate([*colours, *coverages, spreads[1][..., 2:]], axis=2)
+
+
+def _spread_groups(
+    spread: Spread,
+    values: Float32[np.ndarray, "height width channels"],
+    coc_px: Float32[np.ndarray, "height width"],
+    aperture: Aperture,
+    frame: Frame,
+    field_cells: tuple[int, int],
+    channel: int | None,
+) -> Float32[np.ndarray, "height width channels"]:
+    """Both sides of the focus and every field cell by themselves, each within the window that its light reaches."""
+    total = np.zeros_like(values)
+    live = np.any(values != 0, axis=-1)
+    for side, on_side in ((1, live & (coc_px > 0)), (-1, live & ~(coc_px > 0))):
+        for cell, field_xy in _cells(live.shape, frame, field_cells if aperture.varies_over_field else (1, 1)):
+            here = on_side[cell]
+            if not here.any():
+                continue
+            reach = reach_px(aperture, float(np.abs(coc_px[cell][here]).max()))
+            window = tuple(slice(max(0, part.start - reach), part.stop + reach) for part in cell)
+            inner = tuple(slice(part.start - around.start, part.stop - around.start) for part, around in zip(cell, window, strict=True))
+            part_values = np.zeros((*total[window].shape[:2], values.shape[2]), np.float32)
+            part_values[inner] = values[cell] * here[..., None]
+            part_coc_px = np.ascontiguousarray(coc_px[window])
+            total[window] += spread(part_values, part_coc_px, aperture.seen(side, field_xy, channel))
+    return total
+
+
+def _cells(shape: tuple[int, ...], frame: Frame, field_cells: tuple[int, int]) -> Iterator[tuple[tuple[slice, slice], tuple[float, float]]]:
+    """Slices of the array and the field position of each cell's centre; pixels beyond the picture belong to its outermost cells."""
+    columns = _cuts(shape[1], frame.left_px, frame.width_px, field_cells[0])
+    rows = _cuts(shape[0], frame.top_px, frame.height_px, field_cells[1])
+    for row, y_px in rows:
+        for column, x_px in columns:
+            yield (row, column), frame.field_at(x_px, y_px)
+
+
+def _cuts(length: int, offset_px: int, size_px: int, cells: int) -> list[tuple[slice, float]]:
+    """Parts of one axis and, in the array's own pixels, the middle of the cell that each belongs to."""
+    borders = np.rint(np.linspace(0, size_px, cells + 1)).astype(int) - offset_px
+    middles = 0.5 * (borders[:-1] + borders[1:])
+    borders[0], borders[-1] = min(borders[0], 0), max(borders[-1], length)
+    parts = [slice(int(max(0, a)), int(min(length, b))) for a, b in pairwise(borders)]
+    return [(part, float(middle)) for part, middle in zip(parts, middles, strict=True) if part.stop > part.start]
+
 
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]

@@ -1,4 +1,12 @@
-"""Slices: sheets of light sorted by the circle of confusion, spread one by one and put together front to back."""
+"""Slices: sheets of light sorted by the circle of confusion, spread one by one and put together front to back.
+
+Which pixels of which sheets make up a slice, and which part of the frame they reach.
+
+Islands: the pixels of a slice that lie so far apart that their lights do not meet, each spread in a window of its own.
+
+A slice of a slanted or rolling surface is a ring or a few patches in a window that is mostly empty, and spreading costs by the
+window. Islands' lights do not overlap, so it makes no difference which of them claims its share of the pupil first.
+"""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -7,14 +15,89 @@ from heapq import merge
 from operator import itemgetter
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 
-from mrbokeh.layering.psf_over_field import Optics
-from mrbokeh.layering.sheets import Pixels
-from mrbokeh.layering.slice_islands import islands
-from mrbokeh.layering.slice_sorting import Part, Shares, Window, sorted_slices, window_of
-from mrbokeh.layering.spreading import Frame
-from mrbokeh.system.resources import ZeroedMemory, ahead, cores, in_bands
+from mrbokeh.layering.padded_layers import Part, Pixels, Shares
+from mrbokeh.layering.psf_over_field import Frame, Optics
+from mrbokeh.system.resources import ZeroedMemory, ahead, bands, cores, in_bands
+
+_SORTED_PIXELS = 1 << 14
+
+Window = tuple[slice, slice]
+
+
+def sorted_slices(
+    sheets: Sequence[Pixels], shares: Sequence[Shares], step_px: float, width: int, pool: Executor
+) -> list[tuple[int, list[Part]]]:
+    """Numbers and parts of the slices that are not empty, front first; circles of confusion nearest to that multiple of the step.
+
+    width: of the frame that places are counted in.
+    """
+    used = [(sheet, share) for sheet, share in zip(sheets, shares, strict=True) if share.any()]
+    runs = [_runs(*each, np.float32(step_px), width, pool) for each in used]
+    slices = np.unique(np.concatenate([np.empty(0, np.int32), *(of_runs for of_runs, _ in runs)]))
+    cuts = [np.split(of_sheet, np.searchsorted(of_runs, slices[1:])) for of_runs, of_sheet in runs]
+    parts = [[Part(*each, cut) for each, cut in zip(used, cut_of, strict=True) if len(cut) > 0] for cut_of in zip(*cuts, strict=True)]
+    return list(zip(slices.tolist(), parts, strict=True))
+
+
+def _runs(
+    sheet: Pixels, shares: Shares, step_px: np.float32, width: int, pool: Executor
+) -> tuple[Int32[np.ndarray, " runs"], Int32[np.ndarray, "runs 2"]]:
+    """The slices of a sheet's runs, ascending, and the runs, in order within each slice."""
+    from mrbokeh.layering._slices_numba import runs_of_slices
+
+    pixels = sheet.places, sheet.coc_px, shares, width, step_px
+    found = list(pool.map(lambda band: runs_of_slices(*pixels, *band), bands(len(shares), _SORTED_PIXELS)))
+    runs = np.concatenate([np.empty((0, 3), np.int32), *found])
+    runs = runs[np.argsort(runs[:, 0], kind="stable")]
+    return runs[:, 0].copy(), runs[:, 1:].copy()
+
+
+def window_of(parts: Sequence[Part], reach: int, frame: Frame) -> Window | None:
+    """The smallest window that holds what is seen of these pixels and the pixels that it comes from; None if nothing is seen.
+
+    reach: how many pixels their light travels at most. Rows and columns are those of an array that lies as the frame says.
+    """
+    from mrbokeh.layering._slices_numba import extent
+
+    width = frame.width_px - 2 * frame.left_px
+    tops, bottoms, lefts, rights = zip(*(extent(part.runs, part.pixels.places, width) for part in parts), strict=True)
+    rows = _span(min(tops), max(bottoms), reach, -frame.top_px, frame.height_px)
+    columns = _span(min(lefts), max(rights), reach, -frame.left_px, frame.width_px)
+    return None if rows is None or columns is None else (rows, columns)
+
+
+def _span(first: int, end: int, reach: int, inside: int, length: int) -> slice | None:
+    """Of pixels first to end those that reach the inside, together with what of it they reach."""
+    first, end = max(first, inside - reach), min(end, inside + length + reach)
+    return slice(min(first, max(first - reach, inside)), max(end, min(end + reach, inside + length))) if first < end else None
+
+
+_LEAST_CELL_PX = 16
+_MOST_CELLS = 64
+_PIXELS_PER_SPREAD = 1 << 14
+"""What it costs to spread once more, in pixels of a window."""
+
+
+def islands(parts: Sequence[Part], reach: int, size: tuple[int, int]) -> Iterator[list[Part]]:
+    """The parts of a slice whose light travels so far at most, island by island; size: height and width of the frame with its margin."""
+    from mrbokeh.layering._slices_numba import islands_of_runs, join_islands, mark_cells, number_islands
+
+    cell_px = max(_LEAST_CELL_PX, 2 * reach, -(-max(size) // _MOST_CELLS))
+    cells = np.zeros((-(-size[0] // cell_px), -(-size[1] // cell_px)), np.int32)
+    for part in parts:
+        mark_cells(cells, cell_px, part.runs, part.pixels.places, size[1])
+    boxes = np.tile(np.array([size[0], 0, size[1], 0]), (number_islands(cells), 1))
+    own = [islands_of_runs(boxes, cells, cell_px, part.runs, part.pixels.places, size[1]) for part in parts]
+    joined = join_islands(boxes, reach, _PIXELS_PER_SPREAD)
+    if not joined.any():
+        yield list(parts)
+        return
+    for island in np.unique(joined):
+        cut = [replace(part, runs=part.runs[joined[of_runs] == island]) for part, of_runs in zip(parts, own, strict=True)]
+        yield [part for part in cut if len(part.runs) > 0]
+
 
 _LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add

@@ -92,12 +92,6 @@ def have_same_shape(size_px: tuple[int, int], other_px: tuple[int, int], within:
     return abs(size_px[0] * other_px[1] / (size_px[1] * other_px[0]) - 1.0) <= within
 
 
-def depth_m_from_zbuffer(zbuffer: Float[np.ndarray, "*batch"], near_m: float, far_m: float) -> Float[np.ndarray, "*batch"]:
-    """An OpenGL depth buffer in [0, 1] to metres along the optical axis; 1 (nothing drawn) becomes inf."""
-    depth_m = near_m * far_m / (far_m - zbuffer * (far_m - near_m))
-    return np.where(zbuffer >= 1.0, np.inf, depth_m)
-
-
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     return {
         "width_px": camera.width_px,

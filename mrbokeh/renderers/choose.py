@@ -1,4 +1,7 @@
-"""A renderer by its name on the command line; the only module that knows them all."""
+"""A renderer by its name on the command line; the only module that knows them all.
+
+A renderer with a measured bank of kernels in place of the lens's opening, and what its method keeps in files beside the bank.
+"""
 
 import logging
 from collections.abc import Mapping
@@ -8,6 +11,7 @@ from typing import Any
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 
@@ -17,7 +21,7 @@ DEFAULT = "polygon"
 
 
 def _scatter(**settings: Any) -> Renderer:
-    from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+    from mrbokeh.renderers.scatter_reference import ScatterReference
 
     return ScatterReference(**settings)
 
@@ -67,7 +71,7 @@ def make_renderer(
         on = {"device": device} if device else {}
         return BY_NAME[name](threads=threads, layering=layering or Layering(), **on, **kernels or {})
     if name.lower().endswith(".onnx"):
-        from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+        from mrbokeh.renderers.onnx_network import OnnxNetwork
 
         return OnnxNetwork(Path(name), threads)
     raise InputError(f"expected a renderer ({', '.join(BY_NAME)}) or the path of a network (.onnx), got {name!r}")
@@ -76,7 +80,7 @@ def make_renderer(
 def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | None, Renderer]:
     """What `--lens` and `--renderer` mean together: a network brings its lens, a lens file is rendered by the default."""
     if lens is not None and lens.suffix.lower() == ".onnx":
-        from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+        from mrbokeh.renderers.onnx_network import OnnxNetwork
 
         network = OnnxNetwork(lens)
         if network.facts.lens_guessed:
@@ -86,3 +90,36 @@ def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | N
             )
         return network.lens, network if renderer is None else make_renderer(renderer)
     return None if lens is None else read_lens(lens), make_renderer(renderer or DEFAULT)
+
+
+def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:
+    """The renderer of that name; psf: a bank of kernels in place of the lens's opening."""
+    if psf is None:
+        return make_renderer(method, threads=threads, layering=layering, device=device)
+    if method not in WITH_BANKS:
+        raise InputError(
+            f"--psf is for --method {', '.join(WITH_BANKS)}, got --method {method}: other methods take the opening of the lens file"
+        )
+    from mrbokeh.optics.psf_bank_file import read_bank
+
+    kernels = {"bank": read_bank(psf)}
+    return make_renderer(method, threads=threads, layering=layering, device=device, kernels=kernels | _beside(method, psf, kernels["bank"]))
+
+
+def _beside(method: str, psf: Path, bank: PsfBank) -> dict[str, Any]:
+    """What the method keeps in files beside a bank."""
+    from mrbokeh.renderers.bank.kernel_files import apertures_beside, terms_beside
+    from mrbokeh.renderers.bank.lattice import BankLattice
+
+    if method == "laplacian":
+        from mrbokeh.renderers.bank.kernel_files import spreadlets_beside
+
+        return {"spreadlets": spreadlets_beside(psf, bank.kernels)}
+    if method == "polygon":
+        return {"apertures": apertures_beside(psf, BankLattice(bank))}
+    if method == "low-rank":
+        from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+
+        filters = LowRankFilter()
+        return {"terms": terms_beside(psf, BankLattice(bank), filters.decomposed, [filters.relative_error, filters.max_rank])}
+    return {}

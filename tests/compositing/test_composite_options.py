@@ -16,10 +16,11 @@ from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.stacks.exr_layers.composite_exr import read_composite_exr, write_deep_exr
+from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
+from tests.scenes.composite_exr_reader import read_composite_exr
 
 HEIGHT, WIDTH = 96, 144
 LENS = Lens(35.0, 2.0, 2.0, 23.5)

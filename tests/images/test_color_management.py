@@ -64,11 +64,8 @@ def test_mid_grey_of_camera_curves(space: str, code: float) -> None:
 
 def test_an_srgb_display_has_the_srgb_curve() -> None:
     ramp = np.linspace(0, 1, 60, dtype=np.float32).reshape(4, 5, 3)
-    shown = ColorConversion.from_rec709("aces", "sRGB - Display", "Un-tone-mapped").applied(ramp)
+    shown = ColorConversion.from_rec709("aces", "sRGB - Display").applied(ramp)
     np.testing.assert_allclose(shown, linear_to_srgb(ramp), atol=2e-4)
-    # The Academy's own rendering leaves mid grey dark and never exceeds the display.
-    rendered = ColorConversion.from_rec709("aces", "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)").applied(100 * ramp)
-    assert rendered.max() <= 1.0 + 1e-5
 
 
 def test_applied_leaves_the_picture_and_apply_changes_it() -> None:
@@ -97,13 +94,6 @@ def test_unknown_spaces_are_answered_with_near_ones(wrong: str, near: str) -> No
     for conversion in (ColorConversion.to_rec709, ColorConversion.from_rec709):
         with pytest.raises(InputError, match=f"no colour space '{wrong}': .*{near}"):
             conversion("aces", wrong)
-
-
-def test_unknown_displays_and_views() -> None:
-    with pytest.raises(InputError, match=r"no display 'sRGB': did you mean sRGB - Display"):
-        ColorConversion.from_rec709("aces", "sRGB", "Raw")
-    with pytest.raises(InputError, match=r"no view of sRGB - Display 'Film': there are ACES 2\.0"):
-        ColorConversion.from_rec709("aces", "sRGB - Display", "Film")
 
 
 def test_configurations_from_files_and_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

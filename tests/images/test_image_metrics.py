@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from mrbokeh.images.image_metrics import depth_edge_mask, edge_psnr, energy_ratio, flicker, leak, light_error, psnr, ssim
+from mrbokeh.images.image_metrics import depth_edge_mask, energy_ratio, flicker, leak, light_error, psnr, ssim
 from mrbokeh.system.errors import InputError
 
 
@@ -31,13 +31,13 @@ def test_edge_psnr_looks_only_near_depth_edges() -> None:
     depth_m[:, 25:] = 2.0
     truth, result = picture(3), picture(3)
     result[:, :10] += 0.3
-    assert edge_psnr(result, truth, depth_m, 5) == float("inf")
+    assert psnr(result, truth, mask=depth_edge_mask(depth_m, 5)) == float("inf")
     assert depth_edge_mask(depth_m, 0)[0].nonzero()[0].tolist() == [24, 25]
 
 
 def test_edge_psnr_without_edges_says_so() -> None:
     with pytest.raises(InputError, match="mask is empty"):
-        edge_psnr(picture(0), picture(0), np.ones((40, 50)), 3)
+        psnr(picture(0), picture(0), mask=depth_edge_mask(np.ones((40, 50)), 3))
 
 
 def test_energy_ratio_sees_light_beyond_white() -> None:

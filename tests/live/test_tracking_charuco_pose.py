@@ -7,10 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.charuco.pose_branches import pose_from_plane
+from mrbokeh.tracking.charuco.pose_branches import PoseBranches, PoseFit
+from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from tests.scenes.traced_board_clip import BOARD
 
 CAMERA = Camera(640, 360, (590.0, 590.0), (320.0, 180.0))
+
+
+def pose_from_plane(points_m: np.ndarray, xy_px: np.ndarray, camera: Camera) -> PoseFit | None:
+    """The likelier pose of a single picture."""
+    found = poses_from_plane(points_m, xy_px, camera)
+    return None if found is None else PoseBranches().take(found, 0.0)
 
 
 def pose_of(turn_deg: tuple[float, float, float], place_m: tuple[float, float, float]) -> np.ndarray:

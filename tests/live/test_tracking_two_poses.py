@@ -18,8 +18,9 @@ from mrbokeh.tracking.camera_track.board_track import poses_of
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector
 from mrbokeh.tracking.charuco.detector import Corners
-from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot, pose_from_plane
+from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot
 from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
+from tests.live.test_tracking_charuco_pose import pose_from_plane
 from tests.scenes.traced_board_clip import BOARD, camera_frames
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker, ImmediateDetections

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mrbokeh.optics.camera import Camera, depth_m_from_zbuffer
+from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 
 
@@ -38,14 +38,6 @@ def test_resizing_keeps_the_view() -> None:
     half = camera.resized(320, 180)
     points_m = np.array([[0.1, 0.2, 3.0]])
     np.testing.assert_allclose(half.project(points_m)[0], camera.project(points_m)[0] / 2)
-
-
-def test_zbuffer_ends_are_near_far_and_background() -> None:
-    depth_m = depth_m_from_zbuffer(np.array([0.0, 0.5, 0.999999, 1.0]), 0.1, 100.0)
-    # OpenGL: z = f / (f - n) * (1 - n / d), so the middle of the buffer is 2 f n / (f + n).
-    np.testing.assert_allclose(depth_m[:2], [0.1, 2 * 100 * 0.1 / 100.1])
-    assert 99 < depth_m[2] < 100
-    assert np.isinf(depth_m[3])
 
 
 def test_a_camera_without_size_is_refused() -> None:

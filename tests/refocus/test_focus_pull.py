@@ -8,14 +8,11 @@ import pytest
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import (
     FocusPull,
-    focus_of_track,
     parse_focus_keys,
     quantisation_steps,
     read_focus_pull,
     smoothed_within_steps,
 )
-from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
-from tests.tracking.test_camera_track import two_frames
 
 
 def venice(shared_data: Path) -> Path:
@@ -34,7 +31,7 @@ def test_keys_go_linearly_in_dioptres_and_are_held() -> None:
     """1 D to 0.25 D over 30 frames: at frame 10 0.75 D."""
     pull = parse_focus_keys("10:1,40:4")
     assert pull.at(20) == pytest.approx(1.0 / 0.75) and pull.at(10) == 1.0 and pull.at(40) == 4.0
-    assert pull.at(0) == 1.0 and pull.at(99) == 4.0 and pull.f_number_at(20) is None
+    assert pull.at(0) == 1.0 and pull.at(99) == 4.0
     assert pull.shifted(100).at(120) == pytest.approx(1.0 / 0.75)
     assert parse_focus_keys("0:2,10:inf").at(5) == 4.0 and parse_focus_keys("0:2,10:inf").at(10) == float("inf")
 
@@ -58,30 +55,28 @@ def test_keys_that_are_none_are_refused(text: str) -> None:
         parse_focus_keys("0:1", "bouncy")
 
 
-def test_the_venice_writes_feet_and_t_stops(shared_data: Path) -> None:
-    """First row 5.83 ft; T 2 3/10 is T2 and three tenths of a stop: 2 * 2^0.15 = 2.219, as SMPTE's camdkit has it."""
+def test_the_venice_writes_feet(shared_data: Path) -> None:
+    """The first row is 5.83 ft."""
     pull = read_focus_pull(venice(shared_data))
     assert len(pull.frames) == 588 and pull.at(0) == pytest.approx(5.83 * 0.3048)
-    assert pull.t_number_at(300) == pytest.approx(2.0 * 2.0**0.15) and pull.f_number_at(300) is None
-    assert pull.transmitting(0.81).f_number_at(0) == pytest.approx(0.9 * 2.2191, rel=1e-4)
     with pytest.raises(InputError, match="from frame 0 to 587"):
         pull.at(588)
 
 
 def test_red_writes_millimetres_and_canon_bits(shared_data: Path) -> None:
-    """REDline: 410 and 420 mm. Canon: 3F000000 is 0.5; 45/10 in mode 2 is T4.5."""
+    """REDline: 410 and 420 mm. Canon: 3F000000 is 0.5."""
     folder = venice(shared_data).parent
     red, canon = read_focus_pull(folder / "red_frames.csv"), read_focus_pull(folder / "canon_frames.csv")
-    assert (red.at(0), red.at(1)) == (pytest.approx(0.41), pytest.approx(0.42)) and red.t_number_at(0) == pytest.approx(5.6)
-    assert canon.at(0) == pytest.approx(0.5) and canon.t_number_at(0) == pytest.approx(4.5) and canon.f_number_at(0) is None
+    assert (red.at(0), red.at(1)) == (pytest.approx(0.41), pytest.approx(0.42))
+    assert canon.at(0) == pytest.approx(0.5)
 
 
 def test_plain_tables_name_their_unit(tmp_path: Path) -> None:
-    """Frame 12 tells nothing: it is bridged in dioptres, from 1 D to 0.5 D. f/2 to f/8: f/4 in between."""
+    """Frame 12 tells nothing: it is bridged in dioptres, from 1 D to 0.5 D."""
     path = tmp_path / "focus.csv"
     path.write_text("frame,Focus (cm),f_number\n10,100,2\n12,,4\n14,200,8\n")
     pull = read_focus_pull(path)
-    assert pull.at(12) == pytest.approx(1.0 / 0.75) and pull.f_number_at(12) == pytest.approx(4.0)
+    assert pull.at(12) == pytest.approx(1.0 / 0.75)
 
 
 @pytest.mark.parametrize(
@@ -97,14 +92,6 @@ def test_tables_without_focus_are_refused(tmp_path: Path, text: str, says: str) 
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=says):
         read_focus_pull(tmp_path / "a.csv")
-
-
-def test_a_tracks_own_focus() -> None:
-    pull = focus_of_track(two_frames())
-    assert pull.at(12) == pytest.approx(1.5) and pull.f_number_at(12) == pytest.approx(4.0)
-    bare = CameraTrack({0: TrackedFrame(two_frames().at(0).camera)})
-    with pytest.raises(InputError, match="no focus distance"):
-        focus_of_track(bare)
 
 
 @pytest.mark.parametrize(("amplitude", "period", "share"), [(0.25, 240, 0.5), (0.1, 240, 0.3), (0.4, 120, 0.4), (0.05, 480, 0.9)])
@@ -150,7 +137,3 @@ def test_the_real_pull_is_smoothed_within_half_its_steps(shared_data: Path) -> N
 def test_pulls_that_cannot_be_are_refused() -> None:
     with pytest.raises(InputError, match="must grow"):
         FocusPull(np.array([1.0, 1.0]), np.array([1.0, 1.0]))
-    with pytest.raises(InputError, match="transmittance"):
-        parse_focus_keys("0:1").transmitting(1.2)
-    with pytest.raises(InputError, match="no T-numbers"):
-        parse_focus_keys("0:1").transmitting(0.8)

@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.images.exr_io import REC709, read_exr
+from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.images.layer import Layer
-from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, read_composite_exr, write_composite_exr
+from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, write_composite_exr
 from mrbokeh.stacks.exr_layers.flat_render import FlatRender
 from mrbokeh.system.errors import InputError
+from tests.scenes.composite_exr_reader import read_composite_exr
 
 HEIGHT, WIDTH = 10, 14
 SIZE = (HEIGHT, WIDTH)
@@ -78,14 +79,6 @@ def test_what_is_not_there_is_not_written(tmp_path: Path) -> None:
     assert part.channels.keys() == set("RGBA") and (part.channels["A"] == 1).all()
     read = read_composite_exr(tmp_path / "a.exr")
     assert read.depth_m is None and read.matte is None and read.coc_px is None and not read.layers
-
-
-def test_stated_primaries_are_in_the_header(tmp_path: Path) -> None:
-    """Stating Rec.709 changes nothing; numbers in ACEScg that say so come back as Rec.709 (the matrix has a test of its own)."""
-    picture = CompositeLayers(np.ones((*SIZE, 3), np.float32))
-    write_composite_exr(tmp_path / "a.exr", picture, primaries=REC709)
-    assert read_exr(tmp_path / "a.exr")[0].attributes["chromaticities"] == pytest.approx(REC709)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), 1.0)
 
 
 def test_light_too_bright_for_half_stays_finite(tmp_path: Path) -> None:

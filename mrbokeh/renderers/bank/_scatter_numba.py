@@ -1,8 +1,46 @@
-"""The loop over pixels of a bank's plain twin, compiled; same words, nothing cleverer."""
+"""The loop over pixels of a bank's plain twin, compiled; same words, nothing cleverer.
+
+The loop over pixels of scatter_reference, compiled; same words, nothing cleverer.
+"""
+
+import math
 
 import numpy as np
 
+from mrbokeh.optics._aperture_numba import fill_psf
 from mrbokeh.system.kernels import njit
+
+
+@njit(cache=True, nogil=True)
+def scatter_rows(
+    padded: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    margin_px: int,
+    unit_radius: float,
+    vertices: np.ndarray,
+    starts: np.ndarray,
+    weights: np.ndarray,
+) -> None:
+    """Add values (H, W, C), each spread by its pixel's PSF, to padded, which has a margin of the largest kernel's radius."""
+    height, width, channels = values.shape
+    for y in range(height):
+        for x in range(width):
+            lit = False
+            for c in range(channels):
+                lit = lit or values[y, x, c] != 0.0
+            if not lit:
+                continue
+            diameter_px = coc_px[y, x]
+            radius_px = max(0, int(math.ceil(abs(diameter_px) * 0.5 * unit_radius - 0.5)))
+            size = 2 * radius_px + 1
+            kernel, steps = np.zeros((size, size)), np.zeros((size, size))
+            fill_psf(kernel, steps, vertices, starts, weights, diameter_px)
+            top, left = y + margin_px - radius_px, x + margin_px - radius_px
+            for j in range(size):
+                for i in range(size):
+                    for c in range(channels):
+                        padded[top + j, left + i, c] += kernel[j, i] * values[y, x, c]
 
 
 @njit(cache=True, nogil=True)

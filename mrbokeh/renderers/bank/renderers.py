@@ -1,26 +1,107 @@
-"""A bank of kernels behind the renderers that spread one side of the focus, or one opening, at a time."""
+"""A bank of kernels behind the renderers that spread one side of the focus, or one opening, at a time.
 
-from collections.abc import Callable, Sequence
+The kernels of a bank as sums of few separable ones.
+
+A place of a bank in the role of an Aperture: its kernels at any diameter, blended between those that the bank has.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.layering import Layering, render_layers
 from mrbokeh.layering.psf_over_field import Channels, Plane
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf import Psf
 from mrbokeh.optics.psf_bank import PsfBank
-from mrbokeh.renderers.bank.apertures import BankApertures
-from mrbokeh.renderers.bank.around import Around
+from mrbokeh.renderers.bank.apertures import BankApertures, TurnedApertures, grown
 from mrbokeh.renderers.bank.bank_optics import BankOptics
-from mrbokeh.renderers.bank.by_aperture import TurnedApertures, spread_shares
-from mrbokeh.renderers.bank.low_rank_terms import BankTerms
-from mrbokeh.renderers.bank.opening import KernelOpening
-from mrbokeh.renderers.bank.scatter import scatter_side
-from mrbokeh.renderers.bank.spread import AnchorKernels, BlendedTables, SpreadSide, spread_by_bank
+from mrbokeh.renderers.bank.lattice import SIDES, Around, BankLattice
+from mrbokeh.renderers.bank.spread import AnchorKernels, BlendedTables, SpreadSide, scatter_side, spread_by_bank, spread_shares
 from mrbokeh.renderers.bank.tables import Place
-from mrbokeh.renderers.kernels.low_rank_kernel import LowRankKernel
+from mrbokeh.renderers.kernels.low_rank_kernel import Levels, LowRankKernel
+from mrbokeh.system.console import track
+
+BankTerms = Mapping[tuple[int, int, int, int], LowRankKernel]
+"""By side of the focus, node, place and channel (see BankLattice); each states what it misses of its kernel."""
+
+
+def decompose_bank(lattice: BankLattice, decomposed: Callable[[Float64[np.ndarray, "size size"]], LowRankKernel]) -> BankTerms:
+    """All kernels, as behind the focus. decomposed: how, see LowRankFilter."""
+    nodes = [(side, node, place) for side in SIDES for node in range(len(lattice.diameters_px[side])) for place in range(lattice.places)]
+    terms = {}
+    for key in track(nodes, "low-rank terms of the bank"):
+        kernel = lattice.kernel(*key)
+        for channel in range(lattice.bank.channels):
+            terms[(*key, channel)] = decomposed(np.ascontiguousarray(kernel[..., channel]))
+    return terms
+
+
+Decompose = Callable[[Float64[np.ndarray, "size size"]], LowRankKernel]
+
+
+@dataclass(frozen=True, eq=False)
+class KernelOpening:
+    """Of one side of the focus, seen as behind it, one channel of the kernels.
+
+    terms: low-rank terms that are known already; kept: those that were found since, for all openings of a bank.
+    """
+
+    kernels: AnchorKernels
+    side: int
+    anchor: int
+    channel: int
+    terms: BankTerms
+    kept: dict[tuple[int, int, int, int], LowRankKernel]
+
+    @property
+    def unit_radius(self) -> float:
+        return self.kernels.unit_radius
+
+    def rasterize(self, diameter_px: float) -> Psf:
+        """Behind the focus where positive, turned by half a turn where negative."""
+        lower, upper = (each.item() for each in self.kernels.lattice.diameter_shares(self.side, np.array(abs(diameter_px))))
+        parts = [(lower, 1.0 - upper), (lower + 1, upper)]
+        found = [(self._at(node), share) for node, share in parts if share > 0.0]
+        size = max(len(kernel) for kernel, _ in found)
+        kernel = np.sum([share * grown(each, size) for each, share in found], axis=0)
+        return Psf(np.ascontiguousarray(kernel if diameter_px > 0 else kernel[::-1, ::-1]))
+
+    def levels(self, diameters_px: Float32[np.ndarray, "height width"], exact: Float32[np.ndarray, "height width"]) -> Levels:
+        """The bank's own diameters as levels; `diameters_px` is 0 for pixels that take no part."""
+        from mrbokeh.renderers.kernels._low_rank_numba import NOT_A_LEVEL
+
+        nodes_px = self.kernels.lattice.diameters_px[self.side]
+        lower, upper = self.kernels.lattice.diameter_shares(self.side, diameters_px)
+        live = (diameters_px > 0) & (exact < 1.0)
+        used = np.zeros(len(nodes_px), bool)
+        used[lower[live & (upper < 1.0)]] = True
+        used[lower[live & (upper > 0.0)] + 1] = True
+        first, last = np.flatnonzero(used)[[0, -1]]
+        level = np.where(upper < 1.0, lower, lower + 1) - first
+        steps_px = np.where(used, nodes_px, np.nan)[first : last + 1]
+        share = np.where(live & (upper < 1.0), upper, 0.0).astype(np.float32)
+        return Levels(tuple(steps_px.tolist()), np.where(live, level, NOT_A_LEVEL).astype(np.int16), share)
+
+    def low_rank(self, diameter_px: float, decomposed: Decompose) -> LowRankKernel:
+        """The terms of one of the bank's own diameters."""
+        node = int(np.argmin(np.abs(self.kernels.lattice.diameters_px[self.side] - diameter_px)))
+        place, angle_rad = self.kernels.lattice.place_and_angle(self.anchor)
+        known = None if angle_rad else self.terms.get((self.side, node, place, self.channel))
+        key = self.side, node, self.anchor, self.channel
+        if known is None and key not in self.kept:
+            self.kept[key] = decomposed(self._at(node))
+        return known or self.kept[key]
+
+    def _at(self, node: int) -> Float64[np.ndarray, "size size"]:
+        return np.ascontiguousarray(self.kernels.kernel(self.side, node, self.anchor)[..., self.channel])
+
 
 Inner = Callable[[Channels, Plane, Any], Channels]
 

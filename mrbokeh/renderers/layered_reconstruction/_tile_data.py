@@ -1,8 +1,92 @@
-"""What the kernels share: samples sorted by tile, and how they are to be filtered."""
+"""What the kernels share: samples sorted by tile, and how they are to be filtered.
 
+The opening of a lens as strips along u: what the window filter sums over, and where rays are sent through.
+"""
+
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64, Int64
+
+from mrbokeh.optics.aperture import Aperture
+
+STRIPS = (8, 16, 32, 64)
+"""How many strips a diameter has in the coarse to fine drawings of a pupil."""
+
+_LEAST_WIDTH = 1e-9
+_LEAST_SHARE = 1e-4
+
+
+def pupil_spans(aperture: Aperture, strips: int) -> Float64[np.ndarray, "spans 5"]:
+    """All stretches that let light pass on `strips` lines across a plain aperture: v, from u, to u, weight, height in v.
+
+    The weights sum to 1.
+    """
+    corners = np.concatenate(aperture.outlines)
+    low, high = float(corners[:, 1].min()), float(corners[:, 1].max())
+    lines = low + (np.arange(strips) + 0.5) * (high - low) / strips
+    table = np.array([(v, *stretch, (high - low) / strips) for v in lines.tolist() for stretch in _open_stretches(aperture, v)])
+    table[:, 3] /= table[:, 3].sum()
+    return table
+
+
+def packed_pupil(
+    aperture: Aperture, across: int = 1
+) -> tuple[Float64[np.ndarray, "spans 5"], Int64[np.ndarray, " starts"], Float64[np.ndarray, " cells"]]:
+    """All drawings of what is seen in front of the focus, then of what is seen behind it, each in its cells; where each begins; the
+    share of the light that comes through each cell.
+
+    across: cells along either side of the box around the opening; those that nothing comes through are left out. Weights of a
+    cell sum to 1.
+    """
+    corners = np.concatenate(aperture.outlines)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    drawings = [_in_cells(pupil_spans(aperture.seen(side), strips), low, high, across) for side in (-1, 1) for strips in STRIPS]
+    light = np.array([[cell[:, 3].sum() for cell in drawing] for drawing in drawings])
+    is_open = np.all(light > _LEAST_SHARE, axis=0)
+    tables = [cell * (1, 1, 1, 1 / share, 1) for drawing, row in zip(drawings, light, strict=True)
+              for cell, share, kept in zip(drawing, row, is_open, strict=True) if kept]  # fmt: skip
+    shares = light[:, is_open][[len(STRIPS) - 1, -1]].mean(axis=0)
+    return np.concatenate(tables), np.cumsum([0, *(len(table) for table in tables)]), shares / shares.sum()
+
+
+def _in_cells(
+    spans: Float64[np.ndarray, "spans 5"], low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"], across: int
+) -> list[Float64[np.ndarray, "_ 5"]]:
+    """What of the strips lies in each of across x across cells of the box from low to high, u first; weights by area."""
+    u, v = (np.linspace(low[axis], high[axis], across + 1) for axis in (0, 1))
+    middle, from_u, to_u, weight, height = spans.T
+    cells = []
+    for j, i in np.ndindex(across, across):
+        left, right = np.maximum(from_u, u[i]), np.minimum(to_u, u[i + 1])
+        top, bottom = np.maximum(middle - height / 2, v[j]), np.minimum(middle + height / 2, v[j + 1])
+        area = (right - left) / (to_u - from_u) * (bottom - top) / height
+        inside = (right - left > _LEAST_WIDTH) & (bottom - top > _LEAST_WIDTH)
+        cells.append(np.column_stack([(top + bottom) / 2, left, right, weight * area, bottom - top])[inside])
+    return cells
+
+
+def _open_stretches(aperture: Aperture, v: float) -> list[tuple[float, float, float]]:
+    """From u, to u and length times weight along one line, where the weights of all outlines together are above 0."""
+    steps = []
+    for outline, weight in zip(aperture.outlines, aperture.weights, strict=True):
+        steps += [(u, weight if k % 2 == 0 else -weight) for k, u in enumerate(_crossings(outline, v))]
+    steps.sort()
+    stretches, open_share = [], 0.0
+    for (u, step), (following, _) in pairwise(steps):
+        open_share += step
+        if open_share > _LEAST_WIDTH and following - u > _LEAST_WIDTH:
+            stretches.append((u, following, open_share * (following - u)))
+    return stretches
+
+
+def _crossings(outline: Float64[np.ndarray, "points 2"], v: float) -> list[float]:
+    """Where a closed outline crosses the line of this v, from left to right."""
+    closed = np.concatenate([outline, outline[:1]])
+    pairs = ((a, b) for a, b in pairwise(closed) if (a[1] <= v) != (b[1] <= v))
+    return sorted(float(a[0] + (v - a[1]) / (b[1] - a[1]) * (b[0] - a[0])) for a, b in pairs)
+
 
 BLOCKS_ACROSS = 4
 BLOCKS = BLOCKS_ACROSS**2

@@ -10,6 +10,11 @@ What it costs: the light of a pixel is not exactly its PSF. The low-rank sum rip
 adds up to 3 % to that. Ripples average out over an even field (exactly), a texture and even an edge: an edge from 0 to 1 is
 within 0.003 of its exact blur at the default. They do not average out for lights: those are spread by their exact kernels,
 see _low_rank_highlights. Beside a bright area that just fails to count as one, the dark is off by a tenth of its own light.
+
+Tilt-shift: a photograph blurred by a map that somebody drew, without any depth (McGraw, Section 4 and Fig. 14).
+
+A tilted lens keeps a wedge of space sharp; a gradient of blur drawn over a photograph looks alike and makes the subject
+seem small. The map is one of diameters in pixels: 0 along the band to keep, growing smoothly away from it.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -24,14 +29,11 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.layering import Layering, render_layers
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.psf import kernel_radius_px
 from mrbokeh.optics.psf_bank import PsfBank
-from mrbokeh.renderers.bank.low_rank_levels import Levels, Taps, levels_of, taps_of
-from mrbokeh.renderers.bank.low_rank_terms import BankTerms
-from mrbokeh.renderers.bank.opening import KernelOpening
-from mrbokeh.renderers.bank.renderers import BankRenderer, by_low_rank
-from mrbokeh.renderers.kernels.low_rank_kernel import LowRankKernel, decompose
-from mrbokeh.renderers.low_rank.exact import scatter_exactly
-from mrbokeh.renderers.low_rank.highlights import LEAST_RADIUS_PX, exact_share
+from mrbokeh.renderers.bank.renderers import BankRenderer, BankTerms, KernelOpening, by_low_rank
+from mrbokeh.renderers.kernels.low_rank_kernel import Levels, LowRankKernel, Taps, decompose, levels_of, taps_of
+from mrbokeh.renderers.low_rank.exact_scatter import LEAST_RADIUS_PX, exact_share, scatter_exactly
 from mrbokeh.renderers.low_rank.per_pixel import depth_edge_mask, scatter_per_pixel
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
@@ -89,11 +91,11 @@ class LowRankFilter:
         coc_px: Float32[np.ndarray, "height width"],
         aperture: Aperture | KernelOpening,
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.spreading.Spread."""
+        """See mrbokeh.layering.psf_over_field.Spread."""
         if values.shape[2] > _MOST_CHANNELS:
             parts = [values[..., at : at + _MOST_CHANNELS] for at in range(0, values.shape[2], _MOST_CHANNELS)]
             return np.concatenate([self.spread(np.ascontiguousarray(part), coc_px, aperture) for part in parts], axis=2)
-        from mrbokeh.renderers.bank._low_rank_pixels_numba import one_side
+        from mrbokeh.renderers.kernels._low_rank_numba import one_side
 
         with ThreadPoolExecutor(self.threads or cores()) as pool:
             out, diameters_px, sides, signed = _split(values, coc_px, 1.0 / aperture.unit_radius, pool.map)
@@ -153,7 +155,7 @@ def _split(
     each: Callable[[Callable, Iterable], Iterable],
 ) -> tuple[Float32[np.ndarray, "height width channels"], Float32[np.ndarray, "height width"], list[int], Bool[np.ndarray, " channels"]]:
     """What is sharp, the signed diameters of what is not (else 0), the signs among them, and which channels have negative values."""
-    from mrbokeh.renderers.bank._low_rank_pixels_numba import BEHIND, IN_FRONT, NOT_FINITE, prepare
+    from mrbokeh.renderers.kernels._low_rank_numba import BEHIND, IN_FRONT, NOT_FINITE, prepare
 
     height, width, channels = values.shape
     out, diameters_px = np.empty_like(values), np.empty((height, width), np.float32)
@@ -181,7 +183,7 @@ def _scatter_levels(
     each: Callable[[Callable, Iterable], Iterable],
 ) -> None:
     """Add share * value of every pixel that has a level, spread by its low-rank kernels, to out."""
-    from mrbokeh.renderers.bank._low_rank_pixels_numba import level_spans
+    from mrbokeh.renderers.kernels._low_rank_numba import level_spans
     from mrbokeh.renderers.low_rank._filter_numba import TILE_FLOATS, scatter_piece
 
     spans = level_spans(levels.level, levels.upper, TILE_FLOATS // values.shape[2])
@@ -194,3 +196,35 @@ def _scatter_levels(
         scatter_piece(out, *source, *kernels, top, min(height, top + _PIECE_ROWS), first, min(tiles, first + _PIECE_TILES))
 
     list(each(run, [(top, first) for top in range(0, height, _PIECE_ROWS) for first in range(0, tiles, _PIECE_TILES)]))
+
+
+_LEAST_COVERAGE = 1e-6
+
+
+def tilt_shift(
+    rgb: Float32[np.ndarray, "height width 3"],
+    coc_px: Float32[np.ndarray, "rows columns"],
+    aperture: Aperture,
+    rank: int = 3,
+    threads: int = 0,
+) -> Float32[np.ndarray, "height width 3"]:
+    """A scene-linear picture with every pixel spread by its own diameter, and the sum divided by how much arrived.
+
+    coc_px: from 0 (kept; anything below 1 px is) to any size; negative diameters mirror the aperture. Steps in the map are
+    allowed and give what no depth can order: light of both sides mixes across them. aperture: plain.
+    rank: terms per kernel, 3 as in the paper; kernels up to 9 px take as many as they need. threads: 0 takes all cores.
+    The picture is continued beyond its border by its mirror image; an even picture stays even.
+    """
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.shape[:2] != coc_px.shape:
+        raise InputError(f"tilt-shift needs a picture (H, W, 3) and a map of diameters (H, W), got {rgb.shape} and {coc_px.shape}")
+    if not np.isfinite(rgb).all() or not np.isfinite(coc_px).all():
+        raise InputError("tilt-shift needs finite colours and diameters, but some are inf or NaN: draw a diameter for every pixel")
+    if not aperture.is_plain:
+        raise InputError("tilt-shift needs a plain aperture, but this one has modifiers: give it as it is seen, aperture.seen(...)")
+    margin = kernel_radius_px(float(np.abs(coc_px).max()), aperture.unit_radius)
+    around = ((margin, margin), (margin, margin))
+    values = np.dstack([rgb, np.ones_like(coc_px)])
+    wide = np.pad(values, (*around, (0, 0)), mode="symmetric"), np.pad(coc_px, around, mode="symmetric")
+    spread = LowRankFilter(relative_error=0.0, max_rank=rank, threads=threads).spread(*wide, aperture)
+    inside = spread[margin : margin + coc_px.shape[0], margin : margin + coc_px.shape[1]]
+    return inside[..., :3] / np.maximum(inside[..., 3:], np.float32(_LEAST_COVERAGE))

@@ -8,18 +8,24 @@ fast track, to 1.1 % (64 steps per octave) beyond it. Measured (tests/bench/benc
 of 40 px: SSIM 0.998 and 55 dB to dense splatting of the same kernels, 56 dB to exact ones.
 
 A rounding error of one pixel shows, integrated, all over the picture, and those of an even area all go the same way. So Laplacians
-are summed in whole numbers of 32 bits (`mrbokeh.renderers.spreadlets.layout`), of which every pixel adds 0 in all, rounded by
+are summed in whole numbers of 32 bits (`mrbokeh.renderers.spreadlets.sums`), of which every pixel adds 0 in all, rounded by
 dithers that spread evenly; modes are kept and solved in single precision. Pixels that outshine the mean 32 times are splatted tap by
-tap instead (`mrbokeh.renderers.spreadlets.lamps`), which keeps the whole numbers fine. Measured: within 7e-6 of double precision, as
+tap instead (`mrbokeh.renderers.spreadlets.laplacian_spreadlets`), which keeps the whole numbers fine. Measured: within 7e-6 of double precision, as
 a share of the mean, at 960 x 540 and 1e-5 at 1400 x 1400. Whole Laplacians, pyramids and light that is not finite take double precision.
+
+Lamps: pixels so much brighter than the mean that they are splatted tap by tap, so that the rest can be summed in whole numbers.
+
+At most one pixel in as many outshines the mean so many times in one channel: all of their taps are a small share of dense splatting,
+whatever the picture.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Bool, Float32, Float64, Int
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.layering import Layering, render_layers
@@ -31,11 +37,63 @@ from mrbokeh.renderers.bank.bank_optics import BankOptics
 from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.renderers.kernels.laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out, used_codes
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, Sparsification, Spreadlets
-from mrbokeh.renderers.spreadlets.lamps import lamps_among
 from mrbokeh.renderers.spreadlets.samples import reconstructed
 from mrbokeh.renderers.spreadlets.sums import add_light
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.resources import ZeroedMemory
+from mrbokeh.system.resources import ZeroedMemory, workers
+
+OUTSHINES_MEAN = 32.0
+_ROWS_AT_ONCE = 64
+_EVERY = 8  # rows whose mean stands for that of all; how many lamps there may be is no matter of a few percent
+
+Codes = Int[np.ndarray, "height width"]
+Values = Float32[np.ndarray, "height width channels"]
+
+
+class Lamps(NamedTuple):
+    """Which pixels are lamps, and how large light of the other pixels with sparse kernels is at most in each channel, without sign."""
+
+    found: Bool[np.ndarray, "height width"]
+    largest: Float32[np.ndarray, " channels"]
+
+
+def lamps_among(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Lamps:
+    """The lamps among pixels whose code (-1 for none) is sparse."""
+    from mrbokeh.renderers.spreadlets._splat_numba import find_lamps
+
+    limits = (OUTSHINES_MEAN * _mean(values, codes, sparse)).astype(np.float32)
+    starts = range(0, len(codes), _ROWS_AT_ONCE)
+    found, largest = np.zeros(codes.shape, np.bool_), np.zeros((len(starts), values.shape[2]), np.float32)
+
+    def find(band: int) -> None:
+        rows = slice(starts[band], starts[band] + _ROWS_AT_ONCE)
+        find_lamps(found[rows], largest[band], values[rows], codes[rows], sparse, limits)
+
+    with workers(codes.size) as pool:
+        list(pool.map(find, range(len(starts))))
+    return Lamps(found, largest.max(axis=0))
+
+
+def _mean(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Float64[np.ndarray, " channels"]:
+    """Of light without sign of the sparse pixels, in some rows or, if there are none in these, in all."""
+    from mrbokeh.renderers.spreadlets._splat_numba import add_up
+
+    sums = np.zeros(values.shape[2])
+    for step in (_EVERY, 1):
+        count = add_up(sums, values[::step], codes[::step], sparse)
+        if count:
+            return sums / count
+    return sums
+
+
+def lamps_among_plainly(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Lamps:
+    """The plain twin of `lamps_among`."""
+    mine, light = (codes >= 0) & sparse[codes], np.abs(values)
+    some = light[::_EVERY][mine[::_EVERY]]
+    limits = OUTSHINES_MEAN * (some if some.size else light[mine]).mean(axis=0, dtype=np.float64)
+    found = mine & (light > limits.astype(np.float32)).any(axis=2)
+    return Lamps(found, light[mine & ~found].max(axis=0, initial=0.0))
+
 
 _MOST_KEPT_BYTES = 1 << 27
 
@@ -89,7 +147,7 @@ class LaplacianSpreadlets:
     def spread(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.spreading.Spread."""
+        """See mrbokeh.layering.psf_over_field.Spread."""
         return self._spread(values, coc_px, aperture, densely=False)
 
     def spread_densely(
@@ -109,7 +167,7 @@ class LaplacianSpreadlets:
 
         Coverage, three times for a bank of three colours, and others take kernels scaled to sum to 1: light that is absorbed
         darkens what is seen, but is no hole in it. Others go with green. What a bank of one colour is given may also be colour
-        alone, of up to three channels. Circles and what gets lost as in mrbokeh.layering.spreading.Spread. densely: all taps of the
+        alone, of up to three channels. Circles and what gets lost as in mrbokeh.layering.psf_over_field.Spread. densely: all taps of the
         same kernels.
         """
         tables = self._bank_tables

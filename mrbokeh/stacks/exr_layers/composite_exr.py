@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.images.exr_io import ATTRIBUTE, ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
@@ -87,14 +87,8 @@ class CompositeLayers:
                 raise InputError(f"a layer's name is letters, digits and _, a letter first, and not {' or '.join(_RESERVED)}; got {name!r}")
 
 
-def write_composite_exr(
-    path: Path | str, composite: CompositeLayers, *, half: bool = True, primaries: Sequence[float] | None = None
-) -> None:
-    """Colour in half or float, depth and circles of confusion always in float.
-
-    primaries: CIE x, y of red, green, blue and white that the numbers have, to be stated in the header: exr_primaries.REC709 as all is
-    here, or those of the space that a ColorConversion brought them to. None states nothing, which means Rec.709.
-    """
+def write_composite_exr(path: Path | str, composite: CompositeLayers, *, half: bool = True) -> None:
+    """Write colour in half or float, depth and circles of confusion always in float."""
     dtype = np.float16 if half else np.float32
     alpha = np.ones(composite.rgb.shape[:2], np.float32) if composite.alpha is None else composite.alpha
     channels = _rgba("", composite.rgb, alpha, dtype)
@@ -104,28 +98,8 @@ def write_composite_exr(
     channels |= {name: plane for name, plane in maps.items() if plane is not None}
     if composite.matte is not None:
         channels["matte.A"] = composite.matte.astype(dtype)
-    stated = {} if primaries is None else {ATTRIBUTE: tuple(float(each) for each in primaries)}
     order = ",".join(composite.layers)
-    write_exr(path, ExrPart(channels, attributes={"comments": COMMENTS, "mrbokehLayers": order, **stated}))
-
-
-def read_composite_exr(path: Path | str) -> CompositeLayers:
-    """What `write_composite_exr` wrote, as stored: primaries that are stated are not converted (`image_io.read_image` does)."""
-    part = read_exr(path)[0]
-    if "mrbokehLayers" not in part.attributes:
-        raise InputError(f"{path}: expected a layered EXR of mrbokeh; `FlatRender` reads those of other programs")
-    names = [name for name in str(part.attributes["mrbokehLayers"]).split(",") if name]
-    layers = {name: _layer(part, name) for name in names}
-    maps = {key: part.stacked([name])[..., 0] for key, name in _MAPS.items() if name in part.channels}
-    return CompositeLayers(part.stacked("RGB"), layers=layers, **maps)
-
-
-_MAPS = {"alpha": "A", "depth_m": "Z", "matte": "matte.A", "coc_px": "coc.px"}
-
-
-def _layer(part: ExrPart, name: str) -> Layer:
-    values = part.stacked([f"{name}.{each}" for each in "RGBAZ"])
-    return Layer(values[..., :3], values[..., 3], values[..., 4])
+    write_exr(path, ExrPart(channels, attributes={"comments": COMMENTS, "mrbokehLayers": order}))
 
 
 def _rgba(prefix: str, rgb: np.ndarray, alpha: np.ndarray, dtype: type) -> dict[str, np.ndarray]:

@@ -247,10 +247,6 @@ _KINDS = {
 """How the files of each suffix are read (cameras, images) and written."""
 
 
-def is_model(folder: Path) -> bool:
-    return any((folder / f"images{suffix}").is_file() for suffix in _KINDS)
-
-
 def read(folder: Path, options: TrackOptions) -> CameraTrack:
     """Binary goes before text. Frames are numbered by the names of the pictures."""
     found = [suffix for suffix in _KINDS if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images"))]

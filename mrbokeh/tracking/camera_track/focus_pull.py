@@ -23,9 +23,8 @@ Rows count as frames from 0 unless there is a column FrameNo or frame. Rows with
 import csv
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,6 @@ from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.track import CameraTrack
 
 Samples = Float64[np.ndarray, " samples"]
 
@@ -80,7 +78,7 @@ Keys = Float64[np.ndarray, " keys"]
 
 @dataclass(frozen=True)
 class FocusPull:
-    """frames: growing. dioptres: 1/m at those frames, 0 is infinity. f_numbers, t_numbers: at the same frames, where known.
+    """frames: growing. dioptres: 1/m at those frames, 0 is infinity.
 
     easing: linear, or smooth: no kinks, at rest in the first and last key, never beyond the keys (Fritsch and Carlson 1980).
     held: before the first and after the last key the focus stays; else asking for such frames is an InputError.
@@ -89,8 +87,6 @@ class FocusPull:
     frames: Keys
     dioptres: Keys
     easing: str = "linear"
-    f_numbers: Keys | None = None
-    t_numbers: Keys | None = None
     held: bool = True
 
     def __post_init__(self) -> None:
@@ -107,12 +103,6 @@ class FocusPull:
         dioptres = float(np.interp(place, self.frames, self.dioptres) if self.easing == "linear" else self._smooth(place))
         return 1.0 / dioptres if dioptres > 0.0 else float("inf")
 
-    def f_number_at(self, frame: float | int) -> float | None:
-        return self._stop_at(self.f_numbers, frame)
-
-    def t_number_at(self, frame: float | int) -> float | None:
-        return self._stop_at(self.t_numbers, frame)
-
     def shifted(self, offset: float | int) -> "FocusPull":
         """Key n becomes n + offset."""
         return replace(self, frames=self.frames + offset)
@@ -120,14 +110,6 @@ class FocusPull:
     def smoothed(self) -> "FocusPull":
         """Without the steps in which cameras write their metadata: see `focus_steps`. The keys must be one a frame, or about."""
         return replace(self, dioptres=smoothed_within_steps(self.dioptres))
-
-    def transmitting(self, transmittance: float) -> "FocusPull":
-        """f-numbers from T-numbers: T = N / sqrt(transmittance). A cine prime transmits about 0.8; nothing in the metadata tells."""
-        if not 0.0 < transmittance <= 1.0:
-            raise InputError(f"the transmittance of a lens lies above 0 and is at most 1, got {transmittance}")
-        if self.t_numbers is None:
-            raise InputError("this focus pull knows no T-numbers: leave the transmittance out")
-        return replace(self, f_numbers=self.t_numbers * np.sqrt(transmittance))
 
     def _place(self, frame: float | int) -> float:
         first, last = float(self.frames[0]), float(self.frames[-1])
@@ -144,10 +126,6 @@ class FocusPull:
         slopes[[0, -1]] = 0.0
         return max(float(CubicHermiteSpline(self.frames, self.dioptres, slopes)(place)), 0.0)
 
-    def _stop_at(self, numbers: Keys | None, frame: float | int) -> float | None:
-        """Between keys in stops."""
-        return None if numbers is None else float(np.exp2(np.interp(self._place(frame), self.frames, np.log2(numbers))))
-
 
 def parse_focus_keys(text: str, easing: str = "linear") -> FocusPull:
     """ "FRAME:METRES,FRAME:METRES,..." such as 0:1.2,48:3.5; inf is infinity."""
@@ -161,22 +139,10 @@ def parse_focus_keys(text: str, easing: str = "linear") -> FocusPull:
     return FocusPull(frames, 1.0 / metres, easing)
 
 
-def focus_of_track(track: CameraTrack) -> FocusPull:
-    """What the track itself tells. Raises InputError where it tells no focus."""
-    known = [number for number in track.numbers if track.frames[number].focus_distance_m is not None]
-    if not known:
-        raise InputError("the camera track tells no focus distance: give keyframes or the camera's metadata")
-    dioptres = [1.0 / (track.frames[number].focus_distance_m or np.inf) for number in known]
-    stops = [track.frames[number].f_number for number in known]
-    f_numbers = None if any(each is None for each in stops) else np.array(stops, np.float64)
-    return FocusPull(np.array(known, np.float64), np.array(dioptres), f_numbers=f_numbers, held=track.fixed)
-
-
 Row = Mapping[str, str]
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 _HEADER = re.compile(r"focus[ _]?(?:distance|position)?[ _]?\(?(m|cm|mm|ft|in)\)?", re.IGNORECASE)
-_SONY_STOP = re.compile(r"([TF]) ?([0-9]+)(?: ([0-9]+)/10)?")
 _FRAME_COLUMNS = ("frame", "frameno", "frame_number")
 
 
@@ -191,9 +157,7 @@ def read_focus_pull(path: Path | str) -> FocusPull:
         raise InputError(f"{path} has a column of focus distances, but none of its {len(rows)} rows tells one: the lens was not read")
     frames = np.array([_frame_number(rows[index], index, path) for index in known])
     dioptres = np.array([1.0 / (distances[index] or np.inf) for index in known])
-    stops = [_stop(rows[index]) for index in known]
-    f_numbers, t_numbers = (_numbers(stops, kind) for kind in "FT")
-    return FocusPull(frames, dioptres, f_numbers=f_numbers, t_numbers=t_numbers, held=False)
+    return FocusPull(frames, dioptres, held=False)
 
 
 def _rows(path: Path) -> list[Row]:
@@ -243,31 +207,3 @@ def _frame_number(row: Row, index: int, path: Path) -> float:
             except ValueError:
                 raise InputError(f"{path}, row {index + 1}: expected a frame number, got {row[name]!r}") from None
     return float(index)
-
-
-def _stop(row: Row) -> tuple[str, float] | None:
-    """("T" or "F", number), where the row tells it."""
-    text = (row.get("Aperture") or "").strip()
-    if match := _SONY_STOP.fullmatch(text):
-        return match[1], float(2.0 ** ((int(match[2]) + int(match[3] or 0) / 10.0) / 2.0))
-    cooke = bool((row.get("Cooke Metadata") or "").strip())
-    canon = "T" if row.get("ApertureMode") == "2" else "F"
-    for value, kind in (
-        (text, "T" if cooke else "F"),
-        (row.get("ApertureNumber"), canon),
-        (row.get("f_number"), "F"),
-        (row.get("t_number"), "T"),
-    ):
-        try:
-            number = float(Fraction(value or "0"))
-        except (ValueError, ZeroDivisionError):
-            continue
-        if number > 0.0:
-            return kind, number
-    return None
-
-
-def _numbers(stops: Sequence[tuple[str, float] | None], kind: str) -> np.ndarray | None:
-    """None unless every row tells that kind."""
-    found = [each[1] for each in stops if each is not None and each[0] == kind]
-    return np.array(found) if len(found) == len(stops) else None

@@ -13,8 +13,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.charuco.pose_from_points import PlanePose, PlanePoses, PointsM, PointsPx, Pose, poses_from_plane, turn_between_rad
+from mrbokeh.tracking.charuco.pose_from_points import PlanePose, PlanePoses, Pose, turn_between_rad
 
 CERTAIN_DEG = 3.0
 """RMS error of the rotation up to which a pose is shown."""
@@ -44,12 +43,6 @@ class PoseFit:
     @property
     def is_certain(self) -> bool:
         return self.turn_sigma_deg <= CERTAIN_DEG
-
-
-def pose_from_plane(points_m: PointsM, xy_px: PointsPx, camera: Camera) -> PoseFit | None:
-    """From a single picture, see `poses_from_plane`."""
-    found = poses_from_plane(points_m, xy_px, camera)
-    return None if found is None else PoseBranches().take(found, 0.0)
 
 
 class PoseBranches:
