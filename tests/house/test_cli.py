@@ -122,3 +122,15 @@ def test_an_unknown_renderer_is_refused(tmp_path: Path) -> None:
 def test_doctor_names_what_is_there_and_what_is_not() -> None:
     shown = mrbokeh("doctor").stdout
     assert all(name in shown for name in ("rawpy", "torch", "onnxruntime", "exiftool", "CUDA"))
+
+
+def test_doctor_says_what_to_do_about_a_second_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two packages of OpenCV write into one folder: which one is imported nobody knows."""
+    from mrbokeh.commands import doctor
+
+    installed = {doctor.OPENCV: "5.0", "opencv-python": "5.0"}
+    monkeypatch.setattr(doctor, "_version", installed.get)
+    found = next(each for each in doctor.findings() if each.name == doctor.OPENCV)
+    assert found.found is None and "pip uninstall -y opencv-python opencv-contrib-python-headless" in found.remedy
+    del installed["opencv-python"]
+    assert next(each for each in doctor.findings() if each.name == doctor.OPENCV).found == "5.0"
