@@ -26,8 +26,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens, write_lens
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.optics.psf_bank_file import read_bank
-from mrbokeh.renderers.kernels.spreadlets_file import fingerprint
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.bank.kernel_files import fingerprint
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME as MANIFEST
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 
 from mrbokeh.renderers.kernels.laplacian_integration import laplacian
-from mrbokeh.renderers.kernels.spreadlet_values import fitted_values, potential_of, table_for
-from mrbokeh.renderers.kernels.spreadlets import Spreadlet, whole_laplacian
+from mrbokeh.renderers.kernels.spreadlets import Spreadlet, fitted_values, potential_of, table_for, whole_laplacian
 
 _LEAST_LINES = 3
 

@@ -13,8 +13,17 @@ from mrbokeh.optics.psf_bank import physical_boxes
 from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.renderers.kernels.laplacian_integration import laplacian
-from mrbokeh.renderers.kernels.spreadlet_values import fitted_values, moments, potential_of, table_for
-from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
+from mrbokeh.renderers.kernels.spreadlets import (
+    Sparsification,
+    Spreadlet,
+    fitted_values,
+    moments,
+    outline_px,
+    potential_of,
+    sparsify,
+    table_for,
+    whole_laplacian,
+)
 from mrbokeh.system.console import track
 
 OPERATIONAL_POINTS = (0.5, 1.0, 2.0)

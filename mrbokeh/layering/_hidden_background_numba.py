@@ -1,10 +1,161 @@
-"""The searches of mrbokeh.layering.hidden_background, compiled. Pixels are called by place: row times width plus column."""
+"""The searches of mrbokeh.layering.hidden_background, compiled. Pixels are called by place: row times width plus column.
+
+Edges of the depth map for layering.hidden_background, compiled. Whether a pixel needs a closer look at all is asked of whole rows.
+
+How mrbokeh.layering.hidden_background parts the pixels of a rim, compiled.
+"""
 
 import math
 
 import numpy as np
 
 from mrbokeh.system.kernels import njit
+
+_BESIDE = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+@njit(cache=True, nogil=True)
+def snap(snapped: np.ndarray, coc_px: np.ndarray, lit: np.ndarray, step_px: float, top: int, bottom: int) -> None:
+    """Rows top to bottom of circles of confusion in which no pixel floats in the air between two surfaces, as antialiased or
+    resized depth makes them.
+
+    A pixel between two even surfaces, each at most 2 pixels away on opposite sides, takes the nearer value of the two; a lit one
+    does not, for lamps do hang in the air.
+    """
+    height, width = coc_px.shape
+    lowest, highest, even_px = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32), np.float32(0.5 * step_px)
+    uneven = np.empty(width, np.bool_)
+    for y in range(top, bottom):
+        snapped[y] = coc_px[y]
+        if y < 3 or y >= height - 3:
+            continue
+        _extremes_of_columns(lowest, highest, coc_px, y)
+        here = coc_px[y]
+        for x in range(width):
+            low, high = min(min(lowest[x], lowest[x + 1]), lowest[x + 2]), max(max(highest[x], highest[x + 1]), highest[x + 2])
+            uneven[x] = max(here[x] - low, high - here[x]) > even_px
+        for x in range(3, width - 3):
+            if uneven[x] and not lit[y, x]:
+                snapped[y, x] = _snapped(coc_px, y, x, step_px)
+
+
+@njit(cache=True, nogil=True)
+def find_rims(rim: np.ndarray, coc_px: np.ndarray, step_px: float, top: int, bottom: int) -> None:
+    """Rows top to bottom of rim (H, W), bool: pixels with something more than `step_px` nearer beside them; they may hold some of
+    its colour."""
+    width = coc_px.shape[1]
+    lowest, highest, least_px = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32), np.float32(step_px)
+    for y in range(top, bottom):
+        _extremes_of_columns(lowest, highest, coc_px, y)
+        here, found = coc_px[y], rim[y]
+        for x in range(width):
+            found[x] = here[x] - min(min(lowest[x], lowest[x + 1]), lowest[x + 2]) > least_px
+
+
+@njit(cache=True, nogil=True)
+def _extremes_of_columns(lowest: np.ndarray, highest: np.ndarray, coc_px: np.ndarray, y: int) -> None:
+    """The least and the greatest of rows y - 1 to y + 1 (those there are), one pixel on the left; the ends are repeated."""
+    height, width = coc_px.shape
+    above, here, below = coc_px[max(y - 1, 0)], coc_px[y], coc_px[min(y + 1, height - 1)]
+    low, high = lowest[1 : width + 1], highest[1 : width + 1]
+    for x in range(width):
+        low[x] = min(min(above[x], here[x]), below[x])
+        high[x] = max(max(above[x], here[x]), below[x])
+    lowest[0], highest[0] = low[0], high[0]
+    lowest[width + 1], highest[width + 1] = low[width - 1], high[width - 1]
+
+
+@njit(cache=True, nogil=True)
+def _snapped(coc_px: np.ndarray, y: int, x: int, step_px: float) -> np.float32:
+    here, even_px = coc_px[y, x], 0.5 * step_px
+    result = here
+    for dy, dx in _BESIDE:
+        if abs(here - coc_px[y + dy, x + dx]) <= even_px and abs(here - coc_px[y - dy, x - dx]) <= even_px:
+            continue
+        for before in range(1, 3):
+            a, aa = coc_px[y - before * dy, x - before * dx], coc_px[y - (before + 1) * dy, x - (before + 1) * dx]
+            if abs(a - aa) > even_px or abs(here - a) <= even_px:
+                continue
+            for after in range(1, 3):
+                b, bb = coc_px[y + after * dy, x + after * dx], coc_px[y + (after + 1) * dy, x + (after + 1) * dx]
+                between = (here - a) * (b - here) > 0.0 and abs(b - here) > even_px
+                if between and abs(b - bb) <= even_px and abs(b - a) > 2.0 * step_px:
+                    result = a if abs(here - a) < abs(b - here) else b
+    return result
+
+
+_LARGEST_SHARE = 0.6
+
+
+@njit(cache=True, nogil=True)
+def unmix_rims(
+    front: np.ndarray,
+    front_coc_px: np.ndarray,
+    behind: np.ndarray,
+    rims: np.ndarray,
+    of_behind: np.ndarray,
+    values: np.ndarray,
+    coc_px: np.ndarray,
+    lit: np.ndarray,
+    step_px: float,
+) -> None:
+    """Split rim pixels into what the nearer neighbour gave, in front, and the rest, which replaces what was filled in behind.
+
+    rims: (R,) places. front: (R, C), the pixels before; behind: (N, C), at of_behind (R,) what was filled in.
+    Of the nearer neighbours the one counts that differs most from what is filled in: it is the least mixed itself. Its share
+    explains the pixel best as a mixture of the two, is smaller the worse the mixture explains it, and at most 0.6, as the pixel's
+    own depth is that behind. One brighter than the neighbour is no mixture of it (a lamp behind a wire) and stays whole.
+    Front and rest together are the pixel: no light is lost.
+    """
+    width, channels = values.shape[1:]
+    for i in range(len(rims)):
+        y, x, filled = rims[i] // width, rims[i] % width, behind[of_behind[i]]
+        fy, fx, most = _most_different(values, coc_px, y, x, filled, step_px)
+        if fy < 0 or (lit[y, x] and not _lamp_in_front(values, coc_px, y, x, step_px)):
+            continue
+        along, off = 0.0, 0.0
+        for c in range(3):
+            along += (values[y, x, c] - filled[c]) * (values[fy, fx, c] - filled[c])
+            off += (values[y, x, c] - filled[c]) ** 2
+        if along > most:
+            continue
+        explained = along * along / (most * off) if off > 0.0 and along > 0.0 else 0.0
+        share = min(_LARGEST_SHARE, explained * along / most)
+        front_coc_px[i] = coc_px[fy, fx]
+        for c in range(channels):
+            rest = (values[y, x, c] - share * values[fy, fx, c]) / (1.0 - share)
+            filled[c] = max(0.0, rest) if c < 3 else rest
+            front[i, c] = values[y, x, c] - (1.0 - share) * filled[c]
+        front[i, 3], filled[3] = share, 1.0
+
+
+@njit(cache=True, nogil=True)
+def _most_different(values: np.ndarray, coc_px: np.ndarray, y: int, x: int, filled: np.ndarray, step_px: float) -> tuple[int, int, float]:
+    """Of the nearer neighbours the one whose colour is farthest from what is filled in, and the square of that distance; else -1."""
+    height, width, _ = values.shape
+    fy, fx, most = -1, -1, 0.0
+    for ny in range(max(0, y - 1), min(height, y + 2)):
+        for nx in range(max(0, x - 1), min(width, x + 2)):
+            if coc_px[ny, nx] < coc_px[y, x] - step_px:
+                difference = 0.0
+                for c in range(3):
+                    difference += (values[ny, nx, c] - filled[c]) ** 2
+                if difference > most:
+                    fy, fx, most = ny, nx, difference
+    return fy, fx, most
+
+
+@njit(cache=True, nogil=True)
+def _lamp_in_front(values: np.ndarray, coc_px: np.ndarray, y: int, x: int, step_px: float) -> bool:
+    """Whether the brightest of the 5x5 pixels around, the lamp whose light a pixel holds, is nearer than the pixel."""
+    height, width, _ = values.shape
+    brightest, nearer = -1.0, False
+    for ny in range(max(0, y - 2), min(height, y + 3)):
+        for nx in range(max(0, x - 2), min(width, x + 3)):
+            brightness = values[ny, nx, 0] + values[ny, nx, 1] + values[ny, nx, 2]
+            if brightness > brightest:
+                brightest, nearer = brightness, coc_px[ny, nx] < coc_px[y, x] - step_px
+    return nearer
 
 
 @njit(cache=True, nogil=True)

@@ -29,10 +29,9 @@ import numpy as np
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import apart
-from mrbokeh.layering.psf_over_field import Optics, ThroughAperture
-from mrbokeh.layering.sheets import Pixels, Sheet, coc_px_of, sheet_of
+from mrbokeh.layering.padded_layers import Pixels, Sheet, coc_px_of, sheet_of
+from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame, Optics, Spread, ThroughAperture
 from mrbokeh.layering.slices import Channels, Slicing, composited
-from mrbokeh.layering.spreading import FIELD_CELLS, Frame, Spread
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import ZeroedMemory, cores

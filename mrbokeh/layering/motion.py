@@ -76,7 +76,7 @@ def drawn_out(
     values: premultiplied, coverage in channel 3 (it weights the mean); what leaves the array is lost. coc_px: signed diameters.
     All light is kept, its centre stays in place, and what does not move stays bit for bit where nothing moves onto it.
     """
-    from mrbokeh.layering._motion_numba import draw_out
+    from mrbokeh.layering._pixels_numba import draw_out
 
     out, mean_coc_px, weight = np.zeros_like(values), np.zeros_like(coc_px), np.zeros_like(coc_px)
     draw_out(values, coc_px, motion_px, out, mean_coc_px, weight)

@@ -98,7 +98,7 @@ NOWHERE = Box(0, 0, 0, 0)
 
 def lit_box(layer: Layer) -> Box:
     """The smallest box with all pixels that cover or hold any light; NOWHERE where there are none."""
-    from mrbokeh.layering._pixel_box_numba import widen
+    from mrbokeh.layering._pixels_numba import widen
 
     box = np.array([layer.height_px, 0, layer.width_px, 0])
     for values in (layer.alpha[..., None], layer.rgb, *layer.extra.values()):

@@ -79,11 +79,11 @@ def measured(kept: Path | None) -> PsfBank:
 
 def network(folder: Path) -> Callable[[np.ndarray, np.ndarray], object]:
     """The published form, one tile, untrained: its weights do not change its time."""
-    from mrbokeh.renderers.network.onnx_network import OnnxNetwork
-    from training.export_onnx import export_network
-    from training.network_settings import NetworkSettings
-    from training.run_folder import RunFacts, build_network
-    from training.settings import TrainSettings
+    from mrbokeh.renderers.onnx_network import OnnxNetwork
+    from training.export.onnx_export import export_network
+    from training.fitting.run_folder import RunFacts, build_network
+    from training.fitting.settings import TrainSettings
+    from training.networks.network_settings import NetworkSettings
 
     settings = NetworkSettings(tile_px=0, overlap_px=0, blocks=BLOCKS)
     facts = RunFacts(Lens(35.0, 2.8, 1.0, 23.5), WIDTH_PX, HEIGHT_PX, 51.0, 20.0, (), (), None)

@@ -21,7 +21,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.kernels.laplacian_integration import integrate, integrate_by_pyramid, laplacian
 from mrbokeh.renderers.kernels.laplacian_tables import DENSE, WHOLE, kind_of
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from tests.bench.machine import machine_line, memory_line
 

@@ -17,9 +17,8 @@ import numpy as np
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.kernels.low_rank_kernel import aperture_errors
-from mrbokeh.renderers.low_rank.exact import scatter_exactly
-from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
-from mrbokeh.renderers.low_rank.tilt_shift import tilt_shift
+from mrbokeh.renderers.low_rank.exact_scatter import scatter_exactly
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter, tilt_shift
 from tests.bench.machine import machine_line, memory_line
 
 HEIGHT_PX, WIDTH_PX = 1080, 1920

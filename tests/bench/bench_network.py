@@ -21,15 +21,14 @@ import numpy as np
 import torch
 
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.network.onnx_network import OnnxNetwork
-from mrbokeh.renderers.network.onnx_sessions import PROVIDERS, open_session
+from mrbokeh.renderers.onnx_network import OnnxNetwork
+from mrbokeh.renderers.onnx_sessions import PROVIDERS, open_session
 from tests.bench.machine import machine_line, memory_line
-from training.export_onnx import export_network
-from training.fast_export.export import FastExported, export_fast_network, export_fast_run
-from training.network_settings import NetworkSettings
-from training.presets import demo_settings
-from training.run_folder import RunFacts, build_network
-from training.settings import TrainSettings
+from training.export.fast_onnx import FastExported, export_fast_network, export_fast_run
+from training.export.onnx_export import export_network
+from training.fitting.run_folder import RunFacts, build_network
+from training.fitting.settings import TrainSettings, demo_settings
+from training.networks.network_settings import NetworkSettings
 
 HEIGHT_PX, WIDTH_PX, LARGEST_COC_PX = 384, 576, 13.0
 FACTS = RunFacts(Lens(35.0, 2.8, 1.0, 23.5), WIDTH_PX, HEIGHT_PX, LARGEST_COC_PX, 20.0, (), (), None)

@@ -11,7 +11,7 @@ import numpy as np
 
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.scatter.scatter_reference import blur_layer
+from mrbokeh.renderers.scatter_reference import blur_layer
 from tests.bench.machine import machine_line, memory_line
 
 HEIGHT_PX, WIDTH_PX, LARGEST_COC_PX = 360, 640, 20.0

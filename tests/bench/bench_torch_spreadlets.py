@@ -22,7 +22,7 @@ from mrbokeh.renderers.bank.tables import Place
 from mrbokeh.renderers.kernels.laplacian_integration import laplacian
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.spreadlets.torch_spreadlets import DeviceLayer, TorchSpreadlets
-from mrbokeh.renderers.spreadlets.torch_spreadlets._integration import integrate
+from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import integrate
 from mrbokeh.system.torch_device import has_triton
 from tests.bench.device_timing import milliseconds
 from tests.bench.machine import machine_line, memory_line

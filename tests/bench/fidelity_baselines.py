@@ -13,7 +13,7 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf import kernel_radius_px
-from mrbokeh.renderers.scatter.scatter_reference import scatter
+from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 
 _GATHER_STEP_PX = 0.5

@@ -20,7 +20,7 @@ from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import VideoWriter

@@ -25,12 +25,11 @@ LEVELS = (
 )
 # Those of mrbokeh/renderers: what chooses one; the methods, which never import one another; kernels of banks; fitted kernels; the protocol.
 RENDERER_LEVELS = (
-    {"choose_bank"},
     {"choose"},
-    {"polygon", "low_rank", "spreadlets", "layered_reconstruction", "network", "scatter"},
+    {"polygon", "low_rank", "spreadlets", "layered_reconstruction", "onnx_network", "scatter_reference"},
     {"bank"},
     {"kernels"},
-    {"base"},
+    {"base", "onnx_sessions"},
 )
 ALLOWED_ACROSS = {
     "capture": {"mrbokeh"},

@@ -12,7 +12,7 @@ import pytest
 
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.picture_codec import quiet_opencv, without_chatter
-from mrbokeh.renderers.network.onnx_sessions import open_session
+from mrbokeh.renderers.onnx_sessions import open_session
 from mrbokeh.scene.gltf.gltf_loader import load_glb
 from mrbokeh.system.errors import InputError
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from mrbokeh.layering._depth_edges_numba import find_rims, snap
-from mrbokeh.layering._hidden_background_numba import nearest_behind, pure_neighbours
+from mrbokeh.layering._hidden_background_numba import find_rims, nearest_behind, pure_neighbours, snap
 from mrbokeh.layering.hidden_background import apart
-from mrbokeh.layering.lit_pixels import lights
-from mrbokeh.layering.sheets import Sheet
+from mrbokeh.layering.highlights import lights
+from mrbokeh.layering.padded_layers import Sheet
 from mrbokeh.system.resources import CallingThread
 
 SIZE = (72, 96)

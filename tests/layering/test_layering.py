@@ -7,10 +7,10 @@ import pytest
 
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.layering.layering import Layering, render_layers
-from mrbokeh.layering.spreading import Frame, spread_light
+from mrbokeh.layering.psf_over_field import Frame, spread_light
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 SIZE = (72, 96)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrbokeh.layering.lit_pixels import find_lights, lights, without_lights
+from mrbokeh.layering.highlights import find_lights, lights, without_lights
 
 
 def picture(seed: int, size: tuple[int, int]) -> np.ndarray:

@@ -7,11 +7,11 @@ import pytest
 
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
+from mrbokeh.layering.hidden_background import layer_from_view
 from mrbokeh.layering.layering import Layering, render_layers
-from mrbokeh.layering.other_view import layer_from_view
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 WIDTH, HEIGHT = 96, 64

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.layer import Layer, clear, opaque
-from mrbokeh.layering.sheets import Pixels, Sheet, coc_px_of, sheet_of
+from mrbokeh.layering.padded_layers import Pixels, Sheet, coc_px_of, sheet_of
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import CallingThread

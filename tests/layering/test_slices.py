@@ -10,15 +10,12 @@ import pytest
 from mrbokeh.images.layer import Layer, clear
 from mrbokeh.layering._slices_numba import claim, share_out
 from mrbokeh.layering.layering import Layering, render_layers
-from mrbokeh.layering.psf_over_field import ThroughAperture
-from mrbokeh.layering.sheets import Pixels
-from mrbokeh.layering.slice_islands import islands
-from mrbokeh.layering.slice_sorting import Part, sorted_slices
-from mrbokeh.layering.slices import Slicing, composited
-from mrbokeh.layering.spreading import Frame, Spread, spread_light
+from mrbokeh.layering.padded_layers import Part, Pixels
+from mrbokeh.layering.psf_over_field import Frame, Spread, ThroughAperture, spread_light
+from mrbokeh.layering.slices import Slicing, composited, islands, sorted_slices
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.resources import CallingThread, ZeroedMemory
 
 SIZE, MARGIN = (40, 52), 7

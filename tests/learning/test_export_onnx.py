@@ -13,17 +13,16 @@ from typer.testing import CliRunner
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.network import onnx_network
-from mrbokeh.renderers.network.onnx_network import METADATA_KEY, OnnxNetwork
+from mrbokeh.renderers import onnx_network
+from mrbokeh.renderers.onnx_network import METADATA_KEY, OnnxNetwork
 from mrbokeh.system.errors import InputError
-from training import export_onnx
 from training.cli import app
-from training.export_onnx import LARGEST_DIFFERENCE, export_network, largest_difference, picture_for_parity
-from training.network import BlurNetwork
-from training.network_settings import NetworkSettings
-from training.presets import better_settings, demo_settings
-from training.run_folder import RunFacts, build_network, save_network, write_facts
-from training.settings import TrainSettings, write_settings
+from training.export import onnx_export
+from training.export.onnx_export import LARGEST_DIFFERENCE, export_network, largest_difference, picture_for_parity
+from training.fitting.run_folder import RunFacts, build_network, save_network, write_facts
+from training.fitting.settings import TrainSettings, better_settings, demo_settings, write_settings
+from training.networks.network import BlurNetwork
+from training.networks.network_settings import NetworkSettings
 
 FACTS = RunFacts(
     lens=Lens(35.0, 2.8, 1.25, 23.5, Aperture.blades(6)),
@@ -127,7 +126,7 @@ def test_files_from_before_place_and_lens_still_load(exported: tuple[BlurNetwork
 
 
 def test_a_network_that_computes_something_else_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(export_onnx, "largest_difference", lambda *_: 2 * LARGEST_DIFFERENCE)
+    monkeypatch.setattr(onnx_export, "largest_difference", lambda *_: 2 * LARGEST_DIFFERENCE)
     with pytest.raises(InputError, match="nothing was written"):
         export_network(_network(FORMS["gated"]), FORMS["gated"], FACTS, tmp_path / "lens.onnx")
     assert list(tmp_path.iterdir()) == []

@@ -11,20 +11,18 @@ from typer.testing import CliRunner
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_networks import GATED, PARITY, PUBLISHED, SIZE, TOP, blurred, pictures, session_of, twin, untrained
 from training.commands.export import export_command
-from training.export_onnx import network_facts_of, record_path
-from training.fast_export.coarse_kernels import coarse_kernel, seen_kernel, tent
-from training.fast_export.export import export_fast_network
-from training.fast_export.measured_loss import ASSUMED_PSNR_DB, loss_db, made_up_look
-from training.fast_export.plans import model_of, plans
-from training.fast_export.published_graph import BlockPlan, PublishedGraph
-from training.fast_export.separable import separable_kernels
-from training.run_folder import RunFacts, save_network, write_facts
-from training.settings import TrainSettings, write_settings
-from training.tiling import TileGrid
+from training.export.fast_onnx import ASSUMED_PSNR_DB, export_fast_network, loss_db, made_up_look
+from training.export.graph_builder import coarse_kernel, seen_kernel, tent
+from training.export.onnx_export import network_facts_of, record_path
+from training.export.plans import model_of, plans
+from training.export.published_graph import BlockPlan, PublishedGraph, separable_kernels
+from training.fitting.run_folder import RunFacts, save_network, write_facts
+from training.fitting.settings import TrainSettings, write_settings
+from training.networks.network import TileGrid
 
 
 @pytest.mark.parametrize("padding", ["replicate", "reflect", "zeros"])

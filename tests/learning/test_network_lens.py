@@ -7,16 +7,14 @@ import pytest
 import torch
 
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from tests.renderers.test_onnx_network import LARGEST_COC_PX, LENS, SIZE, card
-from training.export_onnx import export_network, network_facts_of
-from training.lens_scale import LensScale
-from training.network import BlurNetwork
-from training.network_settings import NetworkSettings
-from training.presets import demo_settings
-from training.run_folder import RunFacts, build_network, facts_from_json
-from training.settings import TrainSettings
+from training.export.onnx_export import export_network, network_facts_of
+from training.fitting.run_folder import RunFacts, build_network, facts_from_json
+from training.fitting.settings import TrainSettings, demo_settings
+from training.networks.network import BlurNetwork, LensScale
+from training.networks.network_settings import NetworkSettings
 
 FACTS = RunFacts(LENS, SIZE[1], SIZE[0], LARGEST_COC_PX, 4.0, ("a/view_0",), (), None, (1.4, 5.6), (35.0, 35.0))
 SETTINGS = replace(demo_settings().network, field_position=True, lens_inputs=True, field_bases=3)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from capture.dataset.writer import slices_of_a_single_stack
 from mrbokeh.images.image_io import write_image
 from mrbokeh.images.image_metrics import psnr
-from mrbokeh.renderers.network.facts import facts_from_json
+from mrbokeh.renderers.onnx_network import facts_from_json
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import slices_to_hold_out
 from mrbokeh.system.errors import InputError

@@ -25,7 +25,7 @@ from mrbokeh.lens_measuring.matching.photo_facts import PhotoFacts, read_facts
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = 214, 320

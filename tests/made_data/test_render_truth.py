@@ -28,7 +28,7 @@ from mrbokeh.images.layer import over
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.scatter.scatter_reference import scatter
+from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 
 SIZE_PX = 96

@@ -105,7 +105,7 @@ def test_every_renderer_blurs_a_picture_of_pixels_as_the_lens_does(name: str, mo
     coc_px, photographed = fine_and_coarse(Aperture.disc())
     reblur = Reblur(make_renderer(name))
     right = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
-    for module in ("mrbokeh.layering.psf_over_field", "mrbokeh.renderers.layered_reconstruction._layer_samples"):
+    for module in ("mrbokeh.layering.psf_over_field", "mrbokeh.renderers.layered_reconstruction._samples"):
         monkeypatch.setattr(f"{module}.drawn_diameters_px", lambda coc_px, _: coc_px)
     wrong = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
     assert right > wrong + 2.0

@@ -22,9 +22,8 @@ from mrbokeh.psf_models.build import MODEL_NAMES, ModelOptions, build_bank, choo
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.simple_lens import SimpleLens
+from mrbokeh.renderers.bank.kernel_files import build_spreadlets, spreadlets_beside
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify
-from mrbokeh.renderers.kernels.spreadlets_build import build_spreadlets
-from mrbokeh.renderers.kernels.spreadlets_file import spreadlets_beside
 from mrbokeh.system.errors import InputError
 
 SMALL = ["--diameter", "12", "--counts", "4"]
@@ -227,7 +226,7 @@ def test_interrupted_spreadlets_go_on(tmp_path: Path, monkeypatch: pytest.Monkey
         made.append(kernel)
         return sparsify(kernel, settings)
 
-    monkeypatch.setattr("mrbokeh.renderers.kernels.spreadlets_build.sparsify", counted)
+    monkeypatch.setattr("mrbokeh.renderers.bank.kernel_files.sparsify", counted)
     most = 2
     with pytest.raises(KeyboardInterrupt):
         build_spreadlets(tmp_path / "bank", Sparsification(), threads=1)

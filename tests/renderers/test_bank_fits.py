@@ -15,11 +15,10 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.optics.psf_bank_file import write_bank
-from mrbokeh.renderers.bank.apertures import fit_apertures
-from mrbokeh.renderers.bank.fits_file import LOW_RANK, POLYGONS, apertures_beside, terms_beside
+from mrbokeh.renderers.bank.apertures import _fit, fit_apertures, fit_polygons
+from mrbokeh.renderers.bank.kernel_files import LOW_RANK, POLYGONS, apertures_beside, terms_beside
 from mrbokeh.renderers.bank.lattice import SIDES, BankLattice
-from mrbokeh.renderers.bank.low_rank_terms import decompose_bank
-from mrbokeh.renderers.kernels.polygon_fit import _fit, fit_polygons
+from mrbokeh.renderers.bank.renderers import decompose_bank
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 from mrbokeh.system.errors import InputError
 from tests.scenes.renderer_banks import (

@@ -16,11 +16,11 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
 from mrbokeh.optics.psf_bank_file import write_bank
 from mrbokeh.optics.psf_grid import NestedGrid
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
-from training.dataset import read_pair
+from training.data.dataset import read_pair
 
 PLAN = PairsPlan(scenes=2, focuses=2, width_px=64, height_px=40)
 

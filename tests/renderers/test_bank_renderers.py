@@ -17,7 +17,7 @@ from mrbokeh.renderers.bank.apertures import fit_apertures
 from mrbokeh.renderers.bank.lattice import ANGLES, BankLattice
 from mrbokeh.renderers.bank.tables import Place
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.system.errors import InputError
 from tests.scenes.renderer_banks import (

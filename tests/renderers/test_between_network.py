@@ -14,13 +14,12 @@ from mrbokeh.compositing.choose import insertion_of
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
-from mrbokeh.renderers.network.onnx_network import OnnxNetwork
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.onnx_network import OnnxNetwork
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from tests.renderers.test_onnx_network import FACTS, LENS, SIZE, depth_for
-from training.export_onnx import export_network
-from training.presets import demo_settings
-from training.run_folder import build_network
-from training.settings import TrainSettings
+from training.export.onnx_export import export_network
+from training.fitting.run_folder import build_network
+from training.fitting.settings import TrainSettings, demo_settings
 
 POST = np.s_[:, 40:56]
 

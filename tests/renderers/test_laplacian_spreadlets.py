@@ -24,11 +24,9 @@ from mrbokeh.renderers.kernels.laplacian_tables import (
     taps_of,
 )
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
-from mrbokeh.renderers.spreadlets.lamps import lamps_among, lamps_among_plainly
-from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.renderers.spreadlets.layout import FOUR, Laid, Window, gains_for
-from mrbokeh.renderers.spreadlets.sums import _Splatting, splat, splat_plainly
+from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets, lamps_among, lamps_among_plainly
+from mrbokeh.renderers.spreadlets.sums import FOUR, Laid, Window, _Splatting, gains_for, splat, splat_plainly
 from mrbokeh.system.errors import InputError
 
 DISC, PENTAGON = Aperture.disc(), Aperture.blades(5)

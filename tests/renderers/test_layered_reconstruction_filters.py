@@ -9,13 +9,10 @@ from scipy.special import erf
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.layered_reconstruction import footprint_sigmas
-from mrbokeh.renderers.layered_reconstruction._direct_gaussian_numba import direct_gaussian
 from mrbokeh.renderers.layered_reconstruction._filter_numba import axes
-from mrbokeh.renderers.layered_reconstruction._pupil_spans import STRIPS, packed_pupil, pupil_spans
-from mrbokeh.renderers.layered_reconstruction._segment_numba import along_line, line_taps
-from mrbokeh.renderers.layered_reconstruction._sheared_gaussian_numba import recursive_rows, sheared_gaussian
-from mrbokeh.renderers.layered_reconstruction._texture_gaussian_numba import texture_gaussian
-from mrbokeh.renderers.layered_reconstruction._window_numba import pupil_filter, sums_along_x, window_guards
+from mrbokeh.renderers.layered_reconstruction._gaussians_numba import direct_gaussian, recursive_rows, sheared_gaussian, texture_gaussian
+from mrbokeh.renderers.layered_reconstruction._tile_data import STRIPS, packed_pupil, pupil_spans
+from mrbokeh.renderers.layered_reconstruction._windows_numba import along_line, line_taps, pupil_filter, sums_along_x, window_guards
 
 
 def test_alpha_is_where_a_square_holds_95_percent() -> None:
@@ -52,7 +49,7 @@ def test_the_recursive_filter_keeps_light_and_has_the_variance_asked_for(varianc
 
 def test_the_feedback_is_the_papers_for_wide_filters() -> None:
     """Eq. 10: gamma = exp(-sqrt(2) / sigma); 1 % away at 10 px, and exact in variance at any width (the test above)."""
-    from mrbokeh.renderers.layered_reconstruction._sheared_gaussian_numba import feedback
+    from mrbokeh.renderers.layered_reconstruction._gaussians_numba import feedback
 
     assert feedback(100.0) == pytest.approx(math.exp(-math.sqrt(2.0) / 10.0), rel=1e-3)
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mrbokeh.renderers.layered_reconstruction._parts_numba import (
+from mrbokeh.renderers.layered_reconstruction._tile_data import WindowLayer
+from mrbokeh.renderers.layered_reconstruction._tiles_numba import (
     COARSE_PX,
     box_of,
     coarse,
@@ -12,7 +13,6 @@ from mrbokeh.renderers.layered_reconstruction._parts_numba import (
     scale_by_coarse,
     too_detailed,
 )
-from mrbokeh.renderers.layered_reconstruction._tile_data import WindowLayer
 
 
 def layer(rng: np.random.Generator) -> WindowLayer:

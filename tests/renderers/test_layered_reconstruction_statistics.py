@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
-from mrbokeh.renderers.layered_reconstruction._buckets import bucket_of, motion_cells
-from mrbokeh.renderers.layered_reconstruction._filter_numba import axes, sheared_axes, sheared_filter
-from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile
-from mrbokeh.renderers.layered_reconstruction._samples_numba import morton, tile_order
-from mrbokeh.renderers.layered_reconstruction._statistics_numba import rows_of_tile, seeded, xorshift
+from mrbokeh.renderers.layered_reconstruction._filter_numba import axes, morton, sheared_axes, sheared_filter, tile_order
+from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile, rows_of_tile, seeded, xorshift
+from mrbokeh.renderers.layered_reconstruction._samples import bucket_of, motion_cells
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light
 from tests.scenes.sampled_planes import LENS, Plane, even, sample_planes
 

@@ -13,13 +13,12 @@ import torch
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
-from training.export_onnx import export_network
-from training.network_settings import NetworkSettings
-from training.presets import demo_settings
-from training.run_folder import RunFacts, build_network
-from training.settings import TrainSettings
+from training.export.onnx_export import export_network
+from training.fitting.run_folder import RunFacts, build_network
+from training.fitting.settings import TrainSettings, demo_settings
+from training.networks.network_settings import NetworkSettings
 
 LENS = Lens(35.0, 2.8, 0.5, 5.0)
 SIZE = (64, 96)

@@ -8,7 +8,7 @@ import onnxruntime
 import pytest
 from onnx import helper
 
-from mrbokeh.renderers.network.onnx_sessions import CPU, _chosen, open_session, provider_of
+from mrbokeh.renderers.onnx_sessions import CPU, _chosen, open_session, provider_of
 from mrbokeh.system.errors import InputError
 
 ALL = ["TensorrtExecutionProvider", "CUDAExecutionProvider", "OpenVINOExecutionProvider", CPU]

@@ -15,7 +15,7 @@ from mrbokeh.renderers.polygon import bands as _polygon_bands
 from mrbokeh.renderers.polygon.directional_differences import PolygonCorners, edge_profile, polygon_corners
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, rectify_aperture
-from mrbokeh.renderers.scatter.scatter_reference import scatter
+from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 
 APERTURES = {

@@ -15,7 +15,7 @@ from mrbokeh.images.image_io import read_image, read_layer, write_layer
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens_file import read_lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 WIDTH, HEIGHT = 48, 32

@@ -15,7 +15,7 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 
 

@@ -5,11 +5,21 @@ import numpy as np
 import pytest
 
 from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.bank.kernel_files import fingerprint, read_spreadlets, write_spreadlets
 from mrbokeh.renderers.kernels._spreadlets_numba import cell_sums, nearest, solve, throw_darts
 from mrbokeh.renderers.kernels.laplacian_integration import integrate
-from mrbokeh.renderers.kernels.spreadlet_values import biharmonic_table, fitted_values, potential_of, turned
-from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, Spreadlets, outline_px, sparsify, whole_laplacian
-from mrbokeh.renderers.kernels.spreadlets_file import fingerprint, read_spreadlets, write_spreadlets
+from mrbokeh.renderers.kernels.spreadlets import (
+    Sparsification,
+    Spreadlet,
+    Spreadlets,
+    biharmonic_table,
+    fitted_values,
+    outline_px,
+    potential_of,
+    sparsify,
+    turned,
+    whole_laplacian,
+)
 from mrbokeh.system.errors import InputError
 
 QUICK = Sparsification(annealing_steps=20)

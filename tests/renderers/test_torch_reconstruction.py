@@ -18,11 +18,11 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.renderers.layered_reconstruction._filter_numba import extents as extents_compiled
+from mrbokeh.renderers.layered_reconstruction._filter_numba import morton as morton_compiled
 from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_axes as sheared_axes_compiled
 from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_slopes as sheared_slopes_compiled
 from mrbokeh.renderers.layered_reconstruction._filter_numba import slope_distance as slope_distance_compiled
-from mrbokeh.renderers.layered_reconstruction._samples_numba import morton as morton_compiled
-from mrbokeh.renderers.layered_reconstruction._statistics_numba import seeded, xorshift
+from mrbokeh.renderers.layered_reconstruction._partitions_numba import seeded, xorshift
 from mrbokeh.stacks.light_field_samples_file import read_samples
 from mrbokeh.system.errors import InputError
 from tests.scenes.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth
@@ -30,18 +30,20 @@ from tests.scenes.sampled_planes import LENS, Plane, checker, even, fence_scene,
 torch = pytest.importorskip("torch")
 
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction, _picture  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._filter import (  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._kernels import PupilTables, line_kernels, pupil_kernels  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight, morton, tile_light  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._screen import transform_size  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import (  # noqa: E402  # noqa: E402
     Slopes,
+    chance,
+    chosen_samples,
     extents,
     features,
     sheared_axes,
     sheared_slopes,
     slope_distance,
+    tile_rows,
 )
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight, morton, tile_light  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._screen import transform_size  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import chance, chosen_samples, tile_rows  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._windows import PupilTables, line_kernels, pupil_kernels  # noqa: E402
 
 CPU = torch.device("cpu")
 SIZE_PX = 45
@@ -351,8 +353,8 @@ def test_the_kernels_for_gpus_do_what_torch_does() -> None:
     code = """
 import torch
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _merging, _reprojection
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._reprojection_triton import splat_by_kernel
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._sweep_triton import sweep_by_kernel
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import splat_by_kernel
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import sweep_by_kernel
 from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
 
 torch.set_num_threads(1)
@@ -387,8 +389,8 @@ def test_the_kernels_compile_for_gpus() -> None:
 from triton import compile
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._reprojection_triton import _splat
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._sweep_triton import _sweep
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import _splat
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import _sweep
 
 def ptx(kernel, types, sizes, **options):
     signature = {name: "constexpr" if name in sizes else types.get(name, "*i64") for name in kernel.arg_names}

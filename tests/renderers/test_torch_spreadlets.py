@@ -24,18 +24,23 @@ from mrbokeh.renderers.kernels.laplacian_tables import Points, by_rows, joined_p
 from mrbokeh.renderers.kernels.laplacian_tables import stands_out as stands_out_compiled
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.renderers.spreadlets.layout import window_of
-from mrbokeh.renderers.spreadlets.sums import add_light, splat_plainly
+from mrbokeh.renderers.spreadlets.sums import add_light, splat_plainly, window_of
 from mrbokeh.system.errors import InputError
 
 torch = pytest.importorskip("torch")
 
 from mrbokeh.renderers.spreadlets.torch_spreadlets import DeviceLayer, TorchSpreadlets  # noqa: E402
-from mrbokeh.renderers.spreadlets.torch_spreadlets._cells import BankCells, stands_out  # noqa: E402
-from mrbokeh.renderers.spreadlets.torch_spreadlets._integration import integrate  # noqa: E402
-from mrbokeh.renderers.spreadlets.torch_spreadlets._points import table_of  # noqa: E402
-from mrbokeh.renderers.spreadlets.torch_spreadlets._splat import splat, splat_in_chunks  # noqa: E402
-from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import add_light_on  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets._kernels import (  # noqa: E402
+    BankCells,
+    stands_out,
+    table_of,  # noqa: E402
+)
+from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import (  # noqa: E402
+    add_light_on,  # noqa: E402
+    integrate,  # noqa: E402
+    splat,
+    splat_in_chunks,
+)
 
 CPU = torch.device("cpu")
 SIZE = (48, 54)
@@ -302,10 +307,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.spreadlets.layout import window_of
+from mrbokeh.renderers.spreadlets.sums import window_of
 from mrbokeh.renderers.kernels.laplacian_tables import by_rows, joined_points, taps_of
-from mrbokeh.renderers.spreadlets.torch_spreadlets._points import table_of
-from mrbokeh.renderers.spreadlets.torch_spreadlets._splat import splat_in_chunks
+from mrbokeh.renderers.spreadlets.torch_spreadlets._kernels import table_of
+from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import splat_in_chunks
 from mrbokeh.renderers.spreadlets.torch_spreadlets._splat_triton import _SEGMENT, splat_by_kernel
 
 rng = np.random.default_rng(13)

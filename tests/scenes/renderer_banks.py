@@ -16,7 +16,7 @@ from mrbokeh.renderers.bank.apertures import BankApertures, fit_apertures
 from mrbokeh.renderers.bank.lattice import BankLattice
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 
 HEIGHT, WIDTH = SIZE = (64, 96)

@@ -20,7 +20,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.renderers.scatter.scatter_reference import ScatterReference
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mrbokeh.renderers.network.onnx_network import NetworkFacts
+    from mrbokeh.renderers.onnx_network import NetworkFacts
 
 
 def export_command(
@@ -40,14 +40,14 @@ def export_command(
     if fast:
         _export_fast(run, out, max_psnr_loss, data or [])
         return
-    from training.export_onnx import export_run
+    from training.export.onnx_export import export_run
 
     exported = export_run(run, out)
     typer.echo(f"{out}: ONNX Runtime differs from PyTorch by {exported.difference:.1e}; takes {_sizes(exported.facts)}")
 
 
 def _export_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]) -> None:
-    from training.fast_export.export import export_fast_run
+    from training.export.fast_onnx import export_fast_run
 
     done = export_fast_run(run, out, max_psnr_loss_db, data)
     against = "the truth" if data else "the trained network, on a made-up picture"

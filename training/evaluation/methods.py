@@ -17,15 +17,14 @@ from jaxtyping import Float32
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import BY_NAME, WITH_BANKS, make_renderer
-from mrbokeh.renderers.choose_bank import chosen_renderer
-from mrbokeh.renderers.network.onnx_network import OnnxNetwork
+from mrbokeh.renderers.choose import BY_NAME, WITH_BANKS, chosen_renderer, make_renderer
+from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from training.data.batches import network_inputs
 from training.data.dataset import Pair
+from training.data.stacks import Seen
 from training.evaluation.unseen_slice import UnseenSlice
-from training.run_folder import load_run
-from training.stacks import Seen
+from training.fitting.run_folder import load_run
 
 SIGMA_STEP_PX = 0.25
 
@@ -92,7 +91,7 @@ def scatter_reference(
     The picture is continued beyond its border, from where light enters it.
     """
     from mrbokeh.images.layer import opaque
-    from mrbokeh.renderers.scatter.scatter_reference import blur_layer
+    from mrbokeh.renderers.scatter_reference import blur_layer
 
     margin = int(np.ceil(np.abs(coc_px).max(initial=0.0) / 2.0)) + 1
     around = ((margin, margin), (margin, margin))

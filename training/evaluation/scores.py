@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_metrics import energy_ratio, leak, light_error, psnr, ssim
-from mrbokeh.renderers.network.onnx_sessions import open_session
+from mrbokeh.renderers.onnx_sessions import open_session
 from mrbokeh.system.errors import InputError
 from training.evaluation.unseen_slice import UnseenSlice, edge_band, light_discs, sharp_side
 

@@ -14,7 +14,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack
 from training.data.dataset import Pair, PairSet
-from training.stacks import stack_name
+from training.data.stacks import stack_name
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def sharp_side(seen: UnseenSlice) -> Mask:
 
 def light_discs(seen: UnseenSlice) -> Mask:
     """Pixels that count and that light above white reaches from pixels blurred by at least LEAST_DISC_PX."""
-    from mrbokeh.renderers.scatter.scatter_reference import scatter
+    from mrbokeh.renderers.scatter_reference import scatter
 
     excess = np.maximum(seen.pair.all_in_focus.max(axis=2) - WHITE, 0.0).astype(np.float64)
     excess[np.abs(seen.pair.coc_px) < LEAST_DISC_PX] = 0.0

@@ -16,9 +16,8 @@ from jaxtyping import Float32, Float64, Int64
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import MOTION, farthest_px, motion_channels, motion_of, moved
-from mrbokeh.layering.psf_over_field import Channels, Plane
-from mrbokeh.layering.slice_sorting import Part
-from mrbokeh.layering.spreading import Frame
+from mrbokeh.layering.padded_layers import Part
+from mrbokeh.layering.psf_over_field import Channels, Frame, Plane
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.optics.lens import Lens

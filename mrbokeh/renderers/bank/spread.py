@@ -2,25 +2,31 @@
 
 Places in the frame share in proportion (bilinearly), so that nothing jumps where one cell of the bank ends; the shares of a
 pixel sum to 1, so no light is lost or doubled. Renderers differ in how a side of the focus is spread (`SpreadSide`).
+
+The plain twin of all that spread by a bank: every pixel throws its light over the exact kernels around it, blended.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from itertools import product
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from mrbokeh.layering.psf_over_field import Channels, Plane
 from mrbokeh.optics.psf import kernel_radius_px
-from mrbokeh.renderers.bank.around import Around
-from mrbokeh.renderers.bank.lattice import BankLattice
+from mrbokeh.renderers.bank.lattice import Around, BankLattice
 from mrbokeh.renderers.bank.tables import BankTables, Place, turned_kernel
 from mrbokeh.system.errors import InputError
 
 _LARGE_PX = 8.0
 _ALL_LIGHT = 1e-6  # kernels that sum to 1 within the rounding of float32
+SHARP_PX = 1.0
+
+Shares = Iterator[tuple[Plane | None, Any]]
+"""How much of each pixel's light an opening takes, and the opening; None is all, for the only opening there is."""
 
 
 @runtime_checkable
@@ -131,6 +137,25 @@ def spread_by_bank(tables: BlendedTables, spread_side: SpreadSide, values: Chann
     return np.concatenate([*(light[..., :1] for light in each), *(light[..., 1:2] for light in each), each[1][..., 2:]], axis=2)
 
 
+def spread_shares(values: Channels, coc_px: Plane, shares: Shares, spread: Callable[..., Channels]) -> Channels:
+    """What is sharp, and every share spread within the window that its light reaches."""
+    blurred = not_black(values) & (np.abs(coc_px) > SHARP_PX)
+    total = np.where(blurred[..., None], np.float32(0.0), values)
+    for share, opening in shares:
+        if share is None:
+            return spread(np.ascontiguousarray(values), coc_px, opening)
+        mine = blurred & (share > 0)
+        rows, columns = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
+        if not rows.size:
+            continue
+        reach = kernel_radius_px(float(np.abs(coc_px[mine]).max()), opening.unit_radius)
+        ends = ((each[0], each[-1] + 1, length) for each, length in zip((rows, columns), mine.shape, strict=True))
+        window = tuple(slice(max(0, first - reach), min(length, stop + reach)) for first, stop, length in ends)
+        part = values[window] * np.where(mine[window], share[window], np.float32(0.0))[..., None]
+        total[window] += spread(np.ascontiguousarray(part), np.ascontiguousarray(coc_px[window]), opening)
+    return total
+
+
 def not_black(values: Channels) -> Bool[np.ndarray, "height width"]:
     """Which hold anything, faster than `any` along a short axis."""
     return np.asarray(reduce(np.logical_or, np.moveaxis(values[..., 1:], -1, 0), values[..., 0] != 0.0))
@@ -145,3 +170,28 @@ def _passed(lattice: BankLattice, coc_px: Plane, side: int, channel: int, around
     places = around.anchors // lattice.directions
     ends = [(known[np.minimum(lower + i, len(known) - 1)[..., None], places] * around.shares).sum(axis=-1) for i in (0, 1)]
     return ((1.0 - upper) * ends[0] + upper * ends[1]).astype(np.float32)
+
+
+def scatter_side(kernels: AnchorKernels, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels:
+    """See SpreadSide; kernels are blended over place (bilinearly) and diameter (linearly), summed in float64."""
+    from mrbokeh.renderers.bank._scatter_numba import scatter_blended
+
+    lattice = kernels.lattice
+    lower, upper = lattice.diameter_shares(side, np.abs(coc_px))
+    nodes = np.stack([lower, np.minimum(lower + 1, len(lattice.diameters_px[side]) - 1)], axis=-1)
+    of_nodes = np.stack([1.0 - upper, upper], axis=-1)
+    weights = (of_nodes[..., :, None] * around.shares[..., None, :]).reshape(*coc_px.shape, 8)
+    weights = np.where(np.any(values != 0, axis=-1)[..., None], weights, 0.0)
+    codes = (nodes[..., :, None] * lattice.anchors + around.anchors[..., None, :]).reshape(*coc_px.shape, 8)
+    used = np.unique(codes[weights > 0.0])
+    found = [kernels.kernel(side, *divmod(int(code), lattice.anchors))[..., channel] for code in used]
+    taps = [kernel if side > 0 else kernel[::-1, ::-1] for kernel in found]
+    radii_px = np.array([len(each) // 2 for each in taps], np.int64)
+    starts = np.cumsum([0, *(each.size for each in taps[:-1])])
+    margin, (height, width) = int(radii_px.max()), coc_px.shape
+    padded = np.zeros((height + 2 * margin, width + 2 * margin, values.shape[2]))
+    numbers = np.searchsorted(used, np.where(weights > 0.0, codes, used[0]))
+    scatter_blended(
+        padded, values.astype(np.float64), numbers, weights, np.concatenate([each.ravel() for each in taps]), starts, radii_px, margin
+    )
+    return padded[margin : margin + height, margin : margin + width].astype(np.float32)

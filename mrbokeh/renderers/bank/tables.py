@@ -10,8 +10,7 @@ from scipy.ndimage import affine_transform, binary_erosion
 
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.kernels.laplacian_tables import Points, by_rows, joined_points, taps_of
-from mrbokeh.renderers.kernels.spreadlet_values import turned
-from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify, whole_laplacian
+from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, Spreadlets, sparsify, turned, whole_laplacian
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 

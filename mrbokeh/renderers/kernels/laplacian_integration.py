@@ -71,7 +71,7 @@ def rows_to_modes(rows: Channels) -> None:
 
 def solve_modes(modes: Channels, pool: Executor) -> None:
     """The second step of `integrate`, in place, for the modes of all rows."""
-    from mrbokeh.renderers.kernels._laplacian_integration_numba import solve_columns
+    from mrbokeh.renderers.kernels._laplacian_numba import solve_columns
 
     height, width, _ = modes.shape
     beside, pivot = _system(height, width)
@@ -93,7 +93,7 @@ def _in_place(transform: Callable[..., Channels], rows: Channels) -> None:
 @lru_cache(maxsize=4)
 def _system(height: int, width: int) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, "height modes"]]:
     """Of every sine mode what the neighbours in a column weigh, and the reciprocal pivots of its elimination."""
-    from mrbokeh.renderers.kernels._laplacian_integration_numba import pivots
+    from mrbokeh.renderers.kernels._laplacian_numba import pivots
 
     cosine = np.cos(np.pi * np.arange(1, width + 1) / width)
     beside = (4.0 + 2.0 * cosine) / 6.0

@@ -45,7 +45,7 @@ class KernelTables:
     @cached_property
     def _borders_px(self) -> Float32[np.ndarray, " borders"]:
         """The smallest diameter of each level beyond dense_up_to_px, then a few infinite ones."""
-        from mrbokeh.renderers.kernels._laplacian_cells_numba import NEAR
+        from mrbokeh.renderers.kernels._laplacian_numba import NEAR
 
         levels = np.arange(_BLOCK + 2 * NEAR)
         sizes_px = self.dense_up_to_px * 2.0 ** ((levels - 0.5) / LEVELS_PER_OCTAVE)
@@ -59,7 +59,7 @@ class KernelTables:
         aperture: Aperture,
     ) -> Int32[np.ndarray, "height width"]:
         """Codes of the kernels, -1 for what is sharp or dark; sharp pixels are copied to out."""
-        from mrbokeh.renderers.kernels._laplacian_cells_numba import choose_cells
+        from mrbokeh.renderers.kernels._laplacian_numba import choose_cells
 
         codes = np.empty(coc_px.shape, np.int32)
         large = np.abs(coc_px) > self.dense_up_to_px
@@ -134,7 +134,7 @@ def joined_points(cells: Sequence[Spreadlet | None], channel: int = 0) -> Points
 
 def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.ndarray, "height width"]:
     """Pixels that outshine the mean of their surroundings in any channel: lamps and lone pixels, whose PSF can be seen."""
-    from mrbokeh.renderers.kernels._laplacian_cells_numba import find_outshining
+    from mrbokeh.renderers.kernels._laplacian_numba import find_outshining
 
     light = np.ascontiguousarray(values, np.float32)
     found = np.zeros(values.shape[:2], np.bool_)
@@ -154,7 +154,7 @@ def stands_out_plainly(values: Float32[np.ndarray, "height width channels"]) -> 
 
 def used_codes(codes: Int[np.ndarray, "height width"]) -> Int[np.ndarray, " codes"]:
     """The codes that occur, but -1, ascending; without sorting all pixels."""
-    from mrbokeh.renderers.kernels._laplacian_cells_numba import mark_used
+    from mrbokeh.renderers.kernels._laplacian_numba import mark_used
 
     used = np.zeros(int(codes.max(initial=-1)) + 1, np.bool_)
     mark_used(used, codes)

@@ -23,11 +23,9 @@ from mrbokeh.images.layer import Layer, flatten, opaque
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.layered_reconstruction._layer_samples import all_sharp, sample_layers
-from mrbokeh.renderers.layered_reconstruction._prepared import prepared
-from mrbokeh.renderers.layered_reconstruction._pupil_spans import packed_pupil
+from mrbokeh.renderers.layered_reconstruction._samples import all_sharp, prepared, sample_layers
 from mrbokeh.renderers.layered_reconstruction._settings import SCREEN_FILTERS, Settings, footprint_sigmas
-from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Choice, Pupil
+from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Choice, Pupil, packed_pupil
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
 

@@ -54,7 +54,7 @@ def scatter_per_pixel(
     each: Callable[[Callable, Iterable], Iterable] = map,
 ) -> None:
     """Add share * value of every pixel to out, term by term, across and then down; diameters_px unsigned."""
-    from mrbokeh.renderers.low_rank._per_pixel_numba import across, down
+    from mrbokeh.renderers.low_rank._filter_numba import across, down
 
     columns, rows, radii_px = _tables(float(diameters_px.max()), kernel_at, mirrored)
     positions = diameters_px / np.float32(_STEP_PX)

@@ -2,6 +2,8 @@
 
 One plane of impulses for each pair of directions that meets in a corner, and, last, one plane of light that needs no sums
 (in focus, small kernels, highlights).
+
+Corners of an aperture as places in the ring of polygon_differences.
 """
 
 from typing import NamedTuple
@@ -9,6 +11,33 @@ from typing import NamedTuple
 import numpy as np
 
 from mrbokeh.system.kernels import njit
+
+
+@njit(cache=True)
+def lay_out(
+    steps: np.ndarray,
+    places: np.ndarray,
+    turned: np.ndarray,
+    planes: np.ndarray,
+    ring: tuple[int, int],
+    laid: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Set step (corners, 2), place (corners, 4), plane and below (corners,) of mrbokeh.renderers.polygon._ring_numba.Corners.
+
+    The first four are those of mrbokeh.renderers.polygon.tables.CrossedCorners. ring: cells to a row, elements to a plane.
+    Lines count forwards here; crossing 0 of a corner that is turned lies one line on, one step back.
+    """
+    (stride, plane_elements), (step, place, plane, below) = ring, laid
+    for corner in range(len(planes)):
+        plane[corner] = planes[corner] * plane_elements
+        for edge in range(2):
+            elements = 4 * (steps[corner, edge, 0] + stride * steps[corner, edge, 1])
+            step[corner, edge] = -elements if turned[corner, edge] else elements
+            plane[corner] -= elements if turned[corner, edge] else 0
+        for k in range(4):
+            place[corner, k] = 4 * (places[corner, k, 0] + stride * places[corner, k, 1])
+        below[corner] = place[corner].max() + 4 * stride
+
 
 BLOCK_ROWS = 64
 """Rows of which the same columns are splatted before the next columns, so that the cells they share stay in the cache."""
@@ -31,7 +60,7 @@ class Corners(NamedTuple):
 
     Crossings of a corner that are neighbours in a row are added to together, so corners come in three kinds: up to `level`
     crossings 0 and 1 are neighbours and so are 2 and 3, up to `steep` 1 and 2 are, and of the rest none. place (corners, 4):
-    where they are from crossing 0 on, in pairs as mrbokeh.renderers.polygon._aim_numba stores their weights. step, turned
+    where they are from crossing 0 on, in pairs as mrbokeh.renderers.kernels._vectors_numba stores their weights. step, turned
     (corners, 2): of the edge before and the one after, what one line on moves the crossing, and 1 where their two lines count
     backwards, 0 elsewhere. below: the row under the lowest crossing. extent: farthest reach of an outline at radius 1.
     """

@@ -1,4 +1,7 @@
-"""The pieces of work of polygon_differences, and the threads that work through them."""
+"""The pieces of work of polygon_differences, and the threads that work through them.
+
+The working memory of polygon_differences, and the corners of an aperture as places in it.
+"""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -8,15 +11,54 @@ from threading import Lock
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
+from mrbokeh.renderers.kernels._vectors_numba import CHUNK_PX
 from mrbokeh.renderers.polygon._differences_numba import settle, spread_parts
-from mrbokeh.renderers.polygon._ring_numba import Picture, Target
-from mrbokeh.renderers.polygon._survey_numba import TILE_PX
-from mrbokeh.renderers.polygon._tiles_numba import find_parts
-from mrbokeh.renderers.polygon.halves import halves_of
-from mrbokeh.renderers.polygon.light import NO_HIGHLIGHTS, SurveyedLight
-from mrbokeh.renderers.polygon.memory import laid_out, ring_elements, ring_of, scratch_of
+from mrbokeh.renderers.polygon._ring_numba import ALIASED_ROWS, BLOCK_ROWS, GUARD, Corners, Picture, Ring, Scratch, Target, lay_out
+from mrbokeh.renderers.polygon._survey_numba import TILE_PX, find_parts
+from mrbokeh.renderers.polygon.surveyed_light import NO_HIGHLIGHTS, SurveyedLight, halves_of
 from mrbokeh.renderers.polygon.tables import ApertureTables
 from mrbokeh.system.resources import ZeroedMemory
+
+
+def ring_of(tables: ApertureTables, margin: int, width: int, planes: np.ndarray) -> Ring:
+    """A ring for parts of a picture of at most this width, in `planes`: at least `ring_elements` zeros."""
+    rows, stride = 2 * margin + BLOCK_ROWS, width + 2 * margin
+    return Ring(planes, (rows + 2 * ALIASED_ROWS) * stride * 4, len(tables.planes), rows, stride, margin, 0)
+
+
+def ring_elements(tables: ApertureTables, margin: int, width: int) -> int:
+    return (len(tables.planes) + 1) * (2 * margin + BLOCK_ROWS + 2 * ALIASED_ROWS) * (width + 2 * margin) * 4
+
+
+def laid_out(tables: ApertureTables, ring: Ring) -> Corners:
+    """The corners with steps and places for this ring."""
+    crossed, count = tables.crossed, len(tables.crossed.plane)
+    step, place, plane, below = (np.empty(shape, np.int64) for shape in ((count, 2), (count, 4), count, count))
+    lay_out(crossed.steps, crossed.places, crossed.turned, crossed.plane, (ring.stride, ring.plane_elements), (step, place, plane, below))
+    return tables.corners_in(ring.planes.dtype)._replace(step=step, place=place, plane=plane, below=below)
+
+
+def scratch_of(tables: ApertureTables, ring: Ring) -> Scratch:
+    edges, corners = len(tables.corners.slope), len(tables.corners.weight)
+    dtype = ring.planes.dtype
+    return Scratch(
+        element=np.zeros(CHUNK_PX, np.int32),
+        radius=np.zeros(CHUNK_PX, dtype),
+        gain=np.zeros(2 * CHUNK_PX, dtype),
+        line=np.zeros(edges * CHUNK_PX, np.int32),
+        share=np.zeros(edges * CHUNK_PX, dtype),
+        target=np.zeros((corners + 1) * CHUNK_PX, np.int32),
+        weight=np.zeros(4 * corners * CHUNK_PX, dtype),
+        sums=np.zeros((int(tables.sums.row_start[-1]), 4 * ring.stride + 2 * GUARD)),
+        total=np.zeros(4 * ring.stride),
+        carry=np.zeros(4),
+        small=np.zeros(CHUNK_PX, np.int32),
+        small_share=np.zeros(CHUNK_PX, np.float32),
+        rows=np.zeros(2 * tables.exact.radius + 1, np.int64),
+        taps=np.zeros(2 * ring.margin + 1, dtype),
+        kernel=np.zeros((2, (2 * ring.margin + 1) ** 2)),
+    )
+
 
 BAND_ROWS = 384
 """Least height of a band; two margins where these are larger. Bands do not depend on the number of threads."""
@@ -67,7 +109,7 @@ def parts_of(
 
 @dataclass(frozen=True)
 class Workshop:
-    """What all pictures of a call have in common. halve_from_px: see mrbokeh.renderers.polygon.halves; inf for never."""
+    """What all pictures of a call have in common. halve_from_px: see mrbokeh.renderers.polygon.surveyed_light; inf for never."""
 
     tables: ApertureTables
     dtype: type

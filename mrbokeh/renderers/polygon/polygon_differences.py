@@ -14,7 +14,7 @@ Beyond the paper:
   Measured with lights of 1e5 over 0.1: 0.17 of the local signal in single, 2e-7 (the rounding of the result) in double.
 - Small kernels are splatted whole, by the true aperture: below `exact_below_px` they are cheaper and sharper so.
 - What is far out of focus is spread at half the resolution, the blurriest of it at half of that, and so on
-  (mrbokeh.renderers.polygon.halves): such light is smooth, so its kernel's rim may be a cell softer. Centres and light stay.
+  (mrbokeh.renderers.polygon.surveyed_light): such light is smooth, so its kernel's rim may be a cell softer. Centres and light stay.
 - Highlights are splatted whole too: a pixel that gives more than 5 % of the light in the square of four radii around it shows
   its kernel, corners and all, and there can be but few of those. The share spread so rises smoothly from 5 to 10 %.
 - Layers and occlusion: mrbokeh.layering.layering.
@@ -112,9 +112,9 @@ class PolygonDifferences:
     def spread(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.spreading.Spread."""
+        """See mrbokeh.layering.psf_over_field.Spread."""
         from mrbokeh.renderers.polygon.bands import Workshop
-        from mrbokeh.renderers.polygon.light import NO_HIGHLIGHTS, SurveyedLight
+        from mrbokeh.renderers.polygon.surveyed_light import NO_HIGHLIGHTS, SurveyedLight
 
         threads = self.threads or cores()
         with workers(coc_px.size, threads) as pool:

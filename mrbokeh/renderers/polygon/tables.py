@@ -1,17 +1,168 @@
-"""Tables of polygon_differences: what depends on the aperture alone."""
+"""Tables of polygon_differences: what depends on the aperture alone.
 
-from dataclasses import dataclass, field
+Corners of polygon_differences by the lattice points on which their edges' lines cross.
+
+Tables of the kernels that polygon_differences splats whole: small ones by levels of diameter, as groups of neighbouring taps.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float32, Int64, UInt64
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.kernels._vectors_numba import BLENDED_CELLS
 from mrbokeh.renderers.polygon._ring_numba import SPARE_PX, Corners, Exact, Sums
-from mrbokeh.renderers.polygon.crossings import CrossedCorners, crossed_corners, pair_of
 from mrbokeh.renderers.polygon.directional_differences import Direction, PolygonCorners, edge_profile, polygon_corners
 from mrbokeh.renderers.polygon.rectification import rectify_aperture
-from mrbokeh.renderers.polygon.whole import whole_kernels
+
+
+@dataclass(frozen=True)
+class CrossedCorner:
+    """A corner whose four crossings lie at 0, step, step_after and their sum, lattice points in (x, y).
+
+    turned, turned_after: whether the two lines of that edge count backwards, from the one farther along its step.
+    """
+
+    before: int
+    after: int
+    step: Direction
+    step_after: Direction
+    plane: int
+    weight: float
+    turned: bool = False
+    turned_after: bool = False
+
+    @property
+    def kind(self) -> int:
+        """0: crossings 0 and 1 are neighbours in a row, as are 2 and 3; 1: crossings 1 and 2 are; 2: none are."""
+        if self.step == (1, 0):
+            return 0
+        return 1 if (self.step_after[0] - self.step[0], self.step_after[1] - self.step[1]) == (1, 0) else 2
+
+    @property
+    def variants(self) -> "Iterator[CrossedCorner]":
+        """The same corner with its edges named the other way round, and with lines counted backwards."""
+        other = replace(self, before=self.after, after=self.before, step=self.step_after, step_after=self.step)
+        for corner in (self, other):
+            step, step_after = ((-x, -y) for x, y in (corner.step, corner.step_after))
+            yield corner
+            yield replace(corner, step=step, turned=True)
+            yield replace(corner, step_after=step_after, turned_after=True)
+            yield replace(corner, step=step, turned=True, step_after=step_after, turned_after=True)
+
+    @property
+    def places(self) -> list[Direction]:
+        """The crossings, in pairs as their weights are stored."""
+        both = self.step[0] + self.step_after[0], self.step[1] + self.step_after[1]
+        return [(0, 0), self.step, self.step_after, both] if self.kind == 0 else [self.step, self.step_after, (0, 0), both]
+
+
+@dataclass(frozen=True)
+class CrossedCorners:
+    """CrossedCorner by CrossedCorner in arrays: steps (corners, 2, 2) and places (corners, 4, 2) in (x, y), turned (corners, 2);
+    those of kind 0 come first, up to `level`, then those of kind 1, up to `steep`."""
+
+    before: np.ndarray
+    after: np.ndarray
+    steps: np.ndarray
+    places: np.ndarray
+    plane: np.ndarray
+    weight: np.ndarray
+    turned: np.ndarray
+    level: int
+    steep: int
+
+    @classmethod
+    def of(cls, corners: list[CrossedCorner]) -> "CrossedCorners":
+        return cls(
+            before=_whole([corner.before for corner in corners]),
+            after=_whole([corner.after for corner in corners]),
+            steps=_whole([(corner.step, corner.step_after) for corner in corners]),
+            places=_whole([corner.places for corner in corners]),
+            plane=_whole([corner.plane for corner in corners]),
+            weight=np.array([corner.weight for corner in corners]),
+            turned=np.array([(corner.turned, corner.turned_after) for corner in corners]),
+            level=sum(corner.kind == 0 for corner in corners),
+            steep=sum(corner.kind <= 1 for corner in corners),
+        )
+
+
+def crossed_corners(corners: PolygonCorners, planes: dict[tuple[Direction, Direction], int]) -> CrossedCorners:
+    """Corners with as many neighbouring crossings as they have, the best kinds first."""
+    found = []
+    for before, after, weight in zip(corners.before, corners.after, corners.weight, strict=True):
+        first, second = corners.direction[before], corners.direction[after]
+        det = int(first[0] * second[1] - first[1] * second[0])
+        step, step_after = (det * second[0], det * second[1]), (-det * first[0], -det * first[1])
+        pair = pair_of(corners, before, after)
+        corner = CrossedCorner(before, after, step, step_after, planes[pair], weight if pair == (first, second) else -weight)
+        found.append(min(corner.variants, key=lambda each: each.kind))
+    return CrossedCorners.of(sorted(found, key=lambda corner: corner.kind))
+
+
+def pair_of(corners: PolygonCorners, before: int, after: int) -> tuple[Direction, Direction]:
+    first, second = sorted((corners.direction[before], corners.direction[after]))
+    return first, second
+
+
+def _whole(numbers: Any) -> np.ndarray:
+    return np.array(numbers, np.int64)
+
+
+LEVELS_PER_PX = 8.0
+"""Small kernels are tabulated this densely in diameter; between two they are blended, which is 1e-3 of their peak off."""
+_NOTHING = 1e-9
+"""Below this a tap of a kernel is rounding."""
+
+Groups = Int64[np.ndarray, "groups 4"]
+
+
+def whole_kernels(aperture: Aperture, below_px: float) -> Exact:
+    """Kernels up to a little more than this diameter, behind the focus and, turned, in front, and the aperture for all others."""
+    above_px = below_px * 7.0 / 6.0
+    levels = int(np.ceil((above_px - 1.0) * LEVELS_PER_PX)) + 1
+    behind = _stacked([aperture.rasterize(1.0 + level / LEVELS_PER_PX).kernel.astype(np.float32) for level in range(levels + 1)])
+    kernels = np.stack([behind, behind[:, ::-1, ::-1]])
+    low, high, radius = kernels[:, :-1], kernels[:, 1:], behind.shape[1] // 2
+    groups, counts = _groups((np.abs(low) > _NOTHING) | (np.abs(high) > _NOTHING))
+    tables = _taps(low, groups), _taps(high - low, groups), *_laid(groups, radius)
+    start = np.cumsum([0, *counts])
+    return Exact(*tables, start, levels, radius, LEVELS_PER_PX, below_px, above_px, *aperture.packed(), aperture.unit_radius)
+
+
+def _stacked(kernels: Sequence[Float32[np.ndarray, "_ _"]]) -> Float32[np.ndarray, "kernels size size"]:
+    """Each in the middle of as many pixels as the last, the largest, has."""
+    stacked = np.zeros((len(kernels), *kernels[-1].shape), np.float32)
+    for whole, kernel in zip(stacked, kernels, strict=True):
+        border = (len(whole) - len(kernel)) // 2
+        whole[border : border + len(kernel), border : border + len(kernel)] = kernel
+    return stacked
+
+
+def _groups(seen: Bool[np.ndarray, "turns levels size size"]) -> tuple[Groups, Int64[np.ndarray, " kernels"]]:
+    """Turn, level, row and first column of the groups of neighbours that cover all that is seen of each row, from its first to its last;
+    and how many each kernel has."""
+    first, last = seen.argmax(axis=3), seen.shape[3] - 1 - seen[..., ::-1].argmax(axis=3)
+    of_row = np.where(seen.any(axis=3), (last - first) // BLENDED_CELLS + 1, 0)
+    where = np.repeat(np.argwhere(of_row), of_row[of_row > 0], axis=0)
+    before = np.arange(len(where)) - np.repeat(np.cumsum(of_row[of_row > 0]) - of_row[of_row > 0], of_row[of_row > 0])
+    return np.column_stack([where, first[tuple(where.T)] + before * BLENDED_CELLS]), of_row.sum(axis=2).reshape(-1)
+
+
+def _laid(groups: Groups, radius: int) -> tuple[UInt64[np.ndarray, " groups"], Int64[np.ndarray, " groups"]]:
+    """Rows from the first of the kernels on, and columns from the pixel's on, in numbers of four channels."""
+    return groups[:, 2].astype(np.uint64), 4 * (groups[:, 3] - radius)
+
+
+def _taps(kernels: Float32[np.ndarray, "turns levels size size"], groups: Groups) -> Float32[np.ndarray, " taps"]:
+    """All taps of every group, 0 beyond the kernel."""
+    padded = np.pad(kernels, ((0, 0), (0, 0), (0, 0), (0, BLENDED_CELLS - 1)))
+    turn, level, row, column = groups.T
+    return padded[turn[:, None], level[:, None], row[:, None], column[:, None] + np.arange(BLENDED_CELLS)].reshape(-1)
+
 
 EDGE_STEPS = 0.75
 """By default the sums take over where the shortest edge of the outline is this many lattice steps long, ..."""
@@ -119,10 +270,6 @@ def _profile(direction: Direction) -> list[tuple[int, int, float]]:
     itself = taps.pop((0, 0), 0.0)
     rest = sorted(taps.items(), key=lambda tap: (tap[0][1] == 0, tap[0]))
     return [(0, 0, itself), *((x, y, weight) for (x, y), weight in rest)]
-
-
-def _whole(numbers: Any) -> np.ndarray:
-    return np.array(numbers, np.int64)
 
 
 def _starts(lists: list[Any]) -> np.ndarray:

@@ -16,7 +16,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.layering import Layering
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.layering.motion import drawn_out
-from mrbokeh.layering.spreading import Frame, spread_light
+from mrbokeh.layering.psf_over_field import Frame, spread_light
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.bank.tables import Place

@@ -24,7 +24,7 @@ except ModuleNotFoundError as missing:
 
     raise MissingExtraError("torch", "train") from missing
 
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import DeviceSamples
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._picture import TorchReconstruction
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._samples import DeviceSamples
 
 __all__ = ["DeviceSamples", "TorchReconstruction"]

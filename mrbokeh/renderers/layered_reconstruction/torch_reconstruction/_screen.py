@@ -14,25 +14,23 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.layered_reconstruction._parts_numba import COARSE_PX
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._filter import Slopes, Spread, screen_covariance
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._gaussians import (
+from mrbokeh.renderers.layered_reconstruction._tiles_numba import COARSE_PX
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._jobs import Jobs, Task
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._kernels import (
+    PupilTables,
     direct_kernels,
     gaussian_guards,
     less_pixel,
-    recursive_rows,
-    sheared_kernels,
-)
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._jobs import Jobs, Task
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._windows import (
-    PupilTables,
     line_kernels,
     pupil_kernels,
+    recursive_rows,
     rest_kernel,
+    sheared_kernels,
     window_guards,
 )
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import Slopes, Spread, screen_covariance
 from mrbokeh.system.errors import InputError
 
 FILTERS = ("windows", "sheared", "direct")

@@ -12,11 +12,9 @@ from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.bank.tables import BankTables
 from mrbokeh.renderers.kernels.laplacian_integration import fast_width
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, Sparsification, Spreadlets
-from mrbokeh.renderers.spreadlets.layout import FAR_FIELD_PX, Window
-from mrbokeh.renderers.spreadlets.torch_spreadlets._cells import BankCells, stands_out
-from mrbokeh.renderers.spreadlets.torch_spreadlets._integration import integrate
-from mrbokeh.renderers.spreadlets.torch_spreadlets._points import BankPoints, PointTable
-from mrbokeh.renderers.spreadlets.torch_spreadlets._splat import splat
+from mrbokeh.renderers.spreadlets.sums import FAR_FIELD_PX, Window
+from mrbokeh.renderers.spreadlets.torch_spreadlets._kernels import BankCells, BankPoints, PointTable, stands_out
+from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import integrate, splat
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.torch_device import device_named
 

@@ -9,8 +9,8 @@ import triton.language as tl
 from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
-from mrbokeh.renderers.spreadlets.layout import Window
-from mrbokeh.renderers.spreadlets.torch_spreadlets._points import PointTable
+from mrbokeh.renderers.spreadlets.sums import Window
+from mrbokeh.renderers.spreadlets.torch_spreadlets._kernels import PointTable
 
 _PIXELS, _SEGMENT = 64, 128
 """Pixels of a program, side by side, and points that it splats of each: a lamp's thousands are shared between programs."""

@@ -1,0 +1,36 @@
+"""Lights in a picture: pixels far brighter than what is around them."""
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+_LIGHT_OVER_SURROUNDINGS = np.float32(4.0)
+
+Values = Float32[np.ndarray, "height width channels"]
+Mask = Bool[np.ndarray, "height width"]
+
+
+def lights(values: Values) -> Mask:
+    """Pixels several times brighter than the median of the 5x5 pixels around them. values: R, G, B and any others."""
+    lit = np.empty(values.shape[:2], np.bool_)
+    find_lights(lit, np.ascontiguousarray(values), 0, len(lit))
+    return lit
+
+
+def find_lights(lit: Mask, values: Values, top: int, bottom: int) -> None:
+    """Set rows top to bottom of lit."""
+    from mrbokeh.layering._pixels_numba import find_lit
+
+    find_lit(lit, values, _LIGHT_OVER_SURROUNDINGS, top, bottom)
+
+
+def without_lights(values: Values) -> Values:
+    """The picture with the median of the surroundings in place of lights; the same array if there are none."""
+    from cv2 import medianBlur
+
+    lit = lights(values)
+    if not lit.any():
+        return values
+    dark = values.copy()
+    for channel in range(3):
+        dark[lit, channel] = medianBlur(np.ascontiguousarray(values[..., channel]), 5)[lit]
+    return dark

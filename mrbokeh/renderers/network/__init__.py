@@ -1,1 +1,0 @@
-"""The Neural Bokeh network in an ONNX session."""
