@@ -12,19 +12,28 @@ from typer.testing import CliRunner
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.system.errors import InputError
 from tests.scenes.card_stack import SIZE, make_card_stack
-from training import train
-from training.ablation.plan import Ablation, planned_runs, read_data_sets, settings_of
-from training.ablation.results import RunResult, read_result, summary
-from training.ablation.rows import PAPER_TABLE_3, PUBLISHED, TABLES, Row, paper_numbers, rows_of
-from training.ablation.tables import lines_of, markdown_of, table_cells
-from training.blur_functions import blur_of
+from training.ablation.plan import (
+    PAPER_TABLE_3,
+    PUBLISHED,
+    TABLES,
+    Ablation,
+    Row,
+    paper_numbers,
+    planned_runs,
+    read_data_sets,
+    rows_of,
+    settings_of,
+)
+from training.ablation.tables import RunResult, lines_of, markdown_of, read_result, summary, table_cells
 from training.cli import app
-from training.dataset import PairSet
-from training.run_folder import load_run
-from training.settings import TrainSettings, write_settings
-from training.tiling import TileGrid
-from training.training_data import training_data
-from training.weights import WHERE_TRUTH_IS_KNOWN
+from training.data.dataset import PairSet
+from training.data.pairs import WHERE_TRUTH_IS_KNOWN
+from training.data.training_data import training_data
+from training.evaluation.methods import blur_of
+from training.fitting import train
+from training.fitting.run_folder import load_run
+from training.fitting.settings import TrainSettings, write_settings
+from training.networks.network import TileGrid
 
 BUDGET = Ablation(minutes=None, epochs=1, threads=1)
 TILES = ("--tile-px", "32", "--overlap-px", "8")

@@ -20,11 +20,11 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor, nn
 
 from mrbokeh.system.errors import InputError
-from training.deepfocus_network import PAPER_BLOCKS, PAPER_HIDDEN, DeepFocusTiles, interleave
-from training.export_onnx import OPSET
-from training.network_settings import NetworkSettings
-from training.neural_camera_network import GaussianBank, NeuralCameraTiles, bank_sigmas_px
+from training.export.onnx_export import OPSET
+from training.networks.baseline_networks import DeepFocusTiles, GaussianBank, NeuralCameraTiles, bank_sigmas_px, interleave
+from training.networks.network_settings import NetworkSettings
 
+PAPER_BLOCKS, PAPER_HIDDEN = 9, 128  # 20 layers of 128 filters: a first and a last one around 9 blocks of two
 SETTINGS = NetworkSettings(tile_px=0, overlap_px=0, activation="identity", hidden=32, initialisation="default", kernels_per_colour=False)
 LARGEST_COC_PX, SIGMA_OVER_COC, SIZE = 8.0, 1.0 / 3.0, (48, 80)
 FORMS: dict[str, Callable[..., DeepFocusTiles | NeuralCameraTiles]] = {

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from training.depthwise import LEAST_SIZE, depthwise
+from training.networks.kernels import LEAST_SIZE, depthwise
 
 
 def plain(maps: Tensor, kernels: Tensor, bias: Tensor | None, padding: int) -> Tensor:

@@ -19,13 +19,12 @@ from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.stacks.focal_stack import write_focal_stack
 from mrbokeh.system.errors import InputError
 from tests.scenes.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_stack
-from training import train
-from training.blur_functions import blur_of
 from training.cli import app
-from training.dataset import PairSet
-from training.evaluation.comparison import Extras, Unseen, compare, scored, unseen_of
-from training.evaluation.cost import peak_memory_mib
-from training.evaluation.focus_pull import focus_pull, is_fine
+from training.data.dataset import PairSet
+from training.data.pairs import WHERE_TRUTH_IS_KNOWN
+from training.data.stacks import Seen
+from training.data.training_data import training_data
+from training.evaluation.comparison import Extras, Unseen, compare, focus_pull, is_fine, peak_memory_mib, scored, unseen_of
 from training.evaluation.methods import (
     GATHERED,
     NETWORK,
@@ -34,20 +33,17 @@ from training.evaluation.methods import (
     SCATTERED,
     Method,
     bank_methods,
+    blur_of,
     network_names,
     plain_methods,
     renderer_method,
     renderer_methods,
 )
-from training.evaluation.perceptual import OnnxPerceptualDistance
-from training.evaluation.places import edge_band, light_discs, sharp_side
-from training.evaluation.scores import MEASURES, Score, SliceScorer, mean_known
-from training.evaluation.tables import HEADINGS, table_rows
-from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
-from training.presets import demo_settings
-from training.stacks import Seen
-from training.training_data import training_data
-from training.weights import WHERE_TRUTH_IS_KNOWN
+from training.evaluation.report import HEADINGS, table_rows
+from training.evaluation.scores import MEASURES, OnnxPerceptualDistance, Score, SliceScorer, mean_known
+from training.evaluation.unseen_slice import UnseenSlice, edge_band, light_discs, sharp_side, unseen_slice
+from training.fitting import train
+from training.fitting.settings import demo_settings
 
 QUICK = dataclasses.replace(demo_settings(), minutes=None, epochs=1, crop_px=0, threads=1, validate_every_s=0.0)
 ON_THE_CARD, ON_THE_WALL = 0, 2

@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from tests.scenes.made_networks import GATED, PARITY, SIZE, blurred, coarser_model, pictures, session_of, twin, untrained
-from training.fast_export.fewer_bins import fewer_knots, hats, thinned, with_knots
-from training.fast_export.gated_graph import gated_model
-from training.fast_export.gated_groups import cost, groups_of, reach_px, shared
-from training.fast_export.gated_weights import weights_of, widened
-from training.fast_export.plans import plans
-from training.gated_bins import bins_px
-from training.network import BlurNetwork
+from training.export.gated_graph import gated_model
+from training.export.gated_groups import cost, groups_of, reach_px, shared
+from training.export.gated_weights import fewer_knots, hats, thinned, weights_of, widened, with_knots
+from training.export.plans import plans
+from training.networks.gated_network import bins_px
+from training.networks.network import BlurNetwork
 
 
 @torch.no_grad()

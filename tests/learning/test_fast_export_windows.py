@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.scenes.made_networks import GATED, PARITY, blurred, coarser_model, pictures, session_of, twin, untrained
-from training.fast_export import gated_windows
+from training.export import gated_groups
 
 
 def _two_cards() -> dict[str, torch.Tensor]:
@@ -41,7 +41,7 @@ def test_windows_change_nothing_and_save_most(factor: int, tmp_path: Path, monke
     network, results, pixels = untrained(GATED), [], []
     for reach in (None, 1000):
         if reach is not None:
-            monkeypatch.setattr(gated_windows, "reach_of", lambda *_: 1000)
+            monkeypatch.setattr(gated_groups, "reach_of", lambda *_: 1000)
         session = session_of(coarser_model(network, factor), tmp_path / str(reach))
         results.append(blurred(session, _two_cards()))
         pixels.append(_convolved_pixels(session.end_profiling()))

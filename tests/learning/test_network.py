@@ -8,15 +8,12 @@ import torch
 
 from mrbokeh.stacks.focal_stack_dataset import network_blocks
 from mrbokeh.system.errors import InputError
-from training.gated_bins import bins_px, blocks_for_gates, hat_lines
-from training.gated_kernels import disc_kernel
-from training.gated_network import GatedTiles
-from training.network import BlurNetwork
-from training.network_settings import NetworkSettings
-from training.presets import demo_settings
-from training.published_tiles import PublishedTiles
-from training.settings import TrainSettings, settings_from_json, settings_to_json
-from training.tiling import TileGrid
+from training.fitting.settings import TrainSettings, demo_settings, settings_from_json, settings_to_json
+from training.networks.gated_network import GatedTiles, bins_px, blocks_for_gates, hat_lines
+from training.networks.kernels import disc_kernel
+from training.networks.network import BlurNetwork, TileGrid
+from training.networks.network_settings import NetworkSettings
+from training.networks.published_network import PublishedTiles
 
 ONE_TILE = NetworkSettings(tile_px=0, overlap_px=0)
 GATED = demo_settings().network

@@ -9,11 +9,9 @@ import pytest
 import torch
 
 from mrbokeh.system.errors import InputError
-from training.network import BlurNetwork
-from training.network_settings import NetworkSettings
-from training.presets import PRESETS, better_settings, demo_settings
-from training.settings import TrainSettings
-from training.tiling import TileGrid, assemble
+from training.fitting.settings import PRESETS, TrainSettings, better_settings, demo_settings
+from training.networks.network import BlurNetwork, TileGrid, assemble
+from training.networks.network_settings import NetworkSettings
 
 ONE_TILE = NetworkSettings(tile_px=0, overlap_px=0)
 

@@ -11,10 +11,10 @@ from torch import Tensor
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import field_positions
 from mrbokeh.system.errors import InputError
-from training.gated_kernels import disc_kernel, fresh_kernels
-from training.network import BlurNetwork
-from training.network_settings import NetworkSettings
-from training.presets import demo_settings
+from training.fitting.settings import demo_settings
+from training.networks.kernels import disc_kernel, fresh_kernels
+from training.networks.network import BlurNetwork
+from training.networks.network_settings import NetworkSettings
 
 SIZE = (32, 56)
 COC_PX = 7.0

@@ -15,23 +15,29 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
-from training import train
-from training.batches import draw_batch
-from training.blur_functions import blur_of
-from training.classical_blur import gaussian_gather, gaussian_scatter, scatter_reference, sigma_per_coc
 from training.cli import app
-from training.data_facts import gather_facts
-from training.dataset import PairSet, read_pair
+from training.data.batches import draw_batch
+from training.data.dataset import PairSet, read_pair
+from training.data.pairs import Counting
+from training.data.training_data import gather_facts, training_data
 from training.evaluation.comparison import Extras, compare, unseen_of
-from training.evaluation.methods import NETWORK, NO_BLUR, network_method, plain_methods
-from training.network_settings import NetworkSettings
-from training.objective import learning_rate_factor
-from training.presets import demo_settings
-from training.run import Run
-from training.run_folder import load_run
-from training.settings import TrainSettings
-from training.training_data import training_data
-from training.weights import Counting
+from training.evaluation.methods import (
+    NETWORK,
+    NO_BLUR,
+    blur_of,
+    gaussian_gather,
+    gaussian_scatter,
+    network_method,
+    plain_methods,
+    scatter_reference,
+    sigma_per_coc,
+)
+from training.fitting import train
+from training.fitting.objective import learning_rate_factor
+from training.fitting.run import Run
+from training.fitting.run_folder import load_run
+from training.fitting.settings import TrainSettings, demo_settings
+from training.networks.network_settings import NetworkSettings
 
 SIZE = (48, 72)
 LENS = Lens(35.0, 2.8, 1.0, 3.5, Aperture.blades(6, 0.2))

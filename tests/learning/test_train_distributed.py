@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from tests.learning.test_train import DEMO_LIKE, make_stack
-from training import train
-from training.distributed import Ranks
-from training.run_folder import build_network, load_run
-from training.settings import TrainSettings
-from training.training_data import training_data
+from training.data.training_data import training_data
+from training.fitting import train
+from training.fitting.distributed import Ranks
+from training.fitting.run_folder import build_network, load_run
+from training.fitting.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 TWO = dataclasses.replace(DEMO_LIKE, epochs=2, batch=1, device="cpu", crop_px=32, sheets=False)
@@ -67,7 +67,7 @@ def test_two_processes_learn_what_one_with_twice_the_batch_learns(scene: Path, t
 STOPPED_SECOND = """
 import os, signal, sys
 from training.cli import app
-from training.run import Run
+from training.fitting.run import Run
 
 step = Run._step
 def stopped(run, rate_factor):

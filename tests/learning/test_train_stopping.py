@@ -18,16 +18,13 @@ from typer.testing import CliRunner
 
 from mrbokeh.system.errors import InputError
 from tests.learning.test_train import DEMO_LIKE, make_wall
-from training import train
-from training.checkpoint import Progress
 from training.cli import app
-from training.curve import CurvePoint
-from training.held_out import HeldOutSlices, Look
-from training.interruption import Interruption
-from training.run import Run
-from training.run_folder import load_run
-from training.sheets import MOST_KEPT, write_sheet
-from training.training_data import training_data
+from training.data.training_data import training_data
+from training.fitting import train
+from training.fitting.checkpoint import CurvePoint, Progress
+from training.fitting.record import MOST_KEPT, HeldOutSlices, Look, write_sheet
+from training.fitting.run import Interruption, Run
+from training.fitting.run_folder import load_run
 
 SHORT = dataclasses.replace(DEMO_LIKE, epochs=4, sheets=False)
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,9 +34,9 @@ LOGGED_RUN = """
 import sys
 from pathlib import Path
 from training import train
-from training.run import Run
-from training.settings import load_settings
-from training.training_data import training_data
+from training.fitting.run import Run
+from training.fitting.settings import load_settings
+from training.data.training_data import training_data
 
 scene, out, log = sys.argv[1:]
 step = Run._step

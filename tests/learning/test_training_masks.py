@@ -7,8 +7,8 @@ import numpy as np
 from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from training.dataset import read_pair
-from training.weights import WHERE_TRUTH_IS_KNOWN
+from training.data.dataset import read_pair
+from training.data.pairs import WHERE_TRUTH_IS_KNOWN
 
 SIZE = (4, 6)
 MATRIX = ((1.7, -0.6, -0.1), (-0.3, 1.6, -0.3), (0.05, -0.55, 1.5))

@@ -8,11 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from training.batches import Batch
-from training.loss_terms import gaussian
-from training.objective import judged, loss, mean_square_error
-from training.settings import TrainSettings
-from training.tiling import TileGrid, assemble, split
+from training.data.batches import Batch
+from training.fitting.objective import gaussian, judged, loss, mean_square_error
+from training.fitting.settings import TrainSettings
+from training.networks.network import TileGrid, assemble, split
 
 SCALE = 4.0  # errors are halved: 2 / SCALE
 LARGEST_COC_PX = 12.0

@@ -16,13 +16,11 @@ from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
-from training.batches import Batch, draw_batch, draw_share, network_inputs, stack_pairs
-from training.crops import Drawing
-from training.data_facts import gather_facts
-from training.dataset import PairSet, read_pair
-from training.exr_rows import exr_size_px, read_rows
-from training.read_ahead import ReadAhead, Window
-from training.weights import Counting
+from training.data.batches import Batch, Drawing, draw_batch, draw_share, network_inputs, stack_pairs
+from training.data.dataset import PairSet, ReadAhead, Window, read_pair
+from training.data.exr_rows import exr_size_px, read_rows
+from training.data.pairs import Counting
+from training.data.training_data import gather_facts
 
 SIZE = (200, 330)
 MATRIX = ((1.7, -0.6, -0.1), (-0.3, 1.6, -0.3), (0.05, -0.55, 1.5))
@@ -209,7 +207,7 @@ def test_looking_at_all_pictures_takes_little_memory_too(stacks: list[FocalStack
 
 
 def test_pieces_make_up_the_picture(stacks: list[FocalStack], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("training.dataset._PIECE_ROWS", 64)
+    monkeypatch.setattr("training.data.dataset._PIECE_ROWS", 64)
     pairs = PairSet(stacks, cache_mib=1)
     pieces = list(pairs.pieces(4))
     assert [len(each.coc_px) for each in pieces] == [64, 64, 64, 8]

@@ -28,8 +28,8 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
-from training.dataset import PairSet, read_pair
-from training.training_data import training_data
+from training.data.dataset import PairSet, read_pair
+from training.data.training_data import training_data
 
 NEAR_FOCUS_M, FAR_FOCUS_M = 0.9, 6.5
 # Left, middle, right and a corner of the frame, as places of pixels.

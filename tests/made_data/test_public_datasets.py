@@ -20,9 +20,9 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
-from training.classical_blur import scatter_reference
-from training.dataset import read_pair
-from training.training_data import training_data
+from training.data.dataset import read_pair
+from training.data.training_data import training_data
+from training.evaluation.methods import scatter_reference
 
 WIDTH, HEIGHT = 96, 64
 NEAR_M, FAR_M = 1.0, 4.0

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from training.tiling import TileGrid, assemble, split, tile_count
+from training.networks.network import TileGrid, assemble, split, tile_count
 
 
 def test_tiles_of_the_papers_full_hd_frame() -> None:

@@ -9,13 +9,11 @@ import torch
 from onnx import ModelProto
 
 from mrbokeh.optics.camera import field_positions
-from training.fast_export.fewer_bins import thinned
-from training.fast_export.gated_graph import gated_model
-from training.fast_export.gated_weights import weights_of
-from training.network import BlurNetwork
-from training.network_settings import NetworkSettings
-from training.presets import demo_settings
-from training.tiling import TileGrid
+from training.export.gated_graph import gated_model
+from training.export.gated_weights import thinned, weights_of
+from training.fitting.settings import demo_settings
+from training.networks.network import BlurNetwork, TileGrid
+from training.networks.network_settings import NetworkSettings
 
 LARGEST_PX, TOP = 11.0, 4.0
 SIZE = (41, 58)

@@ -22,13 +22,13 @@ from training.ablation.runs import device_of
 from training.ablation.tables import Line, RunResult, lines_of, markdown_of, provenance, read_result, table_cells, write_table
 from training.data.dataset import PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
+from training.data.stacks import stack_name
 from training.evaluation.methods import Blur, blur_of
 from training.evaluation.report import enlarged, telling_windows
 from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
+from training.fitting.run_folder import NETWORK_NAME
 from training.fitting.settings import FILE_NAME as SETTINGS_NAME
 from training.fitting.settings import TrainSettings
-from training.run_folder import NETWORK_NAME
-from training.stacks import stack_name
 
 Lines = Mapping[TableName, Sequence[Line]]
 

@@ -1,20 +1,53 @@
-"""Train what a plan asks for, one run after the other, and measure each on the stacks that it has not seen."""
+"""Train what a plan asks for, one run after the other, and measure each on the stacks that it has not seen.
 
+What a number was measured on, in one line.
+
+How long a plan will take: minutes where the budget says so, else one timed step of each run.
+"""
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import torch
 
-from training import train
 from training.ablation.plan import PlannedRun
-from training.ablation.results import SCORES_NAME, RunResult, read_result, write_result
-from training.blur_functions import blur_of
-from training.evaluation.comparison import Extras, Unseen, scored
-from training.evaluation.focus_pull import focus_pull
-from training.evaluation.methods import network_method
+from training.ablation.tables import SCORES_NAME, RunResult, read_result, write_result
+from training.data.batches import draw_batch
+from training.data.dataset import PairSet
+from training.data.pairs import counting_of
+from training.data.stacks import stack_name
+from training.data.training_data import DataFacts
+from training.evaluation.comparison import Extras, Unseen, focus_pull, scored
+from training.evaluation.methods import blur_of, network_method
+from training.evaluation.report import write_numbers
 from training.evaluation.scores import MEASURES, Perceptual
-from training.evaluation.tables import write_numbers
-from training.machine import machine_line
-from training.resuming import require_same_settings
-from training.run_folder import load_run
-from training.stacks import stack_name
+from training.fitting import train
+from training.fitting.objective import loss
+from training.fitting.run_folder import RunFacts, build_network, load_run
+from training.fitting.train import require_same_settings
+
+
+def machine_line() -> str:
+    """Processor, cores, the GPU where torch sees one, and versions."""
+    import torch
+
+    gpu = [torch.cuda.get_device_name(0)] if torch.cuda.is_available() else []
+    parts = [_processor(), f"{os.cpu_count()} cores", *gpu, f"Python {platform.python_version()}", f"torch {torch.__version__}"]
+    return ", ".join(parts)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
 
 FLICKER = "flicker"
 
@@ -56,3 +89,53 @@ def _measured(planned: PlannedRun, lpips: Perceptual | None) -> tuple[dict[str, 
 
 def device_of(name: str) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+
+
+def is_finished(planned: PlannedRun) -> bool:
+    return read_result(planned.folder) is not None
+
+
+def estimated_minutes(planned: Sequence[PlannedRun]) -> list[float]:
+    """Estimate the minutes of training of each run; 0 for those that are finished. Measuring comes on top."""
+    seconds_of_step: dict[tuple[str, str], float] = {}
+    minutes = []
+    for each in planned:
+        key = (each.data_set.name, each.row.name)
+        if is_finished(each) or each.settings.minutes is not None:
+            minutes.append(0.0 if is_finished(each) else each.settings.minutes or 0.0)
+            continue
+        if key not in seconds_of_step:
+            seconds_of_step[key] = step_seconds(each)
+        minutes.append(seconds_of_step[key] * _steps(each) / 60.0)
+    return minutes
+
+
+def step_seconds(planned: PlannedRun) -> float:
+    """The second of two steps, without the optimizer's part, which is small."""
+    settings, pairs = planned.settings, _pairs(planned)
+    facts = planned.data_set.data.facts(pairs, settings.network.lens_inputs)
+    device = torch.device(device_of(settings.device))
+    network = build_network(settings, _run_facts(facts)).to(device)
+    rng = np.random.default_rng(0)
+    seconds = 0.0
+    for _ in range(2):
+        started_s = time.perf_counter()
+        batch = draw_batch(pairs, settings.batch, settings.crop_px, 0, rng).to(device)
+        loss(network, batch, facts.radiance_scale, facts.largest_coc_px, replace(settings, depth_noise=0.0)).backward()
+        seconds = time.perf_counter() - started_s
+    pairs.close()
+    return seconds
+
+
+def _pairs(planned: PlannedRun) -> PairSet:
+    train_stacks = planned.data_set.data.split(planned.data_set.held_out, 0.0, 0).train
+    return PairSet(train_stacks, counting_of(planned.settings), planned.settings.cache_mib)
+
+
+def _steps(planned: PlannedRun) -> float:
+    return (planned.settings.epochs or 0) * len(_pairs(planned)) / planned.settings.batch
+
+
+def _run_facts(facts: DataFacts) -> RunFacts:
+    """What a network is built from; what a run remembers beside that is left empty."""
+    return RunFacts(**vars(facts), trained_on=(), held_out=(), commit=None)

@@ -12,8 +12,7 @@ import typer
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
-    from training.ablation.plan import Ablation, PlannedRun
-    from training.ablation.rows import Row, TableName
+    from training.ablation.plan import Ablation, PlannedRun, Row, TableName
 
 
 class Table(StrEnum):
@@ -59,8 +58,8 @@ def ablate_command(
     # Threads that wait for one another in a busy loop make training many times slower as soon as anything else uses a core.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read by OpenMP when torch is loaded, in the next lines
     from training.ablation.plan import Ablation, planned_runs, read_data_sets
-    from training.evaluation.perceptual import OnnxPerceptualDistance
-    from training.settings import load_settings
+    from training.evaluation.scores import OnnxPerceptualDistance
+    from training.fitting.settings import load_settings
 
     tables = _tables(table)
     chosen = _rows(tables, rows)
@@ -98,7 +97,7 @@ def _tables(table: list[Table] | None) -> "tuple[TableName, ...]":
 
 
 def _rows(tables: "tuple[TableName, ...]", names: str) -> "list[Row]":
-    from training.ablation.rows import rows_of
+    from training.ablation.plan import rows_of
 
     rows = rows_of(tables)
     wanted = [name.strip() for name in names.split(",") if name.strip()]
@@ -115,8 +114,8 @@ def _minutes(minutes: float | None, epochs: int | None) -> float | None:
 
 
 def _print_plan(planned: "Sequence[PlannedRun]") -> None:
-    from training.ablation.estimate import estimated_minutes, is_finished
     from training.ablation.report import changed_settings
+    from training.ablation.runs import estimated_minutes, is_finished
 
     estimated = estimated_minutes(planned)
     for each, minutes in zip(planned, estimated, strict=True):

@@ -51,11 +51,11 @@ def evaluate_command(
     Example: mrbokeh train evaluate runs/50mm --data lens_50mm --psf lens_50mm.bank --renderer polygon --out measured
     """
     from mrbokeh.stacks.guessed_metres import metres_notes
+    from training.data.training_data import training_data
     from training.evaluation.comparison import Extras, compare, unseen_of
     from training.evaluation.methods import bank_methods, nearest_method, network_methods, plain_methods, renderer_methods
-    from training.evaluation.perceptual import OnnxPerceptualDistance
-    from training.evaluation.tables import gain_lines, table_rows
-    from training.training_data import training_data
+    from training.evaluation.report import gain_lines, table_rows
+    from training.evaluation.scores import OnnxPerceptualDistance
 
     networks, scenes = _networks_and_data(networks, data or [])
     folder = _folder(networks, out)

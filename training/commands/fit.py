@@ -1,4 +1,7 @@
-"""`mrbokeh train fit`."""
+"""`mrbokeh train fit`.
+
+Arguments that several commands take.
+"""
 
 import math
 import os
@@ -10,12 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mrbokeh.system.errors import InputError
-from training.commands.arguments import Scenes
-from training.settings_overrides import with_overrides
+from training.fitting.settings import with_overrides
+
+Scenes = Annotated[
+    list[Path],
+    typer.Argument(help="A data set (of `mrbokeh capture dataset`), or folders of merged focal stacks, or folders of such folders."),
+]
+
 
 if TYPE_CHECKING:
-    from training.checkpoint import Progress
-    from training.settings import TrainSettings
+    from training.fitting.checkpoint import Progress
+    from training.fitting.settings import TrainSettings
 
 
 class Preset(StrEnum):
@@ -92,9 +100,9 @@ def fit_command(
 
 def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str], overwrite: bool) -> None:
     from mrbokeh.stacks.guessed_metres import metres_notes
-    from training.interruption import StoppedError
-    from training.train import fit
-    from training.training_data import training_data
+    from training.data.training_data import training_data
+    from training.fitting.run import StoppedError
+    from training.fitting.train import fit
 
     code, said = 0, ""
     try:
@@ -131,8 +139,7 @@ def _number(name: str) -> int:
 
 
 def _begun_with(preset: Preset, settings_file: Path | None) -> "TrainSettings":
-    from training.presets import PRESETS
-    from training.settings import load_settings
+    from training.fitting.settings import PRESETS, load_settings
 
     return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
 

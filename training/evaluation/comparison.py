@@ -27,11 +27,11 @@ from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 from training.data.dataset import PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
+from training.data.stacks import ChosenSlices, Seen, stack_name
 from training.evaluation.methods import Method, renderer_method
 from training.evaluation.report import Sheets, write_numbers, write_table
 from training.evaluation.scores import Evaluation, Perceptual, Score, SliceScorer
 from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
-from training.stacks import ChosenSlices, Seen, stack_name
 
 Result = TypeVar("Result")
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")

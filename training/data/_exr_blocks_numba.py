@@ -1,0 +1,19 @@
+"""The loop of training.data.exr_rows, compiled."""
+
+import numpy as np
+
+from mrbokeh.system.kernels import njit
+
+
+@njit(cache=True, nogil=True)
+def without_prediction(packed: np.ndarray) -> np.ndarray:
+    """Bytes of a ZIP block of OpenEXR: each is kept as its difference from the last, plus 128, and even ones before odd ones."""
+    result = np.empty(packed.size, np.uint8)
+    half, value = (packed.size + 1) // 2, 128
+    for i in range(half):
+        value = (value + packed[i] + 128) & 255
+        result[2 * i] = value
+    for i in range(half, packed.size):
+        value = (value + packed[i] + 128) & 255
+        result[2 * (i - half) + 1] = value
+    return result

@@ -1,0 +1,187 @@
+"""What a network must know of its data before it is built: from the pictures of scenes, or from the manifest of a data set.
+
+Where the stacks come from: scene folders, or a data set whose manifest knows its split, its radiance scale and its largest blur.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, read_focal_stack
+from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, file_troubles, read_focal_stack_dataset, slices_to_hold_out
+from mrbokeh.system.console import track
+from mrbokeh.system.errors import InputError
+from training.data.dataset import PairSet
+from training.data.stacks import Split, drawn, named, require_usable, split_stacks, stack_name
+
+_SAME = 1e-3
+
+
+@dataclass(frozen=True)
+class DataFacts:
+    """lens: focused where the first slice was; only its focus may change later, or of several lenses the one in the middle of all slices.
+    largest_coc_px: the largest diameter among pixels that count. radiance_scale: the radiance at the top of the network's range.
+    f_numbers, focal_lengths_mm: (lowest, highest) over all slices.
+    """
+
+    lens: Lens
+    width_px: int
+    height_px: int
+    largest_coc_px: float
+    radiance_scale: float
+    f_numbers: tuple[float, float]
+    focal_lengths_mm: tuple[float, float]
+
+
+def gather_facts(pairs: PairSet, several_lenses: bool = False) -> DataFacts:
+    """One pass over all pairs, whose largest radiance is the scale; raises InputError where they are not of one lens and one size.
+
+    several_lenses: for a network that is told which, f-number and focal length may differ.
+    """
+    lens, size = lens_of_stacks(pairs.stacks, several_lenses), pairs.size_px(0)
+    for index, (stack, _) in enumerate(pairs.keys):
+        _require_same_size(stack_name(stack), size, pairs.size_px(index))
+    largest_coc_px, largest_radiance = 0.0, 0.0
+    for piece in (piece for index in track(range(len(pairs)), "look at the pictures") for piece in pairs.pieces(index)):
+        counted = np.abs(piece.coc_px)[piece.weight > 0]
+        largest_coc_px = max(largest_coc_px, float(counted.max(initial=0.0)))
+        largest_radiance = max(largest_radiance, float(piece.all_in_focus.max()), float(piece.target.max()))
+    return DataFacts(lens, size[1], size[0], largest_coc_px, largest_radiance, *lens_ranges(pairs.stacks))
+
+
+def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[FocalStack], several_lenses: bool = False) -> DataFacts:
+    """No picture is opened; raises as `gather_facts` does. stacks: those to train on."""
+    size = (dataset.stacks[0].height_px, dataset.stacks[0].width_px)
+    for record in dataset.stacks:
+        _require_same_size(record.name, size, (record.height_px, record.width_px))
+    lens = lens_of_stacks(stacks, several_lenses)
+    return DataFacts(lens, size[1], size[0], dataset.largest_coc_px, dataset.radiance_scale, *lens_ranges(stacks))
+
+
+def lens_ranges(stacks: Sequence[FocalStack]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(lowest, highest) f-number and focal length in mm of all slices; f-numbers as measured where blur was calibrated."""
+    lenses = [stack.lens_of(index) for stack in stacks for index in range(len(stack))]
+    f_numbers, focal_lengths_mm = [each.f_number for each in lenses], [each.focal_length_mm for each in lenses]
+    return (min(f_numbers), max(f_numbers)), (min(focal_lengths_mm), max(focal_lengths_mm))
+
+
+def lens_of_stacks(stacks: Sequence[FocalStack], several_lenses: bool = False) -> Lens:
+    """`common_lens`, or for several: the one in the middle of all slices, ordered by focal length and f-number.
+
+    Raises InputError where sensors differ, for f-number and focal length do not tell how many pixels a millimetre has.
+    """
+    if not several_lenses:
+        return common_lens(stacks)
+    width_mm = _stated(stacks[0])[2]
+    for stack in stacks:
+        if not np.isclose(_stated(stack)[2], width_mm, rtol=_SAME):
+            raise InputError(
+                f"one network learns lenses on one sensor: expected a sensor {width_mm} mm wide as in the first stack, "
+                f"but {stack.folder} has {_stated(stack)[2]} mm; train on it apart"
+            )
+    lenses = [stack.lens_of(index) for stack in stacks for index in range(len(stack))]
+    return sorted(lenses, key=lambda lens: (lens.focal_length_mm, lens.f_number))[len(lenses) // 2]
+
+
+def common_lens(stacks: Sequence[FocalStack]) -> Lens:
+    """The lens of all slices; its f-number is the median, since where blur was calibrated each slice has a measured one of its own.
+
+    Raises InputError where stacks state different lenses.
+    """
+    expected = _stated(stacks[0])
+    for stack in stacks:
+        if not np.allclose(_stated(stack), expected, rtol=_SAME):
+            raise InputError(
+                f"one network learns one lens: expected (focal length, f-number, sensor width) {expected} as in the first stack, "
+                f"but {stack.folder} has {_stated(stack)}; train on it apart"
+            )
+    f_numbers = [stack.lens_of(index).f_number for stack in stacks for index in range(len(stack))]
+    return replace(stacks[0].lens_of(0), f_number=float(np.median(f_numbers)))
+
+
+def _stated(stack: FocalStack) -> tuple[float, float, float]:
+    stack.lens_of(0)  # says what to do where nobody knows the lens
+    assert stack.lens is not None
+    return stack.lens.focal_length_mm, stack.lens.f_number, stack.lens.sensor_width_mm
+
+
+def _require_same_size(name: str, size: tuple[int, ...], other_size: tuple[int, ...]) -> None:
+    if size != other_size:
+        raise InputError(
+            f"one network learns one size of picture: expected {size[1]}x{size[0]} px as in the first stack, but {name} has "
+            f"{other_size[1]}x{other_size[0]} px; train on it apart"
+        )
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """All stacks, whichever part they belong to; dataset: the manifest that they came with, in its order, or None."""
+
+    stacks: tuple[FocalStack, ...]
+    dataset: FocalStackDataset | None = None
+
+    def split(self, held_out: Sequence[str], test_fraction: float, seed: int) -> Split:
+        """Whole stacks: held out are those named; without names those of the manifest; without one a fraction.
+
+        Of a single stack slices are held out, those of the manifest or `slices_to_hold_out`, unless the fraction is 0.
+        """
+        if held_out:
+            apart = named(self.stacks, held_out)
+        elif self.dataset is not None:
+            apart = [stack_name(stack) for stack, record in zip(self.stacks, self.dataset.stacks, strict=True) if record.part == "test"]
+        else:
+            apart = drawn(self.stacks, test_fraction, seed)
+        train, test = split_stacks(self.stacks, apart)
+        slices = self._slices_apart(test_fraction) if len(self.stacks) == 1 else ()
+        return Split(tuple(train), tuple(train if slices else test), slices)
+
+    def _slices_apart(self, test_fraction: float) -> tuple[int, ...]:
+        if self.dataset is not None:
+            return self.dataset.stacks[0].held_out_slices
+        return slices_to_hold_out(self.stacks[0]) if test_fraction > 0.0 else ()
+
+    def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
+        """Read facts from the manifest, or by a look at every pair to train on. several_lenses: f-number and focal length may differ."""
+        if self.dataset is None:
+            return gather_facts(pairs, several_lenses)
+        return manifest_facts(self.dataset, pairs.stacks, several_lenses)
+
+
+def training_data(folders: Sequence[Path]) -> TrainingData:
+    """The stacks of a data set, or of scene folders. Raises InputError where they cannot be used or are a mixture of both."""
+    datasets = [folder for folder in folders if (folder / FILE_NAME).is_file()]
+    if datasets and len(folders) > 1:
+        raise InputError(
+            f"expected one data set or any number of scene folders, got {datasets[0]} and {len(folders) - 1} more: one network has one "
+            f"split and one radiance scale, so write all scenes into one data set with `mrbokeh capture dataset`"
+        )
+    if datasets:
+        return _of_dataset(read_focal_stack_dataset(datasets[0]))
+    stacks = [stack for folder in folders for stack in find_focal_stacks(folder)]
+    for stack in stacks:
+        _require_no_manifest(stack)
+        require_usable(stack)
+    return TrainingData(tuple(stacks))
+
+
+def _of_dataset(dataset: FocalStackDataset) -> TrainingData:
+    trouble = next((each for record in dataset.stacks for each in file_troubles(dataset, record)), None)
+    if trouble is not None:
+        raise InputError(
+            f"{dataset.folder} is not the data set that its {FILE_NAME} describes: {trouble}; "
+            f"`mrbokeh capture dataset --out {dataset.folder} --verify` names everything that differs"
+        )
+    stacks = tuple(read_focal_stack(dataset.folder / record.name) for record in dataset.stacks)
+    for stack in stacks:
+        require_usable(stack)
+    return TrainingData(stacks, dataset)
+
+
+def _require_no_manifest(stack: FocalStack) -> None:
+    """A part of a data set, given as a scene, would be split anew, and what is held out trained on."""
+    dataset = stack.folder.resolve().parent.parent
+    if (dataset / FILE_NAME).is_file():
+        raise InputError(f"{stack.folder} belongs to the data set {dataset}: give {dataset} itself, so that its split holds")

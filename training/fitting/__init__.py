@@ -1,0 +1,1 @@
+"""Fitting a network: settings, loss, the run and its folder, checkpoints, several processes."""

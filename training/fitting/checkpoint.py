@@ -1,0 +1,214 @@
+"""How a run came along: a table and a picture of it, in the folder of the run.
+
+A network while it learns: its weights, their average, the best so far, and the optimizer.
+
+Checkpoints: everything a training run needs to go on as if it had never stopped, in one file that is whole or absent.
+"""
+
+import copy
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mrbokeh.system.atomic_files import atomic_path
+from mrbokeh.system.errors import InputError
+from training.fitting.settings import TrainSettings
+from training.networks.network import BlurNetwork
+
+TABLE_NAME = "curve.csv"
+PICTURE_NAME = "curve.png"
+
+
+class CurvePoint(NamedTuple):
+    """loss: smoothed, of training; held_out_psnr_db: nan between the looks at held-out slices; learning_rate: of the step before."""
+
+    step: int
+    elapsed_s: float
+    loss: float
+    held_out_psnr_db: float
+    learning_rate: float
+
+
+def write_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
+    """curve.csv; the PSNR is empty where nobody looked."""
+    with atomic_path(folder / TABLE_NAME) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(CurvePoint._fields)
+        rows.writerows(["" if isinstance(value, float) and math.isnan(value) else value for value in point] for point in curve)
+
+
+def draw_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
+    """curve.png: loss and learning rate (both logarithmic) and the PSNR on held-out slices, over steps."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 6.5), layout="constrained")
+    loss, psnr, rate = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 1))
+    steps = [point.step for point in curve]
+    loss.semilogy(steps, [point.loss for point in curve], color="tab:blue")
+    looks = [point for point in curve if not math.isnan(point.held_out_psnr_db)]
+    psnr.plot([point.step for point in looks], [point.held_out_psnr_db for point in looks], "o-", markersize=3, color="tab:green")
+    rate.semilogy(steps, [point.learning_rate for point in curve], color="tab:gray")
+    for axes, label in ((loss, "training loss"), (psnr, "held-out PSNR (dB)"), (rate, "learning rate")):
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+    rate.set_xlabel("step")
+    with atomic_path(folder / PICTURE_NAME) as temporary:
+        figure.savefig(temporary, dpi=100)
+
+
+_HALVES = {"bfloat16": torch.bfloat16, "float16": torch.float16}
+
+
+class Learner:
+    """network: what is trained, average: the moving average that becomes the result; both in float32 whatever the precision.
+
+    best: the averaged weights of the best look at held-out slices, or None before the first.
+    """
+
+    def __init__(self, network: BlurNetwork, settings: TrainSettings, device: torch.device) -> None:
+        self.network = network.to(device)
+        self.average = copy.deepcopy(self.network)
+        self.best: dict[str, Tensor] | None = None
+        self._settings, self.device = settings, device
+        self._optimizer = torch.optim.Adam(self.network.parameters(), settings.learning_rate, betas=(0.9, 0.99))
+        # float16 ends at 6e-8: small gradients would vanish if they were not scaled up.
+        self._scaler = torch.amp.GradScaler(device.type, enabled=settings.precision == "float16")
+
+    @property
+    def learning_rate(self) -> float:
+        """The learning rate of the last step."""
+        return float(self._optimizer.param_groups[0]["lr"])
+
+    def begin(self, rate_factor: float) -> None:
+        """Start a step at this part of the peak learning rate, without gradients."""
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._settings.learning_rate * rate_factor
+        self._optimizer.zero_grad(set_to_none=True)
+
+    def autocast(self) -> torch.autocast:
+        """The block in which the network and its loss are computed in the chosen precision."""
+        half = _HALVES.get(self._settings.precision)
+        return torch.autocast(self.device.type, half, enabled=half is not None)
+
+    def backward(self, loss: Tensor) -> None:
+        """Add the gradients of this loss to those of the step."""
+        self._scaler.scale(loss).backward()
+
+    def apply(self, step: int) -> None:
+        """Update the weights; their average follows, faster while it is young (step counts from 0)."""
+        if self._settings.clip_norm > 0.0:
+            self._scaler.unscale_(self._optimizer)
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self._settings.clip_norm)
+        self._scaler.step(self._optimizer)
+        self._scaler.update()
+        decay = min(self._settings.ema_decay, (1.0 + step) / (10.0 + step))
+        with torch.no_grad():
+            for mean, now in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(now, 1.0 - decay)
+
+    def keep_best(self) -> None:
+        self.best = {name: value.detach().cpu().clone() for name, value in self.average.state_dict().items()}
+
+    def take_best(self) -> None:
+        """The average becomes the best so far, if there is one."""
+        if self.best is not None:
+            self.average.load_state_dict(self.best)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "best": self.best,
+            "optimizer": self._optimizer.state_dict(),
+            "scaler": self._scaler.state_dict(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Raises RuntimeError, KeyError or ValueError where the state is that of another network."""
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.best = state["best"]
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._scaler.load_state_dict(state["scaler"])
+
+
+FILE_NAME = "checkpoint.pt"
+
+
+@dataclass
+class Progress:
+    """State of a run; the one thing that changes while it trains.
+
+    pictures: drawn so far, by all processes together.
+    best_psnr_db, best_step: of the best look at held-out slices; looks_since_best: how many came after it.
+    points_due: of the curve, so many parts of the budget have been noted.
+    kept_step: of the weights that the finished network has; stopped_early: before the budget was used, for want of anything better.
+    """
+
+    step: int = 0
+    pictures: int = 0
+    elapsed_s: float = 0.0
+    smoothed_loss: float = math.nan
+    best_psnr_db: float = -math.inf
+    best_step: int = 0
+    looks_since_best: int = 0
+    points_due: int = 0
+    stopped_early: bool = False
+    kept_step: int = 0
+    finished: bool = False
+    curve: list[CurvePoint] = field(default_factory=list)
+
+    def took_step(self, loss: float, pictures: int) -> None:
+        self.step += 1
+        self.pictures += pictures
+        self.smoothed_loss = loss if math.isnan(self.smoothed_loss) else 0.98 * self.smoothed_loss + 0.02 * loss
+
+    def looked(self, psnr_db: float) -> bool:
+        """Count a look at held-out slices; whether it is the best so far. nan never is."""
+        if psnr_db > self.best_psnr_db:
+            self.best_psnr_db, self.best_step, self.looks_since_best = psnr_db, self.step, 0
+            return True
+        self.looks_since_best += 1
+        return False
+
+
+def save_checkpoint(path: Path, progress: Progress, learner: Learner, rng: np.random.Generator) -> None:
+    plain = dict(vars(progress)) | {"curve": [tuple(point) for point in progress.curve]}
+    random = {"batch_rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}
+    with atomic_path(path) as temporary:
+        torch.save({"progress": plain, "learner": learner.state(), **random}, temporary)
+
+
+def read_checkpoint(path: Path) -> dict[str, Any] | None:
+    """What `restore_checkpoint` takes; None where there is no such file."""
+    if not path.exists():
+        return None
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, UnpicklingError) as error:
+        raise _not_of_this_run(path, error) from None
+    return state
+
+
+def restore_checkpoint(path: Path, state: dict[str, Any], learner: Learner, rng: np.random.Generator) -> Progress:
+    """Put everything back; raises InputError where this is not a checkpoint of such a run. path: for the message."""
+    try:
+        learner.restore(state["learner"])
+        rng.bit_generator.state = state["batch_rng"]
+        torch.set_rng_state(state["torch_rng"])
+        values = state["progress"]
+        return Progress(**values | {"curve": [CurvePoint(*point) for point in values["curve"]]})
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise _not_of_this_run(path, error) from None
+
+
+def _not_of_this_run(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path} is not a checkpoint of this run ({str(error)[:200]}): --overwrite starts again")

@@ -1,0 +1,191 @@
+"""Sheets of predictions on held-out slices, one for every look, so that one can watch a network learn.
+
+How far a network has come, on a few slices of stacks that are held out; they are read when asked for, not kept.
+
+What a run leaves in its folder while it trains: curve, sheets, checkpoints, and the network at the end.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from mrbokeh.images.image_io import WIDEST_PX, SheetRow, write_contact_sheet
+from mrbokeh.stacks.focal_stack import FocalStack
+from training.data.batches import Batch, stack_pairs
+from training.data.dataset import Pair, PairSet
+from training.data.pairs import WHERE_TRUTH_IS_KNOWN
+from training.data.stacks import ChosenSlices
+from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
+from training.fitting.checkpoint import CurvePoint, Learner, Progress, draw_curve, save_checkpoint, write_curve
+from training.fitting.run_folder import RunFacts, save_network
+from training.fitting.settings import TrainSettings
+
+FOLDER_NAME = "sheets"
+MOST_KEPT = 16
+
+
+def small_picture(picture: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "small_height small_width 3"]:
+    """Shrink a picture to the width at which a sheet shows it, so that whole pictures need not be kept until it is written."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    scale = min(1.0, WIDEST_PX / width)
+    return np.asarray(cv2.resize(picture, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def write_sheet(run_folder: Path, step: int, rows: Sequence[SheetRow]) -> None:
+    """sheets/step_0000123.png. At most MOST_KEPT are kept: the first, the last, and of the others such that lie far apart."""
+    if not rows:
+        return
+    folder = run_folder / FOLDER_NAME
+    write_contact_sheet(folder / f"step_{step:07d}.png", rows)
+    kept = sorted(folder.glob("step_*.png"), key=_step)
+    while len(kept) > MOST_KEPT:
+        closest = min(range(1, len(kept) - 1), key=lambda i: _step(kept[i + 1]) - _step(kept[i - 1]))
+        kept.pop(closest).unlink()
+
+
+def _step(path: Path) -> int:
+    return int(path.stem.removeprefix("step_"))
+
+
+SLICES = 4
+SIDE_PX = 384
+"""Side of the middle of a picture that a look is at: with blur of 66 px a network took 20 s for a whole picture of 0.8 megapixels."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """psnr_db: mean over slices, of linear radiance clipped to [0, 1] where the truth is known; nan where nothing is held out.
+
+    rows: for a sheet: the sharp picture, what the network makes of it, and the photograph.
+    """
+
+    psnr_db: float
+    rows: tuple[SheetRow, ...] = ()
+
+
+class HeldOutSlices:
+    """Some slices, spread over stacks and focus range: the middle of each, or all of it where tiles have their own places."""
+
+    def __init__(self, stacks: Sequence[FocalStack], slices: ChosenSlices | None = None) -> None:
+        self._pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0, slices=slices)
+        spread = np.linspace(0, len(self._pairs) - 1, SLICES if len(self._pairs) else 0)
+        self._chosen = [int(index) for index in np.unique(spread.round())]
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    @torch.no_grad()
+    def look(self, network: torch.nn.Module, device: torch.device) -> Look:
+        """Score and show the slices in full precision, whatever the training's."""
+        scored = [self._scored(index, network, device) for index in self._chosen]
+        return Look(float(np.mean([value for value, _ in scored])) if scored else math.nan, tuple(row for _, row in scored))
+
+    def _scored(self, index: int, network: torch.nn.Module, device: torch.device) -> tuple[float, SheetRow]:
+        tiled = getattr(network, "grid", None) is not None
+        batch = stack_pairs([self._pairs[index] if tiled else _middle(self._pairs[index])]).to(device)
+        result = network(batch.rgb, batch.coc_px, batch.place, batch.lens)
+        psnr_db = _psnr_db(result, batch)
+        pictures = {"sharp": batch.rgb, f"network {psnr_db:.2f} dB": result, "photograph": batch.target}
+        small = {caption: small_picture(picture[0].permute(1, 2, 0).cpu().numpy()) for caption, picture in pictures.items()}
+        return psnr_db, SheetRow(self._pairs.label(index), small)
+
+
+def _middle(pair: Pair) -> Pair:
+    """At most SIDE_PX wide and high; what gets light from outside has no weight."""
+    halo_px = math.ceil(float(np.abs(pair.coc_px).max()) / 2.0)
+    parts, weights = [], []
+    for length in pair.coc_px.shape:
+        side = min(length, max(SIDE_PX, 4 * halo_px))
+        start = (length - side) // 2
+        weight = np.ones(side, np.float32)
+        if side < length:
+            weight[:halo_px] = weight[side - halo_px :] = 0.0
+        parts.append(slice(start, start + side))
+        weights.append(weight)
+    return pair.cut(parts[0], parts[1]).weighted(weights[0][:, None] * weights[1])
+
+
+def _psnr_db(result: torch.Tensor, batch: Batch) -> float:
+    error = result.clamp(0, 1) - batch.target.clamp(0, 1)
+    weight = batch.weight.expand_as(error)
+    mean = float((weight * error.square()).sum() / weight.sum().clamp(min=1e-6))
+    return -10.0 * math.log10(max(mean, 1e-12))
+
+
+# Drawing takes a moment, which looks that follow one another closely do not all need.
+_DRAWN_EVERY_S = 20.0
+# Of the curve, over the whole budget, beside those where held-out slices are looked at.
+POINTS = 200
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a run is about: where it is kept, what it learns from and what it is tested on."""
+
+    folder: Path
+    settings: TrainSettings
+    facts: RunFacts
+    pairs: PairSet
+    held_out: HeldOutSlices
+
+
+class Record:
+    """Written by the first process only; progress, learner and rng are those of the run, seen as they change."""
+
+    def __init__(self, task: Task, learner: Learner, progress: Progress, rng: np.random.Generator) -> None:
+        self._task, self._learner, self._progress, self._rng = task, learner, progress, rng
+        self._checkpoint = task.folder / CHECKPOINT_NAME
+        self._drawn_s = -math.inf
+
+    def note(self, psnr_db: float = math.nan) -> None:
+        """A point of the curve."""
+        progress = self._progress
+        elapsed_s, rate = round(progress.elapsed_s, 2), self._learner.learning_rate
+        progress.curve.append(CurvePoint(progress.step, elapsed_s, progress.smoothed_loss, psnr_db, rate))
+
+    def note_if_due(self, done: float) -> None:
+        """A point of the curve for every part of the budget; done: how much of it is used, in [0, 1]."""
+        if done * POINTS >= self._progress.points_due:
+            self._progress.points_due = math.floor(done * POINTS) + 1
+            self.note()
+
+    def look(self) -> bool:
+        """At held-out slices; whether there has been nothing better for as long as patience lasts."""
+        look = self._task.held_out.look(self._learner.average, self._learner.device)
+        if self._progress.looked(look.psnr_db):
+            self._learner.keep_best()
+        self.note(look.psnr_db)
+        if self._task.settings.sheets:
+            write_sheet(self._task.folder, self._progress.step, look.rows)
+        write_curve(self._task.folder, self._progress.curve)
+        if self._progress.elapsed_s - self._drawn_s >= _DRAWN_EVERY_S:
+            self._draw()
+        return 0 < self._task.settings.patience <= self._progress.looks_since_best
+
+    def save(self) -> None:
+        save_checkpoint(self._checkpoint, self._progress, self._learner, self._rng)
+        write_curve(self._task.folder, self._progress.curve)
+
+    def finish(self) -> None:
+        """The last look, and the network: the last weights, or with patience the best ones."""
+        if not self._progress.stopped_early:
+            self.look()
+        self._progress.kept_step = self._progress.step
+        if self._task.settings.patience and self._learner.best is not None:
+            self._learner.take_best()
+            self._progress.kept_step = self._progress.best_step
+        save_network(self._task.folder, self._learner.average.cpu())
+        self._progress.finished = True
+        self.save()
+        self._draw()
+
+    def _draw(self) -> None:
+        draw_curve(self._task.folder, self._progress.curve)
+        self._drawn_s = self._progress.elapsed_s

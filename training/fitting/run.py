@@ -1,0 +1,264 @@
+"""Being asked to stop: Ctrl-C, or the SIGTERM with which batch systems announce that time is up.
+
+Whether a budget in minutes has time for a network to learn anything, told by its first steps.
+
+One run in memory: steps until the budget is used, with looks at held-out slices and checkpoints between them.
+"""
+
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import Progress as Bars
+
+from mrbokeh.system.console import progress_bars
+from mrbokeh.system.errors import InputError
+from training.data.batches import Batch, Drawing, draw_share
+from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
+from training.fitting.checkpoint import Learner, Progress, read_checkpoint, restore_checkpoint
+from training.fitting.distributed import Ranks
+from training.fitting.objective import learning_rate_factor, loss
+from training.fitting.record import Record, Task
+from training.fitting.run_folder import build_network
+from training.fitting.settings import TrainSettings
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StoppedError(KeyboardInterrupt):
+    """A run that was asked to stop did so; number: of the signal. left: what there is now, in words."""
+
+    def __init__(self, number: int, left: str) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}; {left}")
+        self.number = number
+
+    @property
+    def exit_code(self) -> int:
+        """The code that shells give: 130 after Ctrl-C, 143 after SIGTERM."""
+        return 128 + self.number
+
+
+class Interruption:
+    """A block in which the signals only leave a note, so that a step is never torn; `asked` holds the last one.
+
+    A signal that was ignored before stays so: shells start background jobs deaf to Ctrl-C.
+    Of a process on its own a second Ctrl-C stops at once, without a checkpoint (torchrun passes on what its children have got already).
+    """
+
+    def __init__(self, alone: bool = True) -> None:
+        self.asked: int | None = None
+        self._alone = alone
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> "Interruption":
+        if threading.current_thread() is threading.main_thread():
+            heard = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._note) for number in heard}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self._alone and self.asked == number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.asked = number
+
+
+LEAST_STEPS = 200
+"""The smallest networks have learnt a lens roughly after so many; with a tenth of them the result is what it began as."""
+_TELLING_STEPS = 6
+_LONGEST_SHARE = 0.05  # of the budget until the rate is known; at LEAST_STEPS in all that would be ten steps
+
+
+def is_rate_known(ends_s: Sequence[float], budget_s: float) -> bool:
+    """Whether the steps so far tell the rate. ends_s: since training began; the first step also reads data and is not told by."""
+    if not ends_s:
+        return False
+    if len(ends_s) == 1:
+        return ends_s[0] > max(2.0 * _LONGEST_SHARE * budget_s, 10.0)
+    used_s = ends_s[-1] - ends_s[0]
+    return used_s > _LONGEST_SHARE * budget_s or (len(ends_s) >= _TELLING_STEPS and used_s > 0.01 * budget_s)
+
+
+def seconds_of_a_step(ends_s: Sequence[float]) -> float:
+    return ends_s[0] if len(ends_s) == 1 else (ends_s[-1] - ends_s[0]) / (len(ends_s) - 1)
+
+
+def steps_within(ends_s: Sequence[float], budget_s: float) -> int:
+    """How many steps the whole budget makes at that rate."""
+    return len(ends_s) + max(0, int((budget_s - ends_s[-1]) / max(seconds_of_a_step(ends_s), 1e-9)))
+
+
+def too_few_words(ends_s: Sequence[float], settings: TrainSettings, halo_px: int, least: int) -> str:
+    """What to say to somebody whose budget has time for fewer steps than `least`. halo_px: see `training.data.batches.Drawing`."""
+    minutes, step_s = settings.minutes or 0.0, seconds_of_a_step(ends_s)
+    steps, enough = steps_within(ends_s, 60.0 * minutes), 1.25 * (ends_s[0] + least * step_s) / 60.0
+    enough = math.ceil(enough) if enough > 5.0 else math.ceil(10.0 * enough) / 10.0
+    took, plural = f"{float(format(step_s, '.2g')):g}", "" if steps == 1 else "s"
+    return (
+        f"{minutes:g} minutes make about {steps} step{plural} of {took} s, and a network learns no lens in fewer than {least}: "
+        f"give --minutes {enough:g}, or make steps shorter with {' or '.join(_shorter_steps(settings, halo_px))}"
+    )
+
+
+def _shorter_steps(settings: TrainSettings, halo_px: int) -> list[str]:
+    """What makes a step shorter, the most effective first."""
+    ways = []
+    if settings.network.form == "published":
+        ways.append("--preset demo")
+    elif not settings.crop_px:
+        ways.append(f"--set crop_px={max(128, 4 * halo_px)}")
+    elif settings.crop_px >= 8 * halo_px and settings.crop_px >= 64:
+        ways.append(f"--set crop_px={settings.crop_px // 2}")
+    if settings.batch > 1:
+        ways.append("--set batch=1")
+    return [*ways, "smaller pictures (`mrbokeh capture process --max-width`), whose blur has fewer pixels"]
+
+
+class Run:
+    """The constructor restores a checkpoint where there is one, unless it begins afresh. Every process has a run; that of the first one
+    writes and looks."""
+
+    def __init__(self, task: Task, ranks: Ranks, afresh: bool = False) -> None:
+        self.task, self.settings, self.ranks = task, task.settings, ranks
+        torch.set_num_threads(self.settings.threads or max(1, (os.cpu_count() or 1) // ranks.local_count))
+        self.learner = Learner(build_network(self.settings, task.facts), self.settings, ranks.device)
+        self._rng = np.random.default_rng(self.settings.seed)
+        self.progress = Progress() if afresh else self._restored()
+        self._record = Record(task, self.learner, self.progress, self._rng)
+        self._halo_px = math.ceil(task.facts.largest_coc_px / 2.0)
+        # The rim of a crop that wide does not count; at least half of each side has to.
+        self._crop_px = self.settings.crop_px and max(self.settings.crop_px, 4 * self._halo_px)
+        self._interruption = Interruption(alone=ranks.count == 1)
+        self._stopped_by: int | None = None
+        self._started_s = time.monotonic() - self.progress.elapsed_s
+        self._saved_s = self._looked_s = self.progress.elapsed_s
+
+    def require_steps(self, least: int) -> None:
+        """Take the first steps of a budget in minutes; nothing is written.
+
+        Raises InputError where it has no time for `least` of them, StoppedError where any process is asked to stop.
+        """
+        if self.settings.minutes is None or self.progress.step:
+            return
+        budget_s, ends_s = 60.0 * self.settings.minutes, list[float]()
+        with self._interruption, self._bars() as bars:
+            bar = bars.add_task("first steps, to see how many there is time for", total=None)
+            while not is_rate_known(ends_s, budget_s) and self._done() < 1.0 and self._stopped_by is None:
+                self._step(learning_rate_factor(self._done(), self.settings.warm_up))
+                ends_s.append(self.progress.elapsed_s)
+                bars.advance(bar)
+        if self._stopped_by is not None:
+            raise StoppedError(self._stopped_by, f"training had not begun, and nothing was changed in {self.task.folder}")
+        if steps_within(ends_s, budget_s) < least:
+            raise InputError(too_few_words(ends_s, self.settings, self._halo_px, least))
+
+    def train(self) -> Progress:
+        """Use the rest of the budget; raises StoppedError, with a checkpoint, where any process is asked to stop."""
+        if self.progress.finished:
+            return self.progress
+        with self._interruption:
+            self._loop()
+            if self._stopped_by is not None:
+                self._save()
+                kept = f"the checkpoint in {self.task.folder} is kept, run the same command again (without --overwrite) to go on"
+                raise StoppedError(self._stopped_by, kept)
+            self.ranks.from_first(self._record.finish)
+        return self.progress
+
+    def _restored(self) -> Progress:
+        path = self.task.folder / CHECKPOINT_NAME
+        state = self.ranks.from_first(lambda: read_checkpoint(path))
+        return Progress() if state is None else restore_checkpoint(path, state, self.learner, self._rng)
+
+    def _done(self) -> float:
+        """How much of the budget is used, in [0, 1]."""
+        if self.settings.epochs is not None:
+            return min(1.0, self.progress.pictures / (self.settings.epochs * len(self.task.pairs)))
+        return min(1.0, self.progress.elapsed_s / (60.0 * (self.settings.minutes or 0.0) + 1e-9))
+
+    def _loop(self) -> None:
+        with self._bars() as bars:
+            bar = bars.add_task(**self._bar())
+            while (done := self._done()) < 1.0 and self._stopped_by is None and not self.progress.stopped_early:
+                self._step(learning_rate_factor(done, self.settings.warm_up))
+                bars.update(bar, **self._bar())
+                self._keep()
+
+    def _bar(self) -> dict[str, Any]:
+        """What is done of what: steps of those planned, or seconds of a budget in minutes beside the steps that they made."""
+        progress, loss_words = self.progress, "" if math.isnan(self.progress.smoothed_loss) else f", loss {self.progress.smoothed_loss:.2e}"
+        if self.settings.epochs is not None:
+            planned = math.ceil(self.settings.epochs * len(self.task.pairs) / (self.settings.batch * self.ranks.count))
+            return {"description": f"train{loss_words}, steps", "completed": progress.step, "total": planned}
+        budget_s = 60.0 * (self.settings.minutes or 0.0)
+        description = f"train, {progress.step} steps{loss_words}, seconds"
+        return {"description": description, "completed": min(progress.elapsed_s, budget_s), "total": budget_s}
+
+    def _step(self, rate_factor: float) -> None:
+        """One update from `batch` pictures of each process, one after the other: a picture uses few of the network's bins, all
+        together most of them."""
+        self.learner.begin(rate_factor)
+        mean_loss = self._agree(sum(self._learn_from(batch) for batch in self._draw()))
+        self.learner.apply(self.progress.step)
+        self.progress.took_step(mean_loss, self.settings.batch * self.ranks.count)
+
+    def _draw(self) -> Iterator[Batch]:
+        """The pictures of this process, one by one. All draw from one sequence and pass over the pictures of the others, so that it
+        does not matter who draws what: two processes see what one with twice the batch sees."""
+        settings, noise = self.settings, self.settings.depth_noise
+        drawing = Drawing(self.task.pairs, settings.batch, self._crop_px, self._halo_px, settings.crops_per_picture, noise > 0.0)
+        place, most_px = (self.ranks.number, self.ranks.count), self.task.facts.largest_coc_px
+        for batch in draw_share(drawing, self._rng, *place, depth_noise=noise, largest_coc_px=most_px):
+            yield batch.to(self.ranks.device)
+
+    def _learn_from(self, batch: Batch) -> float:
+        """Add the gradients of one picture."""
+        facts, settings = self.task.facts, self.settings
+        with self.learner.autocast():
+            error = loss(self.learner.network, batch, facts.radiance_scale, facts.largest_coc_px, settings) / settings.batch
+        self.learner.backward(error)
+        return error.item()
+
+    def _agree(self, own_loss: float) -> float:
+        """Average gradients and loss over all processes; all take the clock of the first, and stop when one is asked to."""
+        asked, elapsed_s = self._interruption.asked, self._now_s() if self.ranks.first else 0.0
+        own = (own_loss, elapsed_s, float(asked == signal.SIGINT), float(asked == signal.SIGTERM))
+        losses, self.progress.elapsed_s, by_key, by_system = self.ranks.average_gradients(self.learner.network, own)
+        if by_key or by_system:
+            self._stopped_by = signal.SIGTERM if by_system else signal.SIGINT
+        return losses / self.ranks.count
+
+    def _now_s(self) -> float:
+        return time.monotonic() - self._started_s
+
+    def _keep(self) -> None:
+        """Looks and checkpoints, where they are due."""
+        now_s = self.progress.elapsed_s
+        if self.ranks.first:
+            self._record.note_if_due(self._done())
+        if self.settings.validate_every_s and now_s - self._looked_s >= self.settings.validate_every_s:
+            # The next look is due an interval after this one ended; of a budget in minutes looks take a tenth at most.
+            self.progress.stopped_early, self._looked_s = self.ranks.from_first(lambda: (self._record.look(), self._now_s()))
+            if self.settings.minutes is not None:
+                self._looked_s += max(0.0, 9.0 * (self._looked_s - now_s) - self.settings.validate_every_s)
+        if now_s - self._saved_s >= self.settings.checkpoint_every_s:
+            self._save()
+            self._saved_s = now_s
+
+    def _save(self) -> None:
+        if self.ranks.first:
+            self._record.save()
+
+    def _bars(self) -> AbstractContextManager[Bars]:
+        return progress_bars() if self.ranks.first else nullcontext(Bars(disable=True))

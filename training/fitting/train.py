@@ -1,0 +1,140 @@
+"""A run goes on only as what it was begun as.
+
+Fit a network to focal stacks: what is learnt from what is settled here, then `Run` steps. Every choice is in settings.py.
+"""
+
+import shutil
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from mrbokeh.stacks.guessed_metres import is_lens_guessed
+from mrbokeh.system.errors import InputError
+from training.data.dataset import PairSet
+from training.data.pairs import counting_of
+from training.data.stacks import Split, stack_name
+from training.data.training_data import TrainingData
+from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
+from training.fitting.checkpoint import Progress
+from training.fitting.distributed import Ranks, joined
+from training.fitting.record import HeldOutSlices, Task
+from training.fitting.run import LEAST_STEPS, Run
+from training.fitting.run_folder import FILE_NAME as FACTS_NAME
+from training.fitting.run_folder import RunFacts, read_facts, source_commit, write_facts
+from training.fitting.settings import FILE_NAME as SETTINGS_NAME
+from training.fitting.settings import TrainSettings, read_settings, write_settings
+
+_MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
+
+
+def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
+    """Raise InputError for other settings than those of the run, except where and how fast it computes and how often it writes."""
+    if _begun(run_folder, SETTINGS_NAME):
+        _require_same(run_folder, "settings", read_settings(run_folder), settings, _MAY_DIFFER)
+
+
+def require_same_data(run_folder: Path, facts: RunFacts) -> None:
+    """What a run has seen cannot be held out later."""
+    if _begun(run_folder, FACTS_NAME):
+        _require_same(run_folder, "data", read_facts(run_folder), facts, ("lens", "commit"))
+
+
+def _begun(run_folder: Path, name: str) -> bool:
+    return (run_folder / CHECKPOINT_NAME).exists() and (run_folder / name).exists()
+
+
+def _require_same(run_folder: Path, what: str, before: object, now: object, may_differ: tuple[str, ...]) -> None:
+    differing = [name for name, value in vars(now).items() if vars(before)[name] != value and name not in may_differ]
+    if differing:
+        raise InputError(
+            f"{run_folder} holds a run with other {what} ({', '.join(differing)}): give another --out, or --overwrite to start again"
+        )
+
+
+def remove_unfinished(run_folder: Path) -> None:
+    """Remove what a killed run was writing: files get their name when they are whole."""
+    for path in run_folder.rglob(".*.part.*"):
+        path.unlink()
+
+
+def fit(
+    data: TrainingData,
+    run_folder: Path,
+    settings: TrainSettings,
+    held_out: Sequence[str] = (),
+    overwrite: bool = False,
+    least_steps: int = LEAST_STEPS,
+) -> Progress:
+    """Train, or go on training, into run_folder; a finished run is left as it is. held_out: see `TrainingData.split`.
+
+    overwrite: start again where there is a run. least_steps: raises InputError, and writes or removes nothing, where the first steps say
+    that a budget in minutes has no time for so many.
+    Ctrl-C and SIGTERM end it after the step (StoppedError, a KeyboardInterrupt) with a checkpoint, from which the same call goes on; while
+    the first steps tell the time, with nothing changed.
+    Processes that torchrun started train together; all need the data, only the first needs the folder.
+    """
+    with joined(settings.device) as ranks:
+        return _fit(data, run_folder, settings, held_out, ranks, overwrite, least_steps)
+
+
+def _fit(
+    data: TrainingData,
+    run_folder: Path,
+    settings: TrainSettings,
+    held_out: Sequence[str],
+    ranks: Ranks,
+    overwrite: bool,
+    least_steps: int,
+) -> Progress:
+    split = data.split(held_out, settings.test_fraction, settings.seed)
+    pairs = PairSet(split.train, counting_of(settings), settings.cache_mib, split.train_slices)
+    validation = HeldOutSlices(split.test, split.test_slices)
+    _require_looks(settings, validation)
+
+    def checked() -> RunFacts:
+        if overwrite:
+            return _facts_of(data, pairs, split, settings)
+        require_same_settings(run_folder, settings)
+        facts = _facts_of(data, pairs, split, settings)
+        require_same_data(run_folder, facts)
+        return facts
+
+    def begun(facts: RunFacts) -> None:
+        if overwrite and run_folder.exists():
+            shutil.rmtree(run_folder)
+        remove_unfinished(run_folder)
+        write_settings(run_folder, settings)
+        write_facts(run_folder, facts)
+
+    with closing(pairs):
+        facts = ranks.from_first(checked)
+        run = Run(Task(run_folder, settings, facts, pairs, validation), ranks, afresh=overwrite)
+        run.require_steps(least_steps)
+        ranks.from_first(lambda: begun(facts))
+        return run.train()
+
+
+def _require_looks(settings: TrainSettings, validation: HeldOutSlices) -> None:
+    if settings.patience and not (settings.validate_every_s and len(validation)):
+        raise InputError(
+            f"a patience of {settings.patience} looks needs looks at held-out stacks, got validate_every_s={settings.validate_every_s:g} "
+            f"and {len(validation)} held-out slices: hold a stack out and set validate_every_s, or set patience to 0"
+        )
+
+
+def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainSettings) -> RunFacts:
+    found = data.facts(pairs, several_lenses=settings.network.lens_inputs)
+    return RunFacts(
+        lens=found.lens,
+        width_px=found.width_px,
+        height_px=found.height_px,
+        largest_coc_px=found.largest_coc_px,
+        radiance_scale=settings.radiance_scale or found.radiance_scale,
+        trained_on=tuple(stack_name(stack) for stack in pairs.stacks),
+        held_out=() if split.held_out_slices else tuple(stack_name(stack) for stack in split.test),
+        held_out_slices=split.held_out_slices,
+        lens_guessed=any(is_lens_guessed(stack) and not stack.metres_known for stack in pairs.stacks),
+        commit=source_commit(),
+        f_numbers=found.f_numbers,
+        focal_lengths_mm=found.focal_lengths_mm,
+    )
