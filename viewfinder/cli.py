@@ -2,27 +2,37 @@
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from viewfinder.commands import option_words as words
-from viewfinder.commands.board import board_command
-from viewfinder.commands.calibrate_phone import calibrate_phone_command
-
-if TYPE_CHECKING:
-    from viewfinder.app.tracking_choice import PhoneChoice
+from viewfinder.options import CalibrationOptions, ListeningOptions, PhoneOptions, TrackingOptions, ViewfinderOptions
 
 app = typer.Typer(add_completion=False)
-app.command("board")(board_command)
-app.command("calibrate-phone")(calibrate_phone_command)
+
+_SOURCE_HELP = "Video played in a loop, number of a webcam, rtsp/http/udp URL, folder:PATH, gphoto2, whip (a browser), or test."
+
+BoardOption = Annotated[Path | None, typer.Option(help="BOARD.json of `mrbokeh viewfinder board`: the camera is tracked by it.")]
+CameraOption = Annotated[Path | None, typer.Option(help="CAMERA.json with the source's intrinsics; else those of the lens.")]
+PhoneOption = Annotated[
+    str | None, typer.Option(metavar="SOURCE", help="Camera of a phone on the hot shoe, which sees --board: whip, or as --source.")
+]
+PhoneCameraOption = Annotated[Path | None, typer.Option(help="CAMERA.json with the intrinsics of --phone.")]
+WidthOption = Annotated[int | None, typer.Option(min=16, metavar="PX", help="Wider pictures are made smaller.")]
+PortOption = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")]
+LanOption = Annotated[bool, typer.Option(help="Let this network in, with a one-time token; else only this machine.")]
+InterfaceOption = Annotated[str | None, typer.Option(help="With --lan: name or address of the one interface to listen on.")]
+TlsOption = Annotated[Path | None, typer.Option(metavar="CERTIFICATE", help="PEM certificate: phones lend their camera over https only.")]
+TlsKeyOption = Annotated[Path | None, typer.Option(help="PEM key, where it is not in the certificate's file.")]
+QrOption = Annotated[bool, typer.Option("--qr/--no-qr", help="With --lan: print the address as a QR code too.")]
 
 
 @app.callback(invoke_without_command=True)
 def viewfinder(
     context: typer.Context,
-    source: Annotated[str | None, typer.Option(help=words.SOURCE_HELP)] = None,
+    source: Annotated[str | None, typer.Option(help=_SOURCE_HELP)] = None,
     scene: Annotated[Path | None, typer.Option(help="SCENE.toml: objects, light, shadow, lens; read again when it changes.")] = None,
     layer: Annotated[
         Path | None, typer.Option(metavar="RGBAZ.exr", help="Instead of a scene: an all-in-focus layer before a camera that stands still.")
@@ -38,7 +48,7 @@ def viewfinder(
     psf: Annotated[
         Path | None, typer.Option(help="A measured bank of kernels (of `mrbokeh lens fit`) in place of the lens's opening.")
     ] = None,
-    board: words.BoardOption = None,
+    board: BoardOption = None,
     pose: Annotated[Path | None, typer.Option(help="CAMERA.json: the camera stands still, with this pose and these intrinsics.")] = None,
     map_: Annotated[
         Path | None, typer.Option("--map", help="Folder of a COLMAP map with its pictures: the camera is localised in it.")
@@ -47,29 +57,29 @@ def viewfinder(
     opentrackio: Annotated[int | None, typer.Option(min=1, max=65535, metavar="PORT", help="UDP port where OpenTrackIO comes in.")] = None,
     freed: Annotated[int | None, typer.Option(min=1, max=65535, metavar="PORT", help="UDP port where FreeD comes in.")] = None,
     lens_table: Annotated[Path | None, typer.Option(help="CSV that turns FreeD's encoder counts into focus and zoom.")] = None,
-    phone: words.PhoneOption = None,
-    phone_camera: words.PhoneCameraOption = None,
+    phone: PhoneOption = None,
+    phone_camera: PhoneCameraOption = None,
     rig: Annotated[Path | None, typer.Option(help="RIG.json of `mrbokeh viewfinder calibrate-phone`: where --phone sits.")] = None,
     delay_ms: Annotated[float, typer.Option(help="How much later the picture comes than a pose from --phone or a tracking system.")] = 0.0,
-    camera: words.CameraOption = None,
+    camera: CameraOption = None,
     focus_from: Annotated[
         list[str] | None,
         typer.Option(help="Who is asked first for the focus: hand (the page), tracking, source, board (its blur); repeat for an order."),
     ] = None,
     smoothing: Annotated[bool, typer.Option(help="Smooth the track (One-Euro); the page can switch it.")] = False,
-    width: words.WidthOption = 640,
+    width: WidthOption = 640,
     fps: Annotated[float | None, typer.Option(help="At most so many frames per second.")] = None,
     captures: Annotated[Path, typer.Option(help="Folder for captured bundles and recordings.")] = Path("captures"),
     webcam: Annotated[
         str | None,
         typer.Option(metavar="DEVICE", help="Also show it as a webcam for OBS or Zoom: its name (/dev/video9), or auto."),
     ] = None,
-    port: words.PortOption = 8080,
-    lan: words.LanOption = False,
-    interface: words.InterfaceOption = None,
-    tls: words.TlsOption = None,
-    tls_key: words.TlsKeyOption = None,
-    qr: words.QrOption = True,
+    port: PortOption = 8080,
+    lan: LanOption = False,
+    interface: InterfaceOption = None,
+    tls: TlsOption = None,
+    tls_key: TlsKeyOption = None,
+    qr: QrOption = True,
 ) -> None:
     """Show a camera with virtual objects in it, blurred by the lens, on a page for phones; Ctrl-C ends it.
 
@@ -82,50 +92,124 @@ def viewfinder(
     if source is None:
         typer.echo(context.get_help())
         raise typer.Exit(2)
-    from viewfinder.app.tracking_choice import TrackingChoice
-    from viewfinder.commands.listening import ListeningOptions
-    from viewfinder.commands.serve import serve
-    from viewfinder.commands.serve_options import ServeOptions
+    from viewfinder.app.running import serve
 
     logging.basicConfig(level=logging.WARNING)
-    listening = ListeningOptions(port, lan, interface, tls, tls_key, qr)
-    of_phone = _phone_choice(phone, phone_camera, rig)
-    host = listening.host if opentrackio is not None or freed is not None else "127.0.0.1"
-    tracking = TrackingChoice(board, pose, map_, metres_per_unit, opentrackio, freed, lens_table, host, of_phone, delay_ms)
     serve(
-        ServeOptions(
-            source,
-            scene,
-            layer,
-            tuple(lens or ()),
-            tuple(renderer or ()),
-            psf,
-            backend,
-            tracking,
-            camera,
-            tuple(focus_from or ()),
-            smoothing,
-            width,
-            fps,
-            captures,
-            webcam,
-            listening,
+        ViewfinderOptions(
+            source=source,
+            scene=scene,
+            layer=layer,
+            lenses=tuple(lens or ()),
+            renderers=tuple(renderer or ()),
+            psf=psf,
+            backend=backend,
+            tracking=TrackingOptions(
+                board=board,
+                pose=pose,
+                map=map_,
+                metres_per_unit=metres_per_unit,
+                opentrackio=opentrackio,
+                freed=freed,
+                lens_table=lens_table,
+                phone=PhoneOptions.of(phone, phone_camera, rig),
+                delay_ms=delay_ms,
+            ),
+            camera=camera,
+            focus_from=tuple(focus_from or ()),
+            smoothing=smoothing,
+            width_px=width,
+            fps=fps,
+            captures=captures,
+            webcam=webcam,
+            listening=ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr),
         )
     )
 
 
-def _phone_choice(source: str | None, camera: Path | None, rig: Path | None) -> "PhoneChoice | None":
-    """All three of them or none."""
-    from viewfinder.app.tracking_choice import PhoneChoice
+@app.command("board")
+def board_command(
+    out: Annotated[Path, typer.Option(help="Where the page goes: BOARD.pdf; beside it BOARD.json, for --board.")],
+    lens: Annotated[Path | None, typer.Option(help="The lens that will see it; chooses the size of the markers by its blur.")] = None,
+    distance_m: Annotated[
+        str, typer.Option(help="NEAREST,FARTHEST: how far the camera will be, in metres.", metavar="NEAREST,FARTHEST")
+    ] = "0.4,1.0",
+    width_px: Annotated[int, typer.Option(min=64, help="Width of the camera's picture.")] = 1280,
+    paper: Annotated[str, typer.Option(help="a4, a3, letter, or board: a page of the board's own size.")] = "a4",
+    overwrite: Annotated[bool, typer.Option(help="Replace files that exist.")] = False,
+) -> None:
+    """Print a tracking board at true size: markers large enough to be read through the lens's blur, on one paper.
 
-    for word, given in (("--phone-camera", camera), ("--rig", rig)):
-        if source is None and given is not None:
-            raise InputError(f"{word} is for --phone: say where the phone's camera comes from, or leave it out")
-        if source is not None and given is None:
-            made = (
-                "CAMERA.json, its intrinsics"
-                if word == "--phone-camera"
-                else "RIG.json (make it with `mrbokeh viewfinder calibrate-phone`)"
-            )
-            raise InputError(f"--phone needs {word} {made}")
-    return None if source is None or camera is None or rig is None else PhoneChoice(source, camera, rig)
+    Print without scaling, and check the ruler at its foot.
+
+    Example: mrbokeh viewfinder board --lens lens.json --distance-m 0.5,1.2 --paper a4 --out board.pdf
+    """
+    from mrbokeh.optics.lens_file import read_lens
+    from mrbokeh.system.atomic_files import refuse_existing
+    from mrbokeh.tracking.charuco.board import write_board
+    from viewfinder.tracking.printed_board import BoardView, plan_board, write_board_pdf
+
+    if out.suffix.lower() != ".pdf":
+        raise InputError(f"--out: expected a name that ends in .pdf, got {out}")
+    for path in (out, out.with_suffix(".json")):
+        refuse_existing(path, overwrite)
+    try:
+        nearest_m, farthest_m = (float(part) for part in distance_m.split(","))
+    except ValueError:
+        raise InputError(f"--distance-m: expected NEAREST,FARTHEST in metres, got {distance_m!r}") from None
+    # Without a lens that of a phone, to which everything on the table is nearly sharp.
+    used = read_lens(lens) if lens is not None else Lens(5.0, 2.0, 2.0 / (1.0 / nearest_m + 1.0 / farthest_m), 6.4)
+    plan = plan_board(BoardView(used, nearest_m, farthest_m, width_px), paper)
+    typer.echo(plan.sentence)
+    if plan.board is None or plan.paper is None:
+        raise InputError("no paper holds a board that this lens can read: take a larger f-number, or stand farther away")
+    write_board_pdf(out, plan.board, plan.paper, overwrite=overwrite)
+    write_board(out.with_suffix(".json"), plan.board)
+    typer.echo(f"wrote {out} (print it at 100 %) and {out.with_suffix('.json')} (for --board)")
+
+
+@app.command("calibrate-phone")
+def calibrate_phone_command(
+    source: Annotated[str, typer.Option(help=f"The camera. {_SOURCE_HELP}")],
+    phone: Annotated[str, typer.Option(metavar="SOURCE", help="The phone's camera: whip (its browser), or as --source.")],
+    phone_camera: Annotated[Path, typer.Option(help="CAMERA.json with the intrinsics of --phone.")],
+    board: Annotated[Path, typer.Option(help="BOARD.json of `mrbokeh viewfinder board`, which both see.")],
+    out: Annotated[Path, typer.Option(help="RIG.json to write, for --rig.")],
+    camera: CameraOption = None,
+    lens: Annotated[Path | None, typer.Option(help="LENS.json, for the intrinsics where there is no --camera.")] = None,
+    pairs: Annotated[int, typer.Option(min=5, help="How many views to take.")] = 12,
+    seconds: Annotated[float, typer.Option(min=1.0, help="After so long it ends with the views that there are.")] = 300.0,
+    width: WidthOption = 1280,
+    port: PortOption = 8080,
+    lan: LanOption = False,
+    interface: InterfaceOption = None,
+    tls: TlsOption = None,
+    tls_key: TlsKeyOption = None,
+    qr: QrOption = True,
+    overwrite: Annotated[bool, typer.Option(help="Replace RIG.json if it exists.")] = False,
+) -> None:
+    """Find out where a phone sits on the camera's hot shoe; show both the board from many sides, and hold still each time.
+
+    Stop the lens down for this: the camera too must see the board sharply.
+
+    Example: mrbokeh viewfinder calibrate-phone --source gphoto2 --phone whip --phone-camera phone.json --lens lens.json
+    --board board.json --out rig.json --lan --tls phone.pem
+    """
+    from viewfinder.app.calibrating import calibrate
+
+    calibrate(
+        CalibrationOptions(
+            source=source,
+            phone=phone,
+            phone_camera=phone_camera,
+            board=board,
+            out=out,
+            camera=camera,
+            lens=lens,
+            pairs=pairs,
+            seconds=seconds,
+            width_px=width,
+            listening=ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr),
+            overwrite=overwrite,
+        )
+    )

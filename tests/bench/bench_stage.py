@@ -27,7 +27,7 @@ from mrbokeh.scene.staging.staged_scene import Assets, StagedObject, StagedScene
 from mrbokeh.tracking.world_axes import upright_camera
 from tests.bench.machine import machine_line, memory_line
 from tests.scenes.stage_scenes import looking
-from viewfinder.stage.drawing import Brushes, Drawing, DrawRequest, draw
+from viewfinder.stage.drawing import RenderSetup, Drawing, DrawRequest, draw
 from viewfinder.stage.drawing_thread import RESOLUTIONS
 from viewfinder.stage.reprojection import LayerDepth
 from viewfinder.stage.stage import Stage
@@ -85,46 +85,46 @@ def psnr_db(result: np.ndarray, truth: np.ndarray, box: tuple[slice, slice]) -> 
 def main() -> None:
     cv2.setNumThreads(1)
     raycaster, staged = EmbreeRaycaster(threads=1), helmet()
-    brushes = Brushes(raycaster, live_renderer("polygon"), LayerDepth(), live=live_backend(raycaster))
+    render_setup = RenderSetup(raycaster, live_renderer("polygon"), LayerDepth(), live=live_backend(raycaster))
 
     def drawn(time_s: float, resolution: float = 1.0) -> Drawing:
-        return draw(staged, DrawRequest(hand_held(time_s), LENS, 0.0, resolution), brushes)
+        return draw(staged, DrawRequest(hand_held(time_s), LENS, 0.0, resolution), render_setup)
 
     started_s = time.perf_counter()
     first = drawn(0.0)
     print(f"scene: {sum(each.triangle_count for each in staged.objects)} triangles; first drawing {time.perf_counter() - started_s:.2f} s")
-    print_rates(staged, brushes)
-    print_price_of_speed(staged, brushes)
+    print_rates(staged, render_setup)
+    print_price_of_speed(staged, render_setup)
     print_warp(first)
     for step_ms in STEPS_MS:
         print_quality(drawn, step_ms / 1e3)
     whole = helmet(GltfAsset)
     print(f"the whole helmet: {sum(each.triangle_count for each in whole.objects)} triangles")
-    print_rates(whole, brushes)
-    print_changes(whole, brushes)
+    print_rates(whole, render_setup)
+    print_changes(whole, render_setup)
     print_stream()
     print(memory_line())
     print(machine_line())
 
 
-def print_rates(staged: StagedScene, brushes: Brushes) -> None:
+def print_rates(staged: StagedScene, render_setup: RenderSetup) -> None:
     for resolution in RESOLUTIONS:
         request = DrawRequest(hand_held(0.0), LENS, 0.0, resolution)
-        draw(staged, request, brushes)
-        wall_ms, processor_ms = best_ms(partial(draw, staged, request, brushes), 9)
+        draw(staged, request, render_setup)
+        wall_ms, processor_ms = best_ms(partial(draw, staged, request, render_setup), 9)
         rate = f"{1e3 / processor_ms:.1f} per second of it"
         print(f"drawing at {resolution:.2f} of the pixels: {wall_ms:.0f} ms, {processor_ms:.0f} ms of processor time, {rate}")
 
 
-def print_price_of_speed(staged: StagedScene, brushes: Brushes) -> None:
+def print_price_of_speed(staged: StagedScene, render_setup: RenderSetup) -> None:
     """The live backend beside the one for captures: time, and the picture over a grey plate."""
     request, view, plate = (
         DrawRequest(hand_held(0.0), LENS),
         upright_camera(hand_held(0.0), "-z"),
         np.full((HEIGHT, WIDTH, 3), 0.2, np.float32),
     )
-    best, pictures = replace(brushes, live=None), []
-    for each in (brushes, best):
+    best, pictures = replace(render_setup, live=None), []
+    for each in (render_setup, best):
         layer = draw(staged, request, each).layer
         assert layer is not None
         pictures.append(layer.moved_to(view).over(plate))
@@ -133,15 +133,15 @@ def print_price_of_speed(staged: StagedScene, brushes: Brushes) -> None:
     print(f"with 16 rays at edges and the whole shadow: {processor_ms:.0f} ms; the live picture is {near_db:.1f} dB near it")
 
 
-def print_changes(staged: StagedScene, brushes: Brushes) -> None:
+def print_changes(staged: StagedScene, render_setup: RenderSetup) -> None:
     """What a scene that was changed costs before its first drawing, and with it."""
     request, moved = DrawRequest(hand_held(0.0), LENS, 0.0, 0.5), staged
-    steady_ms = best_ms(partial(draw, staged, request, brushes), 3)[1]
+    steady_ms = best_ms(partial(draw, staged, request, render_setup), 3)[1]
     took_ms = []
     for number in range(5):
         started_s = time.process_time()
         moved = moved.with_object("helmet", position_m=(0.01 * number, 0.0, 0.0), yaw_rad=0.1 * number)
-        draw(moved, request, brushes)
+        draw(moved, request, render_setup)
         took_ms.append(1e3 * (time.process_time() - started_s) - steady_ms)
     print(f"moving it costs {min(took_ms):.0f} ms of processor time beside the drawing itself")
     panorama = Environment(np.random.default_rng(1).uniform(0.0, 1.0, (512, 1024, 3)).astype(np.float32))

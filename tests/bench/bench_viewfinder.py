@@ -72,11 +72,11 @@ def _scene(glb: Path | None) -> str:
 async def _ours(clip: LiveClip, count: int, time_s: float) -> float:
     """Prints, and gives CPU seconds per second of this process."""
     async with live(clip, clip.path.parent / "captures", lenses={"clip": LENS}) as one:
-        scenery = one.viewfinder.compositor.scenery
+        overlays = one.viewfinder.compositor.overlays
         draws: list[float] = []
-        with measured(draws, lambda: scenery.status.draws_per_s) as spent:
+        with measured(draws, lambda: overlays.status.draws_per_s) as spent:
             seen = await _watched(one.url, count, time_s, spent)
-        status, dropped = scenery.status, one.viewfinder.pipeline.dropped
+        status, dropped = overlays.status, one.viewfinder.pipeline.dropped
     print(f"viewfinder, {_viewers(count)}: {seen.line()}, {dropped} frames dropped")
     print(f"  virtual layer: {np.mean(draws):.1f} drawings/s at {status.resolution:.2f} of the pixels, {status.triangles} triangles")
     print("  medians in ms: " + ", ".join(f"{name} {took_ms:.1f}" for name, took_ms in seen.stages_ms.items()))

@@ -6,7 +6,7 @@ import pytest
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from viewfinder.app.live_compositor import LensBook
+from viewfinder.app.lenses import LensBook
 from viewfinder.frames import LensState
 
 FIFTY = Lens(50.0, 1.8, 2.0, 36.0)

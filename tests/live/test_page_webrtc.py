@@ -54,7 +54,7 @@ def test_video_comes_first_with_its_age_and_what_is_known_of_each_picture(tmp_pa
             async with chromium_page(url, tmp_path / "profile") as page:
                 await page.comes_true(f"{SHOWN} && viewfinder.age !== null && viewfinder.clock.known")
                 await page.comes_true("document.getElementById('way').textContent === 'video'")
-                assert whep.viewers == 1 and not made.jpeg.room.sockets
+                assert whep.viewers == 1 and not made.jpeg.broadcaster.sockets
                 assert await page.value("!document.getElementById('video').hidden && document.getElementById('picture').hidden")
                 # From the capture to the screen on one machine.
                 assert 0 < await page.value("viewfinder.age") < 1000

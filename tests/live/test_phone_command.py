@@ -33,13 +33,12 @@ from tests.scenes.phone_on_camera import (
     write_files,
 )
 from tests.scenes.traced_board_clip import pose_error
-from viewfinder.app.running import Viewfinder
-from viewfinder.app.tracking_choice import PhoneChoice, TrackingChoice, open_tracker
-from viewfinder.commands.browser_cameras import browser_cameras
-from viewfinder.commands.calibrate_phone import calibrate_phone_command
-from viewfinder.commands.serve import opened
-from viewfinder.commands.serve_options import ServeOptions
+from viewfinder.app.opening import browser_cameras
+from viewfinder.app.running import Viewfinder, opened
+from viewfinder.app.trackers import open_tracker
+from viewfinder.cli import calibrate_phone_command
 from viewfinder.frames import CameraFrame, Pose
+from viewfinder.options import ListeningOptions, PhoneOptions, TrackingOptions, ViewfinderOptions
 from viewfinder.server.access import Access, needed_role
 from viewfinder.server.endpoint import serving_site
 from viewfinder.server.sessions import Role
@@ -128,12 +127,12 @@ def test_a_camera_that_sees_no_board_is_where_its_phone_is(tmp_path: Path) -> No
     cv2.imwrite(str(tmp_path / "phone" / "one.png"), picture(phone_at(2)))
     write_phone_rig(tmp_path / "rig.json", PhoneRig(CAMERA_FROM_PHONE, 0.1, 1.0, 9))
     write_layer(tmp_path / "layer.exr", clear(90, 160))
-    phone = PhoneChoice(f"folder:{tmp_path / 'phone'}", tmp_path / "phone.json", tmp_path / "rig.json")
-    tracking = TrackingChoice(board=tmp_path / "board.json", phone=phone)
+    phone = PhoneOptions(f"folder:{tmp_path / 'phone'}", tmp_path / "phone.json", tmp_path / "rig.json")
+    tracking = TrackingOptions(board=tmp_path / "board.json", phone=phone)
     before = set(threads())
     lenses = (tmp_path / "lens.json",)
     with opened(
-        ServeOptions("test", layer=tmp_path / "layer.exr", lenses=lenses, tracking=tracking, captures=tmp_path), Access()
+        ViewfinderOptions("test", layer=tmp_path / "layer.exr", lenses=lenses, tracking=tracking, captures=tmp_path), Access()
     ) as running:
         tracked = posed(running.compositor)
         assert running.site.controls.state()["failure"] is None
@@ -161,9 +160,11 @@ def test_a_phone_sends_its_camera_through_whip(tmp_path: Path) -> None:
     write_files(tmp_path)
     write_phone_rig(tmp_path / "rig.json", PhoneRig(CAMERA_FROM_PHONE, 0.1, 1.0, 9))
     write_layer(tmp_path / "layer.exr", clear(90, 160))
-    phone = PhoneChoice("whip", tmp_path / "phone.json", tmp_path / "rig.json")
-    tracking = TrackingChoice(board=tmp_path / "board.json", phone=phone)
-    options = ServeOptions("test", layer=tmp_path / "layer.exr", lenses=(tmp_path / "lens.json",), tracking=tracking, captures=tmp_path)
+    phone = PhoneOptions("whip", tmp_path / "phone.json", tmp_path / "rig.json")
+    tracking = TrackingOptions(board=tmp_path / "board.json", phone=phone)
+    options = ViewfinderOptions(
+        "test", layer=tmp_path / "layer.exr", lenses=(tmp_path / "lens.json",), tracking=tracking, captures=tmp_path
+    )
 
     async def work(running: Viewfinder) -> TrackedPose:
         async with serving_site(running.site, "127.0.0.1", 0) as url, aiohttp.ClientSession() as session:
@@ -289,7 +290,7 @@ def test_bad_files_are_refused_before_a_camera_is_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: dict[str, str], sentence: str
 ) -> None:
     write_files(tmp_path)
-    monkeypatch.setattr("viewfinder.commands.phone_session.open_source", lambda *_: pytest.fail("the camera was opened"))
+    monkeypatch.setattr("viewfinder.app.calibrating.open_source", lambda *_: pytest.fail("the camera was opened"))
     done = calibrate(tmp_path, **changed)
     assert isinstance(done.exception, InputError) and sentence in str(done.exception)
 
@@ -350,8 +351,8 @@ def test_the_phone_tells_what_is_wrong(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "phone" / "grey.png"), np.full((270, 480, 3), 90, np.uint8))
     write_files(tmp_path)
     write_phone_rig(tmp_path / "rig.json", PhoneRig(CAMERA_FROM_PHONE, 0.1, 1.0, 9))
-    phone = PhoneChoice(f"folder:{tmp_path / 'phone'}", tmp_path / "phone.json", tmp_path / "rig.json")
-    tracker = open_tracker(TrackingChoice(board=tmp_path / "board.json", phone=phone, delay_ms=80.0))
+    phone = PhoneOptions(f"folder:{tmp_path / 'phone'}", tmp_path / "phone.json", tmp_path / "rig.json")
+    tracker = open_tracker(TrackingOptions(board=tmp_path / "board.json", phone=phone, delay_ms=80.0), ListeningOptions())
     assert isinstance(tracker, PhoneTracker) and tracker.video_delay_s == 0.08
     try:
         deadline_s = time.monotonic() + 10.0

@@ -70,8 +70,8 @@ def test_three_viewers_share_one_encoding(monkeypatch: pytest.MonkeyPatch) -> No
 
     async def work() -> None:
         jpeg = JpegStream()
-        jpeg.room.open()
-        viewers = [asyncio.create_task(jpeg.room.next_message()) for _ in range(3)]
+        jpeg.broadcaster.open()
+        viewers = [asyncio.create_task(jpeg.broadcaster.next_message()) for _ in range(3)]
         await asyncio.sleep(0)
         assert jpeg.wants_frame
         jpeg.show(made_frame(MadeControls(), 3))
@@ -91,11 +91,11 @@ def test_three_viewers_share_one_encoding(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_picture_that_nobody_waited_for_is_not_kept_for_later() -> None:
     async def work() -> None:
         jpeg = JpegStream()
-        jpeg.room.open()
+        jpeg.broadcaster.open()
         jpeg.show(made_frame(MadeControls(), 4))
         while jpeg._newest.waiting:
             await asyncio.sleep(0.01)
-        viewer = asyncio.create_task(jpeg.room.next_message())
+        viewer = asyncio.create_task(jpeg.broadcaster.next_message())
         await asyncio.sleep(0.15)
         assert not viewer.done() and jpeg.wants_frame
         jpeg.show(made_frame(MadeControls(), 9))

@@ -22,6 +22,7 @@ from tests.objects.test_scene_gltf import GlbWriter
 from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, scene_file
 from viewfinder.stage.drawing_thread import AdaptiveResolution
 from viewfinder.stage.stage import Fade, Stage
+from viewfinder.stage.stage_setup import live_renderer
 from viewfinder.tracking.tracker import TrackedPose
 
 BLACK = np.zeros((HEIGHT, WIDTH, 3), np.float32)
@@ -224,12 +225,12 @@ def test_renderers_are_switched_and_one_that_refuses_leaves_the_picture(stage: S
     stream = Stream(stage, camera())
     stream.settled()
     with pytest.raises(InputError, match="expected a renderer"):
-        stage.set_renderer("crystal ball")
+        live_renderer("crystal ball")
     refusing: Renderer = Refusing()
     stage.set_renderer("refusing", refusing)
     stream.until(lambda: stage.status.problem is not None)
     assert "knows no such lens" in str(stage.status.problem) and stream.frame().shines_through.size
-    stage.set_renderer("low-rank")
+    stage.set_renderer("low-rank", live_renderer("low-rank"))
     stream.until(lambda: stage.status.problem is None and stage.status.renderer == "low-rank")
 
 

@@ -16,7 +16,7 @@ from mrbokeh.scene.staging.picture_box import box_around
 from mrbokeh.scene.staging.scene_description import RealThings
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
-from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
+from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, camera, render_setup, staged
 from viewfinder.stage.drawing import Drawing, DrawRequest, draw, is_outdated, moved_px
 from viewfinder.stage.occlusion import Mask, Occlusion, RealDepth, read_occlusion
 from viewfinder.stage.reprojection import LayerDepth
@@ -44,7 +44,7 @@ def centroid(plane: np.ndarray) -> tuple[float, float]:
 
 def whole_frame(folder: Path, view: Camera, lens: object = LENS) -> Layer:
     """The same scene without any box: raycast and blurred as one picture."""
-    tools = brushes()
+    tools = render_setup()
     sharp = tools.backend.render(staged(folder).scene_at(0.0), upright_camera(view, "-z"))
     return tools.renderer.render([sharp], lens)  # type: ignore[arg-type]
 
@@ -53,7 +53,7 @@ def whole_frame(folder: Path, view: Camera, lens: object = LENS) -> Layer:
 def test_the_box_shows_what_the_whole_frame_would(tmp_path: Path, focus_m: float) -> None:
     # The reference renderer sums exact kernels: cutting changes nothing but what is too weak to be seen (1e-4).
     lens = LENS.focused_at(focus_m)
-    drawing = draw(staged(tmp_path), DrawRequest(camera(), lens), brushes())
+    drawing = draw(staged(tmp_path), DrawRequest(camera(), lens), render_setup())
     assert np.abs(shown(drawing, camera()).over(BLACK) - whole_frame(tmp_path, camera(), lens).rgb).max() < 2e-4
     assert drawing.layer is not None and drawing.layer.rgba.shape[1] < WIDTH
 
@@ -67,30 +67,30 @@ def test_only_the_box_is_drawn_and_it_holds_the_blur(tmp_path: Path) -> None:
 
 def test_a_camera_that_looks_away_sees_nothing(tmp_path: Path) -> None:
     away = camera((0.0, 1.0, -0.1), (0.0, 2.0, -0.1))
-    assert draw(staged(tmp_path), DrawRequest(away, LENS), brushes()).layer is None
+    assert draw(staged(tmp_path), DrawRequest(away, LENS), render_setup()).layer is None
     aside = camera((0.0, 1.0, -0.1), (1.5, 0.0, -0.1))
-    assert draw(staged(tmp_path), DrawRequest(aside, LENS), brushes()).layer is None
+    assert draw(staged(tmp_path), DrawRequest(aside, LENS), render_setup()).layer is None
     hidden = staged(tmp_path).with_object("card", visible=False)
-    assert draw(hidden, DrawRequest(camera(), LENS), brushes()).layer is None
+    assert draw(hidden, DrawRequest(camera(), LENS), render_setup()).layer is None
 
 
 def test_a_camera_within_the_object_is_no_mistake(tmp_path: Path) -> None:
     inside = camera((0.05, 0.004, -0.1), (0.0, -1.0, -0.1))
-    draw(staged(tmp_path), DrawRequest(inside, LENS), brushes("polygon"))
+    draw(staged(tmp_path), DrawRequest(inside, LENS), render_setup("polygon"))
 
 
 @pytest.mark.parametrize("lens", [replace(LENS, tilt_rad=(0.0, 0.1)), replace(LENS, aperture=replace(LENS.aperture, cat_eye=0.5))])
 def test_a_blur_that_depends_on_the_place_is_drawn_in_the_whole_frame(tmp_path: Path, lens: object) -> None:
     lens = replace(lens, focus_distance_m=0.6)  # type: ignore[type-var]
-    drawing = draw(staged(tmp_path), DrawRequest(camera(), lens), brushes())  # type: ignore[arg-type]
+    drawing = draw(staged(tmp_path), DrawRequest(camera(), lens), render_setup())  # type: ignore[arg-type]
     assert np.abs(shown(drawing, camera()).over(BLACK) - whole_frame(tmp_path, camera(), lens).rgb).max() < 2e-4
 
 
 @pytest.mark.parametrize("resolution", [0.75, 0.5])
 def test_reduced_resolution_keeps_light_and_place(tmp_path: Path, resolution: float) -> None:
     lens = LENS.focused_at(0.5)
-    full = shown(draw(staged(tmp_path), DrawRequest(camera(), lens), brushes()), camera()).over(BLACK)[..., 0]
-    less = shown(draw(staged(tmp_path), DrawRequest(camera(), lens, 0.0, resolution), brushes()), camera()).over(BLACK)[..., 0]
+    full = shown(draw(staged(tmp_path), DrawRequest(camera(), lens), render_setup()), camera()).over(BLACK)[..., 0]
+    less = shown(draw(staged(tmp_path), DrawRequest(camera(), lens, 0.0, resolution), render_setup()), camera()).over(BLACK)[..., 0]
     assert less.sum() == pytest.approx(full.sum(), rel=0.01)
     assert centroid(less) == pytest.approx(centroid(full), abs=0.05)
 
@@ -100,7 +100,7 @@ def test_a_bokeh_disc_moves_as_its_point_does(tmp_path: Path) -> None:
     # moves by 4 cm to the right:
     # every part of the disc moves by f t / z = 2 px, though half of it lies where the sharp picture shows nothing.
     text = ONE_CARD.replace("0.2", "0.01") + "position_m = [0, -2, -0.1]\n"
-    drawing = draw(staged(tmp_path, text), DrawRequest(camera(), LENS.focused_at(1 / 3)), brushes())
+    drawing = draw(staged(tmp_path, text), DrawRequest(camera(), LENS.focused_at(1 / 3)), render_setup())
     aside = camera((0.04, 1.0, -0.1), (0.04, 0.0, -0.1))
     before, after = (shown(drawing, view).over(BLACK)[..., 0] for view in (camera(), aside))
     assert np.count_nonzero(before > 0.5 * before.max()) == pytest.approx(np.pi / 4 * 8.7**2, rel=0.1)
@@ -110,9 +110,9 @@ def test_a_bokeh_disc_moves_as_its_point_does(tmp_path: Path) -> None:
 
 def test_a_moved_drawing_is_near_a_fresh_one(tmp_path: Path) -> None:
     # 2 cm to the side and 1 cm forward with a turn of half a degree: 3 px of parallax. Resampling softens the card's edges.
-    drawing = draw(staged(tmp_path), DrawRequest(camera(), LENS.focused_at(0.5)), brushes())
+    drawing = draw(staged(tmp_path), DrawRequest(camera(), LENS.focused_at(0.5)), render_setup())
     view = camera((0.02, 0.99, -0.1), (0.01, 0.0, -0.105))
-    fresh = shown(draw(staged(tmp_path), DrawRequest(view, LENS.focused_at(0.5)), brushes()), view).over(BLACK)
+    fresh = shown(draw(staged(tmp_path), DrawRequest(view, LENS.focused_at(0.5)), render_setup()), view).over(BLACK)
     late, stale = shown(drawing, view).over(BLACK), shown(drawing, camera()).over(BLACK)
     errors = [float(np.sqrt(np.mean((each - fresh) ** 2))) for each in (late, stale)]
     assert errors[0] < 0.1 * errors[1] and errors[0] < 0.01
@@ -130,7 +130,7 @@ class TestShadow:
         return int(row), int(column)
 
     def test_it_darkens_the_plate_by_its_strength_where_the_light_is_blocked(self, tmp_path: Path) -> None:
-        overlay = shown(draw(staged(tmp_path, self.TEXT), DrawRequest(self.VIEW, self.STOPPED_DOWN), brushes()), self.VIEW)
+        overlay = shown(draw(staged(tmp_path, self.TEXT), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup()), self.VIEW)
         plate = np.full((HEIGHT, WIDTH, 3), 0.8, np.float32)
         result = overlay.over(plate)
         assert np.allclose(result[self.at(0.0, -0.1)], 0.25 * 0.8, atol=1e-3)
@@ -140,19 +140,19 @@ class TestShadow:
 
     def test_without_a_plane_there_is_none(self, tmp_path: Path) -> None:
         text = self.TEXT.partition("[shadow]")[0]
-        overlay = shown(draw(staged(tmp_path, text), DrawRequest(self.VIEW, self.STOPPED_DOWN), brushes()), self.VIEW)
+        overlay = shown(draw(staged(tmp_path, text), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup()), self.VIEW)
         result = overlay.over(np.full((HEIGHT, WIDTH, 3), 0.8, np.float32))
         assert np.allclose(result[self.at(0.0, -0.1)], 0.8)
 
     def test_it_ends_where_the_plane_ends(self, tmp_path: Path) -> None:
         text = self.TEXT + "size_m = 0.2\n"
-        overlay = shown(draw(staged(tmp_path, text), DrawRequest(self.VIEW, self.STOPPED_DOWN), brushes()), self.VIEW)
+        overlay = shown(draw(staged(tmp_path, text), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup()), self.VIEW)
         result = overlay.over(np.full((HEIGHT, WIDTH, 3), 0.8, np.float32))
         assert np.allclose(result[self.at(0.0, -0.17)], 0.8, atol=1e-3)
 
     def test_it_moves_with_the_table(self, tmp_path: Path) -> None:
         # From a camera 5 cm to the right, the shadow's middle is where that camera sees it.
-        drawing = draw(staged(tmp_path, self.TEXT), DrawRequest(self.VIEW, self.STOPPED_DOWN), brushes())
+        drawing = draw(staged(tmp_path, self.TEXT), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup())
         view = camera((0.05, 0.3, -1.2), (0.05, -0.1, 0.0))
         result = shown(drawing, view).over(np.full((HEIGHT, WIDTH, 3), 0.8, np.float32))
         for x_m, light in ((0.08, 0.2), (0.12, 0.8)):
@@ -162,7 +162,7 @@ class TestShadow:
 
 class TestOcclusion:
     def drawn_behind(self, folder: Path, occlusion: Occlusion | None) -> np.ndarray:
-        tools = replace(brushes(), occlusion=occlusion)
+        tools = replace(render_setup(), occlusion=occlusion)
         drawing = draw(staged(folder), DrawRequest(camera(), LENS), tools)
         return BLACK if drawing.layer is None else shown(drawing, camera()).over(BLACK)
 
@@ -209,7 +209,7 @@ class TestOcclusion:
 
 class TestRedraw:
     def test_it_goes_by_pixels_of_movement_and_of_blur(self, tmp_path: Path) -> None:
-        drawing = draw(staged(tmp_path), DrawRequest(camera(), LENS), brushes())
+        drawing = draw(staged(tmp_path), DrawRequest(camera(), LENS), render_setup())
         request = drawing.request
         assert not is_outdated(drawing, request, is_animated=False)
         # 5 mm to the side at 1 m are 0.75 px; 8 mm are 1.2 px.
@@ -228,7 +228,7 @@ class TestRedraw:
 
     def test_an_empty_drawing_holds_for_its_own_view_only(self, tmp_path: Path) -> None:
         away = camera((0.0, 1.0, -0.1), (0.0, 2.0, -0.1))
-        drawing = draw(staged(tmp_path), DrawRequest(away, LENS), brushes())
+        drawing = draw(staged(tmp_path), DrawRequest(away, LENS), render_setup())
         assert not is_outdated(drawing, DrawRequest(away, LENS), is_animated=False)
         assert is_outdated(drawing, DrawRequest(camera(), LENS), is_animated=False)
 
@@ -251,7 +251,7 @@ def test_the_depth_of_a_blurred_pixel_is_that_of_what_it_shows() -> None:
 def test_real_object_box_and_whole_agree(shared_data: Path, tmp_path: Path) -> None:
     # A real textured object in front of a lens with 3 px of blur, drawn by the renderer that the viewfinder uses.
     text = f'[[object]]\nname = "alien"\nglb = "{shared_data}/objects/alien.glb"\nheight_m = 0.2\n'
-    scene, lens, tools = staged(tmp_path, text), LENS.focused_at(0.5), brushes("polygon")
+    scene, lens, tools = staged(tmp_path, text), LENS.focused_at(0.5), render_setup("polygon")
     drawing = draw(scene, DrawRequest(camera(), lens), tools)
     sharp = tools.backend.render(scene.scene_at(0.0), upright_camera(camera(), "-z"))
     expected = tools.renderer.render([sharp], lens).rgb

@@ -16,7 +16,7 @@ from mrbokeh.scene.staging.picture_box import drawn_points_m
 from mrbokeh.scene.staging.scene_description import Lighting, Sun
 from mrbokeh.scene.staging.staged_scene import Assets
 from mrbokeh.tracking.world_axes import upright_camera
-from tests.scenes.stage_scenes import LENS, ONE_CARD, brushes, camera, scene_file, staged
+from tests.scenes.stage_scenes import LENS, ONE_CARD, camera, render_setup, scene_file, staged
 from viewfinder.stage.drawing import DrawRequest, draw, sharp_layers
 from viewfinder.stage.stage_setup import SetupLoader, live_backend
 
@@ -26,10 +26,10 @@ SHADOW = ONE_CARD + "[[sun]]\ndirection = [0, -1, 1]\nirradiance = 3\n[shadow]\n
 def test_drawings_are_live_and_captures_are_not(tmp_path: Path) -> None:
     loader = SetupLoader(scene_file(tmp_path, SHADOW), EmbreeRaycaster(threads=1))
     setup, upright = loader.load(), upright_camera(camera((0.05, 0.3, -1.2), (0.0, -0.1, 0.0)), "-z")
-    assert setup.brushes.live is not None
-    live = setup.brushes.live.render(setup.staged.scene_at(0.0), upright)
+    assert setup.render_setup.live is not None
+    live = setup.render_setup.live.render(setup.staged.scene_at(0.0), upright)
     assert set(np.unique(live.alpha)) <= {0.0, 0.25, 0.5, 0.75, 1.0}
-    card, shadow = sharp_layers(setup.staged, 0.0, upright, setup.brushes)
+    card, shadow = sharp_layers(setup.staged, 0.0, upright, setup.render_setup)
     expected = EmbreeRaycaster().render(setup.staged.scene_at(0.0), upright)
     assert np.array_equal(card.alpha, expected.alpha)
     assert (
@@ -50,7 +50,7 @@ def test_any_other_backend_draws_live_pictures_too() -> None:
 
 
 def test_a_live_drawing_is_near_the_best(tmp_path: Path) -> None:
-    tools, scene = brushes(), staged(tmp_path, SHADOW)
+    tools, scene = render_setup(), staged(tmp_path, SHADOW)
     live = replace(tools, live=live_backend(tools.backend))
     request = DrawRequest(camera((0.05, 0.3, -1.2), (0.0, -0.1, 0.0)), LENS)
     best, fast = draw(scene, request, tools).sharp, draw(scene, request, live).sharp

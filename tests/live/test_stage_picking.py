@@ -10,11 +10,11 @@ from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.optics.camera import level_plane_dioptres
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
-from tests.scenes.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, brushes, camera, staged
+from tests.scenes.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, camera, render_setup, staged
 from viewfinder.stage.drawing import DrawRequest, draw
 from viewfinder.stage.occlusion import Occlusion, RealDepth
 from viewfinder.stage.reprojection import MovableLayer
-from viewfinder.stage.shown_scene import VIEWS, Seen, depth_at_m, object_at, table_point_m, view_picture
+from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, object_at, table_point_m, view_picture
 
 TWO_CARDS = ONE_CARD + ONE_CARD.replace('"card"', '"far"') + "position_m = [0.3, -0.5, 0]\n"
 TABLES = code_tables("srgb")
@@ -22,13 +22,13 @@ PLATE = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
 ABOVE = camera((0.0, 0.5, -1.0), (0.0, 0.0, 0.0))
 
 
-def seen(folder: Path, text: str = TWO_CARDS, view: object = None, occlusion: Occlusion | None = None, lens: object = LENS) -> Seen:
+def seen(folder: Path, text: str = TWO_CARDS, view: object = None, occlusion: Occlusion | None = None, lens: object = LENS) -> ShownScene:
     pose = camera() if view is None else view
     scene = staged(folder, text)
-    drawing = draw(scene, DrawRequest(pose, lens), brushes())  # type: ignore[arg-type]
+    drawing = draw(scene, DrawRequest(pose, lens), render_setup())  # type: ignore[arg-type]
     upright = upright_camera(pose, "-z")  # type: ignore[arg-type]
     assert isinstance(drawing.layer, MovableLayer)
-    return Seen(drawing.layer.moved_to(upright), upright, drawing, scene, occlusion)
+    return ShownScene(drawing.layer.moved_to(upright), upright, drawing, scene, occlusion)
 
 
 def test_worlds_turn_without_mirroring_and_back() -> None:
@@ -120,9 +120,9 @@ def test_the_circle_of_confusion_has_its_colour(tmp_path: Path, focus_m: float, 
 
 def test_before_anything_is_drawn_and_where_nothing_is_seen(tmp_path: Path) -> None:
     away = camera((0.0, 1.0, -0.1), (0.0, 2.0, -0.1))
-    drawing = draw(staged(tmp_path), DrawRequest(away, LENS), brushes())
+    drawing = draw(staged(tmp_path), DrawRequest(away, LENS), render_setup())
     empty = replace(seen(tmp_path).overlay, rgb=np.zeros((0, 0, 3), np.float32), shines_through=np.zeros((0, 0), np.float32))
-    for nothing in (None, Seen(empty, upright_camera(away, "-z"), drawing, staged(tmp_path))):
+    for nothing in (None, ShownScene(empty, upright_camera(away, "-z"), drawing, staged(tmp_path))):
         for view in VIEWS:
             expected = PLATE if view in ("plate", "final") else np.zeros_like(PLATE)
             assert np.array_equal(view_picture(view, PLATE, nothing, TABLES), expected)

@@ -15,9 +15,9 @@ from mrbokeh.images.image_io import write_layer
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, write_plate
-from viewfinder.commands.serve import opened as serving
-from viewfinder.commands.serve_options import ServeOptions
+from viewfinder.app.running import opened as serving
 from viewfinder.frames import FrameStatus, OutputFrame
+from viewfinder.options import ViewfinderOptions
 from viewfinder.server.access import Access
 from viewfinder.streaming.virtual_webcam import VirtualWebcam, fitted
 
@@ -118,7 +118,7 @@ def test_the_webcam_shows_what_the_viewfinder_composites(opened: list[FakeCamera
     clip, plate_bgr = write_plate(tmp_path)
     write_layer(tmp_path / "layer.exr", bright_square())
     write_lens(tmp_path / "lens.json", LENS)
-    options = ServeOptions(str(clip), layer=tmp_path / "layer.exr", lenses=(tmp_path / "lens.json",), captures=tmp_path, webcam="auto")
+    options = ViewfinderOptions(str(clip), layer=tmp_path / "layer.exr", lenses=(tmp_path / "lens.json",), captures=tmp_path, webcam="auto")
     with serving(options, Access()) as viewfinder:
         assert viewfinder.webcam is not None and viewfinder.webcam.name == "/dev/video9"
         wait_until(lambda: len(opened) == 2 and len(opened[1].sent) > 3)

@@ -27,7 +27,7 @@ from mrbokeh.tracking.charuco.board import (
 )
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
 from tests.scenes.traced_board_clip import BOARD
-from viewfinder.tracking.printed_board import MARGIN_MM, View, page_for, plan_board, write_board_pdf
+from viewfinder.tracking.printed_board import MARGIN_MM, BoardView, page_for, plan_board, write_board_pdf
 
 SIMPLE = CharucoBoard((CharucoGrid((5, 4), 24.0, 18.0),))
 POINTS_PER_MM = 72.0 / 25.4
@@ -156,7 +156,7 @@ def test_a_board_that_was_printed_is_not_replaced(tmp_path: Path) -> None:
 def test_the_marker_needed_follows_from_the_thin_lens() -> None:
     """50 mm f/4 focused at 1 m: the image lies 1000/19 mm behind the lens, and a point at 0.8 m has a circle of 12.5 mm *
     (1000/19) * (1.25 - 1) / 1000 = 0.1645 mm, 5.848 px of 1280 on 36 mm. A millimetre there spans 1280/36 * (1000/19) / 800 px."""
-    view = View(Lens(50.0, 4.0, 1.0, 36.0), 0.8, 1.0, 1280, elevation_deg=30.0)
+    view = BoardView(Lens(50.0, 4.0, 1.0, 36.0), 0.8, 1.0, 1280, elevation_deg=30.0)
     px_per_mm = 1280.0 / 36.0 * (1000.0 / 19.0) / 800.0
     assert view.px_per_mm(0.8) == pytest.approx(px_per_mm)
     assert view.needed_marker_mm(0.8) == pytest.approx(6.0 * 5.8480 / px_per_mm / 0.5, rel=1e-4)
@@ -175,7 +175,7 @@ def corners_read(board: CharucoBoard, lens: Lens, distance_m: float) -> int:
 def test_the_planned_board_is_read_at_both_ends_and_smaller_markers_are_not() -> None:
     """The rule is put to the test where it matters: traced through the lens it was planned for. At 4 blurs nothing is read."""
     lens = Lens(22.0, 2.8, 0.9, 24.0)
-    view = View(lens, 0.5, 0.9, 640)
+    view = BoardView(lens, 0.5, 0.9, 640)
     plan = plan_board(view)
     assert plan.board is not None and plan.paper is not None
     assert page_for(plan.board, plan.paper).holds(plan.board.size_mm)
@@ -186,16 +186,16 @@ def test_the_planned_board_is_read_at_both_ends_and_smaller_markers_are_not() ->
 
 
 def test_two_scales_where_sharpness_varies_and_a_larger_paper_where_needed() -> None:
-    plan = plan_board(View(Lens(28.0, 4.0, 0.7, 24.0), 0.5, 1.2, 1280))
+    plan = plan_board(BoardView(Lens(28.0, 4.0, 0.7, 24.0), 0.5, 1.2, 1280))
     assert plan.paper == "a3" and plan.board is not None and len(plan.board.grids) == 2
     assert plan.board.grids[0].marker_mm >= plan.marker_mm and "which a4 cannot hold" in plan.sentence
 
 
 def test_where_no_paper_helps_the_plan_says_so() -> None:
-    plan = plan_board(View(Lens(50.0, 1.8, 0.8, 36.0), 0.5, 1.2, 1280))
+    plan = plan_board(BoardView(Lens(50.0, 1.8, 0.8, 36.0), 0.5, 1.2, 1280))
     assert plan.board is None and "phone on the camera" in plan.sentence
     with pytest.raises(InputError, match="nearest <= farthest"):
-        View(Lens(50.0, 1.8, 0.8, 36.0), 1.5, 1.2, 1280)
+        BoardView(Lens(50.0, 1.8, 0.8, 36.0), 1.5, 1.2, 1280)
 
 
 def seen_from_all_sides(board: CharucoBoard) -> list[Corners]:
@@ -223,11 +223,11 @@ def coarse_only(board: CharucoBoard) -> CharucoBoard:
     ("view", "corners"),
     [
         # With 3 rows of 57 mm squares, as it was, 6 corners would be left where the blur is strongest.
-        pytest.param(View(Lens(28.0, 4.0, 0.7, 24.0), 0.5, 1.2, 1280), 9, id="two scales"),
-        pytest.param(View(Lens(22.0, 8.0, 0.7, 24.0), 0.5, 2.0, 1280), 8, id="one scale"),
+        pytest.param(BoardView(Lens(28.0, 4.0, 0.7, 24.0), 0.5, 1.2, 1280), 9, id="two scales"),
+        pytest.param(BoardView(Lens(22.0, 8.0, 0.7, 24.0), 0.5, 2.0, 1280), 8, id="one scale"),
     ],
 )
-def test_a_planned_board_keeps_enough_corners_to_calibrate_by(view: View, corners: int) -> None:
+def test_a_planned_board_keeps_enough_corners_to_calibrate_by(view: BoardView, corners: int) -> None:
     plan = plan_board(view)
     assert plan.board is not None and np.bincount(plan.board.grid_of_corner)[0] == corners and "--calibrate" not in plan.sentence
     coarse = coarse_only(plan.board)
@@ -236,7 +236,7 @@ def test_a_planned_board_keeps_enough_corners_to_calibrate_by(view: View, corner
 
 
 def test_a_planned_board_with_too_few_corners_to_calibrate_by_says_so() -> None:
-    plan = plan_board(View(Lens(22.0, 5.6, 0.7, 24.0), 0.5, 2.0, 1280))
+    plan = plan_board(BoardView(Lens(22.0, 5.6, 0.7, 24.0), 0.5, 2.0, 1280))
     assert plan.board is not None and len(plan.board.corners_m) == 6
     assert plan.sentence.endswith("its 6 corners are too few for `mrbokeh track clip --calibrate` (8): give it --camera")
     with pytest.raises(InputError, match="only 0 frames show 8 corners"):

@@ -35,7 +35,7 @@ from tests.scenes.layer_viewfinder import (
 from viewfinder.app.pipeline import Pipeline
 from viewfinder.frames import CameraFrame, FrameStatus, Newest, OutputFrame
 from viewfinder.sources.playback import PatternSource, VideoFileSource
-from viewfinder.stage.static_layer import StillLayer
+from viewfinder.stage.static_layer import StaticLayer
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_a_blur_that_ends_while_a_frame_is_made_is_told_of_with_the_next() -> No
     """Or a header would state a focus that its picture does not show."""
     camera = Camera(WIDTH, HEIGHT, (float(WIDTH), float(WIDTH)), (WIDTH / 2, HEIGHT / 2))
     nearer = replace(LENS, focus_distance_m=1.0)
-    with closing(StillLayer(bright_square(), LENS, ScatterReference())) as still:
+    with closing(StaticLayer(bright_square(), LENS, ScatterReference())) as still:
         before = still.overlay(None, camera, nearer, 0.0)
         while still.shown.overlay is before:
             time.sleep(0.001)

@@ -37,15 +37,13 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board, write_board
 from tests.scenes.phone_on_camera import PHONE
 from tests.scenes.thin_lens_board import Shot, camera_over, display_bgr, photograph
-from viewfinder.app.focus_choice import open_focus
-from viewfinder.app.tracking_choice import TrackingChoice
-from viewfinder.commands.board import board_command
-from viewfinder.commands.listening import Door, ListeningOptions, open_door
-from viewfinder.commands.serve import opened
-from viewfinder.commands.serve_options import ServeOptions
-from viewfinder.focus.sources import FrameFocus, ManualFocus
+from viewfinder.app.running import opened
+from viewfinder.cli import board_command
+from viewfinder.focus.sources import FrameFocus, ManualFocus, open_focus
 from viewfinder.frames import CameraFrame, LensState
+from viewfinder.options import ListeningOptions, TrackingOptions, ViewfinderOptions
 from viewfinder.server.access import Access
+from viewfinder.server.endpoint import Endpoint, open_endpoint
 from viewfinder.server.sessions import Role, Sessions
 from viewfinder.tracking.tracker import TrackedPose
 
@@ -118,11 +116,11 @@ REFUSED = {
 _INVOKE = """
 import json, sys
 from typer.testing import CliRunner
-import viewfinder.commands.serve as serve, viewfinder.app.tracking_choice as tracking
+import viewfinder.app.opening as opening, viewfinder.app.trackers as trackers
 from viewfinder.cli import app
 def opened(*_):
     raise RuntimeError("a camera was opened")
-serve.open_source = tracking.open_source = opened
+opening.open_source = trackers.open_source = opened
 done = [CliRunner().invoke(app, ["--source", "test", *words]) for words in json.loads(sys.argv[1])]
 print(json.dumps([[type(each.exception).__name__, str(each.exception)] for each in done]))
 """
@@ -169,11 +167,11 @@ def command(folder: Path, *words: str, before: str = "") -> Iterator["subprocess
 
 
 _SLOW_CAMERA = """
-import time, viewfinder.commands.serve as serve
+import time, viewfinder.app.opening as opening
 def slowly(*_):
     print("opening", flush=True)
     time.sleep(60)
-serve.open_source = slowly
+opening.open_source = slowly
 """
 
 
@@ -213,25 +211,25 @@ def test_all_that_is_written_goes_to_the_captures(folder: Path) -> None:
 
 
 def test_a_part_that_fails_closes_those_before_it(folder: Path) -> None:
-    """The layer's and the board's threads run when the camera turns out not to be there; the scenery when the tracker fails."""
+    """The layer's and the board's threads run when the camera turns out not to be there; the overlays when the tracker fails."""
     before = set(threads())
-    good = ServeOptions("none.mkv", layer=folder / "layer.exr", lenses=(folder / "lens.json",), captures=folder)
-    by_board = replace(good, tracking=TrackingChoice(board=folder / "board.json"))
+    good = ViewfinderOptions("none.mkv", layer=folder / "layer.exr", lenses=(folder / "lens.json",), captures=folder)
+    by_board = replace(good, tracking=TrackingOptions(board=folder / "board.json"))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        by_freed = replace(good, tracking=TrackingChoice(freed=taken.getsockname()[1]))
-        in_board = replace(good, tracking=TrackingChoice(board=folder / "bad.json"))
+        by_freed = replace(good, tracking=TrackingOptions(freed=taken.getsockname()[1]))
+        in_board = replace(good, tracking=TrackingOptions(board=folder / "bad.json"))
         for options, sentence in ((by_board, "none of them"), (by_freed, "cannot listen"), (in_board, "bad.json")):
             with pytest.raises(InputError, match=sentence), opened(options, Access()):
                 pass
             assert set(threads()) <= before
     with opened(replace(by_board, source="test"), Access()):
-        assert {"board detection", "still layer", "capture", "composite"} <= {each.name for each in threads()}
+        assert {"board detection", "static layer", "capture", "composite"} <= {each.name for each in threads()}
     assert set(threads()) <= before
 
 
 def test_a_browser_camera_behind_a_layer_can_be_sent(folder: Path) -> None:
-    options = ServeOptions("whip", layer=folder / "layer.exr", lenses=(folder / "lens.json",), captures=folder)
+    options = ViewfinderOptions("whip", layer=folder / "layer.exr", lenses=(folder / "lens.json",), captures=folder)
     with opened(options, Access()) as running:
         assert "whip" in running.site.parts
 
@@ -239,11 +237,11 @@ def test_a_browser_camera_behind_a_layer_can_be_sent(folder: Path) -> None:
 def test_what_is_printed_for_a_network(capsys: pytest.CaptureFixture[str]) -> None:
     """The QR code is drawn with half blocks, as long as nobody asks for none. A token that was used is followed by the next."""
     sessions = Sessions()
-    door = Door("10.0.0.1", 8080, None, sessions, Access(sessions=sessions))
     url = "https://10.0.0.1:8080/"
     for qr in (True, False):
-        replace(door, qr=qr).announce("viewfinder of x", url)
-        replace(door, qr=qr).announce_camera(url, "camera")
+        endpoint = Endpoint(ListeningOptions(lan=True, qr=qr), "10.0.0.1", None, Access(sessions=sessions))
+        endpoint.announce("viewfinder of x", url)
+        endpoint.announce_camera(url)
         shown = capsys.readouterr().out
         assert ("\u2588" in shown or "\u2584" in shown) == qr
         assert f"to control, for one device: {url}#token={sessions.invitation(Role.CONTROL)}" in shown
@@ -252,7 +250,7 @@ def test_what_is_printed_for_a_network(capsys: pytest.CaptureFixture[str]) -> No
     used = sessions.invitation(Role.CONTROL)
     assert sessions.enter(used) is not None
     assert f"#token={sessions.invitation(Role.CONTROL)}" in capsys.readouterr().out != used
-    alone = open_door(ListeningOptions())
+    alone = open_endpoint(ListeningOptions())
     alone.announce("viewfinder of x", "http://127.0.0.1:8080/")
     assert capsys.readouterr().out == "viewfinder of x: http://127.0.0.1:8080/ (Ctrl-C stops it)\n"
 
@@ -346,11 +344,11 @@ def test_focus_from_the_blur_of_the_board_follows_the_page(folder: Path) -> None
     """
     write_lens(folder / "lens.json", LENS.focused_at(FOCUS_M))
     write_lens(folder / "stopped.json", replace(LENS.focused_at(FOCUS_M), f_number=5.6))
-    options = ServeOptions(
+    options = ViewfinderOptions(
         "test",
         layer=folder / "layer.exr",
         lenses=(folder / "lens.json", folder / "stopped.json"),
-        tracking=TrackingChoice(board=folder / "board.json"),
+        tracking=TrackingOptions(board=folder / "board.json"),
         focus_from=("board",),
         captures=folder,
     )

@@ -15,13 +15,16 @@ from mrbokeh.system.errors import InputError
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square
 from tests.scenes.stage_scenes import LENS as SCENE_LENS
 from tests.scenes.stage_scenes import ONE_CARD, backend, camera, scene_file
-from viewfinder.app.live_compositor import LensBook, LiveCompositor
+from viewfinder.app.lenses import LensBook
+from viewfinder.app.live_compositor import LiveCompositor
 from viewfinder.app.live_controls import Captures
+from viewfinder.app.opening import Parts
 from viewfinder.focus.sources import ManualFocus
 from viewfinder.frames import CameraFrame, frame_header
+from viewfinder.options import ViewfinderOptions
 from viewfinder.sources.playback import PatternSource
 from viewfinder.stage.stage import FADE_S, Stage
-from viewfinder.stage.static_layer import StillLayer
+from viewfinder.stage.static_layer import StaticLayer
 from viewfinder.tracking.smoothing import SmoothedTracker
 from viewfinder.tracking.tracker import TrackedPose
 
@@ -71,8 +74,9 @@ def test_an_unsure_pose_shows_nothing_at_first_and_fades_what_was_there(stage: S
 def test_the_page_is_told_and_nothing_is_captured(tmp_path: Path) -> None:
     tracker = Saying()
     lenses = LensBook({"test": LENS})
-    still = StillLayer(bright_square(), LENS, ScatterReference(), "scatter")
-    compositor = LiveCompositor(still, PatternSource(WIDTH, HEIGHT), lenses, ManualFocus(), tracker, None)
+    still = StaticLayer(bright_square(), LENS, ScatterReference(), "scatter")
+    parts = Parts(ViewfinderOptions("test"), PatternSource(WIDTH, HEIGHT), still, lenses, {"scatter": ScatterReference})
+    compositor = LiveCompositor(parts, ManualFocus(), tracker)
     captures = Captures(tmp_path, compositor, "scatter")
     plate = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     try:

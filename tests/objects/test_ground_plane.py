@@ -5,7 +5,7 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.world_axes import turned
-from viewfinder.app.ground_plane import ground_from_picture
+from viewfinder.stage.shown_scene import ground_from_picture
 
 
 def looking_down(tilt_rad: float) -> Camera:

@@ -20,11 +20,13 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
-from viewfinder.app.live_compositor import LensBook
-from viewfinder.app.running import Parts, Viewfinder
+from viewfinder.app.lenses import LensBook
+from viewfinder.app.opening import Parts
+from viewfinder.app.running import Viewfinder
 from viewfinder.app.running import running as parts_running
+from viewfinder.options import ViewfinderOptions
 from viewfinder.server.endpoint import serving_site
-from viewfinder.stage.static_layer import StillLayer
+from viewfinder.stage.static_layer import StaticLayer
 
 WIDTH, HEIGHT = 160, 90
 # Half a dioptre out of focus blurs over 13.7 px here: 160 / 6 px per mm, 20 mm aperture, 51.3 mm to the sensor.
@@ -52,8 +54,9 @@ def write_plate(folder: Path) -> tuple[Path, np.ndarray]:
 
 @contextmanager
 def viewfinder(source: Any, captures: Path, layer: Layer | None = None) -> Iterator[Viewfinder]:
-    still = StillLayer(layer or bright_square(), LENS, ScatterReference(), "scatter")
-    with parts_running(Parts(source, still, LensBook({"test": LENS}), {"scatter": ScatterReference}, captures)) as running_one:
+    still = StaticLayer(layer or bright_square(), LENS, ScatterReference(), "scatter")
+    options = ViewfinderOptions("test", captures=captures)
+    with parts_running(Parts(options, source, still, LensBook({"test": LENS}), {"scatter": ScatterReference})) as running_one:
         yield running_one
 
 

@@ -21,9 +21,11 @@ from mrbokeh.video.frames import display_bgr
 from tests.scenes.live_clip import LiveClip, board_tracker
 from tests.scenes.streaming_viewers import Viewer, watching
 from tests.scenes.traced_board_clip import LENS
-from viewfinder.app.assembly import open_scenery, renderers_of
-from viewfinder.app.live_compositor import LensBook, Moment
-from viewfinder.app.running import Parts, Viewfinder, running
+from viewfinder.app.lenses import LensBook
+from viewfinder.app.live_compositor import CompositedFrame
+from viewfinder.app.opening import Parts, open_overlays, renderers_of
+from viewfinder.app.running import Viewfinder, running
+from viewfinder.options import ViewfinderOptions
 from viewfinder.server.endpoint import serving_site
 from viewfinder.sources.frame_source import FrameSource
 from viewfinder.sources.playback import VideoFileSource
@@ -54,7 +56,7 @@ class Live:
             return await answer.json()
 
     @property
-    def moment(self) -> Moment:
+    def moment(self) -> CompositedFrame:
         """What the newest picture was made of; there must have been one."""
         moment = self.viewfinder.compositor.last
         assert moment is not None
@@ -75,9 +77,10 @@ async def live(
     width, height = clip.plates[0].shape[1::-1]
     renderers = renderers_of(["polygon", "scatter"], None, {})
     book = LensBook(lenses or {"clip": LENS, "wide": WIDE})
-    scenery = open_scenery(clip.scene, None, lambda: book.lens, renderers, "embree")
+    options = ViewfinderOptions(str(clip.path), scene=clip.scene, backend="embree", captures=captures)
+    overlays = open_overlays(options, book.lens, renderers)
     source = source or VideoFileSource(clip.path, width, height)
-    parts = Parts(source, scenery, book, renderers, captures, board_tracker(), clip.cameras[0], clip.scene)
+    parts = Parts(options, source, overlays, book, renderers, tracker=board_tracker(), intrinsics=clip.cameras[0])
     with running(parts) as viewfinder:
         async with serving_site(viewfinder.site, "127.0.0.1", 0) as url:
             yield Live(viewfinder, url)

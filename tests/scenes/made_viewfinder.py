@@ -179,7 +179,7 @@ async def made_viewfinder(
 ) -> AsyncIterator[Made]:
     """A site on loopback with pictures; sinks: get them beside the JPEG stream. parts: of the site, by name."""
     controls, jpeg = MadeControls(), JpegStream()
-    site = Site(controls, access=access or Access(), room=jpeg.room, matte=coverage, parts=parts)
+    site = Site(controls, access=access or Access(), broadcaster=jpeg.broadcaster, matte=coverage, parts=parts)
     try:
         with Pictures(controls, [jpeg, *sinks]) as pictures:
             async with serving_site(site, host, port, tls) as url:

@@ -14,7 +14,7 @@ from mrbokeh.scene.staging.scene_description import SceneDescription
 from mrbokeh.scene.staging.scene_file import read_scene_file
 from mrbokeh.scene.staging.staged_scene import Assets, StagedScene
 from tests.objects.test_scene_gltf import GlbWriter
-from viewfinder.stage.drawing import Brushes
+from viewfinder.stage.drawing import RenderSetup
 from viewfinder.stage.reprojection import LayerDepth
 
 WIDTH, HEIGHT = 160, 112
@@ -77,6 +77,6 @@ def described(folder: Path, text: str) -> SceneDescription:
     return read_scene_file(scene_file(folder, text))
 
 
-def brushes(renderer: Renderer | str = "scatter") -> Brushes:
+def render_setup(renderer: Renderer | str = "scatter") -> RenderSetup:
     chosen = make_renderer(renderer, threads=1) if isinstance(renderer, str) else renderer
-    return Brushes(backend(), chosen, LayerDepth())
+    return RenderSetup(backend(), chosen, LayerDepth())

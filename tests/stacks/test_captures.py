@@ -11,16 +11,16 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.capture_bundle import read_bundle
 from mrbokeh.system.errors import InputError
-from viewfinder.app.captures import Captures
-from viewfinder.app.live_compositor import LiveCompositor, Moment
-from viewfinder.flow.frames import CameraFrame, FrameStatus, OutputFrame
-from viewfinder.tracking.base import TrackedPose
+from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
+from viewfinder.app.live_controls import Captures
+from viewfinder.frames import CameraFrame, FrameStatus, OutputFrame
+from viewfinder.tracking.tracker import TrackedPose
 
 LENS = Lens(50.0, 2.0, 2.0, 36.0)
 SMALL, LARGE = Camera(40, 30, (50.0, 52.0), (20.0, 15.0)), Camera(160, 120, (200.0, 208.0), (80.0, 60.0))
 
 
-class Scenery:
+class OverlaySource:
     def sharp_layers(self, camera: Camera) -> list[Layer]:
         self.camera = camera
         return [clear(camera.height_px, camera.width_px)]
@@ -32,17 +32,17 @@ class Compositor(LiveCompositor):
     transfer = "srgb"  # type: ignore[assignment]
 
     def __init__(self) -> None:
-        self.scenery = Scenery()  # type: ignore[assignment]
+        self.overlays = OverlaySource()  # type: ignore[assignment]
         self.last = self.last_tracked = None
 
 
-def moment(captured_s: float, tracked: bool, value: int) -> Moment:
+def moment(captured_s: float, tracked: bool, value: int) -> CompositedFrame:
     """A picture of 40x30 px, of which the camera has 160x120 in another grey."""
     bgr, full = np.full((30, 40, 3), value, np.uint8), np.full((120, 160, 3), value + 1, np.uint8)
     frame = CameraFrame(bgr, captured_s, int(10 * captured_s), full_picture=lambda: full)
     output = OutputFrame(bgr, captured_s, frame.sequence, FrameStatus(2.0, 2.0))
     pose = TrackedPose(np.eye(4), 0.8, captured_s) if tracked else None
-    return Moment(frame, output, Overlay.of(clear(30, 40)), SMALL, LENS, pose)
+    return CompositedFrame(frame, output, Overlay.of(clear(30, 40)), SMALL, LENS, pose)
 
 
 @pytest.fixture

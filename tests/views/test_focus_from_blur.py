@@ -11,13 +11,11 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 from tests.scenes.thin_lens_board import DARK, LIGHT, Shot, camera_over, display_bgr, photograph
-from viewfinder.flow.frames import CameraFrame, LensState
-from viewfinder.focus.blur_of_board_focus import BlurOfBoardFocus, BlurSettings
-from viewfinder.focus.board_edges import board_edges
-from viewfinder.focus.edge_spread import EdgeBlurs, edge_blurs, edge_rise, sharpest_blur_px
-from viewfinder.focus.focus_from_blur import focus_candidates
-from viewfinder.focus.focus_side import Evidence, settled
-from viewfinder.tracking.base import TrackedPose
+from viewfinder.focus.board_focus import BlurOfBoardFocus, BlurSettings
+from viewfinder.focus.edge_blur import EdgeBlurs, board_edges, edge_blurs, edge_rise, sharpest_blur_px
+from viewfinder.focus.focus_from_blur import Evidence, focus_candidates, settled
+from viewfinder.frames import CameraFrame, LensState
+from viewfinder.tracking.tracker import TrackedPose
 
 BOARD = CharucoBoard((CharucoGrid((6, 4), 30.0, 22.0),))
 LENS = Lens(35.0, 2.8, 1.0, 23.5)

@@ -5,7 +5,7 @@ Captures: moments of the viewfinder saved as bundles that `mrbokeh composite` re
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,11 @@ from jaxtyping import UInt8, UInt16
 
 from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.capture_bundle import write_bundle
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import turned, turned_back
-from viewfinder.app.live_compositor import LiveCompositor, Moment
+from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
+from viewfinder.app.opening import Parts
 from viewfinder.focus.sources import FirstKnown, ManualFocus
 from viewfinder.frames import Bgr, CameraFrame
 from viewfinder.server.controls import ObjectState, State
@@ -49,7 +49,7 @@ class Captures:
             self._folder / name,
             plate_png(bgr, self._compositor.transfer),
             _encoded(".jpg", moment.output.bgr),
-            self._compositor.scenery.sharp_layers(camera),
+            self._compositor.overlays.sharp_layers(camera),
             moment.lens,
             camera,
             self.renderer_name,
@@ -62,7 +62,7 @@ class Captures:
         names = (stamp, *(f"{stamp}-{count}" for count in range(2, 1000)))
         return next(name for name in names if not (self._folder / name).exists())
 
-    def _facts(self, moment: Moment) -> dict[str, Any]:
+    def _facts(self, moment: CompositedFrame) -> dict[str, Any]:
         status, pose = moment.output.status, moment.pose
         assert pose is not None, "asked before"
         return {
@@ -97,27 +97,16 @@ def _encoded(suffix: str, bgr: Bgr | UInt16[np.ndarray, "height width 3"]) -> by
 
 
 class LiveControls:
-    """A Controls (viewfinder.server.controls). renderers: by name, made when first chosen.
-
-    stage: None where a finished layer is shown, which has no objects. trouble: a sentence about the camera, or None.
-    """
+    """Controls (viewfinder.server.controls) of a running viewfinder. trouble: a sentence about the camera, or None."""
 
     def __init__(
-        self,
-        compositor: LiveCompositor,
-        manual: ManualFocus,
-        captures: Captures,
-        recorder: Recorder,
-        recordings: Path,
-        renderers: Mapping[str, Callable[[], Renderer]],
-        trouble: Callable[[], str | None],
-        source_name: str,
-        stage: Stage | None = None,
-        smoothed: SmoothedTracker | None = None,
+        self, parts: Parts, compositor: LiveCompositor, manual: ManualFocus, recorder: Recorder, trouble: Callable[[], str | None]
     ) -> None:
-        self._compositor, self._manual, self._captures, self._recorder = compositor, manual, captures, recorder
-        self._recordings, self._renderers, self._trouble = recordings, dict(renderers), trouble
-        self._source_name, self._stage, self._smoothed = source_name, stage, smoothed
+        self._parts, self._compositor, self._manual, self._recorder, self._trouble = parts, compositor, manual, recorder, trouble
+        self._captures = Captures(parts.options.captures, compositor, next(iter(parts.renderers)), parts.options.scene)
+        # A finished layer has no objects.
+        self._stage = parts.overlays if isinstance(parts.overlays, Stage) else None
+        self._smoothed = compositor.tracker if isinstance(compositor.tracker, SmoothedTracker) else None
 
     def focus_at_distance(self, metres: float) -> None:
         closest_m = self._compositor.lenses.closest_m
@@ -128,7 +117,7 @@ class LiveControls:
     def focus_at_point(self, x: float, y: float) -> float:
         moment = self._moment()
         height, width = moment.frame.bgr.shape[:2]
-        metres = self._compositor.scenery.depth_at_m(min(x * width, width - 0.5), min(y * height, height - 0.5))
+        metres = self._compositor.overlays.depth_at_m(min(x * width, width - 0.5), min(y * height, height - 0.5))
         self.focus_at_distance(metres)
         return metres
 
@@ -140,7 +129,7 @@ class LiveControls:
         self._manual.set_f_number(None)
 
     def set_renderer(self, name: str) -> None:
-        self._compositor.scenery.set_renderer(name, self._renderers[name]())
+        self._compositor.overlays.set_renderer(name, self._parts.renderers[name]())
         self._captures.renderer_name = name
 
     def set_view(self, name: str) -> None:
@@ -161,7 +150,7 @@ class LiveControls:
 
     def record(self, on: bool) -> None:
         if on:
-            self._recorder.start(recording_path(self._recordings))
+            self._recorder.start(recording_path(self._parts.options.captures))
         else:
             self._recorder.stop()
 
@@ -172,11 +161,11 @@ class LiveControls:
 
     def state(self) -> State:
         compositor, moment = self._compositor, self._compositor.last
-        lenses, status = compositor.lenses, compositor.scenery.status
+        lenses, status = compositor.lenses, compositor.overlays.status
         lens = moment.lens if moment else lenses.lens
         height, width = moment.frame.bgr.shape[:2] if moment else (0, 0)
         return State(
-            source=self._source_name,
+            source=self._parts.source.name,
             width_px=width,
             height_px=height,
             dioptre_range=lenses.slider_dioptres,
@@ -187,9 +176,9 @@ class LiveControls:
             lens=lenses.chosen,
             lenses=lenses.names,
             renderer=status.renderer,
-            renderers=list(self._renderers),
+            renderers=list(self._parts.renderers),
             view=compositor.view,
-            views=list(compositor.scenery.views),
+            views=list(compositor.overlays.views),
             objects=[] if self._stage is None else [ObjectState(name=each.name, visible=each.visible) for each in self._stage.objects],
             ground_from_picture=self._ground(moment),
             can_capture=True,
@@ -199,13 +188,13 @@ class LiveControls:
             failure=self._trouble() or status.problem,
         )
 
-    def _ground(self, moment: Moment | None) -> list[list[float]] | None:
+    def _ground(self, moment: CompositedFrame | None) -> list[list[float]] | None:
         if self._stage is None or moment is None or moment.pose is None:
             return None
         homography = ground_from_picture(moment.camera, self._stage.up)
         return None if homography is None else homography.tolist()
 
-    def _moment(self) -> Moment:
+    def _moment(self) -> CompositedFrame:
         if self._compositor.last is None:
             raise InputError("the camera has not given a picture yet: wait a moment")
         return self._compositor.last

@@ -1,65 +1,38 @@
-"""A running viewfinder: its parts put together, and their threads ended with the block."""
+"""A running viewfinder, from its options to the address of its page: parts put together, and their threads ended at the end."""
 
-from collections.abc import Callable, Iterator, Mapping
+import asyncio
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
+import typer
 from jaxtyping import UInt8
 
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.resources import keep_few_arenas
-from mrbokeh.tracking.charuco.board import CharucoBoard
-from viewfinder.app.assembly import MakeRenderer
-from viewfinder.app.focus_choice import blur_of_board, open_focus
-from viewfinder.app.live_compositor import LensBook, LiveCompositor, Moment
-from viewfinder.app.live_controls import Captures, LiveControls
+from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
+from viewfinder.app.live_controls import LiveControls
+from viewfinder.app.opening import Parts, open_parts
 from viewfinder.app.pipeline import FrameSink, Pipeline
-from viewfinder.focus.sources import FocusSource, ManualFocus
+from viewfinder.focus.board_focus import BlurOfBoardFocus, FollowingOptics
+from viewfinder.focus.sources import FocusSource, ManualFocus, open_focus
 from viewfinder.frames import OutputFrame
+from viewfinder.options import ViewfinderOptions
 from viewfinder.server.access import Access
+from viewfinder.server.endpoint import Endpoint, on_stop, open_endpoint, serving_site
 from viewfinder.server.jpeg_stream import JpegStream
 from viewfinder.server.site import Part, Site
-from viewfinder.sources.frame_source import FrameSource
-from viewfinder.stage.overlay_source import Scenery
-from viewfinder.stage.stage import Stage
 from viewfinder.streaming.alpha_stream import AlphaStream, ObsPart
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.recording import Recorder
 from viewfinder.streaming.virtual_webcam import VirtualWebcam
 from viewfinder.streaming.whep import Whep
 from viewfinder.tracking.smoothing import SmoothedTracker
-from viewfinder.tracking.tracker import Tracker
 
 _MATTE_WIDTH_PX = 320
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What a viewfinder is made of. renderers: by name, the scenery begins with the first. captures: folder of bundles and recordings.
-
-    scene: the scene file, whose text bundles keep. smoothing: whether the track is smoothed to begin with. focus_from: names of
-    `focus_choice.FOCUS_SOURCES` that are asked first; focus_board: the board whose blur tells the focus. cameras: what else browsers
-    send to, by name. webcam: where the pictures go, too.
-    """
-
-    source: FrameSource
-    scenery: Scenery
-    lenses: LensBook
-    renderers: Mapping[str, MakeRenderer]
-    captures: Path
-    tracker: Tracker | None = None
-    camera: Camera | None = None
-    scene: Path | None = None
-    smoothing: bool = False
-    access: Access = field(default_factory=Access)
-    focus_from: tuple[str, ...] = ()
-    focus_board: CharucoBoard | None = None
-    cameras: Mapping[str, Part] = field(default_factory=dict)
-    webcam: VirtualWebcam | None = None
 
 
 @dataclass(frozen=True)
@@ -72,15 +45,48 @@ class Viewfinder:
     webcam: VirtualWebcam | None = None
 
 
+def serve(options: ViewfinderOptions) -> None:
+    """Run until Ctrl-C."""
+    try:
+        options.refuse_contradictions()
+        endpoint = open_endpoint(options.listening)
+        with opened(options, endpoint.access) as viewfinder:
+            asyncio.run(_served(viewfinder, endpoint))
+    except KeyboardInterrupt:
+        # While it was starting; everything that was open is closed.
+        pass
+    typer.echo("viewfinder stopped")
+
+
+async def _served(viewfinder: Viewfinder, endpoint: Endpoint) -> None:
+    stopped = asyncio.Event()
+    on_stop(stopped.set)
+    async with serving_site(viewfinder.site, endpoint.host, endpoint.options.port, endpoint.tls) as url:
+        endpoint.announce(f"viewfinder of {viewfinder.pipeline.source.name}", url)
+        if viewfinder.webcam is not None:
+            typer.echo(f"also a webcam for other programs: {viewfinder.webcam.name}")
+        if "whip" in viewfinder.site.parts:
+            endpoint.announce_camera(url)
+        await stopped.wait()
+
+
+@contextmanager
+def opened(options: ViewfinderOptions, access: Access) -> Iterator[Viewfinder]:
+    """Open all parts and run everything but the server; threads end with the block, or where a part fails."""
+    options.refuse_contradictions()
+    with ExitStack() as closing, running(open_parts(options, access, closing)) as viewfinder:
+        yield viewfinder
+
+
 @contextmanager
 def running(parts: Parts) -> Iterator[Viewfinder]:
-    """Everything but the server."""
+    """Run everything but the server; the threads of the parts end with the block."""
     keep_few_arenas()
     with ExitStack() as closing:
-        smoothed = None if parts.tracker is None else SmoothedTracker(parts.tracker, parts.smoothing)
+        tracker = None if parts.tracker is None else SmoothedTracker(parts.tracker, parts.options.smoothing)
         manual = ManualFocus()
-        focus = open_focus(manual, parts.tracker, parts.focus_from, _blur_focus(parts, lambda: compositor.last))
-        compositor = LiveCompositor(parts.scenery, parts.source, parts.lenses, focus, smoothed, parts.camera)
+        focus = open_focus(manual, parts.tracker, parts.options.focus_from, _blur_focus(parts, lambda: compositor.last))
+        compositor = LiveCompositor(parts, focus, tracker)
         closing.callback(compositor.close)
         jpeg, stream, alone, recorder = JpegStream(), EncodedStream(), EncodedStream(), Recorder(parts.source.transfer)
         alpha = AlphaStream(alone, parts.source.transfer)
@@ -92,43 +98,34 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
             sinks.append(parts.webcam)
             closing.callback(parts.webcam.close)
         pipeline = closing.enter_context(Pipeline(parts.source, compositor, sinks))
-        controls = LiveControls(
-            compositor,
-            manual,
-            Captures(parts.captures, compositor, next(iter(parts.renderers)), parts.scene),
-            recorder,
-            parts.captures,
-            parts.renderers,
-            lambda: pipeline.failure or pipeline.problem or _remark(parts),
-            parts.source.name,
-            parts.scenery if isinstance(parts.scenery, Stage) else None,
-            smoothed,
-        )
+        controls = LiveControls(parts, compositor, manual, recorder, trouble=lambda: pipeline.failure or pipeline.problem or _remark(parts))
         of_site: dict[str, Part] = {"whep": Whep(stream), "obs": ObsPart(Whep(alone))}
         if isinstance(parts.source, Part):
             of_site["whip"] = parts.source
         of_site |= parts.cameras
-        site = Site(controls, parts.access, jpeg.room, of_site, lambda: matte_of(compositor))
+        site = Site(controls, parts.access, jpeg.broadcaster, of_site, lambda: matte_of(compositor))
         yield Viewfinder(pipeline, compositor, site, parts.webcam)
 
 
 def _remark(parts: Parts) -> str | None:
-    """One sentence of the first part that has something to say."""
+    """Return one sentence of the first part that has something to say."""
     of_tracker: str | None = getattr(parts.tracker, "remark", None)
     of_webcam = None if parts.webcam is None else parts.webcam.failure
     return parts.source.status or of_tracker or of_webcam
 
 
-def _blur_focus(parts: Parts, last: Callable[[], Moment | None]) -> FocusSource | None:
-    """last: what the newest picture was made of; its lens has the f-number and the focal length that the page shows."""
+def _blur_focus(parts: Parts, last: Callable[[], CompositedFrame | None]) -> FocusSource | None:
+    """Return the focus from the blur of the board, None without one; the newest picture's lens has the f-number that the page shows."""
     if parts.focus_board is None:
         return None
 
     def optics() -> tuple[Lens, Camera] | None:
-        moment = last()
-        return None if moment is None else (moment.lens, moment.camera)
+        newest = last()
+        return None if newest is None else (newest.lens, newest.camera)
 
-    return blur_of_board(parts.focus_board, parts.lenses.lens, optics)
+    lens = parts.lenses.lens
+    nominal = Camera(640, 360, (lens.focal_px(640),) * 2, (320.0, 180.0))
+    return FollowingOptics(BlurOfBoardFocus(parts.focus_board, lens, nominal), optics)
 
 
 class OverlaySink:
@@ -152,8 +149,8 @@ class OverlaySink:
 
 def matte_of(compositor: LiveCompositor) -> UInt8[np.ndarray, "height width"] | None:
     """Coverage of the virtual layer in the newest frame, at most 320 px wide; None before the first."""
-    moment = compositor.last
-    return None if moment is None else coverage(moment.overlay, *moment.frame.bgr.shape[1::-1])
+    last = compositor.last
+    return None if last is None else coverage(last.overlay, *last.frame.bgr.shape[1::-1])
 
 
 def coverage(overlay: Overlay, width_px: int, height_px: int) -> UInt8[np.ndarray, "height width"]:

@@ -19,7 +19,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard
 from viewfinder.focus.edge_blur import EdgeBlurs, board_edges, edge_blurs
-from viewfinder.focus.focus_from_blur import Evidence, FocusCandidate, focus_candidates, settled
+from viewfinder.focus.focus_from_blur import FocusCandidate, FocusEvidence, focus_candidates, settled
 from viewfinder.frames import CameraFrame, LensState, Newest
 from viewfinder.tracking.tracker import TrackedPose
 
@@ -97,7 +97,7 @@ class BlurOfBoardFocus:
         if not self.candidates:
             return None
         recent = [each for when_s, each in before if 0.0 <= frame.captured_s - when_s <= _REMEMBERED_S]
-        found = settled(self.candidates, Evidence(blurs, recent, lens, width_px, last))
+        found = settled(self.candidates, FocusEvidence(blurs, recent, lens, width_px, last))
         with self._changing:
             if self.lens is not lens:
                 return None

@@ -99,7 +99,7 @@ _SAME_PX = 2.0
 
 
 @dataclass(frozen=True)
-class Evidence:
+class FocusEvidence:
     """now: the blurs of this frame, before: those of earlier ones with this focus, from which the camera may have moved.
 
     settled_dioptres: the last answer. width_px: of the pictures.
@@ -112,7 +112,7 @@ class Evidence:
     settled_dioptres: float | None = None
 
 
-def settled(candidates: Sequence[FocusCandidate], evidence: Evidence) -> FocusCandidate | None:
+def settled(candidates: Sequence[FocusCandidate], evidence: FocusEvidence) -> FocusCandidate | None:
     """By this frame's depths, else by what earlier frames showed, else by the answer before; None where nothing tells.
 
     Two answers within a pixel of the board's own depth need not be told apart: their middle is as good.

@@ -15,8 +15,9 @@ from typing import Protocol, runtime_checkable
 
 from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame, LensState
+from viewfinder.options import FOCUS_BY_DEFAULT
 from viewfinder.tracking.socket_tracker import SocketTracker
-from viewfinder.tracking.tracker import TrackedPose
+from viewfinder.tracking.tracker import TrackedPose, Tracker
 
 
 @runtime_checkable
@@ -118,3 +119,13 @@ class TrackedLensFocus:
 
     def close(self) -> None:
         """Nothing of its own to close."""
+
+
+def open_focus(manual: ManualFocus, tracker: Tracker | None, first: Sequence[str] = (), blur: FocusSource | None = None) -> FirstKnown:
+    """Return the sources in the order in which they are asked: those named first, then FOCUS_BY_DEFAULT. blur: of the board."""
+    known: dict[str, FocusSource] = {"hand": manual, "source": FrameFocus()}
+    if isinstance(tracker, SocketTracker):
+        known["tracking"] = TrackedLensFocus(tracker)
+    if blur is not None:
+        known["board"] = blur
+    return FirstKnown([known[name] for name in dict.fromkeys((*first, *FOCUS_BY_DEFAULT)) if name in known])

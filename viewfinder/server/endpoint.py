@@ -1,29 +1,32 @@
-"""Which one address the viewfinder listens on for `--lan`, and its URL as text and as a QR code for the phone.
+"""Endpoint: the one address at which a viewfinder listens, its TLS certificate, whom it lets in, and what it prints for them."""
 
-TLS with the user's own certificate: loading it, and the names it is good for.
-
-Serving a site: listening on one address, with or without TLS, until the block ends.
-"""
-
+import asyncio
+import contextlib
 import io
+import signal
 import socket
 import ssl
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import typer
 from aiohttp import web
 
 from mrbokeh.system.errors import InputError, MissingExtraError
-from viewfinder.server.access import is_loopback
+from viewfinder.options import ListeningOptions
+from viewfinder.server.access import LOOPBACK_NAMES, Access, is_loopback
+from viewfinder.server.sessions import Role, Sessions
 from viewfinder.server.site import Site
 
 # Routers of mobile networks and Tailscale use 100.64.0.0/10, which is neither private nor public.
 _SHARED = (IPv4Address("100.64.0.0"), IPv4Address("100.127.255.255"))
 _WHITE_ON_BLACK, _RESET = "\x1b[97;40m", "\x1b[0m"
+_SHUTDOWN_S = 1.0
+_CAMERA_PAGE = "camera"
 # Never answers (RFC 5737); asking for the way there sends nothing.
 _ELSEWHERE = ("198.51.100.1", 9)
 
@@ -33,6 +36,107 @@ class Interface(NamedTuple):
 
     name: str
     address: str
+
+
+class Tls(NamedTuple):
+    """context: for the server. names: host names and addresses that the certificate covers, in lower case, without wildcards."""
+
+    context: ssl.SSLContext
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """An address with its certificate and rules of access, before anything listens there."""
+
+    options: ListeningOptions
+    host: str
+    tls: Tls | None
+    access: Access
+
+    @property
+    def sessions(self) -> Sessions | None:
+        """Sessions of a network; None where only this machine is let in, and everybody on it."""
+        return self.access.sessions
+
+    def announce(self, what: str, url: str) -> None:
+        """Print where `what` is shown. An address with a token is good for one device; the next one is printed when it was used."""
+        if self.sessions is None:
+            typer.echo(f"{what}: {url} (Ctrl-C stops it)")
+            return
+        sessions = self.sessions
+        typer.echo(f"{what} (Ctrl-C stops it)")
+        for role in (Role.VIEW, Role.CONTROL):
+            self._invite(url, sessions, role)
+        typer.echo(f"for OBS, as a browser source: {url}obs#token={sessions.standing_token(Role.VIEW)}")
+        sessions.renewed = lambda role: self._invite(url, sessions, role)
+
+    def announce_camera(self, url: str) -> None:
+        """Print the page with which a browser sends its camera. Its token is never used up: a phone on a camera comes back without asking."""
+        if self.sessions is None:
+            typer.echo(f"to send a camera from a browser: {url}{_CAMERA_PAGE}")
+            return
+        token = self.sessions.standing_token(Role.CONTROL)
+        address = f"{url}{_CAMERA_PAGE}#token={token}"
+        if self.options.qr:
+            typer.echo(qr_text(address))
+        typer.echo(f"to send a camera from a browser: {address}")
+        typer.echo(f"to send one from OBS (WHIP): {url}whip with the bearer token {token}")
+
+    def _invite(self, url: str, sessions: Sessions, role: Role) -> None:
+        address = f"{url}#token={sessions.invitation(role)}"
+        if role is Role.CONTROL and self.options.qr:
+            typer.echo(qr_text(address))
+        typer.echo(f"to {role.word}, for one device: {address}")
+
+
+def open_endpoint(options: ListeningOptions) -> Endpoint:
+    """Read the certificate and find the interface; nothing listens yet."""
+    options.refuse_contradictions()
+    host = host_of(options)
+    tls = None if options.tls is None else load_tls(options.tls, options.tls_key)
+    names = LOOPBACK_NAMES | {host.lower()} | (frozenset() if tls is None else frozenset(tls.names))
+    access = Access(names=names, sessions=Sessions() if options.lan else None, secure=tls is not None)
+    return Endpoint(options, host, tls, access)
+
+
+def host_of(options: ListeningOptions) -> str:
+    """Return the one address to listen on: loopback, or that of the interface with --lan."""
+    return lan_address(options.interface) if options.lan else "127.0.0.1"
+
+
+def on_stop(stop: Callable[[], object]) -> None:
+    """Call `stop` on Ctrl-C and SIGTERM; in a running loop. Where handlers cannot be set (Windows), Ctrl-C is a KeyboardInterrupt."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with contextlib.suppress(NotImplementedError):
+            asyncio.get_running_loop().add_signal_handler(number, stop)
+
+
+@contextlib.asynccontextmanager
+async def serving_site(site: Site, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
+    """Serve a site inside the block; gives the address of the page, without a token. Port 0 takes a free one.
+
+    With TLS the address has a name that the certificate covers; that it leads to this machine is the user's care.
+    """
+    runner = web.AppRunner(site.application(), shutdown_timeout=_SHUTDOWN_S, access_log=None)
+    await runner.setup()
+    try:
+        await _bind(runner, host, port, tls)
+        yield page_url(_spoken_name(host, tls), runner.addresses[0][1], secure=tls is not None)
+    finally:
+        await runner.cleanup()
+
+
+def _spoken_name(host: str, tls: Tls | None) -> str:
+    """The name in the URL: browsers accept a certificate only under a name that it covers."""
+    return host if tls is None or not tls.names or host.lower() in tls.names else tls.names[0]
+
+
+async def _bind(runner: web.AppRunner, host: str, port: int, tls: Tls | None) -> None:
+    try:
+        await web.TCPSite(runner, host, port, ssl_context=None if tls is None else tls.context).start()
+    except (OSError, OverflowError) as error:
+        raise InputError(f"cannot listen on {host} port {port} ({error}): choose another one with --port, or stop what uses it") from None
 
 
 def lan_address(wanted: str | None = None) -> str:
@@ -99,13 +203,6 @@ def _way_out() -> str | None:
         return str(probe.getsockname()[0])
 
 
-class Tls(NamedTuple):
-    """context: for the server. names: host names and addresses that the certificate covers, in lower case, without wildcards."""
-
-    context: ssl.SSLContext
-    names: tuple[str, ...]
-
-
 def load_tls(certificate: Path, key: Path | None = None) -> Tls:
     """A certificate chain in PEM and its key, which may be in the same file; InputError says what is wrong with them."""
     key = key or certificate
@@ -152,33 +249,3 @@ def _refused(certificate: Path, key: Path, error: ssl.SSLError) -> str:
     if error.reason == "KEY_VALUES_MISMATCH":
         return f"the key {key} does not belong to the certificate {certificate}: give the key that was made with it"
     return f"the certificate {certificate} and the key {key} cannot be used ({error.reason or error}): expected a key in PEM"
-
-
-_SHUTDOWN_S = 1.0
-
-
-@asynccontextmanager
-async def serving_site(site: Site, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
-    """Serve a site inside the block; gives the address of the page, without a token. Port 0 takes a free one.
-
-    With TLS the address has a name that the certificate covers; that it leads to this machine is the user's care.
-    """
-    runner = web.AppRunner(site.application(), shutdown_timeout=_SHUTDOWN_S, access_log=None)
-    await runner.setup()
-    try:
-        await _bind(runner, host, port, tls)
-        yield page_url(_spoken_name(host, tls), runner.addresses[0][1], secure=tls is not None)
-    finally:
-        await runner.cleanup()
-
-
-def _spoken_name(host: str, tls: Tls | None) -> str:
-    """The name in the URL: browsers accept a certificate only under a name that it covers."""
-    return host if tls is None or not tls.names or host.lower() in tls.names else tls.names[0]
-
-
-async def _bind(runner: web.AppRunner, host: str, port: int, tls: Tls | None) -> None:
-    try:
-        await web.TCPSite(runner, host, port, ssl_context=None if tls is None else tls.context).start()
-    except (OSError, OverflowError) as error:
-        raise InputError(f"cannot listen on {host} port {port} ({error}): choose another one with --port, or stop what uses it") from None

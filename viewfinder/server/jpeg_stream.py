@@ -2,7 +2,7 @@
 
 A message of the stream is a 4-byte big-endian length, a JSON header of that length, and a JPEG.
 
-WaitingRoom: where WebSockets wait for the next picture, and where a thread that has one hands it to all of them.
+Broadcaster: where WebSockets wait for the next picture, and where a thread that has one hands it to all of them.
 
 The WebSocket that streams JPEG with one credit, answers the clock and takes control messages.
 
@@ -29,7 +29,7 @@ from viewfinder.server.controls import Dispatcher
 from viewfinder.server.sessions import RateLimit, Role
 
 
-class WaitingRoom:
+class Broadcaster:
     """`open` binds it to the running event loop; `publish` and `fail` may be called from any thread, also before and after that."""
 
     def __init__(self) -> None:
@@ -100,10 +100,10 @@ log = logging.getLogger(__name__)
 
 
 class JpegStream:
-    """Runs until `close`, or the end of a `with`. room: where the sockets wait for messages and hear of failures."""
+    """Runs until `close`, or the end of a `with`. broadcaster: where the sockets wait for messages and hear of failures."""
 
     def __init__(self, jpeg_quality: int = 85) -> None:
-        self.room = WaitingRoom()
+        self.broadcaster = Broadcaster()
         self._jpeg_quality = jpeg_quality
         self._newest: Newest[OutputFrame] = Newest()
         self._encoding, self._stopping = Event(), Event()
@@ -113,13 +113,13 @@ class JpegStream:
     @property
     def wants_frame(self) -> bool:
         """Whether a viewer waits whom the picture at hand will not reach."""
-        return self.room.waited_for and not self._encoding.is_set() and not self._newest.waiting
+        return self.broadcaster.waited_for and not self._encoding.is_set() and not self._newest.waiting
 
     def show(self, frame: OutputFrame) -> None:
         self._newest.put(frame)
 
     def fail(self, sentence: str) -> None:
-        self.room.fail(sentence)
+        self.broadcaster.fail(sentence)
 
     def __enter__(self) -> "JpegStream":
         return self
@@ -135,11 +135,11 @@ class JpegStream:
     def _work(self) -> None:
         while not self._stopping.is_set():
             frame = self._newest.take(_POLL_S)
-            if frame is None or not self.room.waited_for:
+            if frame is None or not self.broadcaster.waited_for:
                 continue
             self._encoding.set()
             try:
-                self.room.publish(jpeg_message(frame, self._jpeg_quality))
+                self.broadcaster.publish(jpeg_message(frame, self._jpeg_quality))
             except Exception:
                 log.exception("a picture could not be encoded")
             finally:
@@ -169,26 +169,26 @@ _MOST_SOCKETS = 16
 class JpegSocket:
     """GET /stream. Sockets beyond 16 are refused; one that floods is closed."""
 
-    def __init__(self, room: WaitingRoom, dispatcher: Dispatcher, access: Access) -> None:
-        self._room, self._dispatcher, self._access = room, dispatcher, access
+    def __init__(self, broadcaster: Broadcaster, dispatcher: Dispatcher, access: Access) -> None:
+        self._broadcaster, self._dispatcher, self._access = broadcaster, dispatcher, access
         # Twice what a screen of 120 Hz acknowledges.
         self._limit = RateLimit(per_s=240.0, burst=480.0)
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
-        if len(self._room.sockets) >= _MOST_SOCKETS:
+        if len(self._broadcaster.sockets) >= _MOST_SOCKETS:
             return error(f"{_MOST_SOCKETS} viewers watch already: close one of them", 503)
         # Pictures are compressed already; another compression would only cost time.
         socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=10.0, compress=False)
         await socket.prepare(request)
-        self._room.sockets.add(socket)
+        self._broadcaster.sockets.add(socket)
         credit = asyncio.Event()
         credit.set()
         sender = asyncio.create_task(self._send(socket, credit))
         try:
-            await self._room.tell_failure(socket)
+            await self._broadcaster.tell_failure(socket)
             await self._receive(socket, request, credit)
         finally:
-            self._room.sockets.discard(socket)
+            self._broadcaster.sockets.discard(socket)
             sender.cancel()
             await asyncio.gather(sender, return_exceptions=True)
         return socket
@@ -216,4 +216,4 @@ class JpegSocket:
         while not socket.closed:
             await credit.wait()
             credit.clear()
-            await socket.send_bytes(await self._room.next_message())
+            await socket.send_bytes(await self._broadcaster.next_message())

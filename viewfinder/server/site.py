@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from viewfinder.server.access import LARGEST_BODY, Access, error, message_body
 from viewfinder.server.controls import Controls, Dispatcher
-from viewfinder.server.jpeg_stream import JpegSocket, WaitingRoom
+from viewfinder.server.jpeg_stream import Broadcaster, JpegSocket
 from viewfinder.server.sessions import Role
 
 PAGE = {
@@ -59,14 +59,14 @@ def _no_matte() -> None:
 class Site:
     """dispatcher: of the controls; the data channel of a WebRTC part calls the same one.
 
-    room: of the JPEG stream, None without it. parts: by name; "whep" tells the page to try it first, "whip" offers the camera page.
+    broadcaster: of the JPEG stream, None without it. parts: by name; "whep" tells the page to try it first, "whip" offers the camera page.
     matte: the newest coverage of the virtual layer, small and 8-bit, for the peaking of real and virtual things apart.
     """
 
     controls: Controls
     dispatcher: Dispatcher = field(init=False)
     access: Access = field(default_factory=Access)
-    room: WaitingRoom | None = None
+    broadcaster: Broadcaster | None = None
     parts: dict[str, Part] = field(default_factory=dict)
     matte: Callable[[], Matte | None] = _no_matte
 
@@ -79,8 +79,8 @@ class Site:
         app.add_routes(page_routes())
         app.add_routes([web.post("/enter", self.access.enter), web.get("/state", self._state), web.post("/control", self._control)])
         app.add_routes([web.get("/matte", self._matte)])
-        if self.room is not None:
-            app.add_routes([web.get("/stream", JpegSocket(self.room, self.dispatcher, self.access).handle)])
+        if self.broadcaster is not None:
+            app.add_routes([web.get("/stream", JpegSocket(self.broadcaster, self.dispatcher, self.access).handle)])
         for part in self.parts.values():
             app.add_routes(part.routes())
         app.on_startup.append(self._open)
@@ -92,7 +92,7 @@ class Site:
 
     async def _state(self, request: web.Request) -> web.Response:
         """GET /state: the State, the role of the one who asks, and the ways to watch, best first."""
-        ways = [name for name, present in (("whep", "whep" in self.parts), ("jpeg", self.room is not None)) if present]
+        ways = [name for name, present in (("whep", "whep" in self.parts), ("jpeg", self.broadcaster is not None)) if present]
         own = {"role": self._role(request).word, "transports": ways, "matte": self.matte() is not None, "can_send": "whip" in self.parts}
         return web.json_response(self.controls.state() | own)
 
@@ -112,12 +112,12 @@ class Site:
         return web.Response(body=cv2.imencode(".png", matte)[1].tobytes(), content_type="image/png")
 
     async def _open(self, _app: web.Application) -> None:
-        if self.room is not None:
-            self.room.open()
+        if self.broadcaster is not None:
+            self.broadcaster.open()
 
     async def _close(self, _app: web.Application) -> None:
-        if self.room is not None:
-            await self.room.close()
+        if self.broadcaster is not None:
+            await self.broadcaster.close()
         for part in self.parts.values():
             await part.close()
         self.dispatcher.close()

@@ -55,7 +55,7 @@ class Drawing:
 
 
 @dataclass(frozen=True, eq=False)
-class Brushes:
+class RenderSetup:
     """What draws: a backend for the objects, a renderer for the lens, and what real things hide.
 
     live: a faster backend for what is drawn again and again; None takes `backend` for that too.
@@ -68,7 +68,7 @@ class Brushes:
     live: SceneRenderer | None = None
 
 
-def draw(staged: StagedScene, request: DrawRequest, brushes: Brushes) -> Drawing:
+def draw(staged: StagedScene, request: DrawRequest, render_setup: RenderSetup) -> Drawing:
     """Draw the scene for one pose: the box around its projection and blur, at the resolution asked for."""
     frame = upright_camera(request.camera, staged.description.up)
     points_m = staged.drawn_points_m(request.time_s)
@@ -76,12 +76,12 @@ def draw(staged: StagedScene, request: DrawRequest, brushes: Brushes) -> Drawing
     if box is None:
         return Drawing(request)
     camera, lens = box.cut(frame, request.resolution), box.lens_of(request.lens, frame.width_px)
-    layers = sharp_layers(staged, request.time_s, camera, replace(brushes, backend=brushes.live or brushes.backend))
-    if brushes.occlusion is not None:
-        layers = [covered_by(layer, brushes.occlusion.matte(layer.depth_m, camera, frame)) for layer in layers]
-    blurred, sharp = brushes.renderer.render(layers, lens), flatten(layers)
+    layers = sharp_layers(staged, request.time_s, camera, replace(render_setup, backend=render_setup.live or render_setup.backend))
+    if render_setup.occlusion is not None:
+        layers = [covered_by(layer, render_setup.occlusion.matte(layer.depth_m, camera, frame)) for layer in layers]
+    blurred, sharp = render_setup.renderer.render(layers, lens), flatten(layers)
     in_box = MovableLayer(
-        _rgba(sharp), brushes.depth.seen_dioptres(_padded(layers), lens), camera, box.left_px, box.top_px, request.resolution
+        _rgba(sharp), render_setup.depth.seen_dioptres(_padded(layers), lens), camera, box.left_px, box.top_px, request.resolution
     )
     seen = _trimmed(replace(in_box, rgba=_rgba(blurred)))
     return Drawing(request, seen, in_box, sharp.depth_m, lens, _depth_range_m(points_m, frame))
@@ -92,12 +92,12 @@ def _depth_range_m(points_m: Float[np.ndarray, "points 3"], camera: Camera) -> t
     return max(float(depths_m.min()), NEAREST_M), float(depths_m.max())
 
 
-def sharp_layers(staged: StagedScene, time_s: float, camera: Camera, brushes: Brushes) -> list[Layer]:
-    """Object, then shadow, as `brushes.backend` draws them."""
+def sharp_layers(staged: StagedScene, time_s: float, camera: Camera, render_setup: RenderSetup) -> list[Layer]:
+    """Object, then shadow, as `render_setup.backend` draws them."""
     scene, shadow, catcher = staged.scene_at(time_s), staged.description.shadow, staged.catcher
-    layers = [brushes.backend.render(scene, camera)]
+    layers = [render_setup.backend.render(scene, camera)]
     if shadow is not None and catcher is not None and scene.lighting[0] and shadow.strength > 0:
-        layers.append(shadow_layer(brushes.backend, scene, camera, catcher, shadow.strength))
+        layers.append(shadow_layer(render_setup.backend, scene, camera, catcher, shadow.strength))
     return layers
 
 

@@ -127,7 +127,7 @@ class DrawingThread:
     def _draw(self, request: DrawRequest) -> None:
         setup, started_s = self._setup, time.monotonic()
         try:
-            drawing = draw(setup.staged, request, setup.brushes)
+            drawing = draw(setup.staged, request, setup.render_setup)
         except Exception as error:
             # The stream goes on with the old drawing; another pose, focus or renderer may work.
             if not isinstance(error, InputError):

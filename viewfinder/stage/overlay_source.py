@@ -11,7 +11,6 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.scene.staging.scene_description import Triple
 from viewfinder.frames import Bgr
 from viewfinder.tracking.tracker import TrackedPose
 
@@ -37,7 +36,7 @@ class StageStatus:
 
 
 @runtime_checkable
-class Scenery(Protocol):
+class OverlaySource(Protocol):
     """`overlay` and `picture` belong to the compositing thread; everything else may be called from any. Points are in pixels of the frame.
 
     views: that `picture` can show.
@@ -64,10 +63,6 @@ class Scenery(Protocol):
         """Everything virtual in focus as a camera (with pose) sees it now, front first; may take its time."""
         ...
 
-    def move_object(self, name: str, position_m: Triple) -> None: ...
-
-    def show_object(self, name: str, visible: bool) -> None: ...
-
-    def set_renderer(self, name: str, renderer: Renderer | None = None) -> None: ...
+    def set_renderer(self, name: str, renderer: Renderer) -> None: ...
 
     def close(self) -> None: ...

@@ -1,4 +1,4 @@
-"""Seen: what the newest frame shows of the scene, for those who ask about it: picking and views.
+"""ShownScene: what the newest frame shows of the scene, for those who ask about it: picking and views.
 
 The views of the page: plate, virtual, matte, depth, coc and final, as pictures of the size of the plate.
 
@@ -27,7 +27,7 @@ from viewfinder.stage.occlusion import Occlusion
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ShownScene:
     """camera: of the newest frame, upright. drawing: the one that was moved to it to become the overlay."""
 
     overlay: Overlay
@@ -42,7 +42,7 @@ _LEAST = 1e-3
 _SAME_DIOPTRES = 1e-3
 
 
-def view_picture(view: str, plate_bgr: Bgr, seen: Seen | None, tables: CodeTables) -> Bgr:
+def view_picture(view: str, plate_bgr: Bgr, seen: ShownScene | None, tables: CodeTables) -> Bgr:
     """One of VIEWS. seen: None before the first drawing, when only the plate shows anything. InputError for an unknown name.
 
     matte: white is all virtual, a shadow counts by how dark it is. depth: red is near, blue far, by 1 / depth over what is seen.
@@ -55,24 +55,24 @@ def view_picture(view: str, plate_bgr: Bgr, seen: Seen | None, tables: CodeTable
     return _PAINTERS[view](plate_bgr, seen, tables)
 
 
-def _plate(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+def _plate(plate_bgr: Bgr, seen: ShownScene, tables: CodeTables) -> Bgr:  # noqa: ARG001
     return plate_bgr
 
 
-def _final(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:
+def _final(plate_bgr: Bgr, seen: ShownScene, tables: CodeTables) -> Bgr:
     return seen.overlay.over_codes(plate_bgr, tables)
 
 
-def _virtual(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:
+def _virtual(plate_bgr: Bgr, seen: ShownScene, tables: CodeTables) -> Bgr:
     return seen.overlay.over_codes(np.zeros_like(plate_bgr), tables)
 
 
-def _matte(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+def _matte(plate_bgr: Bgr, seen: ShownScene, tables: CodeTables) -> Bgr:  # noqa: ARG001
     alpha = np.rint(255.0 * np.clip(1.0 - seen.overlay.shines_through, 0.0, 1.0)).astype(np.uint8)
     return _placed(np.repeat(alpha[..., None], 3, axis=2), seen.overlay, plate_bgr)
 
 
-def _depth(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+def _depth(plate_bgr: Bgr, seen: ShownScene, tables: CodeTables) -> Bgr:  # noqa: ARG001
     if seen.drawing.depth_m is None:
         return np.zeros_like(plate_bgr)
     overlay, dioptres, there = _moved((1.0 / seen.drawing.depth_m).astype(np.float32), seen)
@@ -83,7 +83,7 @@ def _depth(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG0
     return _placed(np.where(there[..., None], colours, 0).astype(np.uint8), overlay, plate_bgr)
 
 
-def _coc(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
+def _coc(plate_bgr: Bgr, seen: ShownScene, tables: CodeTables) -> Bgr:  # noqa: ARG001
     drawing = seen.drawing
     if drawing.sharp is None or drawing.depth_m is None or drawing.lens is None:
         return np.zeros_like(plate_bgr)
@@ -95,7 +95,7 @@ def _coc(plate_bgr: Bgr, seen: Seen, tables: CodeTables) -> Bgr:  # noqa: ARG001
     return _placed(np.where(there[..., None], colours, 0).astype(np.uint8), overlay, plate_bgr)
 
 
-def _moved(values: Plane, seen: Seen) -> tuple[Overlay, Float32[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
+def _moved(values: Plane, seen: ShownScene) -> tuple[Overlay, Float32[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
     """Values of the sharp picture in the newest one: (where, the values, whether there is anything)."""
     sharp = seen.drawing.sharp
     assert sharp is not None, "a drawing with depth has a sharp layer"
@@ -117,7 +117,7 @@ def _placed(colours: UInt8[np.ndarray, "rows columns 3"], overlay: Overlay, plat
     return result
 
 
-_PAINTERS: dict[str, Callable[[Bgr, Seen, CodeTables], Bgr]] = {
+_PAINTERS: dict[str, Callable[[Bgr, ShownScene, CodeTables], Bgr]] = {
     "final": _final,
     "plate": _plate,
     "virtual": _virtual,
@@ -132,7 +132,7 @@ _FARTHEST_M = 100.0
 _PARALLEL = 1e-12
 
 
-def object_at(seen: Seen, x_px: float, y_px: float) -> tuple[str, float] | None:
+def object_at(seen: ShownScene, x_px: float, y_px: float) -> tuple[str, float] | None:
     """Name and depth (metres, along the optical axis) of the virtual object at a point of the newest picture; None where there is none."""
     eye_m, ray = _ray(seen.camera, x_px, y_px)
     parts = seen.staged.parts_at(seen.drawing.request.time_s)
@@ -142,7 +142,7 @@ def object_at(seen: Seen, x_px: float, y_px: float) -> tuple[str, float] | None:
     return (name, depth_m) if depth_m < min(real_m, _FARTHEST_M) else None
 
 
-def table_point_m(seen: Seen, x_px: float, y_px: float, height_m: float = 0.0) -> Triple | None:
+def table_point_m(seen: ShownScene, x_px: float, y_px: float, height_m: float = 0.0) -> Triple | None:
     """Where the ray through a point of the picture meets the table, in the tracker's world; None where it does not within 100 m.
 
     height_m: of the plane above the table: dragging an object that floats moves it in the plane in which it is.
@@ -155,7 +155,7 @@ def table_point_m(seen: Seen, x_px: float, y_px: float, height_m: float = 0.0) -
     return turned_back((x, y, z), seen.staged.description.up)
 
 
-def depth_at_m(seen: Seen, x_px: float, y_px: float) -> float:
+def depth_at_m(seen: ShownScene, x_px: float, y_px: float) -> float:
     """What a tap there focuses on: the virtual object, else the depth that was measured, else the table. InputError for none of them."""
     picked = object_at(seen, x_px, y_px)
     if picked is not None:

@@ -23,8 +23,8 @@ from viewfinder.frames import Bgr
 from viewfinder.stage.drawing import DrawRequest, blur_changed, is_outdated, sharp_layers
 from viewfinder.stage.drawing_thread import DrawingThread, Drawn
 from viewfinder.stage.overlay_source import StageStatus
-from viewfinder.stage.shown_scene import VIEWS, Seen, depth_at_m, view_picture
-from viewfinder.stage.stage_setup import SetupLoader, live_renderer
+from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, view_picture
+from viewfinder.stage.stage_setup import SetupLoader
 from viewfinder.tracking.tracker import TrackedPose
 
 FADE_S = 0.5
@@ -50,7 +50,7 @@ _STILL_S = 0.4
 
 
 class Stage:
-    """A Scenery. `overlay` and `picture` belong to one thread, the compositing one; everything else may be called from any."""
+    """A OverlaySource. `overlay` and `picture` belong to one thread, the compositing one; everything else may be called from any."""
 
     views = VIEWS
 
@@ -65,7 +65,7 @@ class Stage:
         self._began_s: float | None = None
         self._still_since_s = 0.0
         self._wanted: DrawRequest | None = None
-        self.seen: Seen | None = None
+        self.seen: ShownScene | None = None
 
     @property
     def lens(self) -> Lens | None:
@@ -117,7 +117,7 @@ class Stage:
         camera = upright_camera(wanted.camera, drawn.setup.staged.description.up)
         layer = drawn.drawing.layer
         overlay = _nothing() if layer is None or opacity == 0.0 else layer.moved_to(camera, opacity)
-        self.seen = Seen(overlay, camera, drawn.drawing, drawn.setup.staged, drawn.setup.brushes.occlusion)
+        self.seen = ShownScene(overlay, camera, drawn.drawing, drawn.setup.staged, drawn.setup.render_setup.occlusion)
         return overlay
 
     @property
@@ -138,14 +138,13 @@ class Stage:
         """Objects, then their shadow, in focus and at every pixel, as a camera (with its pose in the tracker's world) sees them now."""
         setup, wanted = self._thread.setup, self._wanted
         frame = upright_camera(camera, setup.staged.description.up)
-        layers = sharp_layers(setup.staged, wanted.time_s if wanted else 0.0, frame, setup.brushes)
-        occlusion = setup.brushes.occlusion
+        layers = sharp_layers(setup.staged, wanted.time_s if wanted else 0.0, frame, setup.render_setup)
+        occlusion = setup.render_setup.occlusion
         return layers if occlusion is None else [covered_by(layer, occlusion.matte(layer.depth_m, frame, frame)) for layer in layers]
 
-    def set_renderer(self, name: str, renderer: Renderer | None = None) -> None:
-        """Blur by another renderer from the next drawing on: a name of mrbokeh.renderers.choose, or a renderer that is there already."""
-        chosen = renderer or live_renderer(name)
-        self._thread.change(lambda setup: setup.with_renderer(name, chosen))
+    def set_renderer(self, name: str, renderer: Renderer) -> None:
+        """Blur with another renderer from the next drawing on. name: for the page."""
+        self._thread.change(lambda setup: setup.with_renderer(name, renderer))
 
     def move_object(self, name: str, position_m: Triple) -> None:
         """Stand an object elsewhere, in the tracker's world; until the scene file is written again. InputError for an unknown name."""

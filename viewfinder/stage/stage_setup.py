@@ -15,7 +15,7 @@ from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.staging.scene_file import read_scene_file
 from mrbokeh.scene.staging.staged_scene import Assets, StagedScene, modified_s
-from viewfinder.stage.drawing import Brushes
+from viewfinder.stage.drawing import RenderSetup
 from viewfinder.stage.occlusion import read_occlusion
 from viewfinder.stage.reprojection import LayerDepth
 
@@ -46,7 +46,7 @@ class StageSetup:
     """Two setups are the same only if they are one object. lens: of the scene file, None where it names none."""
 
     staged: StagedScene
-    brushes: Brushes
+    render_setup: RenderSetup
     renderer_name: str
     lens: Lens | None = None
 
@@ -54,7 +54,7 @@ class StageSetup:
         return replace(self, staged=staged)
 
     def with_renderer(self, name: str, renderer: Renderer) -> "StageSetup":
-        return replace(self, renderer_name=name, brushes=replace(self.brushes, renderer=renderer))
+        return replace(self, renderer_name=name, render_setup=replace(self.render_setup, renderer=renderer))
 
 
 LIVE_LAYERING = Layering(slices=8)
@@ -96,11 +96,11 @@ class SetupLoader:
         occlusion = read_occlusion(described.occlusion, described.up)
         lens = None if described.lens is None else read_lens(described.lens)
         if before is not None and before.staged.description.renderer == described.renderer:
-            name, renderer = before.renderer_name, before.brushes.renderer
+            name, renderer = before.renderer_name, before.render_setup.renderer
         else:
             name, renderer = described.renderer, live_renderer(described.renderer)
         backend = self._own_backend()
-        return StageSetup(staged, Brushes(backend, renderer, self._depth, occlusion, live_backend(backend)), name, lens)
+        return StageSetup(staged, RenderSetup(backend, renderer, self._depth, occlusion, live_backend(backend)), name, lens)
 
     def _own_backend(self) -> SceneRenderer:
         if self._backend is None:

@@ -1,4 +1,4 @@
-"""StillLayer: a finished virtual layer before a camera that does not move, blurred again beside the stream when the lens changes."""
+"""StaticLayer: a finished virtual layer before a camera that does not move, blurred again beside the stream when the lens changes."""
 
 import logging
 import time
@@ -12,11 +12,9 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.scene.staging.scene_description import Triple
 from mrbokeh.system.errors import InputError
 from viewfinder.frames import Bgr, Newest
 from viewfinder.stage.overlay_source import StageStatus
-from viewfinder.stage.stage_setup import live_renderer
 from viewfinder.tracking.tracker import TrackedPose
 
 # A third of the light that the darkest step of 8-bit sRGB needs: weaker traces of a blur cannot be seen in the stream.
@@ -33,8 +31,8 @@ class Blurred:
     at_s: float
 
 
-class StillLayer:
-    """A Scenery. Lenses that come while a blur is under way replace one another, so that the last one wins.
+class StaticLayer:
+    """A OverlaySource. Lenses that come while a blur is under way replace one another, so that the last one wins.
 
     sharp: the all-in-focus layer, in the size of the frames. `shown` is the newest finished blur. Picture and status are of the blur
     that `overlay` gave last, so that a blur finished while a frame is composited is told of with the next frame.
@@ -50,7 +48,7 @@ class StillLayer:
         self._stopping, self._busy = Event(), Event()
         self._problem: str | None = None
         self.shown = self._given = self._blurred(lens, renderer)
-        self._worker = Thread(target=self._work, name="still layer", daemon=True)
+        self._worker = Thread(target=self._work, name="static layer", daemon=True)
         self._worker.start()
 
     @property
@@ -92,14 +90,8 @@ class StillLayer:
     def sharp_layers(self, camera: Camera) -> list[Layer]:  # noqa: ARG002
         return [self.sharp]
 
-    def move_object(self, name: str, position_m: Triple) -> None:  # noqa: ARG002
-        raise InputError("a finished layer has no objects to move: start the viewfinder with --scene")
-
-    def show_object(self, name: str, visible: bool) -> None:  # noqa: ARG002
-        raise InputError("a finished layer has no objects to hide: start the viewfinder with --scene")
-
-    def set_renderer(self, name: str, renderer: Renderer | None = None) -> None:
-        self._renderer, self._renderer_name = renderer or live_renderer(name), name
+    def set_renderer(self, name: str, renderer: Renderer) -> None:
+        self._renderer, self._renderer_name = renderer, name
 
     def close(self) -> None:
         self._stopping.set()

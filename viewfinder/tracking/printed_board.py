@@ -136,7 +136,7 @@ _STEPS = 33
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """How a board is going to be seen: from nearest_m to farthest_m, in pictures width_px wide, elevation_deg above its plane."""
 
     lens: Lens
@@ -175,7 +175,7 @@ class BoardPlan:
     sentence: str
 
 
-def plan_board(view: View, paper: str = "a4") -> BoardPlan:
+def plan_board(view: BoardView, paper: str = "a4") -> BoardPlan:
     """A board for that paper; for the next larger one where its markers would be too small."""
     distances_m = [1.0 / float(each) for each in np.linspace(1.0 / view.farthest_m, 1.0 / view.nearest_m, _STEPS)]
     markers_mm = [view.needed_marker_mm(each) for each in distances_m]
