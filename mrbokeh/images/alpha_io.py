@@ -1,8 +1,6 @@
-"""The alpha of a plate: read from its file, and carried through to results that can hold it.
+"""Pictures with alpha in and out: the alpha of a plate, and finished pictures in a colour space that the user names.
 
-A finished picture into a file: in a colour space that the user names, with what says so in its header, and with alpha where it has one.
-
-EXR is premultiplied and states its primaries where they are known; PNG and TIFF hold straight colour, as their standards have it.
+EXR is premultiplied and states its primaries if they are known; PNG and TIFF hold straight colour, as their standards ask.
 """
 
 from pathlib import Path
@@ -23,7 +21,7 @@ Plane = Float32[np.ndarray, "height width"]
 
 
 def read_alpha(path: Path, orientation: int = AS_STORED) -> Plane | None:
-    """In [0, 1]; None where the file holds none, or is opaque everywhere. orientation: EXIF's, by which it comes upright."""
+    """Read alpha in [0, 1]; None if the file has none or is opaque everywhere. orientation: EXIF's number, by which it comes upright."""
     alpha = _stored(path)
     if alpha is None or (alpha >= 1.0).all():
         return None
@@ -31,22 +29,22 @@ def read_alpha(path: Path, orientation: int = AS_STORED) -> Plane | None:
 
 
 def stores_alpha(path: Path) -> bool:
-    """Whether the file holds alpha, be it opaque everywhere."""
+    """Return whether the file has an alpha channel, even if it is opaque everywhere."""
     return _stored(path) is not None
 
 
 def is_straight(path: Path) -> bool:
-    """Whether colour is stored as if opaque, as PNG and TIFF have it; that of EXR is multiplied by alpha already."""
+    """Return whether colour is stored unpremultiplied, as in PNG and TIFF; EXR is premultiplied."""
     return path.suffix.lower() in INTEGER_SUFFIXES
 
 
 def alpha_with(plate_alpha: Plane | None, virtual_alpha: Plane) -> Plane | None:
-    """Coverage of a plate with virtual light before it; None stays opaque."""
+    """Return the coverage of a plate behind virtual light; None stays opaque."""
     return None if plate_alpha is None else coverage_with(plate_alpha, virtual_alpha)
 
 
 def coverage_with(plate_alpha: Plane, virtual_alpha: Plane) -> Plane:
-    """Where nothing virtual is, it stays bit for bit."""
+    """Return the coverage of a plate behind virtual light, bit for bit the plate's own where nothing virtual is."""
     covered = np.clip(virtual_alpha, 0.0, 1.0)
     return np.asarray(covered + (1.0 - covered) * plate_alpha, np.float32)
 
@@ -71,9 +69,10 @@ _LARGEST_HALF = float(np.finfo(np.float16).max)
 
 
 def write_finished(path: Path, rgb: Picture, alpha: Plane | None = None, space: NamedSpace | None = None) -> None:
-    """rgb: linear Rec.709, premultiplied by alpha; None is opaque. space: None is linear Rec.709 in EXR and sRGB in integers.
+    """Write a finished picture in the format of its suffix.
 
-    JPEG holds no alpha: what it does not cover is black there.
+    rgb: linear Rec.709, premultiplied by alpha; None is opaque. space: None is linear Rec.709 in EXR and sRGB in integers.
+    JPEG has no alpha: uncovered pixels are black there.
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
@@ -85,20 +84,20 @@ def write_finished(path: Path, rgb: Picture, alpha: Plane | None = None, space: 
 
 
 def exr_part(rgb: Picture, alpha: Plane | None, space: NamedSpace | None) -> ExrPart:
-    """R, G, B and, where there is one, A in half, of numbers that are in the space already."""
+    """Return R, G, B and, if given, A in half floats; the numbers must be in the space already."""
     planes = {name: rgb[..., i] for i, name in enumerate("RGB")} | ({} if alpha is None else {"A": alpha})
     channels = {name: np.clip(plane, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16) for name, plane in planes.items()}
     return ExrPart(channels, attributes=stated(space))
 
 
 def stated(space: NamedSpace | None) -> dict[str, tuple[float, ...]]:
-    """What an EXR header says of a space: nothing where it is Rec.709, as EXR takes it, or its primaries are not known."""
+    """Return the header entries that state the primaries of a space; none for Rec.709, EXR's default, or unknown primaries."""
     primaries = None if space is None else space.primaries
     return {} if primaries is None else {ATTRIBUTE: primaries}
 
 
 def in_named_space(rgb: Picture, alpha: Plane | None, space: NamedSpace | None) -> Picture:
-    """Premultiplied before and after; curves are for straight colour, and light without coverage is lost under them."""
+    """Convert a premultiplied picture to a space, dividing by alpha first if the space has a curve; light without coverage is lost then."""
     if space is None:
         return rgb
     if alpha is None or space.is_linear:
@@ -107,11 +106,11 @@ def in_named_space(rgb: Picture, alpha: Plane | None, space: NamedSpace | None) 
 
 
 def straight(rgb: Picture, alpha: Plane) -> Picture:
-    """Colour divided by coverage; black where nothing is."""
+    """Return colour divided by coverage; black where nothing is covered."""
     return np.divide(rgb, alpha[..., None], out=np.zeros_like(rgb), where=alpha[..., None] > 0)
 
 
 def _write_with_alpha(path: Path, rgb: Picture, alpha: Plane, space: NamedSpace | None) -> None:
-    """16 bit, straight."""
+    """Write 16-bit straight colour with alpha."""
     codes = codes_of(rgb, np.uint16, "srgb") if space is None else codes_of(space.from_rec709(rgb), np.uint16, "linear")
     write_stored(path, np.dstack([codes, even_codes(alpha, np.uint16)]))

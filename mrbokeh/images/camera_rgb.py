@@ -26,20 +26,20 @@ _LARGEST_UNCOMPRESSED_BYTES = 32 * 2**20
 
 @dataclass(frozen=True)
 class SliceMasks:
-    """saturated: (H, W) light from a full photosite is in the pixel. valid: (H, W) the slice has data there."""
+    """Masks (H, W) of a slice. saturated: a full photosite contributed to the pixel. valid: the slice has data there."""
 
     saturated: Bool[np.ndarray, "height width"]
     valid: Bool[np.ndarray, "height width"]
 
 
 def matrix3x3(values: Float[np.ndarray, "3 3"] | Sequence[Sequence[float]]) -> Matrix3x3:
-    """A 3x3 matrix as nested tuples, which compare and go into JSON."""
+    """Return a 3x3 matrix as nested tuples, which compare and go into JSON."""
     first, second, third = (tuple(float(each) for each in row) for row in np.asarray(values, np.float64))
     return first, second, third  # type: ignore[return-value]
 
 
 def chromaticities(rec709_from_camera: Matrix3x3) -> tuple[float, ...] | None:
-    """CIE x, y of red, green, blue and white, as EXR's header wants them; None where a primary has none (its X + Y + Z is 0).
+    """Return CIE x, y of red, green, blue and white for EXR's header; None if a primary has none (its X + Y + Z is 0).
 
     Camera primaries are no real colours: x and y may lie outside the locus or be negative, which EXR allows.
     """
@@ -60,7 +60,7 @@ def write_camera_rgb(
     half: bool = True,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a slice or an all-in-focus picture, atomically. rec709_from_camera: None where the picture is Rec.709 already.
+    """Write a slice or an all-in-focus picture. rec709_from_camera: None if the picture is Rec.709 already.
 
     saturated: the share of each pixel that was full, 0 to 1. valid: where the slice has data. Masks that are None or say nothing are left
     out. Small pictures and floats are not compressed, which is nine times as quick to write as ZIP and five times to read. Large ones are
@@ -80,7 +80,7 @@ def write_camera_rgb(
 
 
 def _planes(rgb: Float[np.ndarray, "height width 3"], half: bool) -> tuple[Float[np.ndarray, "height width"], ...]:
-    """The channels apart."""
+    """Return the three channels as separate planes."""
     import cv2
 
     if not half or rgb.dtype != np.float16:
@@ -104,17 +104,17 @@ def single_of(values: Float16[np.ndarray, "*shape"], out: Float32[np.ndarray, "*
 
 
 def read_camera_rgb(path: Path) -> Float32[np.ndarray, "height width 3"]:
-    """The numbers as they are stored, in whatever RGB the file is."""
+    """Read the stored numbers, in whatever RGB the file is."""
     return read_exr(path)[0].stacked("RGB")
 
 
 def read_slice_masks(path: Path) -> SliceMasks:
-    """The masks of a slice; without layers none of it is saturated and all is valid."""
+    """Read the masks of a slice; without mask layers nothing is saturated and everything is valid."""
     return _masks_of(read_exr(path)[0])
 
 
 def read_slice(path: Path) -> tuple[Float32[np.ndarray, "height width 3"], SliceMasks]:
-    """The numbers of a slice as they are stored and its masks, from a file that is opened once."""
+    """Read the stored numbers of a slice and its masks, opening the file once."""
     part = read_exr(path)[0]
     return part.stacked("RGB"), _masks_of(part)
 
@@ -129,12 +129,12 @@ def _masks_of(part: ExrPart) -> SliceMasks:
 
 
 def write_masks(path: Path, masks: Mapping[str, Bool[np.ndarray, "height width"]]) -> None:
-    """Masks by name as layers mask.NAME (half float, 0 or 1) of one EXR file."""
+    """Write masks as layers mask.NAME (half float, 0 or 1) of one EXR file."""
     write_exr(path, ExrPart({MASK_PREFIX + name: mask.astype(np.float16) for name, mask in masks.items()}))
 
 
 def read_masks(path: Path) -> dict[str, Bool[np.ndarray, "height width"]]:
-    """The masks of a file by name; {} where there is no such file."""
+    """Read the masks of a file by name; {} if there is no such file."""
     if not path.is_file():
         return {}
     channels = read_exr(path)[0].channels

@@ -1,7 +1,4 @@
-"""Colour: transfer functions, primaries and the way to the display. Everything else works on scene-linear numbers.
-
-Scene-linear light as whole numbers of sRGB, by a table: the codes of `color.linear_to_srgb`, rounded, many times as fast.
-"""
+"""Colour: transfer functions, primaries, tone mapping, and sRGB codes by table. Everything else works on scene-linear numbers."""
 
 from functools import cache
 
@@ -18,29 +15,29 @@ _SHOULDER = 0.8
 
 
 def srgb_to_linear(encoded: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """sRGB-encoded values in [0, 1] to linear light (IEC 61966-2-1)."""
+    """Convert sRGB-encoded values in [0, 1] to linear light (IEC 61966-2-1)."""
     encoded = np.asarray(encoded, np.float32)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Linear light to sRGB-encoded values; the curve goes on above 1, negatives stay on its straight foot."""
+    """Convert linear light to sRGB-encoded values; the curve continues above 1, negatives stay on its straight foot."""
     linear = np.asarray(linear, np.float32)
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def luminance(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-    """Y of linear Rec.709."""
+    """Return Y of linear Rec.709."""
     return rgb @ XYZ_from_rec709[1].astype(rgb.dtype)
 
 
 def convert(rgb: Float[np.ndarray, "*batch 3"], target_from_source: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "*batch 3"]:
-    """Colours through a 3x3 matrix of primaries."""
+    """Apply a 3x3 matrix of primaries to colours."""
     return (rgb @ np.asarray(target_from_source, rgb.dtype).T).astype(np.float32)
 
 
 def tone_map(rgb: Float32[np.ndarray, "*shape"], exposure_stops: float = 0.0) -> Float32[np.ndarray, "*shape"]:
-    """Scene-linear to displayable linear in [0, 1]: identity up to 0.8, then highlights roll off towards 1."""
+    """Map scene-linear light to displayable light in [0, 1]: identity up to 0.8, then highlights roll off towards 1."""
     exposed = np.maximum(rgb * np.float32(2.0**exposure_stops), 0.0)
     room = 1.0 - _SHOULDER
     rolled_off = 1.0 - room * np.exp(-(exposed - _SHOULDER) / room)
@@ -48,7 +45,7 @@ def tone_map(rgb: Float32[np.ndarray, "*shape"], exposure_stops: float = 0.0) ->
 
 
 def display_rgb8(rgb: Float32[np.ndarray, "*batch 3"], exposure_stops: float = 0.0) -> UInt8[np.ndarray, "*batch 3"]:
-    """Scene-linear to 8-bit sRGB for people to look at."""
+    """Convert scene-linear light to 8-bit sRGB for people to look at."""
     return np.round(linear_to_srgb(tone_map(rgb, exposure_stops)) * 255.0).astype(np.uint8)
 
 
@@ -59,7 +56,7 @@ _ONE_BITS = 0x3F800000
 
 
 def srgb_codes(rgb: Float32[np.ndarray, "height width channels"], dtype: type) -> Shaped[np.ndarray, "height width channels"]:
-    """0 to 1 becomes 0 to the largest of dtype (uint8 or uint16); what is beyond is clipped, NaN is 0, inf the largest."""
+    """Encode linear light as sRGB integers (uint8 or uint16): 0 to 1 spans all codes, the rest is clipped, NaN is 0, inf the largest."""
     codes: np.ndarray = np.empty(rgb.shape, dtype)
     first, thresholds, most = _table(np.dtype(dtype))
 
@@ -77,14 +74,17 @@ def srgb_codes(rgb: Float32[np.ndarray, "height width channels"], dtype: type) -
 
 
 def plain_srgb_codes(linear: Float32[np.ndarray, "*shape"], dtype: type) -> Shaped[np.ndarray, "*shape"]:
-    """The slow twin."""
+    """Encode by formula: the slow reference from which the table of `srgb_codes` is built."""
     return np.round(np.clip(np.nan_to_num(linear_to_srgb(linear)), 0, 1) * np.iinfo(dtype).max).astype(dtype)
 
 
 @cache
 def _table(dtype: np.dtype) -> tuple[Shaped[np.ndarray, " cells"], Float32[np.ndarray, " codes"], int]:
-    """Return the code of the least value of each cell of floats from 0 to 1, the least value of each code's successor, infinite for the
-    last, and how many codes at most begin within a cell."""
+    """Return the lookup table of `srgb_codes`: the code of the least value of each cell of floats from 0 to 1, the least value of each
+    code's
+    code's
+    last, and how many codes at most begin within a cell.
+    """
     top = np.iinfo(dtype).max
     guess = srgb_to_linear(((np.arange(top) + 0.5) / top).astype(np.float32)).view(np.int32)
     low, high = guess - 256, guess + 256

@@ -1,4 +1,4 @@
-"""Colour spaces of other programs by name, through OpenColorIO 2 (extra `ocio`): plates in, pictures out.
+"""Colour spaces of other programs by name, through OpenColorIO 2 (extra `ocio`).
 
     to_ours = ColorConversion.of("aces", "ARRI LogC4", REC709_LINEAR)
     plate_rgb = to_ours.applied(decoded_rgb)
@@ -28,7 +28,7 @@ _NAMED = 5
 
 @dataclass(frozen=True)
 class ColorConversion:
-    """From one colour space of a configuration to another."""
+    """Conversion from one colour space of a configuration to another."""
 
     source: str
     target: str
@@ -48,7 +48,7 @@ class ColorConversion:
 
     @classmethod
     def to_rec709(cls, config: Path | str | None, source: str) -> "ColorConversion":
-        """From a space of the configuration to ours, linear Rec.709."""
+        """Open the conversion from a space of the configuration to linear Rec.709."""
         return cls.of(config, source, rec709_name(open_config(config)))
 
     @classmethod
@@ -57,13 +57,13 @@ class ColorConversion:
         return cls.of(config, rec709_name(open_config(config)), target)
 
     def applied(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
-        """A converted copy; the picture itself stays. Premultiplied pictures have to be divided by alpha before a curve, not a matrix."""
+        """Return a converted copy. A premultiplied picture must be divided by alpha before a curve, but not before a matrix."""
         copy = np.array(rgb, np.float32, order="C")
         self.apply(copy)
         return copy
 
     def apply(self, rgb: Float32[np.ndarray, "height width 3"]) -> None:
-        """In place, without a copy. Raises InputError where rows or pixels are not packed."""
+        """Convert in place. Raises InputError if rows or pixels are not contiguous."""
         if not rgb.flags.c_contiguous:
             raise InputError("a picture to be converted in place must lie packed in memory: use `applied`, or make it contiguous")
         if rgb.size:
@@ -72,7 +72,7 @@ class ColorConversion:
 
 @dataclass(frozen=True)
 class NamedSpace:
-    """A colour space by its name and its configuration, which can be pickled: opened by whoever uses it.
+    """Colour space by its name and its configuration; it can be pickled and is opened where it is used.
 
     config: as of ColorConversion.of, files as absolute paths. Premultiplied pictures may only go through spaces that are linear.
     """
@@ -82,7 +82,7 @@ class NamedSpace:
 
     @classmethod
     def of(cls, name: str, config: Path | str) -> "NamedSpace":
-        """Raises InputError where there is no such configuration, or none of its spaces has that name."""
+        """Return the space after a check. Raises InputError if the configuration or the space does not exist."""
         is_file = str(config) not in BUILT_IN and not str(config).startswith("ocio://")
         space = cls(name, str(Path(config).resolve()) if is_file else str(config))
         _require_known(open_config(space.config), name)
@@ -90,18 +90,18 @@ class NamedSpace:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """That of the configuration, where it is one."""
+        """Return the configuration's file, if it is one."""
         return (Path(self.config),) if Path(self.config).is_absolute() else ()
 
     @property
     def is_linear(self) -> bool:
-        """Whether twice the light is twice the number, as in ACEScg and unlike in camera curves and on displays."""
+        """Return whether twice the light is twice the number, as in ACEScg and unlike in camera curves and on displays."""
         once = np.array([[[0.05, 0.2, 0.3]]], np.float32)
         return bool(np.allclose(self.from_rec709(2 * once), 2 * self.from_rec709(once), rtol=1e-4))
 
     @property
     def primaries(self) -> tuple[float, ...] | None:
-        """CIE x, y of red, green, blue and white, to be stated in an EXR header.
+        """Return CIE x, y of red, green, blue and white for an EXR header.
 
         None of a space that is not linear, or whose primaries are none of those in `mrbokeh.images.exr_io`.
         """
@@ -110,11 +110,11 @@ class NamedSpace:
         return known_primaries(self.to_rec709(np.eye(3, dtype=np.float32)[None])[0].T.astype(np.float64))
 
     def to_rec709(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
-        """Numbers of this space as linear Rec.709."""
+        """Convert numbers of this space to linear Rec.709."""
         return _conversion(self.config, self.name, True).applied(rgb)
 
     def from_rec709(self, rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
-        """Linear Rec.709 as numbers of this space."""
+        """Convert linear Rec.709 to numbers of this space."""
         return _conversion(self.config, self.name, False).applied(rgb)
 
 
@@ -124,7 +124,7 @@ def _conversion(config: str, name: str, inwards: bool) -> ColorConversion:
 
 
 def open_config(config: Path | str | None) -> Any:
-    """An OpenColorIO configuration; opening the built-in ones takes a moment, so they are kept."""
+    """Open an OpenColorIO configuration, cached because the built-in ones take a moment."""
     if config is None:
         config = os.environ.get("OCIO", "")
         if not config:
@@ -135,7 +135,7 @@ def open_config(config: Path | str | None) -> Any:
 
 
 def rec709_name(opened: Any) -> str:
-    """What a configuration calls linear Rec.709. Raises InputError where it has none."""
+    """Return the configuration's name of linear Rec.709. Raises InputError if it has none."""
     for name in _OURS:
         if opened.getColorSpace(name) is not None:
             return name

@@ -1,9 +1,4 @@
-"""The tags in the header of a TIFF, whatever its pixels are.
-
-Which way up a picture is stored, as EXIF tells, and how it is brought upright.
-
-Whether a photograph was cut out of what its camera took: then it has another shape than its EXIF tells.
-"""
+"""What TIFF and EXIF tags say about a picture: which way up it is stored, and whether it was cropped since."""
 
 import struct
 import warnings
@@ -18,7 +13,7 @@ _HEADER_BYTES, _BIG_HEADER_BYTES, _BIG = 8, 16, 43
 
 
 def tiff_tags(path: Path) -> Mapping[int, Any]:
-    """By their numbers, of the first picture; none where the file is no TIFF or its header is damaged."""
+    """Read the tags of a TIFF's first picture by number; {} if the file is no TIFF or its header is damaged."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     try:
@@ -43,7 +38,7 @@ Picture = TypeVar("Picture", bound=np.ndarray)
 
 
 def stored_orientation(path: Path) -> int:
-    """EXIF's number, 1 to 8; AS_STORED where the file tells none."""
+    """Return EXIF's orientation, 1 to 8; AS_STORED if the file has none."""
     from PIL import Image, UnidentifiedImageError
 
     suffix = path.suffix.lower()
@@ -60,23 +55,23 @@ def stored_orientation(path: Path) -> int:
 
 
 def known_orientation(told: object) -> int:
-    """AS_STORED where it is none of EXIF's numbers."""
+    """Return the orientation if it is one of EXIF's numbers, else AS_STORED."""
     return told if isinstance(told, int) and told in _UPRIGHT else AS_STORED
 
 
 def quarter_turns(orientation: int) -> int:
-    """Counter-clockwise, that bring the stored picture upright."""
+    """Return how many counter-clockwise quarter turns bring the stored picture upright."""
     return _UPRIGHT[orientation][0]
 
 
 def upright(picture: Picture, orientation: int) -> Picture:
-    """A picture as it is stored, (H, W) or (H, W, channels): mirrored left to right where asked, then turned by quarters."""
+    """Turn a stored picture, (H, W) or (H, W, channels), upright: mirror it left to right if needed, then turn it by quarters."""
     turns, mirrored = _UPRIGHT[orientation]
     return np.ascontiguousarray(np.rot90(picture[:, ::-1] if mirrored else picture, turns))  # type: ignore[return-value]
 
 
 def as_stored(picture: Picture, orientation: int) -> Picture:
-    """The other way round."""
+    """Turn an upright picture back to how it is stored: the inverse of `upright`."""
     turns, mirrored = _UPRIGHT[orientation]
     turned = np.rot90(picture, -turns)
     return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)  # type: ignore[return-value]
@@ -89,20 +84,20 @@ _SAME_ASPECT = 0.01
 
 
 def as_it_lies(full_px: SizePx, size_px: SizePx) -> SizePx:
-    """The size of the whole, with its sides exchanged where the picture was turned by a quarter since."""
+    """Return the full size with its sides exchanged if the picture was turned by a quarter since."""
     turned = (size_px[0] < size_px[1]) != (full_px[0] < full_px[1])
     return full_px[::-1] if turned else full_px
 
 
 def is_same_shape(size_px: SizePx, full_px: SizePx) -> bool:
-    """To 1 %: sizes are rounded to pixels, and RAW shows a few more than the JPEG of its camera."""
+    """Return whether aspect ratios agree to 1 %: sizes are rounded, and RAW shows a few pixels more than the camera's JPEG."""
     return abs(size_px[0] / size_px[1] * full_px[1] / full_px[0] - 1.0) < _SAME_ASPECT
 
 
 def cut_from_px(size_px: SizePx, full_px: SizePx | None) -> SizePx | None:
-    """The size of the whole, or None where it is not known or the picture shows all of it.
+    """Return the full size that a picture was cropped from; None if that is unknown or the picture is whole.
 
-    What does not fit into the whole as it was taken was turned by a quarter since.
+    A picture that does not fit into the full size as taken has been turned by a quarter since.
     """
     if full_px is None or min(*full_px, *size_px) < 1:
         return None

@@ -1,7 +1,4 @@
-"""OpenEXR files: parts of named channels, half or float, to and from NumPy.
-
-What R, G and B of an EXR file mean: the attribute `chromaticities` of its header, and the way from there to linear Rec.709.
-"""
+"""OpenEXR files to and from NumPy: parts of named channels, half or float, and the primaries that a header states."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +17,7 @@ Channels = dict[str, Float[np.ndarray, "height width"]]
 
 @dataclass(frozen=True)
 class ExrPart:
-    """One picture of an EXR file.
+    """Picture of an EXR file: one part with its channels.
 
     channels: name to (H, W) float16 or float32, all of the size of the display window.
     attributes: further header entries: numbers, strings, and chromaticities (CIE x, y of red, green, blue and white).
@@ -43,7 +40,7 @@ class ExrPart:
 
 
 def read_exr(path: Path | str) -> list[ExrPart]:
-    """All flat parts of an EXR file; data windows are placed into their display windows, with 0 outside.
+    """Read all flat parts of an EXR file; data windows are placed into their display windows, with 0 outside.
 
     Raises InputError when the file is not EXR, is damaged or holds only deep parts.
     """
@@ -100,7 +97,7 @@ def _part_from_openexr(part: Any) -> ExrPart:
 
 
 def _placed(pixels: np.ndarray, size: tuple[int, ...], offset_y: int, offset_x: int) -> np.ndarray:
-    """A data window within its display window; what lies outside the display window is cut off."""
+    """Place a data window in its display window; pixels outside the display window are dropped."""
     if pixels.dtype == np.uint32:
         pixels = pixels.astype(np.float32)
     if pixels.shape == size and (offset_y, offset_x) == (0, 0):
@@ -139,7 +136,7 @@ _LARGEST_CONDITION = 1e4
 
 
 def stated_primaries(part: ExrPart, parts: Sequence[ExrPart] = ()) -> tuple[float, ...] | None:
-    """x, y of red, green, blue and white of one part; parts: the others of its file, with which EXR lets it share them."""
+    """Return the primaries (x, y of red, green, blue, white) that a part states. parts: others of its file, which may state them for it."""
     stated = (each.attributes.get(ATTRIBUTE) for each in (part, *parts))
     return next((each for each in stated if isinstance(each, tuple)), None)
 
@@ -147,7 +144,7 @@ def stated_primaries(part: ExrPart, parts: Sequence[ExrPart] = ()) -> tuple[floa
 def in_rec709(
     rgb: Float32[np.ndarray, "*batch 3"], primaries: tuple[float, ...] | None, path: Path | str
 ) -> Float32[np.ndarray, "*batch 3"]:
-    """Linear Rec.709 with D65 white. Primaries of Rec.709, or none, leave it as it is, and so do pixels that are NaN or infinite.
+    """Convert RGB of stated primaries to linear Rec.709 with D65 white; Rec.709, no primaries, NaN and infinite pixels stay as they are.
 
     path: the file, for the error. Raises InputError where the primaries are no colour space.
     """
@@ -166,7 +163,7 @@ def in_rec709(
 
 
 def rec709_from_chromaticities(chromaticities: Sequence[float]) -> Float64[np.ndarray, "3 3"] | None:
-    """Linear Rec.709 from RGB of stated primaries; rows sum to 1, for a white other than D65 is adapted to it (Bradford).
+    """Return the matrix to linear Rec.709 from RGB of stated primaries; a white other than D65 is adapted (Bradford), so rows sum to 1.
 
     chromaticities: CIE x, y of red, green, blue and white; they may lie outside of real colours, as those of cameras do.
     None where they are no colour space: primaries on one line, white without luminance.
@@ -182,7 +179,7 @@ def rec709_from_chromaticities(chromaticities: Sequence[float]) -> Float64[np.nd
 
 
 def known_primaries(rec709_from_rgb: Float64[np.ndarray, "3 3"]) -> tuple[float, ...] | None:
-    """Those of the public standards whose way to linear Rec.709 this matrix is; None where it is that of none of them."""
+    """Return the primaries of the public standard whose matrix to linear Rec.709 this is; None if it is none of them."""
     for primaries in (REC709, BT2020, AP0, AP1, P3_D65):
         if np.abs(_known(rec709_from_chromaticities(primaries)) - rec709_from_rgb).max() < _SAME_MATRIX:
             return primaries
@@ -190,7 +187,7 @@ def known_primaries(rec709_from_rgb: Float64[np.ndarray, "3 3"]) -> tuple[float,
 
 
 def _xyz_matrix(xy: Float[np.ndarray, "4 2"]) -> Float64[np.ndarray, "3 3"] | None:
-    """XYZ from RGB, whose primaries add up to a white of Y = 1 (OpenEXR, technical introduction). No primary's y divides: it may be 0."""
+    """Return XYZ from RGB, whose primaries add up to a white of Y = 1 (OpenEXR, technical introduction); a primary's y may be 0."""
     if not np.isfinite(xy).all() or xy[3, 1] <= 0:
         return None
     xyz = np.column_stack([xy, 1.0 - xy.sum(axis=1)]).T

@@ -1,13 +1,9 @@
 """Pictures and layers to and from scene-linear float32: HDR as it is, EXR from the primaries that it states, PNG, TIFF, JPEG and WebP
-through a stated encoding.
+through a stated encoding; and previews and contact sheets for people.
 
 WebP is read only: it keeps 8 bits, mostly lossily. HEIC is not read: what decodes it from Python brings x265 (GPL) or must be built.
 
-Files are written without stating primaries: EXR takes Rec.709 where none are stated, and kernels and maps of numbers have none.
-
-Refusing pictures whose numbers cannot be meant.
-
-A sheet of labelled pictures: one row per slice, one column per method.
+Files are written without stating primaries: EXR takes Rec.709 by default, and kernels and maps of numbers have none.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,16 +21,16 @@ from mrbokeh.system.errors import InputError
 
 
 def require_numbers(path: Path | str, planes: Mapping[str, np.ndarray]) -> None:
-    """Raises InputError where values are NaN; planes by what they hold."""
+    """Raise InputError if values are NaN. planes: arrays by what they hold."""
     for what, values in planes.items():
         if broken := int(np.isnan(values).sum()):
             raise InputError(f"{path}: {what} is NaN in {broken} place{'' if broken == 1 else 's'}: mend the render first")
 
 
 def require_depth_ahead(path: Path | str, name: str, stored: np.ndarray) -> None:
-    """Raises InputError where depth is negative and nowhere positive, as programs write it whose cameras look along -z.
+    """Raise InputError if depth is negative and nowhere positive, as written by programs whose cameras look along -z.
 
-    stored: of what is seen. 0 everywhere is fine: all is background.
+    stored: depths of visible pixels. All zeros are accepted: everything is background.
     """
     if (stored < 0).any() and not (stored > 0).any():
         raise InputError(
@@ -51,14 +47,14 @@ FONT_SCALE = 0.36
 
 @dataclass(frozen=True)
 class SheetRow:
-    """Pictures (H, W, 3), scene-linear, by their caption."""
+    """Row of a contact sheet: scene-linear pictures (H, W, 3) by caption."""
 
     label: str
     pictures: Mapping[str, Float32[np.ndarray, "height width 3"]]
 
 
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow]) -> None:
-    """An 8-bit PNG for people to look at; pictures wider than 320 px are made smaller."""
+    """Write rows of labelled pictures as an 8-bit PNG; pictures wider than 320 px are reduced."""
     write_stored(path, np.concatenate([_row(each) for each in rows], axis=0))
 
 
@@ -83,7 +79,7 @@ def _cell(caption: str, picture: Float32[np.ndarray, "height width 3"]) -> UInt8
 
 
 def _font_scale(caption: str, width_px: int) -> float:
-    """The usual one, or smaller, so that a caption does not run into the next."""
+    """Return the usual font scale, or a smaller one so that the caption does not run into the next."""
     import cv2
 
     (length_px, _), _ = cv2.getTextSize(caption, cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, 1)
@@ -102,7 +98,7 @@ _LONE_DEPTH_NAMES = (*_DEPTH_NAMES, "Y")
 
 
 def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
-    """A picture as scene-linear Rec.709 (H, W, 3); transparent pictures lose their alpha (see `read_layer`).
+    """Read a picture as scene-linear Rec.709 (H, W, 3), without its alpha (see `read_layer`).
 
     encoding: what the numbers of an integer file (PNG, TIFF, JPEG, WebP) mean; EXR, HDR and float TIFF are linear already. EXR of other
     primaries (ACES, the camera RGB of focal stacks) is converted; `read_camera_rgb` gives what is stored.
@@ -111,7 +107,7 @@ def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndar
 
 
 def require_suffix(path: Path | str, suffixes: tuple[str, ...], what: str) -> None:
-    """Said before the work, not after it. what: what would be written, such as "--sheet"."""
+    """Refuse a file name with another suffix before the work begins. what: the output's name in the message, such as "--sheet"."""
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"{what}: expected a name that ends in {' or '.join(suffixes)}, got {path}")
 
@@ -130,7 +126,7 @@ def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], enco
 
 
 def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR first") -> Float32[np.ndarray, "height width 3"]:
-    """A picture that is scene-linear as stored (EXR, HDR, float TIFF); a file of integers is refused, for it is encoded for display.
+    """Read a picture that is stored scene-linear (EXR, HDR, float TIFF); refuse integers, which are encoded for display.
 
     instead: what the error advises then.
     """
@@ -147,7 +143,7 @@ def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR fi
 
 
 def read_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
-    """Depth along the optical axis in metres from an EXR with Z, depth.Z or Y; inf and what is not above 0 is background (inf)."""
+    """Read depth in metres along the optical axis from an EXR with Z, depth.Z or Y; inf and values not above 0 are background (inf)."""
     channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
     name = next((name for name in _LONE_DEPTH_NAMES if name in channels), None)
     if name is None:
@@ -159,7 +155,7 @@ def read_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
 
 
 def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
-    """A layer from an EXR with R, G, B and, where present, A and Z (or depth.Z), in one part or several.
+    """Read a layer from an EXR with R, G, B and, if present, A and Z (or depth.Z), in one part or several.
 
     Without A the layer is opaque; without Z, and where Z is 0 or alpha is 0, the depth is inf. Of several views (stereo)
     it is the first that has colour, with its own depth. R, G, B become Rec.709 where the file states other primaries.
@@ -180,7 +176,7 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
 
 
 def write_layer(path: Path | str, layer: Layer, *, half: bool = True) -> None:
-    """A layer as EXR: R, G, B, A in half or float; Z (metres along the optical axis, not antialiased) and extra channels in float.
+    """Write a layer as EXR: R, G, B, A in half or float; Z (metres along the optical axis, not antialiased) and extra channels in float.
 
     An extra channel of one component keeps its name, others become NAME.0, NAME.1 and so on.
     """
@@ -210,5 +206,5 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
 
 
 def write_preview(path: Path | str, rgb: Float32[np.ndarray, "height width 3"], exposure_stops: float = 0.0) -> None:
-    """An 8-bit tone-mapped sRGB picture for people to look at."""
+    """Write an 8-bit tone-mapped sRGB picture for people to look at."""
     write_stored(path, display_rgb8(rgb, exposure_stops))

@@ -1,4 +1,4 @@
-"""How alike two pictures are: PSNR, SSIM, PSNR near depth edges, light that was lost, made or leaked, and how steadily a film changes."""
+"""Measures of how alike two pictures are: PSNR, SSIM, light that was lost, made or leaked, and flicker of a film."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ Image = Float[np.ndarray, "..."]
 
 
 def psnr(result: Image, truth: Image, peak: float = 1.0, mask: Bool[np.ndarray, "height width"] | None = None) -> float:
-    """Peak signal-to-noise ratio in dB; both pictures are clipped to [0, peak]. inf where they are equal.
+    """Return the peak signal-to-noise ratio in dB of pictures clipped to [0, peak]; inf if they are equal.
 
     mask: which pixels count, all where it is None.
     """
@@ -27,7 +27,7 @@ def psnr(result: Image, truth: Image, peak: float = 1.0, mask: Bool[np.ndarray, 
 
 
 def ssim(result: Image, truth: Image, peak: float = 1.0) -> float:
-    """Mean structural similarity (Wang et al. 2004: Gaussian window of 1.5 px, K1 0.01, K2 0.03), averaged over channels."""
+    """Return the mean structural similarity (Wang et al. 2004: Gaussian window of 1.5 px, K1 0.01, K2 0.03), averaged over channels."""
     from scipy.ndimage import gaussian_filter
 
     _require_same_shape(result, truth)
@@ -49,7 +49,7 @@ def ssim(result: Image, truth: Image, peak: float = 1.0) -> float:
 def depth_edge_mask(
     depth_m: Float[np.ndarray, "height width"], reach_px: int, least_step_dioptres: float = 0.05
 ) -> Bool[np.ndarray, "height width"]:
-    """Pixels within `reach_px` of a jump in depth, where occlusion decides the picture."""
+    """Return the pixels within `reach_px` of a jump in depth, where occlusion decides the picture."""
     from scipy.ndimage import binary_dilation, maximum_filter, minimum_filter
 
     dioptres = 1.0 / depth_m
@@ -58,16 +58,16 @@ def depth_edge_mask(
 
 
 def energy_ratio(result: Image, truth: Image) -> float:
-    """Light of the result over light of the truth, unclipped: 1 where nothing was lost or made."""
+    """Return the light of the result over the light of the truth, unclipped: 1 if nothing was lost or made."""
     _require_same_shape(result, truth)
     return float(result.astype(np.float64).sum() / truth.astype(np.float64).sum())
 
 
 def leak(result: Image, truth: Image, band: Bool[np.ndarray, "height width"]) -> float:
-    """Light that the result has too much within `band`, over the light of the truth there; both are clipped to [0, 1].
+    """Return the surplus light of the result within `band` over the light of the truth there; both are clipped to [0, 1].
 
-    0 where nothing leaked; what is missing does not make up for it. With a band on the sharp side of depth edges this is the
-    blur of one side that runs over the other. nan where the band is empty or black.
+    0 means that nothing leaked; missing light does not make up for it. With a band on the sharp side of depth edges this is the
+    blur of one side that runs over the other. nan if the band is empty or black.
     """
     _require_same_shape(result, truth)
     shown, expected = np.clip(result[band], 0, 1).astype(np.float64), np.clip(truth[band], 0, 1)
@@ -78,7 +78,7 @@ def leak(result: Image, truth: Image, band: Bool[np.ndarray, "height width"]) ->
 def light_error(
     result: Image, truth: Image, mask: Bool[np.ndarray, "height width"], saturated: Bool[np.ndarray, "height width"] | None = None
 ) -> float:
-    """Absolute differences over the light of the truth within `mask`, unclipped: 0 is perfect, 0.5 discs of half the light.
+    """Return absolute differences over the light of the truth within `mask`, unclipped: 0 is perfect, 0.5 discs of half the light.
 
     saturated: where the truth says only "at least that much", so that more is no error. nan where the mask is empty or black.
     """
@@ -91,7 +91,7 @@ def light_error(
 
 
 def flicker(frames: Sequence[Image], truth: Sequence[Image]) -> float:
-    """How much a film jumps that the true one does not: root mean square of the error of second differences in time, over 4.
+    """Return how much a film jumps that the true one does not: RMS error of second differences in time, over 4.
 
     An error that stays, or that grows evenly, scores 0; one that alternates by +a and -a from frame to frame scores a. All is
     clipped to [0, 1]. Raises InputError for fewer than three frames.

@@ -48,20 +48,20 @@ class Layer:
 
 
 def opaque(rgb: Float32[np.ndarray, "height width 3"], depth_m: Float32[np.ndarray, "height width"]) -> Layer:
-    """A layer without holes, such as a photograph with its depth map."""
+    """Return a layer without holes, such as a photograph with its depth map."""
     return Layer(rgb, np.ones_like(depth_m), depth_m)
 
 
 def clear(height_px: int, width_px: int) -> Layer:
-    """A layer in which nothing is: alpha 0, depth infinite."""
+    """Return an empty layer: alpha 0, depth infinite."""
     size = (height_px, width_px)
     return Layer(np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), np.full(size, np.inf, np.float32))
 
 
 def over(front: Layer, behind: Layer) -> Layer:
-    """Porter and Duff's "over" of premultiplied layers (Compositing Digital Images, 1984).
+    """Lay one premultiplied layer over another (Porter and Duff, Compositing Digital Images, 1984).
 
-    The depth is the front one wherever the front layer covers anything at all.
+    The depth is the front layer's wherever that covers anything at all.
     """
     shines_through = 1.0 - front.alpha
     return Layer(
@@ -76,7 +76,7 @@ def over(front: Layer, behind: Layer) -> Layer:
 
 
 def flatten(layers: Sequence[Layer]) -> Layer:
-    """All layers, front first, as one."""
+    """Merge layers, front first, into one."""
     if not layers:
         raise InputError("nothing to flatten: expected at least one layer, got none")
     result = layers[-1]

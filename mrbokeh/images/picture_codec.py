@@ -1,14 +1,8 @@
 """PNG, TIFF, JPEG, WebP and HDR files to and from the numbers that they store, and these to and from scene-linear light.
 
-Pixels of a TIFF as its file stores them.
-
-OpenCV turns a TIFF as its tag Orientation says, unlike pictures of other formats, and multiplies straight colour of 8 bits by alpha, as
-libtiff's reader of RGBA does; neither is wanted where files of all formats are to be treated alike. What it writes does not say what the
-fourth channel is.
-
-PNG files without what libpng would talk about: it writes its complaints to standard error itself, beside our one sentence.
-
-OpenCV without its own lines on standard error, while a file is decoded that may be damaged: what is wrong, we say.
+OpenCV turns a TIFF by its tag Orientation, unlike other formats, and multiplies straight 8-bit colour by alpha, as libtiff's RGBA
+reader does; both are undone here so that all formats are treated alike. PNG chunks that carry no pixels are dropped before decoding,
+because libpng writes its complaints about them to standard error.
 """
 
 import struct
@@ -34,7 +28,10 @@ _SHORT, _ENTRY_BYTES = 3, 12
 
 
 def tiff_as_stored(path: Path, decoded: np.ndarray) -> np.ndarray:
-    """decoded: by OpenCV, (H, W) or (H, W, 3 or 4) with blue first. Colour that is multiplied by alpha is divided by it, code by code."""
+    """Undo what OpenCV did to a TIFF: its orientation, and the multiplication by alpha.
+
+    decoded: by OpenCV, (H, W) or (H, W, 3 or 4), blue first. Colour that is stored multiplied by alpha is divided by it, code by code.
+    """
     tags = tiff_tags(path)
     extra = tags.get(_EXTRA_SAMPLES, ())
     has_alpha = decoded.ndim == 3 and decoded.shape[2] == 4 and len(extra) == 1
@@ -44,9 +41,9 @@ def tiff_as_stored(path: Path, decoded: np.ndarray) -> np.ndarray:
 
 
 def with_straight_alpha(encoded: bytes) -> bytes:
-    """A TIFF of four channels as OpenCV encodes it, whose header then says that the fourth is alpha, not multiplied into colour.
+    """Mark the fourth channel of a TIFF that OpenCV encoded as alpha that is not multiplied into colour.
 
-    The tags are written anew behind all else, for they stand in rising order. Other TIFFs come back as they are.
+    The tags are rewritten at the end of the file, because they stand in rising order. Other TIFFs come back as they are.
     """
     if encoded[:4] != b"II*\x00":
         return encoded
@@ -64,7 +61,7 @@ def with_straight_alpha(encoded: bytes) -> bytes:
 
 
 def _by_pillow(path: Path) -> np.ndarray:
-    """Turned as well, but not multiplied. From memory: Pillow 13 confuses rows and columns of a file that it maps and turns."""
+    """Decode a TIFF turned upright but not multiplied. From memory, as Pillow 13 confuses rows and columns of a mapped, turned file."""
     from PIL import Image
 
     with Image.open(BytesIO(path.read_bytes())) as picture:
@@ -72,7 +69,7 @@ def _by_pillow(path: Path) -> np.ndarray:
 
 
 def _divided(multiplied: np.ndarray) -> np.ndarray:
-    """Straight colour; what nothing covers is black."""
+    """Return straight colour; uncovered pixels are black."""
     top = 1.0 if multiplied.dtype.kind == "f" else float(np.iinfo(multiplied.dtype).max)
     alpha = multiplied[..., 3:].astype(np.float64)
     colour = np.divide(multiplied[..., :3] * top, alpha, out=np.zeros(multiplied[..., :3].shape), where=alpha > 0)
@@ -88,10 +85,10 @@ _OF_PIXELS = {b"IHDR", b"PLTE", b"tRNS", b"IDAT", _LAST}
 
 
 def without_chatter(data: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, " fewer"] | None:
-    """The chunks that say what the pixels are (PNG specification, third edition, section 5), or None where one is missing or damaged.
+    """Return the PNG chunks that define pixels (PNG specification, third edition, section 5); None if one is missing or damaged.
 
-    Profiles, comments and the like are left out: their numbers are not asked for here, and many are written wrongly. What is no PNG, or has
-    none of them, is returned as it is.
+    Profiles, comments and the like are dropped: they are not used here, and many are malformed. A file that is no PNG, or has none of
+    them, is returned as it is.
     """
     if data[: len(SIGNATURE)].tobytes() != SIGNATURE:
         return data
@@ -116,7 +113,10 @@ _state = {"inside": 0, "before": 0}
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """The level of OpenCV's log is one for all threads: the first in silences it, the last out restores it."""
+    """Silence OpenCV's log while a possibly damaged file is decoded.
+
+    The level is shared by all threads: the first in sets it, the last out restores it.
+    """
     from cv2.utils import logging
 
     with _lock:
@@ -140,9 +140,9 @@ _SWAPPED_BY_OPENCV = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float
 
 
 def stored_pixels(path: Path) -> np.ndarray:
-    """The numbers of a PNG, TIFF, JPEG, WebP or HDR file as they are stored: (H, W) or (H, W, 3 or 4) with blue first.
+    """Read the stored numbers of a PNG, TIFF, JPEG, WebP or HDR file: (H, W) or (H, W, 3 or 4), blue first.
 
-    Raises InputError where the file is empty or damaged.
+    Raises InputError if the file is empty or damaged.
     """
     import cv2
 
@@ -158,7 +158,7 @@ def stored_pixels(path: Path) -> np.ndarray:
 
 
 def stored_rgb(path: Path) -> Shaped[np.ndarray, "height width channels"]:
-    """The stored numbers as (H, W, 3 or 4), red first; grey is repeated."""
+    """Read the stored numbers as (H, W, 3 or 4), red first; grey is repeated."""
     import cv2
 
     pixels = stored_pixels(path)
@@ -171,7 +171,7 @@ def stored_rgb(path: Path) -> Shaped[np.ndarray, "height width channels"]:
 
 
 def write_stored(path: Path | str, pixels: Shaped[np.ndarray, "height width *channels"]) -> None:
-    """(H, W) or (H, W, 3 or 4) codes with red first, in the format of the suffix. Raises InputError where that does not hold them."""
+    """Write codes (H, W) or (H, W, 3 or 4), red first, in the format of the suffix. Raises InputError if it cannot hold them."""
     import cv2
 
     suffix = Path(path).suffix.lower()
@@ -188,7 +188,7 @@ def write_stored(path: Path | str, pixels: Shaped[np.ndarray, "height width *cha
 def linear_from_codes(
     codes: Shaped[np.ndarray, "height width channels"], encoding: Encoding, path: Path
 ) -> Float32[np.ndarray, "height width channels"]:
-    """Codes of 8 or 16 bits as scene-linear light; alpha, a fourth channel, is never curved. path: of the file, for the error."""
+    """Convert 8 or 16 bit codes to scene-linear light; alpha, the fourth channel, has no curve. path: the file, for the error."""
     if codes.dtype not in _INTEGER_RANGE:
         raise InputError(f"{path} stores {codes.dtype}: expected 8 or 16 bit integers or float")
     top = np.float32(_INTEGER_RANGE[codes.dtype])
@@ -201,17 +201,17 @@ def linear_from_codes(
 def _looked_up(
     table: Float32[np.ndarray, " codes"], codes: Shaped[np.ndarray, "height width channels"]
 ) -> Float32[np.ndarray, "height width channels"]:
-    """The entry of each code; by OpenCV for 8 bits, which its tables are for."""
+    """Return the table's entry of each code; OpenCV's LUT is for 8 bits."""
     import cv2
 
     return np.asarray(cv2.LUT(np.ascontiguousarray(codes), table)) if codes.dtype == np.uint8 else table[codes]
 
 
 def codes_of(rgb: Float32[np.ndarray, "height width 3"], dtype: type, encoding: Encoding) -> Shaped[np.ndarray, "height width 3"]:
-    """Codes of dtype (uint8 or uint16) of scene-linear light; 0 to 1 becomes 0 to the largest, what is beyond is clipped, NaN is 0."""
+    """Encode scene-linear light as uint8 or uint16: 0 to 1 spans all codes, the rest is clipped, NaN is 0."""
     return srgb_codes(rgb, dtype) if encoding == "srgb" else even_codes(rgb, dtype)
 
 
 def even_codes(values: Float[np.ndarray, "*shape"], dtype: type) -> Shaped[np.ndarray, "*shape"]:
-    """Codes at even steps, without a curve."""
+    """Encode values at even steps, without a curve."""
     return np.round(np.clip(np.nan_to_num(values), 0, 1) * np.iinfo(dtype).max).astype(dtype)

@@ -1,7 +1,4 @@
-"""Exact pixel coverage of a polygon: the area that every pixel shares with it.
-
-The table of mrbokeh.optics.drawn_diameters, looked up pixel by pixel without a branch so that it vectorises.
-"""
+"""Kernels of apertures, compiled: exact pixel coverage of polygons, and the lookup of drawn diameters."""
 
 import math
 
@@ -12,7 +9,7 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True)
 def _mean_ramp(t: float, low: float, high: float) -> float:
-    """Mean of max(0, t - x) for x spread evenly over [low, high]."""
+    """Return the mean of max(0, t - x) for x spread evenly over [low, high]."""
     if t <= low:
         return 0.0
     if t >= high:
@@ -66,7 +63,7 @@ def add_polygon_coverage(kernel: np.ndarray, steps: np.ndarray, outline: np.ndar
 
 @njit(cache=True, nogil=True)
 def _shown_diameter_px(diameter_px: float, unit_radius: float) -> float:
-    """`mrbokeh.optics.psf.shown_diameter_px` for one number."""
+    """Return `mrbokeh.optics.psf.shown_diameter_px` of one number."""
     size = abs(diameter_px)
     if size <= 1.0:
         return 0.0
@@ -98,7 +95,7 @@ def fill_psf(kernel: np.ndarray, steps: np.ndarray, vertices: np.ndarray, starts
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def look_up(drawn: np.ndarray, coc_px: np.ndarray, table: np.ndarray, steps_per_px: int) -> None:
-    """Signed diameters of float32; between two steps of the table linearly, beyond the last by the difference of its squares."""
+    """Look up signed float32 diameters: linear between two steps of the table, beyond the last by the difference of its squares."""
     last, steps = np.int32(len(table) - 1), np.float32(steps_per_px)
     widest = np.float32(last) / steps
     less = widest * widest - table[last] * table[last]

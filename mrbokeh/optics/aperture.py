@@ -64,12 +64,12 @@ class Aperture:
 
     @classmethod
     def disc(cls, sides: int = CIRCLE_SIDES) -> "Aperture":
-        """A round opening: a regular polygon with the area of the unit disc, so that it passes the same light."""
+        """Return a round opening: a regular polygon with the area of the unit disc, so that it passes the same light."""
         return cls((unit_disc(sides),), (1.0,))
 
     @classmethod
     def blades(cls, count: int, rotation_rad: float = 0.0, curvature: float = 0.0) -> "Aperture":
-        """An iris of `count` blades with its corners on the unit circle, the first at `rotation_rad` from x towards y.
+        """Return an iris of `count` blades with its corners on the unit circle, the first at `rotation_rad` from x towards y.
 
         curvature: 1 over the radius of the blades in pupil radii (McGraw Fig. 7 names the radius: 2.0, 1.5, 1.0 there are
         0.5, 0.67, 1 here). 0: straight, 1: the unit circle, negative: blades that bulge inwards.
@@ -78,35 +78,37 @@ class Aperture:
 
     @classmethod
     def ring(cls, inner: float) -> "Aperture":
-        """A disc whose inner part, `inner` (0 to below 1) of the diameter, is closed: a mirror lens, a doughnut."""
+        """Return a disc whose inner part, `inner` (0 to below 1) of the diameter, is closed: a mirror lens, a doughnut."""
         return cls.disc().obstructed(inner)
 
     @classmethod
     def star(cls, points: int = 5, inner: float = 0.4, rotation_rad: float = 0.0) -> "Aperture":
-        """Tips on the unit circle, the first one upwards (turned by `rotation_rad` from x towards y), notches at radius `inner`."""
+        """Return a star: tips on the unit circle, the first one upwards (turned by `rotation_rad` from x towards y), notches at radius
+        `inner`.
+        """
         return cls((aperture_shapes.star(points, inner, rotation_rad),), (1.0,))
 
     @classmethod
     def heart(cls) -> "Aperture":
-        """A heart, tip down behind the focus; the centroid of its light is the origin, its farthest point lies at radius 1."""
+        """Return a heart, tip down behind the focus; the centroid of its light is the origin, its farthest point lies at radius 1."""
         return cls((aperture_shapes.heart(),), (1.0,))
 
     @classmethod
     def from_picture(cls, transmission: Float[np.ndarray, "height width"], levels: int = 1) -> "Aperture":
-        """Traced from a picture (H, W), light where open, in `levels` steps of grey; see `aperture_shapes.from_picture`."""
+        """Trace an opening from a picture (H, W), light where open, in `levels` steps of grey; see `aperture_shapes.from_picture`."""
         return cls(*aperture_shapes.from_picture(transmission, levels))
 
     @classmethod
     def from_outline(cls, outline: str | Sequence[Sequence[float]] | Float64[np.ndarray, "points 2"]) -> "Aperture":
-        """From corners [[x, y], ...] or the `d` of an SVG path, y down; moved and scaled as a heart is."""
+        """Return an opening from corners [[x, y], ...] or the `d` of an SVG path, y down; moved and scaled as a heart is."""
         traced = aperture_shapes.from_svg_path(outline) if isinstance(outline, str) else aperture_shapes.from_points(outline)
         return cls(*traced)
 
     def obstructed(self, share: float) -> "Aperture":
-        """With a round stop in the middle, as the mirror of a catadioptric lens leaves it: points blur to rings.
+        """Return the opening with a round stop in the middle, like the mirror of a catadioptric lens: points blur to rings.
 
-        share: diameter of the stop over that of the unit pupil, 0 to below 1. Where the stop reaches beyond the
-        opening, only what it covers is taken away.
+        share: diameter of the stop over that of the unit pupil, 0 to below 1. If the stop reaches beyond the opening, only the covered part
+        is taken away.
         """
         if not 0.0 <= share < 1.0:
             raise InputError(f"a central obstruction is a share of the diameter from 0 to below 1, got {share}")
@@ -118,21 +120,21 @@ class Aperture:
         return replace(self, outlines=outlines, weights=weights)
 
     def rotated(self, angle_rad: float) -> "Aperture":
-        """Turned about the origin from x towards y: clockwise in the picture, behind the focus and in front."""
+        """Return the opening turned about the origin from x towards y: clockwise in the picture, behind the focus and in front."""
         if angle_rad == 0.0:
             return self
         turn = np.array([[np.cos(angle_rad), np.sin(angle_rad)], [-np.sin(angle_rad), np.cos(angle_rad)]])
         return replace(self, outlines=tuple(outline @ turn for outline in self.outlines))
 
     def squeezed(self, squeeze: float) -> "Aperture":
-        """An anamorphic lens of this squeeze: after desqueezing, blur is `squeeze` times as high as wide (x is divided by it)."""
+        """Return the opening of an anamorphic lens: after desqueezing, blur is `squeeze` times as high as wide (x is divided by it)."""
         if not (np.isfinite(squeeze) and squeeze > 0.0):
             raise InputError(f"an anamorphic squeeze is a positive number such as 1.33 or 2 (1: none), got {squeeze}")
         return self if squeeze == 1.0 else replace(self, outlines=tuple(outline / np.array([squeeze, 1.0]) for outline in self.outlines))
 
     @property
     def is_plain(self) -> bool:
-        """Whether all modifiers are neutral: the same weighted polygons everywhere and for every colour."""
+        """Return whether all modifiers are neutral: the same weighted polygons everywhere and for every colour."""
         return not (self.varies_over_field or self.is_chromatic or self.spherical_aberration)
 
     @property
@@ -144,12 +146,12 @@ class Aperture:
         return any(self.axial_chromatic) or any(self.lateral_chromatic)
 
     def channel_scale(self, side: int) -> PerColour:
-        """Factor on the circle of confusion of each colour; side: +1 behind the focus, -1 in front."""
+        """Return the factor on the circle of confusion of each colour; side: +1 behind the focus, -1 in front."""
         red, green, blue = (1.0 + _sign(side) * share for share in self.axial_chromatic)
         return red, green, blue
 
     def seen(self, side: int, field_xy: tuple[float, float] = (0.0, 0.0), channel: int | None = None) -> "Aperture":
-        """The plain aperture that a point sees; it still has to be mirrored in front of the focus, as ever.
+        """Return the plain aperture that a point sees; in front of the focus it still has to be mirrored.
 
         side: +1 behind the focus, -1 in front. field_xy: place in the frame, in half diagonals. channel: 0, 1, 2 for red,
         green, blue; None for no colour (without lateral_chromatic). The result is kept, and is `self` where self is plain.
@@ -169,7 +171,7 @@ class Aperture:
         return self._seen[key]
 
     def _without_colour(self, side: int, field_xy: tuple[float, float]) -> "Aperture":
-        """First the weight over the pupil, then the rim that cuts it."""
+        """Apply the weight over the pupil, then the rim that cuts it."""
         opening = (self.outlines, self.weights)
         if self.spherical_aberration:
             opening = radially_weighted(opening, side * self.spherical_aberration)
@@ -181,18 +183,18 @@ class Aperture:
 
     @property
     def unit_radius(self) -> float:
-        """Distance of the farthest vertex from the centre of the pupil, before any modifier."""
+        """Return the distance of the farthest vertex from the centre of the pupil, before any modifier."""
         return max(float(np.hypot(*outline.T).max()) for outline in self.outlines)
 
     def packed(self) -> tuple[Float64[np.ndarray, "vertices 2"], np.ndarray, Float64[np.ndarray, " outlines"]]:
-        """(vertices of all outlines, where each starts, weights), the form that compiled code takes; of a plain aperture."""
+        """Return (vertices of all outlines, where each starts, weights) of a plain aperture, the form that compiled code takes."""
         if not self.is_plain:
             raise InputError("this aperture changes over the frame, the side of the focus or the colours: ask for what a point has `seen`")
         starts = np.cumsum([0, *(len(outline) for outline in self.outlines)])
         return np.concatenate(self.outlines), starts, np.asarray(self.weights, np.float64)
 
     def rasterize(self, diameter_px: float) -> Psf:
-        """The PSF at a signed diameter with exact area coverage, sum 1; up to one pixel it is the identity.
+        """Return the PSF at a signed diameter with exact area coverage, sum 1; up to one pixel it is the identity.
 
         Openings within the unit circle are the identity up to one pixel by themselves. Those that reach beyond (see
         `mrbokeh.optics.psf.shown_diameter_px`) grow out of it a little faster, so that nothing jumps. An aperture that is not

@@ -1,12 +1,11 @@
-"""Outlines of openings: regular polygons, curved blades, stars, hearts, and shapes traced from pictures and SVG paths.
+"""Outlines of openings: regular polygons, curved blades, stars, hearts, shapes traced from pictures and SVG paths, and what clips them.
 
 All lie in the unit pupil, x right, y down, as the blur of a far light shows them in an upright picture. Shapes without a
 centre of their own (hearts, pictures, paths) are `settled`: the centroid of their light, that is of their weighted area,
 lies at the origin and their farthest point at radius 1, so that a blurred point stays in place.
 
-What changes an opening with the place in the frame and the side of the focus, worked out on weighted polygons.
-
-Where a modifier leaves an outline untouched, the very same array comes back. Boolean work is Shapely's.
+Modifiers (a rim that clips, weights over the pupil) work on weighted polygons; an outline that a modifier leaves untouched comes back
+as the very same array. Boolean operations are Shapely's.
 """
 
 import math
@@ -33,18 +32,18 @@ _CURVE_TOLERANCE = 5e-4  # of the extent of an SVG path
 
 
 def regular_polygon(sides: int, rotation_rad: float = 0.0) -> Float64[np.ndarray, "sides 2"]:
-    """Corners on the unit circle, the first one on the x axis turned by `rotation_rad` (from x to y)."""
+    """Return corners on the unit circle, the first one on the x axis turned by `rotation_rad` (from x to y)."""
     angles_rad = rotation_rad + 2.0 * np.pi * np.arange(sides) / sides
     return np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=1)
 
 
 def unit_disc(sides: int = CIRCLE_SIDES) -> Float64[np.ndarray, "sides 2"]:
-    """The regular polygon that has the area of the unit disc, so that it passes the same light."""
+    """Return the regular polygon that has the area of the unit disc, so that it passes the same light."""
     return regular_polygon(sides) * np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
 
 
 def blades(count: int, rotation_rad: float = 0.0, curvature: float = 0.0) -> Float64[np.ndarray, "vertices 2"]:
-    """An iris; see `mrbokeh.optics.aperture.Aperture.blades`."""
+    """Return an iris; see `mrbokeh.optics.aperture.Aperture.blades`."""
     if count < 3:
         raise InputError(f"an iris needs at least 3 blades, got {count}")
     corners = regular_polygon(count, rotation_rad)
@@ -52,7 +51,7 @@ def blades(count: int, rotation_rad: float = 0.0, curvature: float = 0.0) -> Flo
 
 
 def _with_arcs(corners: Float64[np.ndarray, "corners 2"], curvature: float) -> Float64[np.ndarray, "vertices 2"]:
-    """Arcs of radius 1 / |curvature| from corner to corner of a regular polygon, at 1 as finely cut as a disc is."""
+    """Return arcs of radius 1 / |curvature| from corner to corner of a regular polygon, at 1 as finely cut as a disc is."""
     half_angle_rad = np.pi / len(corners)
     bow_rad = np.arcsin(np.clip(curvature, -1.0, 1.0) * np.sin(half_angle_rad))
     if not abs(curvature) <= 1.0 or -bow_rad > 0.5 * np.pi - half_angle_rad + 1e-9:
@@ -72,7 +71,7 @@ def _with_arcs(corners: Float64[np.ndarray, "corners 2"], curvature: float) -> F
 
 
 def star(points: int, inner: float, rotation_rad: float = 0.0) -> Float64[np.ndarray, "vertices 2"]:
-    """Tips on the unit circle, the first one upwards (turned by `rotation_rad` from x to y), notches at radius `inner`."""
+    """Return a star: tips on the unit circle, the first one upwards (turned by `rotation_rad` from x to y), notches at radius `inner`."""
     if points < 3 or not 0.0 < inner <= 1.0:
         raise InputError(f"a star needs at least 3 points and an inner radius above 0 and up to 1, got {points} and {inner}")
     corners = regular_polygon(2 * points, rotation_rad - 0.5 * np.pi)
@@ -81,14 +80,14 @@ def star(points: int, inner: float, rotation_rad: float = 0.0) -> Float64[np.nda
 
 
 def heart() -> Outline:
-    """x = 16 sin^3 t, y = 13 cos t - 5 cos 2t - 2 cos 3t - cos 4t (area 180 pi), tip down, settled."""
+    """Return x = 16 sin^3 t, y = 13 cos t - 5 cos 2t - 2 cos 3t - cos 4t (area 180 pi), tip down, settled."""
     t = 2.0 * np.pi * np.arange(HEART_SIDES) / HEART_SIDES
     up = 13.0 * np.cos(t) - 5.0 * np.cos(2.0 * t) - 2.0 * np.cos(3.0 * t) - np.cos(4.0 * t)
     return settled(((np.stack([16.0 * np.sin(t) ** 3, -up], axis=1),), (1.0,)))[0][0]
 
 
 def from_picture(transmission: Float[np.ndarray, "height width"], levels: int = 1) -> WeightedOutlines:
-    """Outlines of the light parts of a picture, settled; holes have negative weights.
+    """Trace outlines of the light parts of a picture, settled; holes have negative weights.
 
     transmission: (H, W), any scale; the largest value passes all light, 0 none, and nothing passes beyond the picture.
     levels: 1 traces the contour at half of the largest value; n stacks n contours at (k - 1/2) / n, each of weight 1 / n,
@@ -117,7 +116,7 @@ def from_picture(transmission: Float[np.ndarray, "height width"], levels: int = 
 
 
 def from_points(points: Sequence[Sequence[float]] | Outline) -> WeightedOutlines:
-    """A closed outline from its corners, in any unit, settled; where it crosses itself the even-odd rule holds."""
+    """Return a closed outline from its corners, in any unit, settled; if it crosses itself the even-odd rule holds."""
     corners = np.asarray(points, np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise InputError(f"an outline is a list of at least 3 points [x, y], got an array of shape {corners.shape}")
@@ -125,7 +124,7 @@ def from_points(points: Sequence[Sequence[float]] | Outline) -> WeightedOutlines
 
 
 def from_svg_path(path: str) -> WeightedOutlines:
-    """The area of an SVG path (its `d` attribute, all commands, y down), settled; overlapping parts follow the even-odd rule."""
+    """Return the area of an SVG path (its `d` attribute, all commands, y down), settled; overlapping parts follow the even-odd rule."""
     from fontTools.pens.recordingPen import RecordingPen
     from fontTools.svgLib.path import parse_path
 
@@ -146,7 +145,7 @@ def from_svg_path(path: str) -> WeightedOutlines:
 
 
 def _bezier_points(controls: Float64[np.ndarray, "controls 2"], tolerance: float) -> Float64[np.ndarray, "points 2"]:
-    """Points on a straight, quadratic or cubic Bezier curve after its start, so dense that chords stay within `tolerance`.
+    """Return points on a straight, quadratic or cubic Bezier curve after its start, so dense that chords stay within `tolerance`.
 
     A chord over 1/n of the parameter strays by at most max|B''| / (8 n^2), and |B''| by degree (degree - 1) times the
     largest second difference of the control points.
@@ -171,7 +170,7 @@ def _even_odd(rings: Sequence[Outline]) -> WeightedOutlines:
 
 
 def settled(opening: WeightedOutlines) -> WeightedOutlines:
-    """Moved and scaled so that the centroid of light is the origin and the farthest point lies at radius 1."""
+    """Move and scale an opening so that the centroid of light is the origin and the farthest point lies at radius 1."""
     if not opening[0] or not net_area(opening) > 0.0:
         raise InputError("expected an outline that encloses an area, but this one encloses none")
     middle = centroid(opening)
@@ -180,7 +179,7 @@ def settled(opening: WeightedOutlines) -> WeightedOutlines:
 
 
 def outlines_of(geometry: "Geometry", weight: float = 1.0) -> WeightedOutlines:
-    """The polygons of a Shapely geometry: outer rings with `weight`, holes with its negative; lines and specks are left out."""
+    """Return the polygons of a Shapely geometry: outer rings with `weight`, holes with its negative; lines and specks are left out."""
     from shapely import Polygon, get_parts
 
     outlines: list[Outline] = []
@@ -195,18 +194,18 @@ def outlines_of(geometry: "Geometry", weight: float = 1.0) -> WeightedOutlines:
 
 
 def net_area(opening: WeightedOutlines) -> float:
-    """Weighted sum of areas: the light that passes, in units in which the unit disc passes pi."""
+    """Return the weighted sum of areas: the light that passes, where the unit disc passes pi."""
     return sum(weight * area(outline) for outline, weight in zip(*opening, strict=True))
 
 
 def area(outline: Outline) -> float:
-    """By the shoelace formula; the direction of winding does not matter."""
+    """Return the area by the shoelace formula; the winding direction does not matter."""
     x, y = outline.T
     return 0.5 * abs(float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)))
 
 
 def centroid(opening: WeightedOutlines) -> Float64[np.ndarray, "2"]:
-    """The centroid of light: of the weighted area, not of the vertices."""
+    """Return the centroid of light: of the weighted area, not of the vertices."""
     moment = np.zeros(2)
     for outline, weight in zip(*opening, strict=True):
         following = np.roll(outline, -1, axis=0)
@@ -221,7 +220,7 @@ _RIM_TOLERANCE = 1e-3
 
 
 def clipped(outline: Outline, clip: Outline, weight: float = 1.0) -> WeightedOutlines:
-    """What of an outline lies within the convex outline `clip`, in as many parts as that leaves, each with `weight`."""
+    """Return the parts of an outline within the convex outline `clip`, each with `weight`."""
     from shapely import Polygon
 
     whole, window = Polygon(outline), Polygon(clip)
@@ -233,7 +232,7 @@ def clipped(outline: Outline, clip: Outline, weight: float = 1.0) -> WeightedOut
 
 
 def clipped_by_rim(opening: WeightedOutlines, centre_xy: tuple[float, float]) -> WeightedOutlines:
-    """Cat-eye: the part of the opening that is seen through a round rim of radius 1 about `centre_xy`.
+    """Return the part of the opening that is seen through a round rim of radius 1 about `centre_xy`: a cat-eye.
 
     Outlines that reach beyond the rim by less than its own polygon strays from a circle are left as they are.
     """
@@ -250,7 +249,7 @@ def joined(parts: list[WeightedOutlines]) -> WeightedOutlines:
 
 
 def radially_weighted(opening: WeightedOutlines, strength: float) -> WeightedOutlines:
-    """Spherical aberration: light weighted by 1 + strength (2 rho^2 - 1), rho the distance from the centre of the pupil.
+    """Weight light by 1 + strength (2 rho^2 - 1), rho the distance from the centre of the pupil: spherical aberration.
 
     strength: -1 (rim dark) to 1 (centre dark). The mean over the unit disc is 1, whatever the strength. The weight is
     constant within concentric zones of equal area and equals the formula in the middle of each (in rho^2); there are as
@@ -267,7 +266,7 @@ def radially_weighted(opening: WeightedOutlines, strength: float) -> WeightedOut
 
 
 def _without_repeats(opening: WeightedOutlines) -> WeightedOutlines:
-    """Equal outlines as one with the sum of their weights; the discs inside the hole of a ring cancel."""
+    """Merge equal outlines and add their weights; the discs inside the hole of a ring cancel."""
     total: dict[bytes, tuple[Outline, float]] = {}
     for outline, weight in zip(*opening, strict=True):
         before = total.get(outline.tobytes(), (outline, 0.0))[1]

@@ -1,11 +1,4 @@
-"""Camera: an undistorted pinhole with a pose; where world points land in the picture and back.
-
-Where pixels lie in the frame: x right, y down from its middle, in half diagonals (CONVENTIONS, "Field position").
-
-A Camera as JSON.
-
-A level plane, such as the ground or a table, as a camera sees it. Up is -y.
-"""
+"""Camera: an undistorted pinhole with a pose, where world points land in the picture and back, and its JSON."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +12,7 @@ from mrbokeh.system.errors import InputError
 def field_positions(
     size_px: tuple[int, int], frame_px: tuple[int, int] | None = None, origin_px: tuple[int, int] = (0, 0)
 ) -> Float32[np.ndarray, "height width 2"]:
-    """(H, W, 2): (x, y) of the centre of every pixel; length 1 is reached in the corner of a corner pixel.
+    """Return (H, W, 2) field positions (x, y) of pixel centres in half diagonals; length 1 is reached in the corner of a corner pixel.
 
     size_px: (height, width) of the part wanted, whose top left pixel is origin_px (row, column) of a frame of frame_px (height, width);
     None: the part is the whole frame.
@@ -62,25 +55,25 @@ class Camera:
         return np.linalg.inv(self.camera_from_world)
 
     def project(self, points_m: Float[np.ndarray, "*batch 3"]) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
-        """World points to (pixel positions, depth in metres along the optical axis)."""
+        """Project world points to (pixel positions, depth in metres along the optical axis)."""
         in_camera = points_m @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
         depth_m = in_camera[..., 2]
         return in_camera[..., :2] / depth_m[..., None] * self.focal_px + self.principal_px, depth_m
 
     def unproject(self, xy_px: Float[np.ndarray, "*batch 2"], depth_m: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3"]:
-        """Pixel positions at a depth (metres along the optical axis) to world points: the inverse of `project`."""
+        """Return the world points of pixel positions at a depth (metres along the optical axis): the inverse of `project`."""
         plane = (xy_px - np.asarray(self.principal_px)) / np.asarray(self.focal_px)
         in_camera = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1) * depth_m[..., None]
         world_from_camera = self.world_from_camera
         return in_camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
 
     def pixel_centres_px(self) -> Float[np.ndarray, "height width 2"]:
-        """(H, W, 2): the x, y position of each pixel's centre."""
+        """Return (H, W, 2): the x, y position of each pixel's centre."""
         x, y = np.meshgrid(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
         return np.stack([x, y], axis=-1)
 
     def resized(self, width_px: int, height_px: int) -> "Camera":
-        """The same view sampled with another number of pixels."""
+        """Return the same view sampled with another number of pixels."""
         scale = np.array([width_px / self.width_px, height_px / self.height_px])
         fx, fy = np.asarray(self.focal_px) * scale
         cx, cy = np.asarray(self.principal_px) * scale
@@ -88,7 +81,7 @@ class Camera:
 
 
 def have_same_shape(size_px: tuple[int, int], other_px: tuple[int, int], within: float = _SAME_SHAPE) -> bool:
-    """Whether (width, height) of two pictures are of one shape, up to the rounding to whole or even pixels."""
+    """Return whether two pictures (width, height) have one aspect ratio, up to rounding to whole or even pixels."""
     return abs(size_px[0] * other_px[1] / (size_px[1] * other_px[0]) - 1.0) <= within
 
 
@@ -112,9 +105,9 @@ def camera_from_json(document: dict[str, Any], where: str = "camera") -> Camera:
 
 
 def level_plane_dioptres(camera: Camera, y_m: float = 0.0) -> Float32[np.ndarray, "height width"]:
-    """(H, W): 1 / depth along the optical axis of the plane y = y_m of the world at every pixel; 0 where it is not seen.
+    """Return (H, W) 1 / depth along the optical axis of the world plane y = y_m at every pixel; 0 where it is not seen.
 
-    On a plane it is linear in the pixel's position, so that it is finite up to the horizon and beyond. The pose turns as it likes.
+    Up is -y. On a plane 1 / depth is linear in the pixel's position, so it is finite up to the horizon and beyond. Any pose is allowed.
     """
     turn, eye_y_m = camera.world_from_camera[1, :3], float(camera.world_from_camera[1, 3])
     below_m = y_m - eye_y_m

@@ -1,4 +1,4 @@
-"""The diameters at which kernels are drawn, so that they blur a picture of pixels as much as the lens blurs the scene.
+"""Diameters at which kernels are drawn, so that they blur a picture of pixels as much as the lens blurs the scene.
 
 A kernel holds the share of an opening that lies in each pixel, and a pixel of the sharp picture is a mean over its area already. That
 area would count twice: a disc drawn at 2 px blurs as one of 2.3 px does. Kernels are drawn at the diameter at which they pass an edge
@@ -33,7 +33,7 @@ _EVEN = np.hanning(17)[1:-1]
 
 
 def drawn_diameters_px(coc_px: Plane, aperture: Aperture) -> Plane:
-    """(H, W) signed diameters to draw for blur of diameters coc_px; in the same order, and of the same sign.
+    """Return (H, W) signed diameters to draw for blur of diameters coc_px, in the same order and of the same sign.
 
     An aperture that changes over the frame, with the side of the focus or with the colour is taken as in the middle of the frame, behind
     the focus, without colour.
@@ -47,7 +47,7 @@ def drawn_diameters_px(coc_px: Plane, aperture: Aperture) -> Plane:
 
 @lru_cache(maxsize=64)
 def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
-    """Diameters that are drawn for 0, 1 / STEPS_PER_PX, ... px of blur; the last one says how it goes on."""
+    """Return the diameters to draw for 0, 1 / STEPS_PER_PX, ... px of blur; the last one determines how it continues."""
     steps_px = np.arange(_WIDEST_PX * STEPS_PER_PX + 1.0) / STEPS_PER_PX
     off = _distances(_drawn_transfers(aperture), _transfers(aperture))
     meant = np.maximum.accumulate([_lowest(_BLURS_PX, row) for row in off]) + _RISE * _DRAWN_PX
@@ -57,13 +57,13 @@ def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
 
 
 def _distances(one: Transfers, other: Transfers) -> Float[np.ndarray, "ones others"]:
-    """(ones, others) squared and weighted."""
+    """Return (ones, others) squared weighted distances."""
     weights = np.tile(_WEIGHTS, 2)
     return np.stack([((row - other) ** 2) @ weights for row in one])
 
 
 def _lowest(places: Float[np.ndarray, " places"], values: Float[np.ndarray, " places"]) -> float:
-    """Of the parabola through the lowest value and its neighbours."""
+    """Return the minimum of the parabola through the lowest value and its neighbours."""
     middle = int(np.clip(np.argmin(values), 1, len(values) - 2))
     before, here, after = values[middle - 1 : middle + 2]
     bend = before - 2.0 * here + after
@@ -76,13 +76,13 @@ def _drawn_transfers(aperture: Aperture) -> Transfers:
 
 
 def _transfers(aperture: Aperture) -> Transfers:
-    """Of blur itself: a kernel so large that its pixels do not matter, made smaller."""
+    """Return the transfer of blur itself: a kernel so large that its pixels do not matter, scaled down."""
     fine = aperture.rasterize(_FINE_PX).kernel
     return _transfer(fine, np.multiply.outer(_BLURS_PX / _FINE_PX, _FREQUENCIES))
 
 
 def _transfer(kernel: Float[np.ndarray, "size size"], frequencies: Float[np.ndarray, "*batch values"]) -> Float[np.ndarray, "*batch _"]:
-    """Cosine parts along x and along y, in cycles per pixel."""
+    """Return cosine parts along x and along y; frequencies in cycles per pixel."""
     along = np.arange(len(kernel)) - len(kernel) // 2
     waves = np.cos(2.0 * np.pi * frequencies[..., None] * along)
     return np.concatenate([waves @ kernel.sum(axis=0), waves @ kernel.sum(axis=1)], axis=-1)

@@ -1,7 +1,4 @@
-"""Lens: the thin lens that tells how large a point's blur is; the only place where millimetres meet metres.
-
-Focus distances as cameras state them, from the film plane, counted from the lens.
-"""
+"""Lens: the thin lens that tells how large a point's blur is; the only place where millimetres meet metres."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -18,7 +15,7 @@ _STEEPEST_TILT_RAD = np.pi / 4
 
 @dataclass(frozen=True)
 class Lens:
-    """A thin lens focused at a distance, in front of a sensor.
+    """Thin lens focused at a distance, in front of a sensor.
 
     focus_distance_m: from the lens (front principal plane) to the plane in focus, along the axis of the camera (the
       normal of the sensor through the lens); inf is allowed.
@@ -64,7 +61,7 @@ class Lens:
 
     @property
     def has_flat_focus(self) -> bool:
-        """Whether one depth is in focus over the whole picture."""
+        """Return whether one depth is in focus over the whole picture."""
         return not any(self.tilt_rad) and bool(np.isinf(self.petzval_radius_mm))
 
     @property
@@ -73,12 +70,12 @@ class Lens:
 
     @property
     def image_distance_mm(self) -> float:
-        """Lens to sensor along the camera's axis; from the thin-lens equation f d_f / (d_f - f), see `focus_dioptres` for a tilt."""
+        """Return the distance from lens to sensor along the camera's axis, f d_f / (d_f - f); see `focus_dioptres` for a tilt."""
         return self.focal_length_mm / (self._lens_axis[2] - self.focal_length_mm / (self.focus_distance_m * MM_PER_M))
 
     @property
     def _lens_axis(self) -> tuple[float, float, float]:
-        """Unit vector along the axis of the lens in camera axes (x right, y down, z forward)."""
+        """Return the unit vector along the axis of the lens in camera axes (x right, y down, z forward)."""
         if not any(self.tilt_rad):
             return 0.0, 0.0, 1.0
         x, y = np.tan(self.tilt_rad)
@@ -89,7 +86,7 @@ class Lens:
         return replace(self, focus_distance_m=float(focus_distance_m))
 
     def focused_on(self, depth_m: Float[np.ndarray, "height width"], x_px: float, y_px: float, radius_px: float = 0.0) -> "Lens":
-        """Autofocus: what lies at a place of the depth map (metres, of the whole picture) comes into focus there.
+        """Autofocus: return the lens focused on what lies at a place of the depth map (metres, of the whole picture).
 
         x_px, y_px: the place, with the centre of the top left pixel at (0.5, 0.5). radius_px: 0 takes the pixel there, more
         takes all pixels whose centres lie within that radius. Of their finite positive depths the median counts; of an
@@ -110,7 +107,7 @@ class Lens:
         return self._focused_through(float(depths_m[(depths_m.size - 1) // 2]), *self._place_mm(x_px, y_px, width_px, height_px))
 
     def _focused_through(self, depth_m: float, x_mm: float, y_mm: float) -> "Lens":
-        """With the surface in focus through a depth at a place on the sensor: `focus_dioptres` solved for the focus on the axis."""
+        """Return the lens whose surface in focus passes through a depth at a place on the sensor: `focus_dioptres` solved for the axis."""
         if self.has_flat_focus:
             return self.focused_at(depth_m)
         wanted, axis = 1.0 / depth_m, self._lens_axis
@@ -129,12 +126,12 @@ class Lens:
         return self.focused_at(1.0 / dioptres if dioptres > 0.0 else np.inf)
 
     def _place_mm(self, x_px: float, y_px: float, width_px: int, height_px: int) -> tuple[float, float]:
-        """Place on the upright sensor picture from its middle, which is where the camera's axis meets it."""
+        """Return the place on the upright sensor picture from its middle, where the camera's axis meets it."""
         mm_per_px = self.sensor_width_mm / width_px
         return (x_px - 0.5 * width_px) * mm_per_px, (y_px - 0.5 * height_px) * mm_per_px
 
     def focus_dioptres(self, width_px: int, height_px: int) -> Float[np.ndarray, "height width"]:
-        """1 / depth (per metre, along the camera's axis) of what is in focus at each pixel; below 0 is beyond infinity.
+        """Return 1 / depth (per metre, along the camera's axis) of what is in focus at each pixel; below 0 is beyond infinity.
 
         The lens has the axis m (a unit vector) and a point P = z (t_x, t_y, 1) forms its image at -P f / (P.m - f), from
         the thin-lens equation along the tilted axis. The image lies on the sensor, d_s behind the lens, where
@@ -153,16 +150,16 @@ class Lens:
         return 1.0 / self.focus_distance_m + tilt + (t_x**2 + t_y**2) * MM_PER_M / (2.0 * self.petzval_radius_mm)
 
     def focal_px(self, image_width_px: int) -> float:
-        """Pinhole focal length in pixels: the image distance, so that it breathes with the focus."""
+        """Return the pinhole focal length in pixels: the image distance, so that it breathes with the focus."""
         return self.image_distance_mm * image_width_px / self.sensor_width_mm
 
     def coc_px_per_dioptre(self, image_width_px: int) -> float:
-        """How many pixels the circle of confusion grows for each dioptre away from the focus plane."""
+        """Return how many pixels the circle of confusion grows per dioptre away from the focus plane."""
         px_per_mm = image_width_px / self.sensor_width_mm
         return px_per_mm * self.aperture_diameter_mm * self.image_distance_mm / MM_PER_M
 
     def coc_px(self, depth_m: Float[np.ndarray, "*batch"] | float, image_width_px: int) -> Float[np.ndarray, "*batch"]:
-        """Signed DIAMETER of the circle of confusion: positive behind the focus plane, negative in front.
+        """Return the signed DIAMETER of the circle of confusion: positive behind the focus plane, negative in front.
 
         Neural Bokeh's Eq. 1 (Mandl et al. 2024) with its sign kept and its units made equal; written in dioptres,
         so that it is linear and finite at infinity. depth_m must be positive.
@@ -184,7 +181,7 @@ class Lens:
 
 
 def lens_distance_m(film_plane_m: float, focal_length_mm: float, hiatus_mm: float = 0.0) -> float | None:
-    """The distance d_f from the front principal plane for a distance D = d_f + h + d_s from the film plane, d_s = f d_f / (d_f - f).
+    """Return the distance d_f from the front principal plane for a distance D = d_f + h + d_s from the film plane, d_s = f d_f / (d_f - f).
 
     h is the hiatus, the distance between the principal planes (0 for a thin lens). d_f is the far root of
     d_f^2 - (D - h) d_f + (D - h) f = 0. None below D = 4 f + h, which no lens of that focal length reaches.
@@ -197,5 +194,5 @@ def lens_distance_m(film_plane_m: float, focal_length_mm: float, hiatus_mm: floa
 
 
 def film_plane_m(lens: Lens) -> float:
-    """Focus distance as a camera's scale and metadata count it: d_f + d_s, the principal planes of a thin lens being one."""
+    """Return the focus distance as a camera's scale and metadata count it: d_f + d_s, the principal planes of a thin lens being one."""
     return lens.focus_distance_m + lens.image_distance_mm / MM_PER_M

@@ -40,7 +40,7 @@ from mrbokeh.system.errors import InputError
 
 
 class _Missing:
-    """Stands for "has no default"."""
+    """Marker for "has no default"."""
 
 
 _MISSING = _Missing()
@@ -48,9 +48,9 @@ _MISSING = _Missing()
 
 @dataclass(frozen=True)
 class Values:
-    """A JSON object with the keys it may and must have.
+    """Values of a JSON object, checked one by one; each error names the key and what stands there.
 
-    where: names the object in messages.
+    where: names the object in messages. known, required: the keys it may and must have.
     """
 
     document: Any
@@ -70,7 +70,7 @@ class Values:
             )
 
     def number(self, key: str, default: float | _Missing = _MISSING, null: float | _Missing = _MISSING) -> float:
-        """A finite number; `null` stands for a JSON null and, being infinite, lets the number be infinite too."""
+        """Return a finite number; `null` stands for a JSON null and, if it is infinite, allows the number to be infinite too."""
         value = self._value(key, default)
         if value is None and not isinstance(null, _Missing):
             return float(null)
@@ -97,7 +97,7 @@ class Values:
         return value
 
     def numbers(self, key: str, count: int | None) -> tuple[float, ...]:
-        """A list of `count` finite numbers, zeros where it is absent; of any length where count is None."""
+        """Return a list of `count` finite numbers, zeros if absent; of any length if count is None."""
         value = self._value(key, [0.0] * count if count else _MISSING)
         if not isinstance(value, list) or (count and len(value) != count) or not all(_is_number(v) and np.isfinite(v) for v in value):
             raise self._wrong(key, f"a list of {count} numbers" if count else "a list of numbers")
@@ -108,7 +108,7 @@ class Values:
         return first, second, third
 
     def points(self, key: str, value: Any) -> Float64[np.ndarray, "points 2"]:
-        """A list of [x, y]."""
+        """Return a list of [x, y] as an array."""
         pairs = value if isinstance(value, list) else []
         fine = all(isinstance(pair, list) and len(pair) == 2 and all(_is_number(v) and np.isfinite(v) for v in pair) for pair in pairs)
         if len(pairs) < 3 or not fine:
@@ -129,9 +129,9 @@ def _is_number(value: Any) -> bool:
 
 
 def read_transmission(path: Path) -> Float32[np.ndarray, "height width"]:
-    """How much light every pixel of a drawn opening lets through: the mean of its colours as stored, times its opacity.
+    """Read how much light every pixel of a drawn opening lets through: the mean of its stored colours times its opacity.
 
-    A drawing of an opening is a matte: its numbers mean shares of light, without a display curve.
+    A drawing of an opening is a matte: its numbers are shares of light, without a display curve.
     """
     if not path.is_file():
         raise InputError(f"expected a picture of the opening at {path}, but there is no such file")
@@ -155,7 +155,7 @@ _OF_SHAPES = {"shape", "blades", "curvature", "rotation_deg", "inner", "image", 
 
 
 def lens_to_json(lens: Lens) -> dict[str, Any]:
-    """The document of a lens; what is neutral among tilt, field curvature and the aperture's modifiers is left out."""
+    """Return the document of a lens; a neutral tilt, field curvature or aperture modifier is left out."""
     opening = lens.aperture
     aperture: dict[str, Any] = {
         "outlines": [np.round(outline, 9).tolist() for outline in opening.outlines],
@@ -185,7 +185,7 @@ def lens_to_json(lens: Lens) -> dict[str, Any]:
 
 
 def lens_from_json(document: dict[str, Any], where: str = "lens", folder: Path | str = ".") -> Lens:
-    """The lens of a document, as in the head of this module; `folder` is where the path of its image starts."""
+    """Return the lens of a document, as in the head of this module; `folder` is where the path of its image starts."""
     if not isinstance(document, dict) or (document.get("format", FORMAT), document.get("version", VERSION)) != (FORMAT, VERSION):
         raise InputError(f"{where}: expected a lens with format {FORMAT!r} and version {VERSION}; write one with `mrbokeh lens new`")
     values = Values(document, where, known=_OPTIONAL | _REQUIRED, required=_REQUIRED)

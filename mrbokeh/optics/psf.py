@@ -10,7 +10,7 @@ from mrbokeh.system.errors import InputError
 
 @dataclass(frozen=True)
 class Psf:
-    """A kernel centred on its source pixel.
+    """Kernel centred on its source pixel.
 
     kernel: (K, K), K odd, sums to 1; rows go down, columns go right.
     """
@@ -23,17 +23,17 @@ class Psf:
 
     @property
     def radius_px(self) -> int:
-        """Whole pixels from the centre to the border of the kernel."""
+        """Return the whole pixels from the centre to the border of the kernel."""
         return self.kernel.shape[0] // 2
 
 
 def identity_psf() -> Psf:
-    """The PSF of what is in focus: the pixel itself."""
+    """Return the PSF of what is in focus: the pixel itself."""
     return Psf(np.ones((1, 1)))
 
 
 def shown_diameter_px(diameter_px: Float[np.ndarray, "*batch"] | float, unit_radius: float) -> Float[np.ndarray, "*batch"]:
-    """The signed diameter at which an opening is drawn, so that its kernel is the identity up to one pixel and never jumps.
+    """Return the signed diameter at which an opening is drawn, so that its kernel is the identity up to one pixel and never jumps.
 
     An opening that stays within the unit circle fits into one pixel up to a diameter of 1, so it is drawn as it is. One that
     reaches `unit_radius` = 1 + e would leave the pixel before: it is drawn at 0 (the identity) up to 1 px, at 1 / (1 + e) just
@@ -49,5 +49,5 @@ def shown_diameter_px(diameter_px: Float[np.ndarray, "*batch"] | float, unit_rad
 
 
 def kernel_radius_px(diameter_px: float, unit_radius: float = 1.0) -> int:
-    """The smallest radius of an odd kernel that holds an outline reaching `unit_radius` at this (signed) diameter."""
+    """Return the smallest radius of an odd kernel that holds an outline reaching `unit_radius` at this (signed) diameter."""
     return max(0, int(np.ceil(abs(diameter_px) * 0.5 * unit_radius - 0.5)))

@@ -1,7 +1,4 @@
-"""PsfBank: every kernel of a lens that a renderer may need, sampled over a few physical coordinates.
-
-Axis: a physical coordinate of point spread functions, and how finely it is sampled where.
-"""
+"""PsfBank: every kernel of a lens that a renderer may need, sampled over a few physical coordinates (Axis)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,7 +17,7 @@ _SIGNED = ("diameter_px", "field_x", "field_y")
 
 @dataclass(frozen=True)
 class Axis:
-    """One coordinate of a space of PSFs and how its range is mapped to 0..1 (power remapping, Leimkuehler 2018, Section 5.2).
+    """Coordinate of a space of PSFs and how its range is mapped to 0..1 (power remapping, Leimkuehler 2018, Section 5.2).
 
     With the share x of the range at which a coordinate lies, its unit coordinate is x ** (1 / exponent): equal steps of the
     unit coordinate are steps of x that grow for exponent > 1, so small coordinates are sampled more finely (the beta of the
@@ -56,11 +53,11 @@ class Axis:
 
     @property
     def is_signed(self) -> bool:
-        """Whether the two sides of the focus, or of the frame, lie apart."""
+        """Return whether the two sides of the focus, or of the frame, are kept apart."""
         return bool(self.low < 0.0)
 
     def to_unit(self, coordinate: Float[np.ndarray, "*batch"] | float) -> Float64[np.ndarray, "*batch"]:
-        """Physical to unit coordinate; what lies beyond the range goes to its nearer end."""
+        """Convert a physical to a unit coordinate; values beyond the range go to its nearer end."""
         value = np.asarray(coordinate, np.float64)
         if self.is_signed:
             share = np.clip(value / self.high, -1.0, 1.0)
@@ -73,7 +70,7 @@ class Axis:
         return np.asarray(np.clip(share, 0.0, 1.0) ** (1.0 / self.exponent))
 
     def from_unit(self, unit: Float[np.ndarray, "*batch"] | float) -> Float64[np.ndarray, "*batch"]:
-        """Unit (0..1) to physical coordinate, the inverse of `to_unit`."""
+        """Convert a unit (0..1) to a physical coordinate, the inverse of `to_unit`."""
         value = np.asarray(unit, np.float64)
         if self.is_signed:
             share = 2.0 * value - 1.0
@@ -81,7 +78,7 @@ class Axis:
         return self.between(self.low, self.high, value**self.exponent)
 
     def between(self, low: float, high: float, share: Float[np.ndarray, "*batch"] | float) -> Float64[np.ndarray, "*batch"]:
-        """The coordinate at a share (0..1) of the way from low to high, in metres, pixels or, where the axis says so, dioptres."""
+        """Return the coordinate at a share (0..1) of the way from low to high, in metres, pixels or, if the axis says so, dioptres."""
         part = np.asarray(share, np.float64)
         if self.in_dioptres:
             dioptres = 1.0 / low + part * (1.0 / high - 1.0 / low)
@@ -144,39 +141,39 @@ class PsfBank:
 
     @property
     def radius_px(self) -> int:
-        """Whole pixels from the centre to the border of the largest kernel."""
+        """Return the whole pixels from the centre to the border of the largest kernel."""
         return max(kernel.shape[0] for kernel in self.kernels) // 2
 
     @cached_property
     def throughput(self) -> Float64[np.ndarray, "cells channels"]:
-        """The sum of each kernel, 1 where no light is absorbed."""
+        """Return the sum of each kernel, 1 if no light is absorbed."""
         return np.stack([kernel.sum(axis=(0, 1), dtype=np.float64) for kernel in self.kernels])
 
     @cached_property
     def boxes(self) -> Float64[np.ndarray, "cells axes 2"]:
-        """Low and high end of each cell on each axis, in physical coordinates."""
+        """Return the low and high end of each cell on each axis, in physical coordinates."""
         return physical_boxes(self.axes, self.grid)
 
     @cached_property
     def centres(self) -> Float64[np.ndarray, "cells axes"]:
-        """The middle of each cell, in physical coordinates."""
+        """Return the middle of each cell, in physical coordinates."""
         ends = [[axis.between(low, high, 0.5) for axis, (low, high) in zip(self.axes, box, strict=True)] for box in self.boxes]
         return np.array(ends, np.float64)
 
     def nearest(self, coords: Float[np.ndarray, "*batch axes"]) -> Int64[np.ndarray, "*batch"]:
-        """The cells whose kernels stand for these physical coordinates; found in constant time."""
+        """Return the cells whose kernels stand for these physical coordinates; found in constant time."""
         unit = np.stack([axis.to_unit(coords[..., index]) for index, axis in enumerate(self.axes)], axis=-1)
         return self.grid.index_of(unit)
 
     def kernel_at(self, coords: Float[np.ndarray, " axes"]) -> Kernel:
-        """The kernel for one point, in front of the focus turned where the bank says so; not turned by motion or field."""
+        """Return the kernel for one point, in front of the focus turned if the bank says so; not turned by motion or field."""
         kernel = self.kernels[int(self.nearest(np.asarray(coords, np.float64)))]
         in_front = any(axis.name == "diameter_px" and value < 0.0 for axis, value in zip(self.axes, coords, strict=True))
         return kernel[::-1, ::-1] if in_front and self.near_side_turned else kernel
 
 
 def grid_over(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, knee_px: float | None) -> Grid:
-    """The grid of a bank, in unit coordinates of its axes."""
+    """Return the grid of a bank, in unit coordinates of its axes."""
     if knee_px is None:
         return NestedGrid(counts, nested)
     if any(axis.low != 0.0 or axis.exponent != 1.0 or not axis.name.endswith("_px") for axis in axes):
@@ -185,7 +182,7 @@ def grid_over(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, kne
 
 
 def check_space(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, turns: str) -> None:
-    """Whether axes, counts and the rest make a space of PSFs."""
+    """Refuse axes, counts and turns that make no space of PSFs."""
     names = [axis.name for axis in axes]
     if not axes or len(axes) != len(counts) or len(set(names)) != len(names):
         raise InputError(f"a bank needs different axes and a count for each, got {names} and {counts}")
@@ -196,7 +193,7 @@ def check_space(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, t
 
 
 def check_kernel(kernel: np.ndarray, where: str) -> None:
-    """Whether an array is a kernel: (K, K, C), K odd, finite, no channel brighter than its source or black."""
+    """Refuse an array that is no kernel: (K, K, C), K odd, finite, no channel brighter than its source or black."""
     if kernel.ndim != 3 or kernel.shape[0] != kernel.shape[1] or kernel.shape[0] % 2 == 0 or kernel.dtype != np.float32:
         raise InputError(f"{where}: expected (K, K, C) float32 with an odd K, got {kernel.shape} {kernel.dtype}")
     light = kernel.sum(axis=(0, 1), dtype=np.float64)
@@ -205,5 +202,5 @@ def check_kernel(kernel: np.ndarray, where: str) -> None:
 
 
 def physical_boxes(axes: tuple[Axis, ...], grid: Grid) -> Float64[np.ndarray, "cells axes 2"]:
-    """The cells of a grid in physical coordinates."""
+    """Return the cells of a grid in physical coordinates."""
     return np.stack([axis.from_unit(grid.boxes[:, index]) for index, axis in enumerate(axes)], axis=1)

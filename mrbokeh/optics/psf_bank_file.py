@@ -26,7 +26,7 @@ POLYGONS, LOW_RANK = "polygons.npz", "low_rank.npz"
 
 @dataclass(frozen=True)
 class BankHead:
-    """All of a bank but its kernels; fields as in `PsfBank`."""
+    """Description of a bank without its kernels; fields as in `PsfBank`."""
 
     model: str
     channels: int
@@ -60,7 +60,7 @@ def cell_path(folder: Path | str, cell: int) -> Path:
 
 
 def read_head(folder: Path | str) -> BankHead:
-    """What a bank consists of, whether its cells are there or not."""
+    """Read what a bank consists of, whether its cells exist or not."""
     path = Path(folder) / HEAD
     document = read_json(path, "a bank of PSFs (a folder written by `mrbokeh lens psf`)")
     if not isinstance(document, dict) or (document.get("format"), document.get("version")) != (FORMAT, VERSION):
@@ -84,7 +84,7 @@ def write_cell(folder: Path | str, cell: int, kernel: np.ndarray) -> None:
 
 
 def missing_cells(folder: Path | str, head: BankHead) -> list[int]:
-    """Cells that still have to be built."""
+    """Return the cells that still have to be built."""
     return [cell for cell in range(len(head.grid)) if not cell_path(folder, cell).is_file()]
 
 
@@ -97,7 +97,7 @@ def clear_bank(folder: Path | str) -> None:
 
 
 def refuse_existing_bank(folder: Path | str, overwrite: bool) -> None:
-    """A new bank wants an empty place or, with `overwrite`, that of another bank; a folder of other things is left alone."""
+    """Refuse a place that is neither empty nor, with `overwrite`, that of another bank; folders of other things are left alone."""
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and (not any(folder.iterdir()) or (folder / HEAD).is_file())):
         raise InputError(f"{folder} exists and is not a bank of PSFs: give another name")
@@ -106,7 +106,7 @@ def refuse_existing_bank(folder: Path | str, overwrite: bool) -> None:
 
 
 def write_bank(folder: Path | str, bank: PsfBank, overwrite: bool = False) -> None:
-    """A whole bank at once."""
+    """Write a whole bank at once."""
     refuse_existing_bank(folder, overwrite)
     clear_bank(folder)
     write_head(folder, head_of(bank))
@@ -115,7 +115,7 @@ def write_bank(folder: Path | str, bank: PsfBank, overwrite: bool = False) -> No
 
 
 def read_bank(folder: Path | str) -> PsfBank:
-    """A whole bank; one that is not finished, or damaged, is an InputError."""
+    """Read a whole bank. Raises InputError if it is not finished or damaged."""
     head = read_head(folder)
     cells = len(head.grid)
     if missing := len(missing_cells(folder, head)):

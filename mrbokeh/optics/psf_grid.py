@@ -1,15 +1,13 @@
-"""A grid of few cells with a finer end: cells grow with their smallest coordinate (Leimkuehler et al. 2018, Section 5.2).
+"""Grids over the coordinates of a bank of PSFs, whose cells each share one kernel: nested and proportional.
 
-A grid over two lengths in pixels whose cells grow in proportion to the kernels that they stand for.
+`NestedGrid` has few cells with a finer end: cells grow with their smallest coordinate (Leimkuehler et al. 2018, Section 5.2). If one
+coordinate is small it takes small steps of both; mrbokeh.psf_models.combined says what that costs.
 
-How much of a kernel's light lies elsewhere after a small step depends on the step over the size of what changes. For a disc of
-diameter d, swept by a motion m, that is d for a step of d, and the larger of d and m for a step of m (a motion much shorter than
-the disc only softens its rim). So rows of equal steps of log(d + knee) have equal errors, and within a row steps of
-log(m + d + knee): many where the disc is small, few where it is larger than all motion. The knee, some pixels, is where
-pixels blur more than steps do.
-
-The nested grid of Leimkuehler et al. 2018 (mrbokeh.optics.psf_grid) grows with the smaller coordinate; where one is small it takes
-small steps of both. mrbokeh.psf_models.combined says what that costs.
+`ProportionalGrid` covers two lengths in pixels with cells that grow in proportion to the kernels that they stand for. How much of a
+kernel's light lies elsewhere after a small step depends on the step over the size of what changes. For a disc of diameter d, swept by a
+motion m, that is d for a step of d, and the larger of d and m for a step of m (a motion much shorter than the disc only softens its rim).
+So rows of equal steps of log(d + knee) have equal errors, and within a row steps of log(m + d + knee): many if the disc is small, few if
+it is larger than all motion. The knee, some pixels, is where pixels blur more than steps do.
 """
 
 from dataclasses import dataclass
@@ -24,12 +22,12 @@ from mrbokeh.system.errors import InputError
 
 
 def triangular(level: Int64[np.ndarray, "*batch"] | int) -> Int64[np.ndarray, "*batch"]:
-    """0, 1, 3, 6, 10, ...: where the cells of a level begin."""
+    """Return 0, 1, 3, 6, 10, ...: where the cells of a level begin."""
     return np.asarray(level * (level + 1) // 2)
 
 
 def triangular_root(steps: Float[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*batch"]:
-    """The largest level that begins at or below `steps` >= 0: floor((sqrt(8 s + 1) - 1) / 2), right at its jumps as well."""
+    """Return the largest level that begins at or below `steps` >= 0: floor((sqrt(8 s + 1) - 1) / 2), right at its jumps as well."""
     level = np.asarray((np.sqrt(8.0 * steps + 1.0) - 1.0) / 2.0).astype(np.int64)
     level = np.asarray(level - (triangular(level) > steps))
     return np.asarray(level + (triangular(np.asarray(level + 1)) <= steps))
@@ -37,7 +35,7 @@ def triangular_root(steps: Float[np.ndarray, "*batch"]) -> Int64[np.ndarray, "*b
 
 @dataclass(frozen=True)
 class NestedGrid:
-    """Boxes that cover the unit cube once; which one holds a point is found without a search.
+    """Grid of boxes that cover the unit cube once; the box that holds a point is found without a search.
 
     counts: steps of the underlying regular grid along each axis. Level l = 0, 1, 2, ... begins at the triangular number
     l (l + 1) / 2 on every axis, consists of cubes of edge l + 1 steps (cut off where the cube ends) and holds the points
@@ -57,16 +55,16 @@ class NestedGrid:
 
     @cached_property
     def _starts(self) -> list[int]:
-        """Where each level begins, in steps."""
+        """Return where each level begins, in steps."""
         levels = int(triangular_root(np.array(min(self.counts) - 1.0))) + 1 if self.nested else 1
         return [int(triangular(level)) for level in range(levels)]
 
     def _shape(self, level: int) -> tuple[int, ...]:
-        """Cells along each axis if the level were a full grid from its start to the end."""
+        """Return the cells along each axis if the level were a full grid from its start to the end."""
         return tuple(ceil((count - self._starts[level]) / (level + 1)) for count in self.counts)
 
     def _faces(self, level: int) -> list[tuple[range, ...]]:
-        """The cells of a level as blocks of lattice indices: block j has index 0 on axis j and none on the axes before."""
+        """Return the cells of a level as blocks of lattice indices: block j has index 0 on axis j and none on the axes before."""
         shape = self._shape(level)
         if not self.nested:
             return [tuple(range(size) for size in shape)]
@@ -74,13 +72,13 @@ class NestedGrid:
 
     @cached_property
     def _first_cells(self) -> Int64[np.ndarray, " levels_and_end"]:
-        """The inter-level index: how many cells lie on the levels before each level."""
+        """Return the inter-level index: how many cells lie on the levels before each level."""
         sizes = [sum(prod(map(len, face)) for face in self._faces(level)) for level in range(len(self._starts))]
         return np.cumsum([0, *sizes], dtype=np.int64)
 
     @cached_property
     def boxes(self) -> Float64[np.ndarray, "cells axes 2"]:
-        """The backward map: low and high end of each cell on each axis, in unit coordinates."""
+        """Return the low and high end of each cell on each axis, in unit coordinates: the backward map."""
         cells = []
         for level, start in enumerate(self._starts):
             for lattice in (each for face in self._faces(level) for each in product(*face)):
@@ -90,7 +88,7 @@ class NestedGrid:
 
     @cached_property
     def _tables(self) -> tuple[Int64[np.ndarray, " levels"], Int64[np.ndarray, "levels axes"], Int64[np.ndarray, "levels blocks"]]:
-        """Starts, shapes and the index of the first cell of each block of each level."""
+        """Return starts, shapes and the index of the first cell of each block of each level."""
         levels = range(len(self._starts))
         shapes = np.array([self._shape(level) for level in levels], np.int64)
         sizes = [[prod(map(len, face)) for face in self._faces(level)] for level in levels]
@@ -98,7 +96,7 @@ class NestedGrid:
         return np.array(self._starts, np.int64), shapes, blocks
 
     def index_of(self, coords: Float[np.ndarray, "*batch axes"]) -> Int64[np.ndarray, "*batch"]:
-        """The forward map: the cell that holds a point in unit coordinates; points outside belong to the nearest cell."""
+        """Return the cell that holds a point in unit coordinates, the forward map; points outside belong to the nearest cell."""
         starts, shapes, blocks = self._tables
         unit = np.clip(np.asarray(coords, np.float64), 0.0, 1.0)
         steps = np.minimum(unit * self.counts, np.array(self.counts) - 0.5)
@@ -110,7 +108,7 @@ class NestedGrid:
     def _within(
         self, lattice: Int64[np.ndarray, "*batch axes"], shape: Int64[np.ndarray, "*batch axes"], blocks: Int64[np.ndarray, "*batch blocks"]
     ) -> Int64[np.ndarray, "*batch"]:
-        """First cell of the block plus the place in it, row by row; the block is that of the first axis with index 0."""
+        """Return the first cell of the block plus the place in it, row by row; the block is that of the first axis with index 0."""
         axes = len(self.counts)
         face = np.asarray(np.argmin(lattice, axis=-1)) if self.nested else np.full(lattice.shape[:-1], -1, np.int64)
         place = np.zeros(lattice.shape[:-1], np.int64)
@@ -127,7 +125,7 @@ _ENOUGH = 1.2  # rounding may take finer rows back below the number of cells; no
 
 @dataclass(frozen=True)
 class ProportionalGrid:
-    """Boxes that cover the unit square once; which one holds a point is found without a search.
+    """Grid of boxes that cover the unit square once; the box that holds a point is found without a search.
 
     counts: rows along the first axis, and steps along the second one of the row that begins at 0; others get as many as keep
     steps alike. highs_px: what 1 means on either axis; both begin at 0. knee_px: see above.
@@ -147,7 +145,7 @@ class ProportionalGrid:
 
     @classmethod
     def of_cells(cls, cells: int, highs_px: tuple[float, float], knee_px: float, step_ratio: float) -> "ProportionalGrid":
-        """The finest with at most so many cells whose steps along the second axis are `step_ratio` times those along the first."""
+        """Return the finest grid with at most `cells` cells whose steps along the second axis are `step_ratio` times those along the first."""
         if cells < 1:
             raise InputError(f"a grid needs at least one cell, got {cells}")
         grid, rows = cls((1, 1), highs_px, knee_px), 1
@@ -168,24 +166,24 @@ class ProportionalGrid:
 
     @cached_property
     def knees_px(self) -> Float64[np.ndarray, " rows"]:
-        """The knee of the second axis in each row: that of the grid and the row's middle."""
+        """Return the knee of the second axis in each row: that of the grid plus the row's middle."""
         borders = _borders(self.counts[0], self.highs_px[0], self.knee_px)
         return np.asarray(self.knee_px + 0.5 * (borders[:-1] + borders[1:]))
 
     @cached_property
     def steps(self) -> Int64[np.ndarray, " rows"]:
-        """Cells of each row."""
+        """Return the number of cells of each row."""
         widths = np.log1p(self.highs_px[1] / self.knees_px)
         return np.maximum(np.rint(self.counts[1] * widths / widths[0]).astype(np.int64), 1)
 
     @cached_property
     def starts(self) -> Int64[np.ndarray, " rows_and_end"]:
-        """The first cell of each row."""
+        """Return the first cell of each row."""
         return np.concatenate([[0], np.cumsum(self.steps)])
 
     @cached_property
     def boxes(self) -> Float64[np.ndarray, "cells axes 2"]:
-        """Low and high end of each cell on each axis, in unit coordinates."""
+        """Return the low and high end of each cell on each axis, in unit coordinates."""
         rows = _borders(self.counts[0], self.highs_px[0], self.knee_px) / self.highs_px[0]
         cells = []
         for row, (steps, knee_px) in enumerate(zip(self.steps.tolist(), self.knees_px.tolist(), strict=True)):
@@ -194,7 +192,7 @@ class ProportionalGrid:
         return np.array(cells, np.float64)
 
     def index_of(self, coords: Float[np.ndarray, "*batch axes"]) -> Int64[np.ndarray, "*batch"]:
-        """The cell that holds a point in unit coordinates; points outside belong to the nearest cell."""
+        """Return the cell that holds a point in unit coordinates; points outside belong to the nearest cell."""
         px = np.clip(np.asarray(coords, np.float64), 0.0, 1.0) * self.highs_px
         row = _step(px[..., 0], np.asarray(self.counts[0]), self.highs_px[0], np.asarray(self.knee_px))
         step = _step(px[..., 1], np.asarray(self.steps[row]), self.highs_px[1], np.asarray(self.knees_px[row]))
@@ -202,7 +200,7 @@ class ProportionalGrid:
 
 
 def _borders(steps: int, high_px: float, knee_px: float) -> Float64[np.ndarray, " borders"]:
-    """Where equal steps of log(x + knee) from 0 to `high_px` begin and end."""
+    """Return where equal steps of log(x + knee) from 0 to `high_px` begin and end."""
     borders = knee_px * np.expm1(np.linspace(0.0, 1.0, steps + 1) * np.log1p(high_px / knee_px))
     return np.append(borders[:-1], high_px)
 
@@ -210,6 +208,6 @@ def _borders(steps: int, high_px: float, knee_px: float) -> Float64[np.ndarray, 
 def _step(
     px: Float64[np.ndarray, "*batch"], steps: Int64[np.ndarray, "*#batch"], high_px: float, knee_px: Float64[np.ndarray, "*#batch"]
 ) -> Int64[np.ndarray, "*batch"]:
-    """Which of `_borders`' steps holds a length."""
+    """Return which of the steps of `_borders` holds a length."""
     share = np.log1p(px / knee_px) / np.log1p(high_px / knee_px)
     return np.asarray(np.minimum((share * steps).astype(np.int64), steps - 1))

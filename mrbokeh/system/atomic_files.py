@@ -13,7 +13,7 @@ from mrbokeh.system.errors import InputError
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """A temporary path beside `path` with its suffix; renamed to `path` when the block ends well, else removed."""
+    """Open a temporary path beside `path` with its suffix; rename it to `path` if the block ends well, else remove it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -26,7 +26,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(folder: Path | str) -> Iterator[Path]:
-    """A temporary folder beside `folder`, renamed to it when the block ends well, else removed. Raises InputError where it exists."""
+    """Open a temporary folder, renamed to `folder` if the block ends well, else removed. Raises InputError if `folder` exists."""
     folder = Path(folder)
     refuse_existing(folder, overwrite=False)
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +46,7 @@ def write_json(path: Path | str, document: Any) -> None:
 
 
 def read_json(path: Path | str, expected: str) -> Any:
-    """A JSON document; `expected` says in the error message what the file should have been."""
+    """Read a JSON document; `expected` says in error messages what the file should have been."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -56,13 +56,13 @@ def read_json(path: Path | str, expected: str) -> Any:
 
 
 def refuse_existing(path: Path | str, overwrite: bool) -> None:
-    """Existing results are kept unless the user asked to overwrite them."""
+    """Refuse to replace an existing result unless the user asked for it with --overwrite."""
     if Path(path).exists() and not overwrite:
         raise InputError(f"{path} exists already: give another name, or --overwrite to replace it")
 
 
 def require_safe_outputs(outputs: Iterable[Path | str | None], inputs: Iterable[Path | str | None], overwrite: bool) -> None:
-    """Every file that will be written is one of its own: no two are the same, none is read (also through links), none is there already.
+    """Require that outputs differ from each other and from all inputs (also through links), and do not exist yet.
 
     None stands for what was not asked for. Raises InputError; `overwrite` allows replacing what exists, but never what is read.
     """

@@ -1,8 +1,6 @@
-"""Progress with the time left, the same everywhere: bars on a terminal, else a plain line now and then, as it suits a log.
+"""What a command says on the terminal: progress with the time left, the line after Ctrl-C, and the names of its options.
 
-Ctrl-C in a command whose work is kept: what there is, and how to go on, in one line; exit code 130, as shells have it.
-
-What the command line calls what the library names with its unit: for messages, and for options that once had the longer name.
+On a terminal progress is drawn as bars, in a log as a plain line now and then.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,7 +23,7 @@ WORTH_A_LINE_S = 2.0
 
 
 class PlainLines(Progress):
-    """Rich's tasks, told in lines: the first after LINE_EVERY_S, the last where a task is complete or the block ends."""
+    """Progress of rich as plain lines: the first after LINE_EVERY_S, the last when a task is complete or the block ends."""
 
     def __init__(self, console: Console, **settings: Any) -> None:
         super().__init__(console=console, auto_refresh=False, **settings)
@@ -48,7 +46,7 @@ class PlainLines(Progress):
         self._tell(task_id)
 
     def start(self) -> None:
-        """Nothing is drawn."""
+        """Draw nothing; lines are printed as tasks advance."""
 
     def stop(self) -> None:
         for task in self.task_ids:
@@ -70,7 +68,7 @@ class PlainLines(Progress):
 
 
 def _line(task: Task, took_s: float, begun_with: float = 0.0) -> str:
-    """slices: 3 of 12, 0:01:30, about 0:04:30 left"""
+    """Return a line such as "slices: 3 of 12, 0:01:30, about 0:04:30 left"."""
     line = f"{task.description}: {task.completed:.0f}{f' of {task.total:.0f}' if task.total else ''}, {timedelta(seconds=round(took_s))}"
     done = task.completed - begun_with
     if not task.total or done <= 0 or task.completed >= task.total:
@@ -80,7 +78,7 @@ def _line(task: Task, took_s: float, begun_with: float = 0.0) -> str:
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """A block in which `add_task` and `advance` of rich draw bars on standard error, or tell how far they are."""
+    """Open a block in which `add_task` and `advance` of rich draw bars on standard error, or print lines in a log."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -95,7 +93,7 @@ def progress_bars() -> Iterator[Progress]:
 
 
 def track(items: Iterable[Item], description: str, total: int | None = None) -> Iterator[Item]:
-    """Go through items under one bar; total is needed where they have no length."""
+    """Iterate over items under one progress bar. total: needed if they have no length."""
     total = len(items) if total is None else total  # type: ignore[arg-type]
     with progress_bars() as progress:
         task: TaskID = progress.add_task(description, total=total)
@@ -105,13 +103,16 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
 
 
 def working(description: str) -> AbstractContextManager[object]:
-    """A spinner on the terminal while something runs whose length nobody knows."""
+    """Show a spinner on the terminal while something of unknown length runs."""
     return Console(stderr=True).status(description)
 
 
 @contextmanager
 def kept_when_interrupted(kept: str, overwrite: bool = False) -> Iterator[None]:
-    """kept: what is there to go on with and where, such as "finished slices are kept in scene/". overwrite: begins anew all the same."""
+    """Turn Ctrl-C into one line that says what was kept and how to continue, and exit with 130.
+
+    kept: such as "finished slices are kept in scene/". overwrite: the command would start again instead of continuing.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -135,10 +136,10 @@ FLAGS = {
 
 
 def flag(name: str) -> str:
-    """The option that sets a parameter: `focus_distance_m` is --focus, and what FLAGS does not hold goes by its own name."""
+    """Return the option that sets a parameter: --focus for `focus_distance_m`; names that FLAGS lacks are spelled out."""
     return FLAGS.get(name, spelled_out(name))
 
 
 def spelled_out(name: str) -> str:
-    """--focus-distance-m for `focus_distance_m`."""
+    """Return --focus-distance-m for `focus_distance_m`."""
     return "--" + name.replace("_", "-")

@@ -43,19 +43,19 @@ def library() -> Any:
 
 
 def explanation(error: Any) -> str:
-    """What a GPhoto2Error says, its code, and what to do about it where that is known."""
+    """Return what a GPhoto2Error says, its code, and what to do about it if that is known."""
     hint = _HINTS.get(error.code)
     return f"{error.string or error} ({error.code}){f'; {hint}' if hint else ''}"
 
 
 def detected() -> list[tuple[str, str]]:
-    """(model, port) of every camera connected; a port is such as usb:001,005."""
+    """Return (model, port) of every connected camera; a port looks like usb:001,005."""
     found = library().Camera.autodetect()
     return [(found.get_name(index), found.get_value(index)) for index in range(found.count())]
 
 
 def chosen_of(found: list[tuple[str, str]], port: str | None, option: str) -> tuple[str, str]:
-    """(model, port) of the only camera, or of the one at that port; NoCameraError where there is none, InputError where many.
+    """Return (model, port) of the only camera, or of the one at `port`.
 
     option: by which the user chooses, such as --camera.
     """

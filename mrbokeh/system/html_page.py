@@ -1,4 +1,4 @@
-"""Pages of one file: sections, tables, pictures and charts inline, so that a page can be sent and read anywhere, also on a phone."""
+"""HTML pages in one file: sections, tables, pictures and charts inline, so that a page can be sent and read anywhere."""
 
 import base64
 import html
@@ -21,7 +21,7 @@ code { font-size: 12px; overflow-wrap: anywhere; } .muted { color: #667; }
 
 
 def write_page(path: Path, title: str, blocks: Iterable[str], style: str = "") -> None:
-    """blocks: HTML, one below the other. style: CSS beside that of all pages."""
+    """Write an HTML page of blocks, one below the other. style: CSS in addition to STYLE."""
     head = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{html.escape(title)}</title><style>{STYLE}{style}</style>"
@@ -40,14 +40,14 @@ def cell(text: str, kind: str = "text") -> str:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """rows of cells made by `cell`; a table too wide for the screen can be moved sideways."""
+    """Return a table of rows of cells made by `cell`; a table wider than the screen scrolls sideways."""
     head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
     body = "".join(f"<tr>{''.join(cells)}</tr>" for cells in rows)
     return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
 
 
 def inline_figure(picture: bytes, kind: str, caption: str) -> str:
-    """picture: an encoded file. kind: jpeg or png."""
+    """Return a figure with the picture inside the page. picture: an encoded file. kind: jpeg or png."""
     data = base64.b64encode(picture).decode("ascii")
     text = html.escape(caption)
     return f'<figure><img src="data:image/{kind};base64,{data}" alt="{text}"><figcaption>{text}</figcaption></figure>'

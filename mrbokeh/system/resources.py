@@ -1,9 +1,4 @@
-"""Workers for pieces of a picture: a pool of threads where that pays, the calling thread where it does not.
-
-Settings of glibc's malloc for programs that move large pictures; nothing where the C library is another one.
-
-Zeroed memory that goes from one use to the next: fresh zeros cost more than to make the few used ones zero again.
-"""
+"""Threads and memory: worker pools for pieces of a picture, scratch arrays that stay zeroed, and settings of glibc's malloc."""
 
 import ctypes
 import sys
@@ -27,29 +22,32 @@ _Result = TypeVar("_Result")
 
 @cache
 def cores() -> int:
-    """How many the machine has; asking it anew takes longer than a small task."""
+    """Return the number of cores, cached because asking the system takes longer than a small task."""
     return cpu_count() or 1
 
 
 def workers(pixels: int, threads: int = 0) -> Executor:
-    """An executor for a picture of so many pixels; threads: 0 takes all cores. What is computed must not depend on it."""
+    """Return an executor for a picture of this many pixels: threads if it is large, else the calling thread.
+
+    threads: 0 takes all cores. What is computed must not depend on it.
+    """
     return ThreadPoolExecutor(threads or cores()) if pixels > _FEW_PIXELS else CallingThread()
 
 
 def bands(length: int, least: int) -> list[tuple[int, int]]:
-    """First and end of some pieces of equal length, `least` or more, that make up the whole: a few for every core."""
+    """Return (first, end) of equal pieces, each at least `least` long, that make up the whole: a few for every core."""
     size = max(least, -(-length // (_BANDS_PER_CORE * cores())))
     return [(first, min(first + size, length)) for first in range(0, length, size)]
 
 
 def in_bands(pool: Executor, length: int, least: int, work: Callable[[int, int], object]) -> None:
-    """Call work(first, end) for each of the bands and wait for all. What is computed must not depend on where one ends."""
+    """Call work(first, end) for each of the bands and wait for all. Results must not depend on where a band ends."""
     for done in [pool.submit(work, first, end) for first, end in bands(length, least)]:
         done.result()
 
 
 def ahead(pool: Executor, work: Callable[[Any], _Result], tasks: Iterable[Any], at_once: int) -> Iterator[_Result]:
-    """What work makes of the tasks, in their order; so many are under way or waiting to be taken: bounded memory, busy cores."""
+    """Yield the results of work on the tasks in order, with at most `at_once` tasks under way: bounded memory, busy cores."""
     under_way: deque[Future[_Result]] = deque()
     for task in tasks:
         under_way.append(pool.submit(work, task))
@@ -60,7 +58,7 @@ def ahead(pool: Executor, work: Callable[[Any], _Result], tasks: Iterable[Any], 
 
 
 class CallingThread(Executor):
-    """An executor without threads: work is done when it is submitted, and what is mapped at once."""
+    """Executor without threads: work is done when it is submitted."""
 
     def submit(self, fn: Callable[..., _Result], /, *args: Any, **kwargs: Any) -> "Future[_Result]":
         future: Future[_Result] = Future()
@@ -88,7 +86,7 @@ _KEPT_BYTES = 1 << 30
 
 
 def keep_few_arenas() -> None:
-    """Keep to two arenas: codecs come with threads, and glibc gives each new thread an arena, which keeps what was in it.
+    """Limit glibc to two arenas: codecs create threads, and each new thread gets an arena that keeps what was in it.
 
     Ten minutes with a recording every 15 s grew by 65 MB between the medians of their thirds (tests/live/test_viewfinder_soak.py); with two
     arenas the same memory is used again.
@@ -97,7 +95,7 @@ def keep_few_arenas() -> None:
 
 
 def keep_freed_pictures() -> None:
-    """Use the memory of freed pictures again instead of giving it back: a new picture of 24 MB costs 6000 page faults, twice its making."""
+    """Reuse the memory of freed pictures instead of returning it: a new picture of 24 MB costs 6000 page faults, twice its making."""
     _set(_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD_BYTES)
     _set(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
@@ -111,9 +109,9 @@ def _set(parameter: int, value: int) -> None:
 
 
 class ZeroedMemory:
-    """Zeroed arrays for several threads; whoever takes one gives it back as zeros.
+    """Pool of zeroed scratch arrays for several threads: zeroing the few used elements again is cheaper than fresh zeros.
 
-    most_bytes: what is larger than this is let go as soon as it is given back.
+    Whoever takes an array returns it as zeros. most_bytes: larger arrays are freed when they are given back.
     """
 
     def __init__(self, most_bytes: int | float = np.inf) -> None:
@@ -121,7 +119,7 @@ class ZeroedMemory:
         self._arrays: list[np.ndarray] = []
 
     def take(self, elements: int, dtype: type) -> np.ndarray:
-        """At least so many zeros. Arrays too small for that are let go."""
+        """Return at least this many zeros and free arrays that are too small."""
         with self._lock:
             fitting = [i for i, array in enumerate(self._arrays) if array.dtype == dtype and array.size >= elements]
             if fitting:
@@ -130,7 +128,7 @@ class ZeroedMemory:
         return np.zeros(elements, dtype)
 
     def give_back(self, array: np.ndarray) -> None:
-        """An array that holds zeros again."""
+        """Take back an array that holds zeros again."""
         if array.nbytes <= self._most_bytes:
             with self._lock:
                 self._arrays.append(array)

@@ -11,7 +11,7 @@ TYPES = ("cpu", "cuda")
 
 
 def device_named(name: str) -> torch.device:
-    """'cpu', 'cuda' or 'cuda:1' and so on, as torch knows it, if it is there."""
+    """Return the torch device 'cpu', 'cuda' or 'cuda:1' and so on, if it is there."""
     try:
         device = torch.device(name)
     except RuntimeError:
