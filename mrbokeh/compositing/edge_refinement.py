@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from mrbokeh.compositing.near_and_far import NearAndFar, continued, without_edge
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.layering.highlights import lights
+from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.resources import in_bands, workers
 
@@ -38,7 +38,7 @@ Mask = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
-class RimColours:
+class EdgeColours:
     """near: by depth. unsure: where it may be wrong. nearness: 0 as the far side, 1 as the near one; NaN where colours do not tell.
 
     lit: lights and what is beside them; their colour says nothing.
@@ -50,11 +50,11 @@ class RimColours:
     lit: Mask
 
     @classmethod
-    def of(cls, rgb: Picture, near: Mask, at_edge: Mask) -> "RimColours":
+    def of(cls, rgb: Picture, near: Mask, at_edge: Mask) -> "EdgeColours":
         """rgb: all in focus. at_edge: where depth has an edge; elsewhere it is right."""
         from cv2 import dilate
 
-        lit = np.asarray(dilate(lights(rgb).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+        lit = np.asarray(dilate(find_highlights(rgb).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
         near_sure, near_unsure = _certain(near)
         far_sure, far_unsure = _certain(~near)
         unsure = (near_unsure | far_unsure) & at_edge
@@ -101,7 +101,7 @@ def _nearness(rgb: Picture, sides: UInt8[np.ndarray, "height width"], places: In
 
 
 _AROUND_PX = 4.0
-_PROPOSED = ((RimColours.without_rim, np.float32(0.9)), (RimColours.by_colour, np.float32(1.0)))
+_PROPOSED = ((EdgeColours.without_rim, np.float32(0.9)), (EdgeColours.by_colour, np.float32(1.0)))
 """One after the other. Each wins where it leaves less than this part of the error."""
 _LARGE_PX = 2_000_000
 """Above it half as many rows and columns are compared: a pixel is little there, and time is short."""
@@ -109,7 +109,7 @@ _FLOOR, _ROUND = np.float32(0.1), np.float32(1e-6)
 
 
 @dataclass(frozen=True)
-class TrueRims:
+class EdgeRefinement:
     """cut: a plate's sharp scene in two. tolerance: see `Between`."""
 
     cut: Callable[[Plate, Mask], NearAndFar]
@@ -126,7 +126,7 @@ class TrueRims:
         at_edge = ~without_edge(plate.depth_m, self.tolerance)
         best, error = near, None
         for propose, part in _PROPOSED:
-            proposed = propose(RimColours.of(plate.sharp_rgb, best, at_edge))
+            proposed = propose(EdgeColours.of(plate.sharp_rgb, best, at_edge))
             if not (proposed != best).any():
                 continue
             error = self._error(plate, near, best) if error is None else error

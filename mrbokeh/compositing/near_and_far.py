@@ -1,7 +1,7 @@
 """The sharp photographed scene cut in two by a virtual surface: what is nearer, with soft rims, and the rest, continued behind it.
 
 A pixel on the rim of a near thing holds both colours; they are taken apart as mrbokeh.layering.hidden_background does, but at depth edges
-alone: where the virtual surface cuts through a smooth surface (a table that an object stands on), the cut is hard. Lights are kept
+alone: where the virtual surface cuts through a smooth surface (a table that an object stands on), the cut is hard. Highlights are kept
 apart from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
 
 The virtual layers as one surface: where it shows anything, and its depth continued beyond its outline.
@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.hidden_background import apart
-from mrbokeh.layering.highlights import lights, without_lights
-from mrbokeh.layering.padded_layers import Sheet
+from mrbokeh.layering.hidden_background import split_edges
+from mrbokeh.layering.highlights import find_highlights, without_highlights
+from mrbokeh.layering.padded_layers import PaddedLayer
 from mrbokeh.system.resources import workers
 
 _TWO_DEEP = 2.0
@@ -29,15 +29,15 @@ Mask = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
-class Lights:
+class Highlights:
     """Single pixels far brighter than what is around them: places (row times width plus column), colour and depth."""
 
-    places: Int64[np.ndarray, " lights"]
-    rgb: Float32[np.ndarray, "lights 3"]
-    depth_m: Float32[np.ndarray, " lights"]
+    places: Int64[np.ndarray, " highlights"]
+    rgb: Float32[np.ndarray, "highlights 3"]
+    depth_m: Float32[np.ndarray, " highlights"]
 
 
-NO_LIGHTS = Lights(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+NO_HIGHLIGHTS = Highlights(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class NearAndFar:
     near: Layer
     far_rgb: Picture
     far_depth_m: Plane | None
-    lights: Lights
+    highlights: Highlights
 
     @property
     def far(self) -> Layer:
         """What is far as one opaque layer, its lights in it; for photographs with depth."""
         assert self.far_depth_m is not None
         layer = Layer(self.far_rgb.copy(), np.ones_like(self.far_depth_m), self.far_depth_m)
-        layer.rgb.reshape(-1, 3)[self.lights.places] += self.lights.rgb
+        layer.rgb.reshape(-1, 3)[self.highlights.places] += self.highlights.rgb
         return layer
 
 
@@ -87,15 +87,15 @@ def nearest_places(known: Mask) -> Int64[np.ndarray, "height width"]:
 def cut_in_two(sharp_rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance: float) -> NearAndFar:
     """reach_px: how far the lens looks past an edge; nothing is made up farther behind the near things."""
     rgb = np.ascontiguousarray(sharp_rgb)
-    without, places = without_lights(rgb), np.flatnonzero(lights(rgb))
+    without, places = without_highlights(rgb), np.flatnonzero(find_highlights(rgb))
     places = places[~_brightest_is_near(rgb, near, places)]
     dark = rgb.copy()
     dark.reshape(-1, 3)[places] = without.reshape(-1, 3)[places]
     near_values, far_rgb = _parted(dark, depth_m, near, reach_px, tolerance)
     near_depth_m, far_depth_m = _without_specks(continued(depth_m, near)), continued(depth_m, ~near)
-    far_lights = Lights(places, (rgb - dark).reshape(-1, 3)[places], far_depth_m.reshape(-1)[places])
+    far_highlights = Highlights(places, (rgb - dark).reshape(-1, 3)[places], far_depth_m.reshape(-1)[places])
     alpha = np.ascontiguousarray(near_values[..., 3])
-    return NearAndFar(Layer(np.ascontiguousarray(near_values[..., :3]), alpha, near_depth_m), far_rgb, far_depth_m, far_lights)
+    return NearAndFar(Layer(np.ascontiguousarray(near_values[..., :3]), alpha, near_depth_m), far_rgb, far_depth_m, far_highlights)
 
 
 def _without_specks(depth_m: Plane) -> Plane:
@@ -112,7 +112,7 @@ def _parted(rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance
     values[..., :3] = rgb
     step_px = np.float32(_TWO_DEEP * reach_px + _TWO_DEEP)
     with workers(near.size) as pool:
-        front, behind = apart(Sheet(values, np.where(near, -step_px, np.float32(0.0)), True), pool)
+        front, behind = split_edges(PaddedLayer(values, np.where(near, -step_px, np.float32(0.0)), True), pool)
     in_front = front.coc_px.reshape(height, width) < -0.5 * step_px
     near_values = np.where(in_front[..., None], front.values.reshape(height, width, 4), np.float32(0.0))
     far = np.where(in_front[..., None], continued(rgb, ~near), rgb)
@@ -133,7 +133,7 @@ def without_edge(depth_m: Plane, tolerance: float) -> Mask:
     return dilate(dioptres, kernel) <= np.float32(1.0 + 2.0 * tolerance) * erode(dioptres, kernel)
 
 
-def _brightest_is_near(rgb: Picture, near: Mask, places: Int64[np.ndarray, " lights"]) -> Bool[np.ndarray, " lights"]:
+def _brightest_is_near(rgb: Picture, near: Mask, places: Int64[np.ndarray, " highlights"]) -> Bool[np.ndarray, " highlights"]:
     """Whether the brightest of the 5x5 pixels around each place, the lamp whose light it holds, is near."""
     height, width = near.shape
     rows, columns = places // width, places % width

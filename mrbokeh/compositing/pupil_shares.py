@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from mrbokeh.compositing.near_and_far import NearAndFar
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.highlights import without_lights
+from mrbokeh.layering.highlights import without_highlights
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
@@ -102,7 +102,7 @@ class Rays:
         from mrbokeh.compositing._between_numba import gather
 
         sums, near, far = np.zeros((len(places), 16), np.float32), self.scene.near.alpha, self.scene.far_rgb
-        in_reach, dark = self.near_in_reach, self.virtual_without_lights
+        in_reach, dark = self.near_in_reach, self.virtual_without_highlights
         for which, aperture in self.cells(places):
             pupil = pupil_points(aperture, self.points).astype(np.float32)
             with workers(len(which) * self.points) as pool:
@@ -116,8 +116,8 @@ class Rays:
         return np.ascontiguousarray(np.dstack([self.virtual.rgb, self.virtual.alpha]))
 
     @cached_property
-    def virtual_without_lights(self) -> Float32[np.ndarray, "height width 4"]:
-        return np.ascontiguousarray(without_lights(self.virtual_rgba))
+    def virtual_without_highlights(self) -> Float32[np.ndarray, "height width 4"]:
+        return np.ascontiguousarray(without_highlights(self.virtual_rgba))
 
     @property
     def one_far_colour(self) -> Bool[np.ndarray, "height width"]:

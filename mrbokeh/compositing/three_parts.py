@@ -1,6 +1,6 @@
 """A photograph, near light, virtual light and rays through all of them put together: what each pixel shows of the three parts.
 
-Lights followed ray by ray: at every place of its blur a light is seen through one point of the pupil, which is hidden or not.
+Highlights followed ray by ray: at every place of its blur a light is seen through one point of the pupil, which is hidden or not.
 
 Few rays per pixel would miss it, and a blurred coverage would dim its whole disc where the truth cuts it. Only lights whose discs come
 to a pixel that is asked for are followed.
@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from mrbokeh.compositing.near_and_far import Lights
+from mrbokeh.compositing.near_and_far import Highlights
 from mrbokeh.compositing.plate import Inserted, Plate
 from mrbokeh.compositing.pupil_shares import PupilMeans, Rays, pupil_points
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.highlights import lights
+from mrbokeh.layering.highlights import find_highlights
 
 _LEAST_POINTS, _MOST_POINTS = 64, 16384
 _POINTS_PER_PX = 4.0
@@ -26,21 +26,21 @@ Mask = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
-class LightThrough:
+class HighlightsThrough:
     """Light of single bright pixels (H, W, 3) as it arrives past one layer, and past that and another."""
 
     one: Float32[np.ndarray, "height width 3"]
     both: Float32[np.ndarray, "height width 3"]
 
 
-def far_lights(rays: Rays, left_over: Plane) -> LightThrough:
+def far_highlights(rays: Rays, left_over: Plane) -> HighlightsThrough:
     """Past the near things, and past near and virtual ones, where `left_over` is a number.
 
     left_over: light of the photograph (r + g + b) that surfaces do not explain, NaN where unknown. A light that the sharp picture
     shows half hidden or clipped gets the brightness of its disc there.
     """
     first, second = (rays.scene.near.alpha, rays.coc_px[0]), (rays.virtual.alpha, rays.coc_px[1])
-    bright = _arriving(rays, rays.scene.lights, rays.coc_px[2], np.isfinite(left_over))
+    bright = _arriving(rays, rays.scene.highlights, rays.coc_px[2], np.isfinite(left_over))
     dim = _followed(rays, bright, rays.coc_px[2], first, second)
     if len(bright.places) == 0:
         return dim
@@ -48,7 +48,7 @@ def far_lights(rays: Rays, left_over: Plane) -> LightThrough:
     return _followed(rays, replace(bright, rgb=bright.rgb * brighter[:, None]), rays.coc_px[2], first, second)
 
 
-def _arriving(rays: Rays, bright: Lights, coc_px: Plane, wanted: Mask) -> Lights:
+def _arriving(rays: Rays, bright: Highlights, coc_px: Plane, wanted: Mask) -> Highlights:
     """Those lights whose discs come to a wanted pixel, or to one beside it."""
     from cv2 import integral
 
@@ -59,10 +59,10 @@ def _arriving(rays: Rays, bright: Lights, coc_px: Plane, wanted: Mask) -> Lights
     top, bottom = np.maximum(rows - half_px, 0), np.minimum(rows + half_px + 1, height)
     left, right = np.maximum(columns - half_px, 0), np.minimum(columns + half_px + 1, width)
     kept = counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left] > 0
-    return Lights(bright.places[kept], bright.rgb[kept], bright.depth_m[kept])
+    return Highlights(bright.places[kept], bright.rgb[kept], bright.depth_m[kept])
 
 
-def _gains(rays: Rays, bright: Lights, ratio: Plane) -> Float32[np.ndarray, " lights"]:
+def _gains(rays: Rays, bright: Highlights, ratio: Plane) -> Float32[np.ndarray, " highlights"]:
     """Per light the median, over its disc, of how much more light there is than it gives."""
     height, width = ratio.shape
     gains = np.ones(len(bright.places), np.float32)
@@ -79,16 +79,16 @@ def _gains(rays: Rays, bright: Lights, ratio: Plane) -> Float32[np.ndarray, " li
     return gains
 
 
-def virtual_lights(rays: Rays, wanted: Mask) -> LightThrough:
+def virtual_highlights(rays: Rays, wanted: Mask) -> HighlightsThrough:
     """As if nothing hid them, and past the near things; where it is wanted."""
-    places = np.flatnonzero(lights(rays.virtual_rgba))
-    whole, dark = (each.reshape(-1, 4)[places, :3] for each in (rays.virtual_rgba, rays.virtual_without_lights))
-    bright = _arriving(rays, Lights(places, whole - dark, np.zeros(len(places), np.float32)), rays.coc_px[1], wanted)
+    places = np.flatnonzero(find_highlights(rays.virtual_rgba))
+    whole, dark = (each.reshape(-1, 4)[places, :3] for each in (rays.virtual_rgba, rays.virtual_without_highlights))
+    bright = _arriving(rays, Highlights(places, whole - dark, np.zeros(len(places), np.float32)), rays.coc_px[1], wanted)
     nothing = (np.zeros_like(rays.virtual.alpha), rays.coc_px[0])
     return _followed(rays, bright, rays.coc_px[1], nothing, (rays.scene.near.alpha, rays.coc_px[0]))
 
 
-def _followed(rays: Rays, bright: Lights, coc_px: Plane, first: tuple[Plane, Plane], second: tuple[Plane, Plane]) -> LightThrough:
+def _followed(rays: Rays, bright: Highlights, coc_px: Plane, first: tuple[Plane, Plane], second: tuple[Plane, Plane]) -> HighlightsThrough:
     from mrbokeh.compositing._between_numba import follow
 
     width = coc_px.shape[1]
@@ -101,7 +101,7 @@ def _followed(rays: Rays, bright: Lights, coc_px: Plane, first: tuple[Plane, Pla
             count = int(np.clip(_POINTS_PER_PX * light_coc_px**2, _LEAST_POINTS, _MOST_POINTS))
             light = (row, column, light_coc_px, float(rgb[0]), float(rgb[1]), float(rgb[2]))
             follow(one, both, light, *first, *second, pupil[:count])
-    return LightThrough(one, both)
+    return HighlightsThrough(one, both)
 
 
 LEAST_LIGHT = np.float32(1e-5)
@@ -155,7 +155,7 @@ def _virtual_light(blurred: Layer, rays: Rays, places: Places, means: PupilMeans
     """What gets past the near things: surfaces by the part of the pupil they leave and the covariance, lights one by one."""
     wanted = np.zeros(blurred.alpha.shape, np.bool_)
     wanted.reshape(-1)[places] = True
-    own = virtual_lights(rays, wanted)
+    own = virtual_highlights(rays, wanted)
     alone, past = own.one.reshape(-1, 3)[places], own.both.reshape(-1, 3)[places]
     surfaces = free[:, None] * (blurred.rgb.reshape(-1, 3)[places] - alone)
     return surfaces + means.f_virtual - means.f[:, None] * means.virtual + past
@@ -169,7 +169,7 @@ def _far_light(
     surfaces = means.f_far * (free / np.maximum(means.f, _ROUND))[:, None]
     left_over = np.full_like(near.alpha, np.nan)
     left_over.reshape(-1)[places] = (photo_rgb - near_rgb - surfaces).astype(np.float32).sum(axis=1)
-    bright = far_lights(rays, left_over)
+    bright = far_highlights(rays, left_over)
     before, after = bright.one.reshape(-1, 3)[places], bright.both.reshape(-1, 3)[places]
     stays = np.clip((1.0 - share / free)[:, None] * _colour_change(means), 0.0, 1.0)
     far = surfaces + before

@@ -17,7 +17,7 @@ _MOST = 13  # of 25
 
 
 @njit(cache=True, nogil=True)
-def find_lit(lit: np.ndarray, values: np.ndarray, ratio: np.float32, top: int, bottom: int) -> None:
+def mark_rows(lit: np.ndarray, values: np.ndarray, ratio: np.float32, top: int, bottom: int) -> None:
     """Rows top to bottom of lit (H, W): pixels of values (H, W, 3 or more) more than `ratio` times as bright as most of the 5x5 around.
 
     A pixel's brightness is its strongest channel. Where most of 5 columns of 5 are that much darker, most of one column are; so one

@@ -1,6 +1,6 @@
 """The loops over pixels of mrbokeh.layering.slices, compiled.
 
-Pixels of a sheet go by their number; their places, row times width plus column, ascend. Runs of numbers are of one slice and
+Pixels of a layer go by their number; their places, row times width plus column, ascend. Runs of numbers are of one slice and
 one row, without gaps: what is done for a pixel is done for neighbours in memory.
 
 The loops of mrbokeh.layering.slices, compiled: a grid of square cells lies over the frame; runs are those of slice_sorting.
@@ -22,7 +22,7 @@ def mark_cells(cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.nda
 
 
 @njit(cache=True)
-def number_islands(cells: np.ndarray) -> int:
+def label_components(cells: np.ndarray) -> int:
     """Number marked cells from 1 on, those that touch at a side or a corner alike; how many numbers there are."""
     rows, columns = cells.shape
     count, stack = 0, np.empty(cells.size, np.int64)
@@ -43,21 +43,21 @@ def number_islands(cells: np.ndarray) -> int:
 
 
 @njit(cache=True)
-def islands_of_runs(boxes: np.ndarray, cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.ndarray, width: int) -> np.ndarray:
-    """(R,) which island, from 0 on, each run belongs to; widens boxes (islands, 4: first and end row, first and end column) by them."""
-    islands = np.empty(len(runs), np.int32)
+def components_of_runs(boxes: np.ndarray, cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.ndarray, width: int) -> np.ndarray:
+    """(R,) which component, from 0 on, each run belongs to; widens boxes (components, 4: first and end row, first and end column) by them."""
+    components = np.empty(len(runs), np.int32)
     for r in range(len(runs)):
         y, x = places[runs[r, 0]] // width, places[runs[r, 0]] % width
-        islands[r] = cells[y // cell_px, x // cell_px] - 1
-        box = boxes[islands[r]]
+        components[r] = cells[y // cell_px, x // cell_px] - 1
+        box = boxes[components[r]]
         box[0], box[1] = min(box[0], y), max(box[1], y + 1)
         box[2], box[3] = min(box[2], x), max(box[3], x + runs[r, 1] - runs[r, 0])
-    return islands
+    return components
 
 
 @njit(cache=True)
-def join_islands(boxes: np.ndarray, reach: int, pixels_per_spread: int) -> np.ndarray:
-    """(islands,) which other island, or itself, each is joined with, where one window for both costs less than two; boxes are widened."""
+def join_components(boxes: np.ndarray, reach: int, pixels_per_spread: int) -> np.ndarray:
+    """(components,) which other component, or itself, each is joined with, where one window for both costs less than two; boxes are widened."""
     joined = np.arange(len(boxes))
     changed = True
     while changed:

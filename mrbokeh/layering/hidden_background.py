@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.highlights import find_lights
-from mrbokeh.layering.padded_layers import Pixels, Sheet
+from mrbokeh.layering.highlights import mark_highlights
+from mrbokeh.layering.padded_layers import PaddedLayer, Pixels
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import in_bands
@@ -99,22 +99,22 @@ class _Edges:
     lit: Mask
 
 
-def apart(sheet: Sheet, pool: Executor) -> tuple[Pixels, Pixels]:
+def split_edges(sheet: PaddedLayer, pool: Executor) -> tuple[Pixels, Pixels]:
     """An opaque sheet as what is in front, with soft rims, and what lies behind its edges. The front takes over the sheet's memory."""
     edges = _edges(sheet, pool)
     rims, places, seeds = _sources(edges)
     behind = _filled(sheet.values, edges, places, seeds, pool)
     _unmix(sheet.values, edges, rims, behind)
-    return Pixels.of(Sheet(sheet.values, edges.coc_px, False)), behind
+    return Pixels.of(PaddedLayer(sheet.values, edges.coc_px, False)), behind
 
 
-def _edges(sheet: Sheet, pool: Executor) -> _Edges:
+def _edges(sheet: PaddedLayer, pool: Executor) -> _Edges:
     from mrbokeh.layering._hidden_background_numba import find_rims, snap
 
     coc_px, lit, rim = np.empty_like(sheet.coc_px), np.empty(sheet.coc_px.shape, np.bool_), np.empty(sheet.coc_px.shape, np.bool_)
 
     def look(top: int, bottom: int) -> None:
-        find_lights(lit, sheet.values, top, bottom)
+        mark_highlights(lit, sheet.values, top, bottom)
         snap(coc_px, sheet.coc_px, lit, _STEP_PX, top, bottom)
 
     in_bands(pool, len(rim), _BAND_ROWS, look)

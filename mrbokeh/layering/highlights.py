@@ -9,25 +9,25 @@ Values = Float32[np.ndarray, "height width channels"]
 Mask = Bool[np.ndarray, "height width"]
 
 
-def lights(values: Values) -> Mask:
+def find_highlights(values: Values) -> Mask:
     """Pixels several times brighter than the median of the 5x5 pixels around them. values: R, G, B and any others."""
     lit = np.empty(values.shape[:2], np.bool_)
-    find_lights(lit, np.ascontiguousarray(values), 0, len(lit))
+    mark_highlights(lit, np.ascontiguousarray(values), 0, len(lit))
     return lit
 
 
-def find_lights(lit: Mask, values: Values, top: int, bottom: int) -> None:
+def mark_highlights(lit: Mask, values: Values, top: int, bottom: int) -> None:
     """Set rows top to bottom of lit."""
-    from mrbokeh.layering._pixels_numba import find_lit
+    from mrbokeh.layering._pixels_numba import mark_rows
 
-    find_lit(lit, values, _LIGHT_OVER_SURROUNDINGS, top, bottom)
+    mark_rows(lit, values, _LIGHT_OVER_SURROUNDINGS, top, bottom)
 
 
-def without_lights(values: Values) -> Values:
+def without_highlights(values: Values) -> Values:
     """The picture with the median of the surroundings in place of lights; the same array if there are none."""
     from cv2 import medianBlur
 
-    lit = lights(values)
+    lit = find_highlights(values)
     if not lit.any():
         return values
     dark = values.copy()

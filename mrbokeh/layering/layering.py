@@ -1,6 +1,6 @@
 """Layering: layers with depth become slices of the circle of confusion, and slices, spread one by one, become a picture again.
 
-Shared by all renderers that spread light; they differ in the `Spread` alone.
+Shared by all renderers that spread light; they differ in the `KernelSum` alone.
 
 Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.drawn_diameters) from here on.
 1. Every layer is continued beyond the frame by the largest blur: the border of an opaque one outwards, one with holes not at all.
@@ -28,9 +28,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.hidden_background import apart
-from mrbokeh.layering.padded_layers import Pixels, Sheet, coc_px_of, sheet_of
-from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame, Optics, Spread, ThroughAperture
+from mrbokeh.layering.hidden_background import split_edges
+from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
+from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
 from mrbokeh.layering.slices import Channels, Slicing, composited
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
@@ -55,19 +55,19 @@ class Layering:
     field_cells: tuple[int, int] = FIELD_CELLS
 
 
-def render_layers(layers: Sequence[Layer], lens: Lens, spread: Spread | Optics, layering: Layering) -> Layer:
+def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | PsfField, layering: Layering) -> Layer:
     """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first.
 
-    spread: how kernels of the lens's aperture are summed, or an Optics that takes the aperture's place.
+    kernel_sum: how kernels of the lens's aperture are summed, or an PsfField that takes the aperture's place.
     """
     _check(layers)
-    optics = spread if isinstance(spread, Optics) else ThroughAperture.of(layers, lens.aperture, spread, layering.field_cells)
-    coc_px = [optics.drawn_px(coc_px_of(layer, lens)) for layer in layers]
-    margin = optics.margin_px(layers, coc_px)
+    psf = kernel_sum if isinstance(kernel_sum, PsfField) else AperturePsf.of(layers, lens.aperture, kernel_sum, layering.field_cells)
+    coc_px = [psf.drawn_px(coc_px_of(layer, lens)) for layer in layers]
+    margin = psf.margin_px(layers, coc_px)
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
-        slicing = Slicing(optics, layering.slices, frame, pool, _KEPT)
-        groups = _groups([sheet_of(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
+        slicing = Slicing(psf, layering.slices, frame, pool, _KEPT)
+        groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
         colour, taken = _rendered(groups[-1], layering, slicing)
         for group in reversed(groups[:-1]):
             colour, taken = _over(*_rendered(group, layering, slicing), colour, taken)
@@ -85,7 +85,7 @@ def _check(layers: Sequence[Layer]) -> None:
         raise InputError(f"layers must have the same extra channels in the same order, but came with {sorted(names)}")
 
 
-def _groups(sheets: Sequence[Sheet]) -> list[list[Sheet]]:
+def _groups(sheets: Sequence[PaddedLayer]) -> list[list[PaddedLayer]]:
     """Sheets that must be rendered together, front first."""
     groups = [[sheets[0]]]
     for sheet in sheets[1:]:
@@ -96,13 +96,13 @@ def _groups(sheets: Sequence[Sheet]) -> list[list[Sheet]]:
     return groups
 
 
-def _interleave(front: Sheet, behind: Sheet) -> bool:
+def _interleave(front: PaddedLayer, behind: PaddedLayer) -> bool:
     """Whether a sheet listed before another lies behind it anywhere."""
     both = (front.values[..., 3] > 0) & (behind.values[..., 3] > 0)
     return bool((both & (front.coc_px > behind.coc_px + _ONE_SURFACE_PX)).any())
 
 
-def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing) -> tuple[Channels, Channels]:
+def _rendered(group: Sequence[PaddedLayer], layering: Layering, slicing: Slicing) -> tuple[Channels, Channels]:
     """Colour and how much of the pupil is taken of one group, within the frame."""
     is_filled = layering.fill and group[0].is_opaque
     sheets = _with_hidden(group, slicing.pool) if is_filled else [Pixels.covered(sheet) for sheet in group]
@@ -110,10 +110,10 @@ def _rendered(group: Sequence[Sheet], layering: Layering, slicing: Slicing) -> t
     return _shared_out(colour, taken) if any(sheet.is_opaque for sheet in group) else (colour, taken)
 
 
-def _with_hidden(group: Sequence[Sheet], pool: Executor) -> list[Pixels]:
+def _with_hidden(group: Sequence[PaddedLayer], pool: Executor) -> list[Pixels]:
     """An opaque sheet taken apart, what is known to lie behind it, and last what was filled in where nothing is known."""
     known = [Pixels.covered(sheet, sheet.coc_px > group[0].coc_px + _ONE_SURFACE_PX) for sheet in group[1:]]
-    front, behind = apart(group[0], pool)
+    front, behind = split_edges(group[0], pool)
     if not known:
         return [front, behind]
     of_rim = front.values[behind.places, 3] < 1.0

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.highlights import without_lights
+from mrbokeh.layering.highlights import without_highlights
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import in_bands
@@ -20,7 +20,7 @@ Shares = Float32[np.ndarray, " _"]
 
 
 @dataclass(frozen=True)
-class Sheet:
+class PaddedLayer:
     """Premultiplied light of one layer with its blur, ready to be spread.
 
     values: (H, W, 4 + E) R, G, B, coverage, others. coc_px: (H, W) signed diameters, finite; 0 where nothing is.
@@ -40,12 +40,12 @@ class Pixels:
     coc_px: Float32[np.ndarray, " pixels"]
 
     @classmethod
-    def of(cls, sheet: Sheet) -> "Pixels":
+    def of(cls, sheet: PaddedLayer) -> "Pixels":
         """All of them; light and circles of confusion share the sheet's memory."""
         return cls(np.arange(sheet.coc_px.size, dtype=np.int32), sheet.values.reshape(-1, sheet.values.shape[2]), sheet.coc_px.reshape(-1))
 
     @classmethod
-    def covered(cls, sheet: Sheet, where: Bool[np.ndarray, "height width"] | None = None) -> "Pixels":
+    def covered(cls, sheet: PaddedLayer, where: Bool[np.ndarray, "height width"] | None = None) -> "Pixels":
         """Those that cover anything (and that are asked for)."""
         if sheet.is_opaque and where is None:
             return cls.of(sheet)
@@ -79,7 +79,7 @@ def coc_px_of(layer: Layer, lens: Lens) -> Plane:
     return np.where(covered, lens.coc_px(np.where(covered, layer.depth_m, np.inf), layer.width_px), 0.0).astype(np.float32)
 
 
-def sheet_of(layer: Layer, coc_px: Plane, margin_px: int, pool: Executor) -> Sheet:
+def pad_layer(layer: Layer, coc_px: Plane, margin_px: int, pool: Executor) -> PaddedLayer:
     """Colour, coverage and extra channels side by side, with a margin all around: border pixels go on outwards where the layer is
     opaque, nothing where it has holes.
 
@@ -102,7 +102,7 @@ def sheet_of(layer: Layer, coc_px: Plane, margin_px: int, pool: Executor) -> She
     if margin_px > 0:
         _continue(values, _dark_border(values[inside]) if is_opaque else np.zeros((1, 1, channels), np.float32), margin_px)
         _continue(all_coc_px, coc_px if is_opaque else np.zeros((1, 1), np.float32), margin_px)
-    return Sheet(values, all_coc_px, is_opaque)
+    return PaddedLayer(values, all_coc_px, is_opaque)
 
 
 def _dark_border(picture: Float32[np.ndarray, "height width channels"]) -> Float32[np.ndarray, "height width channels"]:
@@ -110,7 +110,7 @@ def _dark_border(picture: Float32[np.ndarray, "height width channels"]) -> Float
     dark = picture
     for border in (np.s_[:_BORDER_PX], np.s_[-_BORDER_PX:], np.s_[:, :_BORDER_PX], np.s_[:, -_BORDER_PX:]):
         strip = np.ascontiguousarray(dark[border])
-        without = without_lights(strip)
+        without = without_highlights(strip)
         if without is not strip:
             dark = picture.copy() if dark is picture else dark
             dark[border] = without

@@ -1,12 +1,12 @@
-"""Optics: what the light of a slice goes through on its way to the picture, and how far it travels there.
+"""PsfField: what the light of a slice goes through on its way to the picture, and how far it travels there.
 
-Renderers that differ in how they sum the kernels of an opening give a `Spread` alone; `ThroughAperture` does the rest for all
+Renderers that differ in how they sum the kernels of an opening give a `KernelSum` alone; `AperturePsf` does the rest for all
 of them. Kernels that come from elsewhere may be wide where the opening's are points, hold motion themselves, or lose light:
-a renderer that has such kernels brings an Optics of its own.
+a renderer that has such kernels brings an PsfField of its own.
 
 Spreading: every pixel throws its light over its own PSF, the one step in which the classical renderers differ.
 
-A `Spread` knows plain apertures only, weighted polygons that hold for every pixel and colour. What varies with the side
+A `KernelSum` knows plain apertures only, weighted polygons that hold for every pixel and colour. What varies with the side
 of the focus, with the place in the frame or with the colour is resolved here, once for all of them: the pixels are
 sorted by side and by field cell, and each group goes through the plain aperture that it sees.
 """
@@ -31,7 +31,7 @@ FIELD_CELLS = (16, 9)
 
 
 @runtime_checkable
-class Spread(Protocol):
+class KernelSum(Protocol):
     """The sum over all pixels of value times PSF, same size out; light that leaves the frame is lost.
 
     values: (H, W, C), HDR; a pixel whose values are all 0 has no say, whatever its circle of confusion.
@@ -72,8 +72,8 @@ def reach_px(aperture: Aperture, largest_coc_px: float) -> int:
     return kernel_radius_px(largest_coc_px * growth, aperture.unit_radius + drift)
 
 
-def spread_light(
-    spread: Spread,
+def blur_colours(
+    kernel_sum: KernelSum,
     values: Float32[np.ndarray, "height width channels"],
     coc_px: Float32[np.ndarray, "height width"],
     aperture: Aperture,
@@ -86,21 +86,21 @@ def spread_light(
     that the result has R, G, B, three coverages and the others (which spread as green does).
     """
     if aperture.is_plain:
-        return spread(values, coc_px, aperture)
+        return kernel_sum(values, coc_px, aperture)
     if not aperture.is_chromatic:
-        return _spread_groups(spread, values, coc_px, aperture, frame, field_cells, None)
+        return _blur_field_cells(kernel_sum, values, coc_px, aperture, frame, field_cells, None)
     rest = list(range(4, values.shape[2]))
     spreads = []
     for channel, also in ((0, []), (1, rest), (2, [])):
         scale = np.where(coc_px > 0, aperture.channel_scale(1)[channel], aperture.channel_scale(-1)[channel]).astype(np.float32)
         picked = np.ascontiguousarray(values[..., [channel, 3, *also]])
-        spreads.append(_spread_groups(spread, picked, coc_px * scale, aperture, frame, field_cells, channel))
+        spreads.append(_blur_field_cells(kernel_sum, picked, coc_px * scale, aperture, frame, field_cells, channel))
     colours, coverages = [each[..., :1] for each in spreads], [each[..., 1:2] for each in spreads]
     return np.concatenate([*colours, *coverages, spreads[1][..., 2:]], axis=2)
 
 
-def _spread_groups(
-    spread: Spread,
+def _blur_field_cells(
+    kernel_sum: KernelSum,
     values: Float32[np.ndarray, "height width channels"],
     coc_px: Float32[np.ndarray, "height width"],
     aperture: Aperture,
@@ -122,7 +122,7 @@ def _spread_groups(
             part_values = np.zeros((*total[window].shape[:2], values.shape[2]), np.float32)
             part_values[inner] = values[cell] * here[..., None]
             part_coc_px = np.ascontiguousarray(coc_px[window])
-            total[window] += spread(part_values, part_coc_px, aperture.seen(side, field_xy, channel))
+            total[window] += kernel_sum(part_values, part_coc_px, aperture.seen(side, field_xy, channel))
     return total
 
 
@@ -149,7 +149,7 @@ Channels = Float32[np.ndarray, "height width _"]
 
 
 @runtime_checkable
-class Optics(Protocol):
+class PsfField(Protocol):
     """How light travels from the sharp picture to the blurred one.
 
     coverages: 1, or 3 where red, green and blue each cover their own share of the pupil.
@@ -170,7 +170,7 @@ class Optics(Protocol):
         """The same of the pixels of a slice, none of whose diameters is larger. Nothing beyond it is kept."""
         ...
 
-    def spread(self, values: Channels, coc_px: Plane, frame: Frame) -> Channels:
+    def blur(self, values: Channels, coc_px: Plane, frame: Frame) -> Channels:
         """The light (R, G, B, coverage, others, premultiplied) where it arrives, of the same height and width.
 
         R, G, B, then `coverages` of coverage, then others. Coverage counts shares of the pupil as this place sees it: where
@@ -180,23 +180,23 @@ class Optics(Protocol):
 
 
 @dataclass(frozen=True)
-class ThroughAperture:
-    """An Optics of an opening, by a renderer's Spread; motion is drawn out along its path before (mrbokeh.layering.motion).
+class AperturePsf:
+    """An PsfField of an opening, by a renderer's KernelSum; motion is drawn out along its path before (mrbokeh.layering.motion).
 
     motion: the channels that hold it, if anything moves, and farthest_px: by how many whole pixels at most.
     """
 
     aperture: Aperture
-    kernels: Spread
+    kernel_sum: KernelSum
     field_cells: tuple[int, int] = FIELD_CELLS
     motion: slice | None = None
     farthest_px: int = 0
 
     @classmethod
-    def of(cls, layers: Sequence[Layer], aperture: Aperture, kernels: Spread, field_cells: tuple[int, int]) -> "ThroughAperture":
+    def of(cls, layers: Sequence[Layer], aperture: Aperture, kernel_sum: KernelSum, field_cells: tuple[int, int]) -> "AperturePsf":
         """With the motion that these layers have."""
         farthest = farthest_px(layers)
-        return cls(aperture, kernels, field_cells, motion_channels(layers[0].extra) if farthest else None, farthest)
+        return cls(aperture, kernel_sum, field_cells, motion_channels(layers[0].extra) if farthest else None, farthest)
 
     @property
     def coverages(self) -> int:
@@ -211,6 +211,6 @@ class ThroughAperture:
     def reach_px(self, parts: Sequence[Part], largest_coc_px: float, frame: Frame) -> int:  # noqa: ARG002
         return reach_px(self.aperture, largest_coc_px) + self.farthest_px
 
-    def spread(self, values: Channels, coc_px: Plane, frame: Frame) -> Channels:
+    def blur(self, values: Channels, coc_px: Plane, frame: Frame) -> Channels:
         drawn, drawn_coc_px = (values, coc_px) if self.motion is None else moved(values, coc_px, self.motion)
-        return spread_light(self.kernels, drawn, drawn_coc_px, self.aperture, frame, self.field_cells)
+        return blur_colours(self.kernel_sum, drawn, drawn_coc_px, self.aperture, frame, self.field_cells)

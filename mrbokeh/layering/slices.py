@@ -1,11 +1,11 @@
-"""Slices: sheets of light sorted by the circle of confusion, spread one by one and put together front to back.
+"""Slices: layers of light sorted by the circle of confusion, spread one by one and put together front to back.
 
-Which pixels of which sheets make up a slice, and which part of the frame they reach.
+Which pixels of which layers make up a slice, and which part of the frame they reach.
 
-Islands: the pixels of a slice that lie so far apart that their lights do not meet, each spread in a window of its own.
+Connected components: the pixels of a slice that lie so far apart that their lights do not meet, each spread in a window of its own.
 
 A slice of a slanted or rolling surface is a ring or a few patches in a window that is mostly empty, and spreading costs by the
-window. Islands' lights do not overlap, so it makes no difference which of them claims its share of the pupil first.
+window. Connected components' lights do not overlap, so it makes no difference which of them claims its share of the pupil first.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from mrbokeh.layering.padded_layers import Part, Pixels, Shares
-from mrbokeh.layering.psf_over_field import Frame, Optics
+from mrbokeh.layering.psf_over_field import Frame, PsfField
 from mrbokeh.system.resources import ZeroedMemory, ahead, bands, cores, in_bands
 
 _SORTED_PIXELS = 1 << 14
@@ -27,27 +27,27 @@ Window = tuple[slice, slice]
 
 
 def sorted_slices(
-    sheets: Sequence[Pixels], shares: Sequence[Shares], step_px: float, width: int, pool: Executor
+    layers: Sequence[Pixels], shares: Sequence[Shares], step_px: float, width: int, pool: Executor
 ) -> list[tuple[int, list[Part]]]:
     """Numbers and parts of the slices that are not empty, front first; circles of confusion nearest to that multiple of the step.
 
     width: of the frame that places are counted in.
     """
-    used = [(sheet, share) for sheet, share in zip(sheets, shares, strict=True) if share.any()]
+    used = [(layer, share) for layer, share in zip(layers, shares, strict=True) if share.any()]
     runs = [_runs(*each, np.float32(step_px), width, pool) for each in used]
     slices = np.unique(np.concatenate([np.empty(0, np.int32), *(of_runs for of_runs, _ in runs)]))
-    cuts = [np.split(of_sheet, np.searchsorted(of_runs, slices[1:])) for of_runs, of_sheet in runs]
+    cuts = [np.split(of_layer, np.searchsorted(of_runs, slices[1:])) for of_runs, of_layer in runs]
     parts = [[Part(*each, cut) for each, cut in zip(used, cut_of, strict=True) if len(cut) > 0] for cut_of in zip(*cuts, strict=True)]
     return list(zip(slices.tolist(), parts, strict=True))
 
 
 def _runs(
-    sheet: Pixels, shares: Shares, step_px: np.float32, width: int, pool: Executor
+    layer: Pixels, shares: Shares, step_px: np.float32, width: int, pool: Executor
 ) -> tuple[Int32[np.ndarray, " runs"], Int32[np.ndarray, "runs 2"]]:
-    """The slices of a sheet's runs, ascending, and the runs, in order within each slice."""
+    """The slices of a layer's runs, ascending, and the runs, in order within each slice."""
     from mrbokeh.layering._slices_numba import runs_of_slices
 
-    pixels = sheet.places, sheet.coc_px, shares, width, step_px
+    pixels = layer.places, layer.coc_px, shares, width, step_px
     found = list(pool.map(lambda band: runs_of_slices(*pixels, *band), bands(len(shares), _SORTED_PIXELS)))
     runs = np.concatenate([np.empty((0, 3), np.int32), *found])
     runs = runs[np.argsort(runs[:, 0], kind="stable")]
@@ -80,22 +80,22 @@ _PIXELS_PER_SPREAD = 1 << 14
 """What it costs to spread once more, in pixels of a window."""
 
 
-def islands(parts: Sequence[Part], reach: int, size: tuple[int, int]) -> Iterator[list[Part]]:
-    """The parts of a slice whose light travels so far at most, island by island; size: height and width of the frame with its margin."""
-    from mrbokeh.layering._slices_numba import islands_of_runs, join_islands, mark_cells, number_islands
+def connected_components(parts: Sequence[Part], reach: int, size: tuple[int, int]) -> Iterator[list[Part]]:
+    """The parts of a slice whose light travels so far at most, component by component; size: height and width of the frame with its margin."""
+    from mrbokeh.layering._slices_numba import components_of_runs, join_components, label_components, mark_cells
 
     cell_px = max(_LEAST_CELL_PX, 2 * reach, -(-max(size) // _MOST_CELLS))
     cells = np.zeros((-(-size[0] // cell_px), -(-size[1] // cell_px)), np.int32)
     for part in parts:
         mark_cells(cells, cell_px, part.runs, part.pixels.places, size[1])
-    boxes = np.tile(np.array([size[0], 0, size[1], 0]), (number_islands(cells), 1))
-    own = [islands_of_runs(boxes, cells, cell_px, part.runs, part.pixels.places, size[1]) for part in parts]
-    joined = join_islands(boxes, reach, _PIXELS_PER_SPREAD)
+    boxes = np.tile(np.array([size[0], 0, size[1], 0]), (label_components(cells), 1))
+    own = [components_of_runs(boxes, cells, cell_px, part.runs, part.pixels.places, size[1]) for part in parts]
+    joined = join_components(boxes, reach, _PIXELS_PER_SPREAD)
     if not joined.any():
         yield list(parts)
         return
-    for island in np.unique(joined):
-        cut = [replace(part, runs=part.runs[joined[of_runs] == island]) for part, of_runs in zip(parts, own, strict=True)]
+    for component in np.unique(joined):
+        cut = [replace(part, runs=part.runs[joined[of_runs] == component]) for part, of_runs in zip(parts, own, strict=True)]
         yield [part for part in cut if len(part.runs) > 0]
 
 
@@ -118,7 +118,7 @@ class Slicing:
     frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them.
     """
 
-    optics: Optics
+    psf: PsfField
     slices: int
     frame: Frame
     pool: Executor
@@ -138,19 +138,19 @@ class Slicing:
             return 5 * cores()
         return cores() + 2 if pixels <= _FEW_PIXELS else 2 if pixels <= _MANY_PIXELS else 1
 
-    def spread_piece(self, piece: tuple[Sequence[Part], int]) -> list[tuple[Channels, Window]]:
+    def blur_component(self, piece: tuple[Sequence[Part], int]) -> list[tuple[Channels, Window]]:
         """The light of parts of a slice, which travels so far at most, and the window where it lies.
 
-        Where pixels of two sheets share a place there are two rounds of that or more.
+        Where pixels of two layers share a place there are two rounds of that or more.
         """
         parts, reach = piece
         rounds: list[tuple[Channels, Window]] = []
         while parts and (window := window_of(parts, reach, self.frame)) is not None:
-            light, parts = self._spread_round(parts, window)
+            light, parts = self._blur_round(parts, window)
             rounds.append((light, window))
         return rounds
 
-    def _spread_round(self, parts: Sequence[Part], window: Window) -> tuple[Channels, list[Part]]:
+    def _blur_round(self, parts: Sequence[Part], window: Window) -> tuple[Channels, list[Part]]:
         """Light spread within a window of the frame, and what finds its place taken."""
         from mrbokeh.layering._slices_numba import place_light, remove_light
 
@@ -161,7 +161,7 @@ class Slicing:
             place_light(light, coc_px, each.runs, each.pixels.places, each.pixels.values, each.pixels.coc_px, each.shares, *where)
             for each in parts
         ]
-        spread = self.optics.spread(light, coc_px, self.frame.moved(window[1].start, window[0].start))
+        spread = self.psf.blur(light, coc_px, self.frame.moved(window[1].start, window[0].start))
         spread = spread.copy() if np.may_share_memory(spread, memory) else spread
         for part in parts:
             remove_light(light, coc_px, part.runs, part.pixels.places, *where)
@@ -176,35 +176,35 @@ def _laid_out(memory: Float32[np.ndarray, " elements"], window: Window, channels
     return memory[:elements].reshape(rows, columns, channels), memory[elements : elements + rows * columns].reshape(rows, columns)
 
 
-def composited(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tuple[Channels, Channels]:
-    """All sheets as the lens sees them, put together front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
+def composited(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tuple[Channels, Channels]:
+    """All layers as the lens sees them, put together front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
 
-    by_depth: which sheet the pinhole picture shows at a pixel is a matter of depth, else of their order (slices are always by depth).
+    by_depth: which layer the pinhole picture shows at a pixel is a matter of depth, else of their order (slices are always by depth).
     The pupil is counted per colour where the optics are chromatic.
     """
     from mrbokeh.layering._slices_numba import claim
 
-    frame, channels = slicing.frame, sheets[0].values.shape[1]
+    frame, channels = slicing.frame, layers[0].values.shape[1]
     colour = np.zeros((frame.height_px, frame.width_px, channels - 1), np.float32)
-    taken = np.zeros((frame.height_px, frame.width_px, slicing.optics.coverages), np.float32)
-    for rounds in ahead(slicing.pool, slicing.spread_piece, _pieces(sheets, slicing, by_depth), slicing.at_once):
+    taken = np.zeros((frame.height_px, frame.width_px, slicing.psf.coverages), np.float32)
+    for rounds in ahead(slicing.pool, slicing.blur_component, _pieces(layers, slicing, by_depth), slicing.at_once):
         for light, (rows, columns) in rounds:
             claim(colour, taken, light, rows.start + frame.top_px, columns.start + frame.left_px)
     return colour, taken
 
 
-def _pieces(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[tuple[list[Part], int]]:
+def _pieces(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[tuple[list[Part], int]]:
     """Parts of slices that can be spread by themselves, and how far their light travels at most, in the order in which they claim."""
-    nearest, farthest = _range_px(sheets, slicing.size[0] * slicing.size[1])
+    nearest, farthest = _range_px(layers, slicing.size[0] * slicing.size[1])
     step_px = max((farthest - nearest) / slicing.slices, _LEAST_STEP_PX)
-    for k, parts in _in_turn(sheets, slicing, by_depth, step_px):
+    for k, parts in _in_turn(layers, slicing, by_depth, step_px):
         largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
-        reach = slicing.optics.reach_px(parts, largest_px, slicing.frame)
-        for island in islands(parts, reach, slicing.size):
-            yield island, reach
+        reach = slicing.psf.reach_px(parts, largest_px, slicing.frame)
+        for component in connected_components(parts, reach, slicing.size):
+            yield component, reach
 
 
-def _in_turn(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px: float) -> Iterator[tuple[int, list[Part]]]:
+def _in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px: float) -> Iterator[tuple[int, list[Part]]]:
     """Numbers and parts of the slices in the order in which they claim the pupil.
 
     Front to back, what the pinhole picture shows; last what hides. But what hides behind something on the other side of the focus
@@ -212,49 +212,49 @@ def _in_turn(sheets: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px
     """
 
     def cut(shares: list[Shares]) -> list[tuple[int, list[Part]]]:
-        return sorted_slices(sheets, shares, step_px, slicing.size[1], slicing.pool)
+        return sorted_slices(layers, shares, step_px, slicing.size[1], slicing.pool)
 
-    if len(sheets) == 1:
-        yield from cut([np.ones_like(sheets[0].coc_px)])
+    if len(layers) == 1:
+        yield from cut([np.ones_like(layers[0].coc_px)])
         return
-    seen, crossing = _shown_by_depth(sheets, slicing.size) if by_depth else _shown_in_order(sheets, slicing)
+    seen, crossing = _shown_by_depth(layers, slicing.size) if by_depth else _shown_in_order(layers, slicing)
     yield from merge(cut(crossing), cut(seen), key=itemgetter(0))
     yield from cut([1.0 - shown - across for shown, across in zip(seen, crossing, strict=True)])
 
 
-def _range_px(sheets: Sequence[Pixels], pixels: int) -> tuple[float, float]:
-    """The least and the greatest circle of confusion; what a sheet leaves uncovered counts as in focus."""
-    in_focus = [0.0] if any(len(sheet.places) < pixels for sheet in sheets) else []
-    used = [sheet.coc_px for sheet in sheets if len(sheet.places) > 0]
+def _range_px(layers: Sequence[Pixels], pixels: int) -> tuple[float, float]:
+    """The least and the greatest circle of confusion; what a layer leaves uncovered counts as in focus."""
+    in_focus = [0.0] if any(len(layer.places) < pixels for layer in layers) else []
+    used = [layer.coc_px for layer in layers if len(layer.places) > 0]
     return float(min([*in_focus, *(coc_px.min() for coc_px in used)])), float(max([*in_focus, *(coc_px.max() for coc_px in used)]))
 
 
-def _shown_in_order(sheets: Sequence[Pixels], slicing: Slicing) -> tuple[list[Shares], list[Shares]]:
-    """How much of each pixel the sheets listed before leave uncovered, and how much hides behind one on the other side of the focus."""
+def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> tuple[list[Shares], list[Shares]]:
+    """How much of each pixel the layers listed before leave uncovered, and how much hides behind one on the other side of the focus."""
     from mrbokeh.layering._slices_numba import cover
 
     pixels = slicing.size[0] * slicing.size[1]
     free, nearest_px = np.ones(pixels, np.float32), np.zeros(pixels, np.float32)
-    shown, crossing = ([np.empty_like(sheet.coc_px) for sheet in sheets] for _ in range(2))
+    shown, crossing = ([np.empty_like(layer.coc_px) for layer in layers] for _ in range(2))
 
     def cover_band(first: int, end: int) -> None:
-        for each, across, sheet in zip(shown, crossing, sheets, strict=True):
-            cover(each, across, free, nearest_px, sheet.places, sheet.values, sheet.coc_px, _SHARP_PX, first, end)
+        for each, across, layer in zip(shown, crossing, layers, strict=True):
+            cover(each, across, free, nearest_px, layer.places, layer.values, layer.coc_px, _SHARP_PX, first, end)
 
     in_bands(slicing.pool, pixels, _BAND_PIXELS, cover_band)
     return shown, crossing
 
 
-def _shown_by_depth(sheets: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
-    """The same of nearer sheets, and of those at one depth the ones listed before."""
-    shown, crossing = ([np.full_like(sheet.coc_px, value) for sheet in sheets] for value in (1.0, 0.0))
-    for j, front in enumerate(sheets):
+def _shown_by_depth(layers: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
+    """The same of nearer layers, and of those at one depth the ones listed before."""
+    shown, crossing = ([np.full_like(layer.coc_px, value) for layer in layers] for value in (1.0, 0.0))
+    for j, front in enumerate(layers):
         coverage, coc_px = np.zeros(size[0] * size[1], np.float32), np.zeros(size[0] * size[1], np.float32)
         coverage[front.places], coc_px[front.places] = front.values[:, 3], front.coc_px
-        for i, sheet in enumerate(sheets):
+        for i, layer in enumerate(layers):
             if i != j:
-                there_px, over = coc_px[sheet.places], coverage[sheet.places]
-                nearer = there_px <= sheet.coc_px if j < i else there_px < sheet.coc_px
+                there_px, over = coc_px[layer.places], coverage[layer.places]
+                nearer = there_px <= layer.coc_px if j < i else there_px < layer.coc_px
                 shown[i] *= np.where(nearer, np.float32(1.0) - over, np.float32(1.0))
-                crossing[i][(over > 0) & (there_px < -_SHARP_PX) & (sheet.coc_px > _SHARP_PX)] = 1.0
+                crossing[i][(over > 0) & (there_px < -_SHARP_PX) & (layer.coc_px > _SHARP_PX)] = 1.0
     return shown, [across * (np.float32(1.0) - each) for across, each in zip(crossing, shown, strict=True)]

@@ -38,17 +38,17 @@ class ScatterReference:
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         if self._of_bank is None or not layers:
-            return render_layers(layers, lens, self.spread, self.layering)
+            return render_layers(layers, lens, self.sum_kernels, self.layering)
         return self._of_bank.render(layers, lens, self.layering)
 
     @cached_property
     def _of_bank(self) -> BankRenderer | None:
         return None if self.bank is None else by_scatter(self.bank)
 
-    def spread(
+    def sum_kernels(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.Spread."""
+        """See mrbokeh.layering.psf_over_field.KernelSum."""
         return scatter(values.astype(np.float64), coc_px, aperture, self.threads).astype(np.float32)
 
 

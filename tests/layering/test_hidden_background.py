@@ -8,9 +8,9 @@ import pytest
 from scipy.ndimage import minimum_filter
 
 from mrbokeh.layering._hidden_background_numba import find_rims, nearest_behind, pure_neighbours, snap
-from mrbokeh.layering.hidden_background import apart
-from mrbokeh.layering.highlights import lights
-from mrbokeh.layering.padded_layers import Sheet
+from mrbokeh.layering.hidden_background import split_edges
+from mrbokeh.layering.highlights import find_highlights
+from mrbokeh.layering.padded_layers import PaddedLayer
 from mrbokeh.system.resources import CallingThread
 
 SIZE = (72, 96)
@@ -19,7 +19,7 @@ Parts = tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 def parted(values: np.ndarray, coc_px: np.ndarray) -> Parts:
     """Front and behind, each as light and circles of confusion of the whole picture."""
-    front, behind = apart(Sheet(values.copy(), coc_px.astype(np.float32), True), CallingThread())
+    front, behind = split_edges(PaddedLayer(values.copy(), coc_px.astype(np.float32), True), CallingThread())
     shown = np.zeros_like(values), np.zeros(coc_px.shape, np.float32)
     shown[0].reshape(-1, values.shape[2])[behind.places], shown[1].reshape(-1)[behind.places] = behind.values, behind.coc_px
     return (front.values.reshape(values.shape), front.coc_px.reshape(coc_px.shape)), shown
@@ -65,7 +65,7 @@ def plainly_snapped(coc_px: np.ndarray, lit: np.ndarray) -> np.ndarray:
 def test_edges_of_the_depth_map_against_plain_definitions(seed: int) -> None:
     """Snapped pixels, and rims: something more than 1 px nearer among the 8 neighbours."""
     values, coc_px = cluttered(seed, (36, 44))
-    lit = lights(values)
+    lit = find_highlights(values)
     snapped, rim = np.empty_like(coc_px), np.empty(coc_px.shape, np.bool_)
     snap(snapped, coc_px, lit, 1.0, 0, len(coc_px))
     np.testing.assert_array_equal(snapped, plainly_snapped(coc_px, lit))
@@ -103,7 +103,7 @@ def test_parting_does_not_depend_on_threads(seed: int, monkeypatch: pytest.Monke
     alone = parted(values, coc_px)
     monkeypatch.setattr("mrbokeh.system.resources.cores", lambda: 3)
     with ThreadPoolExecutor(3) as pool:
-        front, behind = apart(Sheet(values.copy(), coc_px.copy(), True), pool)
+        front, behind = split_edges(PaddedLayer(values.copy(), coc_px.copy(), True), pool)
     np.testing.assert_array_equal(front.values, alone[0][0].reshape(-1, 4))
     np.testing.assert_array_equal(front.coc_px, alone[0][1].reshape(-1))
     np.testing.assert_array_equal(behind.values, alone[1][0].reshape(-1, 4)[behind.places])
@@ -162,6 +162,6 @@ def test_lamps_are_no_source_of_background() -> None:
     coc_px = np.zeros(SIZE, np.float32)
     coc_px[:, :48] = -16.0
     values[36, 50, :3] = 1000.0
-    assert lights(values).sum() == 1
+    assert find_highlights(values).sum() == 1
     _, (behind, _) = parted(values, coc_px)
     assert behind[..., :3].max() < 0.11

@@ -7,7 +7,7 @@ import pytest
 
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.layering.layering import Layering, render_layers
-from mrbokeh.layering.psf_over_field import Frame, spread_light
+from mrbokeh.layering.psf_over_field import Frame, blur_colours
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
@@ -15,7 +15,7 @@ from mrbokeh.system.errors import InputError
 
 SIZE = (72, 96)
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)  # up to 64 px of blur at infinity
-SPREAD = ScatterReference().spread
+SPREAD = ScatterReference().sum_kernels
 
 
 def depth_m(coc_px: np.ndarray | float) -> np.ndarray:
@@ -122,7 +122,7 @@ def test_field_cells_meet_their_limit() -> None:
     values[20:52, 20:76] = rng.uniform(0.0, 1.0, (32, 56, 4))
     coc_px = np.full(SIZE, 12.0, np.float32)
     frame = Frame(SIZE[1], SIZE[0])
-    coarse, middle, finest = (spread_light(SPREAD, values, coc_px, aperture, frame, cells) for cells in ((4, 3), (8, 6), (48, 36)))
+    coarse, middle, finest = (blur_colours(SPREAD, values, coc_px, aperture, frame, cells) for cells in ((4, 3), (8, 6), (48, 36)))
     for each in (coarse, middle, finest):
         np.testing.assert_allclose(each.sum((0, 1)), values.sum((0, 1)), rtol=1e-5)
     assert np.abs(middle - finest).mean() < 0.6 * np.abs(coarse - finest).mean()
@@ -134,9 +134,9 @@ def test_cells_of_a_part_are_those_of_the_whole_frame() -> None:
     values = np.zeros((*SIZE, 4), np.float32)
     values[60, 80] = 1.0
     coc_px = np.full(SIZE, 14.0, np.float32)
-    whole = spread_light(SPREAD, values, coc_px, aperture, Frame(SIZE[1], SIZE[0]))
+    whole = blur_colours(SPREAD, values, coc_px, aperture, Frame(SIZE[1], SIZE[0]))
     window = np.s_[44:72, 64:96]
-    part = spread_light(SPREAD, values[window].copy(), coc_px[window].copy(), aperture, Frame(SIZE[1], SIZE[0], 64, 44))
+    part = blur_colours(SPREAD, values[window].copy(), coc_px[window].copy(), aperture, Frame(SIZE[1], SIZE[0], 64, 44))
     np.testing.assert_allclose(part, whole[window], atol=1e-7)
 
 

@@ -67,7 +67,7 @@ def test_what_another_view_saw_is_nearer_to_the_truth_than_what_was_guessed() ->
     rgb, depth_m = seen_by(CAMERA)
     clean, _ = seen_by(CAMERA, with_post=False)
     others = [layer_from_view(*seen_by(moved(x_m)), moved(x_m), CAMERA, depth_m) for x_m in (0.25, -0.25)]
-    spread, layering = ScatterReference().spread, Layering()
+    spread, layering = ScatterReference().sum_kernels, Layering()
     picture = opaque(rgb, depth_m)
     truth = render_layers([picture, opaque(clean, np.full_like(depth_m, WALL_M))], lens, spread, layering).rgb
     guessed = render_layers([picture], lens, spread, layering).rgb

@@ -1,4 +1,4 @@
-"""Slices: sorted, cut into islands, spread and put together, against a plain composition of the same."""
+"""Slices: sorted, cut into connected_components, spread and put together, against a plain composition of the same."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,8 +11,8 @@ from mrbokeh.images.layer import Layer, clear
 from mrbokeh.layering._slices_numba import claim, share_out
 from mrbokeh.layering.layering import Layering, render_layers
 from mrbokeh.layering.padded_layers import Part, Pixels
-from mrbokeh.layering.psf_over_field import Frame, Spread, ThroughAperture, spread_light
-from mrbokeh.layering.slices import Slicing, composited, islands, sorted_slices
+from mrbokeh.layering.psf_over_field import AperturePsf, Frame, KernelSum, blur_colours
+from mrbokeh.layering.slices import Slicing, composited, connected_components, sorted_slices
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
@@ -20,7 +20,7 @@ from mrbokeh.system.resources import CallingThread, ZeroedMemory
 
 SIZE, MARGIN = (40, 52), 7
 FRAME = Frame(SIZE[1] - 2 * MARGIN, SIZE[0] - 2 * MARGIN, -MARGIN, -MARGIN)
-SPREAD = ScatterReference().spread
+SPREAD = ScatterReference().sum_kernels
 DISC = Aperture.disc(16)
 INSIDE = np.s_[MARGIN:-MARGIN, MARGIN:-MARGIN]
 
@@ -36,12 +36,12 @@ def sheet(seed: int, covered: float, extra: int = 0) -> Pixels:
     return Pixels(places, values, coc_px.astype(np.float32))
 
 
-def slicing(aperture: Aperture, spread: Spread = SPREAD, slices: int = 6) -> Slicing:
-    return Slicing(ThroughAperture(aperture, spread, (4, 3)), slices, FRAME, CallingThread(), ZeroedMemory())
+def slicing(aperture: Aperture, spread: KernelSum = SPREAD, slices: int = 6) -> Slicing:
+    return Slicing(AperturePsf(aperture, spread, (4, 3)), slices, FRAME, CallingThread(), ZeroedMemory())
 
 
 def plainly_composited(
-    sheets: Sequence[Pixels], aperture: Aperture, slices: int, by_depth: bool, spread: Spread = SPREAD
+    sheets: Sequence[Pixels], aperture: Aperture, slices: int, by_depth: bool, spread: KernelSum = SPREAD
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slice by slice and sheet by sheet over whole arrays; where two sheets meet in a pixel of a slice the later one goes after.
 
@@ -74,7 +74,7 @@ def plainly_composited(
             light = sum(values * (mine[i] * shares[i])[..., None] for i, (values, _) in enumerate(dense)).astype(np.float32)
             coc_px = np.where(mine, diameters_px, 0.0).sum(axis=0, dtype=np.float32)
             if mine.any():
-                plainly_claim(colour, taken, spread_light(spread, light, coc_px, aperture, FRAME, (4, 3)))
+                plainly_claim(colour, taken, blur_colours(spread, light, coc_px, aperture, FRAME, (4, 3)))
     return colour[INSIDE], taken[INSIDE]
 
 
@@ -137,7 +137,7 @@ def patches(corners: Sequence[tuple[int, int]], size: tuple[int, int]) -> list[P
 def test_light_of_different_islands_does_not_meet_and_neighbours_stay_together() -> None:
     size = (300, 400)
     parts = patches([(10, 10), (10, 22), (150, 200), (280, 390)], size)
-    pieces = list(islands(parts, 3, size))
+    pieces = list(connected_components(parts, 3, size))
     reached = []
     for piece in pieces:
         covered = np.zeros(size, bool)
@@ -154,7 +154,7 @@ def test_light_of_different_islands_does_not_meet_and_neighbours_stay_together()
 def test_islands_too_near_to_pay_are_one() -> None:
     """Two patches of 4 px with 46 px between: one window of 60 x 60 px costs less than to spread twice."""
     parts = patches([(10, 10), (60, 60)], (80, 80))
-    assert len(list(islands(parts, 3, (80, 80)))) == 1
+    assert len(list(connected_components(parts, 3, (80, 80)))) == 1
 
 
 @pytest.mark.parametrize(("extra", "kinds"), [(0, 1), (2, 1), (0, 3), (2, 3)])

@@ -25,7 +25,7 @@ from mrbokeh.renderers.kernels.laplacian_tables import (
 )
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets, lamps_among, lamps_among_plainly
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets, highlights_among, highlights_among_plainly
 from mrbokeh.renderers.spreadlets.sums import FOUR, Laid, Window, _Splatting, gains_for, splat, splat_plainly
 from mrbokeh.system.errors import InputError
 
@@ -56,22 +56,22 @@ def test_whole_laplacians_are_dense_splatting_to_rounding(aperture: Aperture, si
     taps = renderer._tables.points(used.tolist(), aperture, 1, dense=True)
     reach, dense = taps.reach_px, np.zeros((SIZE[0] + 2 * taps.reach_px, SIZE[1] + 2 * taps.reach_px, 4))
     splat(dense, values, cells.reshape(SIZE).astype(np.int32), taps, (-reach, -reach))
-    np.testing.assert_allclose(renderer.spread(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=2e-7)
-    np.testing.assert_allclose(renderer.spread_densely(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=5e-5)
+    np.testing.assert_allclose(renderer.sum_kernels(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=2e-7)
+    np.testing.assert_allclose(renderer.sum_kernels_densely(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=5e-5)
 
 
 def test_sparse_points_come_near_dense_splatting_of_the_same_kernels() -> None:
     """Mean circle 40 px. What the bench measures on a larger picture, here in small: SSIM within 0.01, more than 45 dB."""
     renderer = LaplacianSpreadlets()
     values, coc_px = picture(1), slope_px(30.0, 50.0)
-    found, dense = renderer.spread(values, coc_px, DISC), renderer.spread_densely(values, coc_px, DISC)
+    found, dense = renderer.sum_kernels(values, coc_px, DISC), renderer.sum_kernels_densely(values, coc_px, DISC)
     assert ssim(found[..., :3], dense[..., :3]) > 0.99
     assert psnr(found, dense) > 45.0
 
 
 def test_sparse_points_come_near_the_reference() -> None:
     values, coc_px = picture(2), slope_px(-50.0, -30.0)
-    found, reference = LaplacianSpreadlets().spread(values, coc_px, PENTAGON), ScatterReference().spread(values, coc_px, PENTAGON)
+    found, reference = LaplacianSpreadlets().sum_kernels(values, coc_px, PENTAGON), ScatterReference().sum_kernels(values, coc_px, PENTAGON)
     assert psnr(found, reference) > 45.0
     assert found.sum() == pytest.approx(reference.sum(), rel=2e-3)
 
@@ -79,7 +79,7 @@ def test_sparse_points_come_near_the_reference() -> None:
 def test_the_fast_track_is_near_the_reference() -> None:
     """Diameters rounded to 1/32 px."""
     values, coc_px = picture(3), slope_px(0.0, 24.0)
-    found, reference = LaplacianSpreadlets().spread(values, coc_px, DISC), ScatterReference().spread(values, coc_px, DISC)
+    found, reference = LaplacianSpreadlets().sum_kernels(values, coc_px, DISC), ScatterReference().sum_kernels(values, coc_px, DISC)
     assert psnr(found, reference) > 60.0
 
 
@@ -90,7 +90,7 @@ def test_light_of_a_sparse_area_is_kept_and_stays_in_place() -> None:
     coc_px = np.full((200, 220), 48.0, np.float32)
     renderer = LaplacianSpreadlets()
     assert not stands_out(values)[92:108, 102:128].all(), "else all would be whole Laplacians"
-    light = renderer.spread(values, coc_px, DISC).astype(np.float64)[..., 0]
+    light = renderer.sum_kernels(values, coc_px, DISC).astype(np.float64)[..., 0]
     rows, columns = np.indices(light.shape)
     truth = values[..., 0].astype(np.float64)
     assert light.sum() == pytest.approx(truth.sum(), rel=1e-3)
@@ -105,8 +105,8 @@ def test_a_lamp_shows_its_exact_disc() -> None:
     lamp = values.copy()
     lamp[96, 96, :3] = 1e5
     renderer = LaplacianSpreadlets()
-    alone = renderer.spread(lamp, coc_px, DISC) - renderer.spread(values, coc_px, DISC)
-    dense = renderer.spread_densely(lamp, coc_px, DISC) - renderer.spread_densely(values, coc_px, DISC)
+    alone = renderer.sum_kernels(lamp, coc_px, DISC) - renderer.sum_kernels(values, coc_px, DISC)
+    dense = renderer.sum_kernels_densely(lamp, coc_px, DISC) - renderer.sum_kernels_densely(values, coc_px, DISC)
     np.testing.assert_allclose(alone[..., :3], dense[..., :3], atol=2e-3 * dense.max())
     assert np.abs(alone[:60]).max() < 1e-3, "1e-8 of the lamp"
 
@@ -115,20 +115,20 @@ def test_a_lamp_shows_its_exact_disc() -> None:
 def test_linear_in_radiance(dense_up_to_px: float) -> None:
     renderer = LaplacianSpreadlets(dense_up_to_px=dense_up_to_px)
     values, coc_px = picture(6), slope_px(-6.0, 36.0)
-    one, scaled = (renderer.spread(factor * values, coc_px, DISC) for factor in (np.float32(1.0), np.float32(1000.0)))
+    one, scaled = (renderer.sum_kernels(factor * values, coc_px, DISC) for factor in (np.float32(1.0), np.float32(1000.0)))
     np.testing.assert_allclose(scaled, 1000.0 * one, rtol=1e-5, atol=1e-3)
 
 
 def test_the_number_of_threads_changes_no_bit_of_sparse_sums() -> None:
     values, coc_px = picture(7, (240, 120)), slope_px(-36.0, 40.0, (240, 120))
-    one, three = (LaplacianSpreadlets(threads=threads).spread(values, coc_px, PENTAGON) for threads in (1, 3))
+    one, three = (LaplacianSpreadlets(threads=threads).sum_kernels(values, coc_px, PENTAGON) for threads in (1, 3))
     np.testing.assert_array_equal(one, three)
 
 
 def test_the_pyramid_is_another_integration_and_a_worse_one() -> None:
     values, coc_px = picture(8), slope_px(30.0, 50.0)
-    dense = LaplacianSpreadlets().spread_densely(values, coc_px, DISC)
-    exact, pyramid = (LaplacianSpreadlets(integration=name).spread(values, coc_px, DISC) for name in ("exact", "pyramid"))
+    dense = LaplacianSpreadlets().sum_kernels_densely(values, coc_px, DISC)
+    exact, pyramid = (LaplacianSpreadlets(integration=name).sum_kernels(values, coc_px, DISC) for name in ("exact", "pyramid"))
     assert psnr(exact, dense) > psnr(pyramid, dense) + 6.0 > 26.0
 
 
@@ -218,7 +218,7 @@ def test_whole_numbers_are_as_good_as_double_precision(name: str) -> None:
     """To 1e-5 of what each channel is without lamps and the rounding of the result; coverage far brighter than colour costs nothing."""
     values, coc_px = LIGHTS[name](), slope_px(30.0, 50.0, (192, 192))
     whole = LaplacianSpreadlets()
-    found, exact = (each.spread(values, coc_px, DISC) for each in (whole, in_double(whole)))
+    found, exact = (each.sum_kernels(values, coc_px, DISC) for each in (whole, in_double(whole)))
     typical = np.median(values, axis=(0, 1))
     assert np.all(np.abs(found - exact) <= 1e-5 * typical + 2.0**-22 * np.abs(exact))
     np.testing.assert_allclose(found.sum(axis=(0, 1), dtype=np.float64), exact.sum(axis=(0, 1), dtype=np.float64), rtol=3e-6)
@@ -229,7 +229,7 @@ def test_light_that_is_no_number_goes_no_other_way_than_before() -> None:
     """Whole numbers cannot hold it: sums in double precision say so."""
     values, coc_px = picture(19), slope_px(30.0, 50.0)
     values[40, 50, 1] = np.nan
-    found = LaplacianSpreadlets().spread(values, coc_px, DISC)
+    found = LaplacianSpreadlets().sum_kernels(values, coc_px, DISC)
     assert np.isnan(found[40, 50, 1])
     assert np.isfinite(found[..., 0]).all()
 
@@ -301,7 +301,7 @@ def test_lamps_agree_with_their_plain_twin(share: float) -> None:
     values[rng.uniform(size=(90, 150)) < 2e-3] *= 100.0
     codes = np.where(rng.uniform(size=(90, 150)) < share, rng.integers(-1, 2, (90, 150)), rng.integers(2, 5, (90, 150))).astype(np.int32)
     sparse = np.array([False, False, True, True, True])
-    found, plain = lamps_among(values, codes, sparse), lamps_among_plainly(values, codes, sparse)
+    found, plain = highlights_among(values, codes, sparse), highlights_among_plainly(values, codes, sparse)
     np.testing.assert_array_equal(found.found, plain.found)
     assert 0 < found.found.sum() < 0.03 * found.found.size
     assert np.all(found.largest >= plain.largest)
@@ -312,9 +312,9 @@ def test_lamps_cost_no_likeness_elsewhere() -> None:
     """A lamp of 1e5 leaves the rest of the picture as it was, but for its disc."""
     values, coc_px = picture(22, (192, 192)), np.full((192, 192), 42.0, np.float32)
     renderer = LaplacianSpreadlets()
-    before = renderer.spread(values, coc_px, DISC)
+    before = renderer.sum_kernels(values, coc_px, DISC)
     values[96, 96, :3] = 1e5
-    after = renderer.spread(values, coc_px, DISC)
+    after = renderer.sum_kernels(values, coc_px, DISC)
     far = np.hypot(*(np.indices((192, 192)) - 96)) > 24.0
     np.testing.assert_allclose(after[far], before[far], atol=2e-3, err_msg="the pixel's own light is gone from its surroundings")
 
@@ -326,9 +326,9 @@ def test_by_name_and_by_mistake() -> None:
     with pytest.raises(InputError, match="at least 2 px"):
         LaplacianSpreadlets(dense_up_to_px=0.0)
     with pytest.raises(InputError, match="finite circle of confusion"):
-        LaplacianSpreadlets().spread(picture(), np.full(SIZE, np.nan, np.float32), DISC)
+        LaplacianSpreadlets().sum_kernels(picture(), np.full(SIZE, np.nan, np.float32), DISC)
     with pytest.raises(InputError, match="without a bank"):
-        LaplacianSpreadlets().spread_bank(picture(), slope_px(1, 2), Place())
+        LaplacianSpreadlets().sum_bank_kernels(picture(), slope_px(1, 2), Place())
 
 
 def bank_of(aperture: Aperture, sizes_px: tuple[float, ...] = (6.0, 18.0, 30.0, 42.0), **facts: object) -> PsfBank:
@@ -341,10 +341,10 @@ def bank_of(aperture: Aperture, sizes_px: tuple[float, ...] = (6.0, 18.0, 30.0, 
 @pytest.mark.parametrize("coc_px", [18.0, 42.0, -42.0])
 def test_a_bank_of_an_apertures_kernels_is_the_aperture(coc_px: float) -> None:
     values, circles = picture(10), np.full(SIZE, coc_px, np.float32)
-    found = LaplacianSpreadlets(bank_of(PENTAGON)).spread_bank(values, circles, Place())
-    reference = ScatterReference().spread(values, circles, PENTAGON)
+    found = LaplacianSpreadlets(bank_of(PENTAGON)).sum_bank_kernels(values, circles, Place())
+    reference = ScatterReference().sum_kernels(values, circles, PENTAGON)
     assert psnr(found, reference) > 45.0
-    densely = LaplacianSpreadlets(bank_of(PENTAGON)).spread_bank(values, circles, Place(), densely=True)
+    densely = LaplacianSpreadlets(bank_of(PENTAGON)).sum_bank_kernels(values, circles, Place(), densely=True)
     np.testing.assert_allclose(densely, reference, atol=4e-5)  # single precision: each of 1400 sums may round by 2**-25
 
 
@@ -352,9 +352,9 @@ def test_a_kernel_that_was_turned_first_is_the_same_upright() -> None:
     """What lies before the focus asks for it turned; kept unsorted for that, it was summed wrongly for what lies behind."""
     values, far, near = picture(11), np.full(SIZE, 42.0, np.float32), np.full(SIZE, -42.0, np.float32)
     renderer = LaplacianSpreadlets(bank_of(PENTAGON))
-    renderer.spread_bank(values, near, Place())
-    expected = LaplacianSpreadlets(bank_of(PENTAGON)).spread_bank(values, far, Place())
-    np.testing.assert_array_equal(renderer.spread_bank(values, far, Place()), expected)
+    renderer.sum_bank_kernels(values, near, Place())
+    expected = LaplacianSpreadlets(bank_of(PENTAGON)).sum_bank_kernels(values, far, Place())
+    np.testing.assert_array_equal(renderer.sum_bank_kernels(values, far, Place()), expected)
 
 
 def test_kernels_are_turned_with_the_motion() -> None:
@@ -365,10 +365,10 @@ def test_kernels_are_turned_with_the_motion() -> None:
     values = np.zeros((81, 81, 1), np.float32)
     values[40, 40] = 1.0
     motion = np.broadcast_to(np.float32([0.0, 30.0]), (81, 81, 2))
-    found = LaplacianSpreadlets(bank).spread_bank(values, np.zeros((81, 81), np.float32), Place(motion_px=motion))[..., 0]
+    found = LaplacianSpreadlets(bank).sum_bank_kernels(values, np.zeros((81, 81), np.float32), Place(motion_px=motion))[..., 0]
     np.testing.assert_allclose(found[20:61, 20:61], bar[..., 0].T, atol=1e-7)
     with pytest.raises(InputError, match="needs motion"):
-        LaplacianSpreadlets(bank).spread_bank(values, np.zeros((81, 81), np.float32), Place())
+        LaplacianSpreadlets(bank).sum_bank_kernels(values, np.zeros((81, 81), np.float32), Place())
 
 
 def test_a_kernel_of_very_many_points_is_turned_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -377,10 +377,10 @@ def test_a_kernel_of_very_many_points_is_turned_as_a_whole(monkeypatch: pytest.M
     bank = PsfBank("star", (Axis("motion_px", 0.0, 9.0),), (1,), (star,), turns="motion", nested=False)
     values, circles = picture(13), np.zeros(SIZE, np.float32)
     place = Place(motion_px=np.broadcast_to(np.float32([3.0, 2.0]), (*SIZE, 2)))
-    dense = LaplacianSpreadlets(bank).spread_bank(values, circles, place, densely=True)
-    assert np.abs(LaplacianSpreadlets(bank).spread_bank(values, circles, place) - dense).max() > 1e-3
+    dense = LaplacianSpreadlets(bank).sum_bank_kernels(values, circles, place, densely=True)
+    assert np.abs(LaplacianSpreadlets(bank).sum_bank_kernels(values, circles, place) - dense).max() > 1e-3
     monkeypatch.setattr("mrbokeh.renderers.bank.tables._MOST_TURNED", 10)
-    np.testing.assert_allclose(LaplacianSpreadlets(bank).spread_bank(values, circles, place), dense, atol=1e-4)
+    np.testing.assert_allclose(LaplacianSpreadlets(bank).sum_bank_kernels(values, circles, place), dense, atol=1e-4)
 
 
 def test_colours_of_a_bank_take_their_own_kernels_and_coverage_too() -> None:
@@ -390,7 +390,7 @@ def test_colours_of_a_bank_take_their_own_kernels_and_coverage_too() -> None:
     values = np.zeros((9, 9, 4), np.float32)
     values[4, 4] = 1.0
     field_xy = np.zeros((9, 9, 2))
-    found = LaplacianSpreadlets(bank).spread_bank(values, np.zeros((9, 9), np.float32), Place(field_xy=field_xy))
+    found = LaplacianSpreadlets(bank).sum_bank_kernels(values, np.zeros((9, 9), np.float32), Place(field_xy=field_xy))
     np.testing.assert_allclose(found[4, 2:7, :3], kernels[2], atol=1e-7)
     np.testing.assert_allclose(found[4, 2:7, 3:6], kernels[2], atol=1e-7)
 

@@ -49,7 +49,7 @@ def point(value: float = 1.0, size_px: int = 81) -> np.ndarray:
 @pytest.mark.parametrize("aperture", APERTURES)
 def test_it_agrees_with_the_exact_scatter(name: str, aperture: str) -> None:
     """48 dB on white noise of range 1; with the default error of 0.1 theory says 0.1 * 0.29 / (0.44 d) for a disc: 53 dB at 20 px."""
-    result = LowRankFilter().spread(noise(), MAPS[name], APERTURES[aperture])
+    result = LowRankFilter().sum_kernels(noise(), MAPS[name], APERTURES[aperture])
     truth = exact(noise(), MAPS[name], APERTURES[aperture])
     assert psnr(result, truth) > 48.0
     np.testing.assert_allclose(result.sum(), truth.sum(), rtol=1e-4)
@@ -57,19 +57,19 @@ def test_it_agrees_with_the_exact_scatter(name: str, aperture: str) -> None:
 
 def test_a_photograph_comes_closer_than_noise() -> None:
     smooth = cv2.GaussianBlur(noise(), (0, 0), 1.5)
-    assert psnr(LowRankFilter().spread(smooth, SLOPE, Aperture.disc()), exact(smooth, SLOPE, Aperture.disc())) > 65.0
+    assert psnr(LowRankFilter().sum_kernels(smooth, SLOPE, Aperture.disc()), exact(smooth, SLOPE, Aperture.disc())) > 65.0
 
 
 def test_a_lower_target_comes_closer() -> None:
     truth = exact(noise(), MAPS["even"], Aperture.disc())
-    reached = [psnr(LowRankFilter(error).spread(noise(), MAPS["even"], Aperture.disc()), truth) for error in (0.2, 0.1, 0.03, 0.0)]
+    reached = [psnr(LowRankFilter(error).sum_kernels(noise(), MAPS["even"], Aperture.disc()), truth) for error in (0.2, 0.1, 0.03, 0.0)]
     assert reached == sorted(reached) and reached[-1] > 120.0
 
 
 @pytest.mark.parametrize("coc_px", [-33.3, -5.2, 1.4, 9.0, 13.7, 40.0])
 def test_a_point_keeps_its_energy_centroid_and_shape(coc_px: float) -> None:
     """A point is far above its surroundings: it is spread by the exact kernel, within its circle of confusion."""
-    result = LowRankFilter().spread(point(1e5), np.full((81, 81), coc_px, np.float32), Aperture.blades(7))
+    result = LowRankFilter().sum_kernels(point(1e5), np.full((81, 81), coc_px, np.float32), Aperture.blades(7))
     psf = Aperture.blades(7).rasterize(coc_px)
     inside = slice(40 - psf.radius_px, 41 + psf.radius_px)
     np.testing.assert_allclose(result[inside, inside, 0], 1e5 * psf.kernel, atol=1e-6 * 1e5 * psf.kernel.max())
@@ -85,7 +85,7 @@ def test_points_of_many_diameters_keep_to_their_circles(own_kernels: int, monkey
     values = np.zeros((200, 200, 1), np.float32)
     values[20::40, 20::40] = 1.0
     coc_px = np.linspace(11.0, 38.0, 200 * 200, dtype=np.float32).reshape(200, 200)
-    result, truth = LowRankFilter().spread(values, coc_px, Aperture.disc()), exact(values, coc_px, Aperture.disc())
+    result, truth = LowRankFilter().sum_kernels(values, coc_px, Aperture.disc()), exact(values, coc_px, Aperture.disc())
     largest_tap_near = cv2.dilate(truth[..., 0], np.ones((39, 39)))
     assert (np.abs(result - truth)[..., 0] <= (0.01 if own_kernels == 0 else 1e-6) * largest_tap_near).all()
     outside = truth[..., 0] == 0 if own_kernels else cv2.dilate(truth[..., 0], np.ones((3, 3))) == 0
@@ -96,35 +96,35 @@ def test_points_of_many_diameters_keep_to_their_circles(own_kernels: int, monkey
 def test_below_one_pixel_nothing_changes(coc_px: float) -> None:
     values = noise(5)
     np.testing.assert_array_equal(
-        LowRankFilter().spread(values, np.full((HEIGHT_PX, WIDTH_PX), coc_px, np.float32), Aperture.disc()), values
+        LowRankFilter().sum_kernels(values, np.full((HEIGHT_PX, WIDTH_PX), coc_px, np.float32), Aperture.disc()), values
     )
 
 
 def test_doubled_light_gives_doubled_results_bit_for_bit() -> None:
     """Highlights are told by ratios, so that they stay the same pixels."""
     values = noise() ** 12 * 100.0
-    one, two = (LowRankFilter().spread(scale * values, SLOPE, Aperture.disc()) for scale in (np.float32(1.0), np.float32(2.0)))
+    one, two = (LowRankFilter().sum_kernels(scale * values, SLOPE, Aperture.disc()) for scale in (np.float32(1.0), np.float32(2.0)))
     np.testing.assert_array_equal(two, np.float32(2.0) * one)
 
 
 def test_pictures_without_highlights_add_up() -> None:
     a, b = noise(seed=1), noise(seed=2)
-    apart = LowRankFilter().spread(a, SLOPE, Aperture.disc()) + LowRankFilter().spread(b, SLOPE, Aperture.disc())
-    np.testing.assert_allclose(LowRankFilter().spread(a + b, SLOPE, Aperture.disc()), apart, atol=2e-6)
+    apart = LowRankFilter().sum_kernels(a, SLOPE, Aperture.disc()) + LowRankFilter().sum_kernels(b, SLOPE, Aperture.disc())
+    np.testing.assert_allclose(LowRankFilter().sum_kernels(a + b, SLOPE, Aperture.disc()), apart, atol=2e-6)
 
 
 def test_it_moves_with_the_picture() -> None:
     values, coc_px = np.zeros_like(noise()), np.zeros_like(SLOPE)
     values[40:100, 40:120], coc_px[40:100, 40:120] = noise()[40:100, 40:120] ** 6, SLOPE[40:100, 40:120]
-    one = LowRankFilter().spread(values, coc_px, Aperture.blades(5))
-    moved = LowRankFilter().spread(np.roll(values, (7, -13), (0, 1)), np.roll(coc_px, (7, -13), (0, 1)), Aperture.blades(5))
+    one = LowRankFilter().sum_kernels(values, coc_px, Aperture.blades(5))
+    moved = LowRankFilter().sum_kernels(np.roll(values, (7, -13), (0, 1)), np.roll(coc_px, (7, -13), (0, 1)), Aperture.blades(5))
     np.testing.assert_allclose(moved, np.roll(one, (7, -13), (0, 1)), atol=1e-6)
 
 
 def test_in_front_of_the_focus_the_aperture_is_mirrored() -> None:
     triangle = Aperture.blades(3, 0.2)
-    behind = LowRankFilter().spread(noise(), SLOPE, triangle)
-    in_front = LowRankFilter().spread(noise()[::-1, ::-1].copy(), -SLOPE[::-1, ::-1], triangle)
+    behind = LowRankFilter().sum_kernels(noise(), SLOPE, triangle)
+    in_front = LowRankFilter().sum_kernels(noise()[::-1, ::-1].copy(), -SLOPE[::-1, ::-1], triangle)
     np.testing.assert_allclose(in_front[::-1, ::-1], behind, atol=1e-6)
 
 
@@ -134,7 +134,7 @@ def test_the_number_of_threads_changes_nothing(per_pixel: bool) -> None:
     results = []
     for threads in (1, 2, 5):
         cv2.setNumThreads(threads)
-        results.append(LowRankFilter(per_pixel=per_pixel, threads=threads).spread(values, MAPS["through the focus"], Aperture.disc()))
+        results.append(LowRankFilter(per_pixel=per_pixel, threads=threads).sum_kernels(values, MAPS["through the focus"], Aperture.disc()))
     cv2.setNumThreads(-1)
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
@@ -146,7 +146,7 @@ def test_a_lamp_leaves_the_dark_beside_it_alone(contrast: float) -> None:
     values = 0.5 + noise(1)
     values[50:90, 60:120] *= contrast
     coc_px = MAPS["even"]
-    result, truth = LowRankFilter().spread(values, coc_px, Aperture.disc()), exact(values, coc_px, Aperture.disc())
+    result, truth = LowRankFilter().sum_kernels(values, coc_px, Aperture.disc()), exact(values, coc_px, Aperture.disc())
     inside = np.s_[20:-20, 20:-20]
     assert result.min() > 0.0
     np.testing.assert_allclose(result[inside], truth[inside], rtol=0.1)
@@ -159,22 +159,22 @@ def test_an_edge_is_right_to_three_thousandths(angle_rad: float, diameter_px: fl
     y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
     values = ((x - 95) * np.cos(angle_rad) + (y - 75) * np.sin(angle_rad) > 0).astype(np.float32)[..., None]
     coc_px = np.full(values.shape[:2], diameter_px, np.float32)
-    result = LowRankFilter().spread(values, coc_px, APERTURES[aperture])
+    result = LowRankFilter().sum_kernels(values, coc_px, APERTURES[aperture])
     assert result.min() >= 0.0
     error = np.abs(result - exact(values, coc_px, APERTURES[aperture]))[40:-40, 40:-40].max()
     assert error < (0.006 if aperture == "ring" else 0.003)
 
 
 def test_an_even_field_stays_even() -> None:
-    result = LowRankFilter().spread(np.full((HEIGHT_PX, WIDTH_PX, 1), 0.7, np.float32), MAPS["even"], Aperture.blades(5, 0.3))
+    result = LowRankFilter().sum_kernels(np.full((HEIGHT_PX, WIDTH_PX, 1), 0.7, np.float32), MAPS["even"], Aperture.blades(5, 0.3))
     np.testing.assert_allclose(result[15:-15, 15:-15], 0.7, rtol=2e-6)
 
 
 def test_a_focus_pull_does_not_pop() -> None:
     """A hundredth of a pixel of blur changes the picture by a hundredth of what a pixel does, across every level."""
     values = noise(1)
-    flat = [LowRankFilter().spread(values, SLOPE + np.float32(0.01 * step), Aperture.disc()) for step in range(3)]
-    whole = LowRankFilter().spread(values, SLOPE + np.float32(1.0), Aperture.disc())
+    flat = [LowRankFilter().sum_kernels(values, SLOPE + np.float32(0.01 * step), Aperture.disc()) for step in range(3)]
+    whole = LowRankFilter().sum_kernels(values, SLOPE + np.float32(1.0), Aperture.disc())
     inside = np.s_[:, 40:-20]
     for one, next_one in pairwise(flat):
         assert np.abs(next_one - one)[inside].max() < 0.03 * np.abs(whole - flat[0])[inside].max()
@@ -183,15 +183,15 @@ def test_a_focus_pull_does_not_pop() -> None:
 def test_pixels_without_light_have_no_say() -> None:
     values, coc_px = noise().copy(), SLOPE.copy()
     values[30:60], coc_px[30:45], coc_px[45:60] = 0.0, np.nan, np.inf
-    result = LowRankFilter().spread(values, coc_px, Aperture.disc())
-    np.testing.assert_array_equal(result, LowRankFilter().spread(values, np.where(np.isfinite(coc_px), coc_px, 90.0), Aperture.disc()))
+    result = LowRankFilter().sum_kernels(values, coc_px, Aperture.disc())
+    np.testing.assert_array_equal(result, LowRankFilter().sum_kernels(values, np.where(np.isfinite(coc_px), coc_px, 90.0), Aperture.disc()))
     with pytest.raises(InputError, match="finite circle of confusion"):
-        LowRankFilter().spread(noise(), coc_px, Aperture.disc())
+        LowRankFilter().sum_kernels(noise(), coc_px, Aperture.disc())
 
 
 def test_any_number_of_channels_and_signs() -> None:
     values = noise(19) - np.float32(0.5)
-    result = LowRankFilter().spread(values, SLOPE, Aperture.disc())
+    result = LowRankFilter().sum_kernels(values, SLOPE, Aperture.disc())
     assert psnr(result, exact(values, SLOPE, Aperture.disc())) > 48.0 and result.min() < -0.01
 
 
@@ -209,7 +209,7 @@ def test_edges_of_depth_are_masked_as_far_as_the_blur_reaches() -> None:
 
 @pytest.mark.parametrize(("name", "least_db"), [("even", 48.0), ("slope", 43.0), ("two planes", 48.0), ("through the focus", 40.0)])
 def test_the_paper_s_passes_agree_where_the_blur_changes_slowly(name: str, least_db: float) -> None:
-    result = LowRankFilter(per_pixel=True).spread(noise(), MAPS[name], Aperture.disc())
+    result = LowRankFilter(per_pixel=True).sum_kernels(noise(), MAPS[name], Aperture.disc())
     truth = exact(noise(), MAPS[name], Aperture.disc())
     assert psnr(result, truth) > least_db
     np.testing.assert_allclose(result.sum(), truth.sum(), rtol=2e-3)
@@ -239,8 +239,8 @@ def test_tilt_shift_refuses_what_it_cannot_blur() -> None:
 
 def test_kernels_are_kept_between_calls() -> None:
     renderer = LowRankFilter()
-    renderer.spread(noise(), MAPS["even"], Aperture.disc())
+    renderer.sum_kernels(noise(), MAPS["even"], Aperture.disc())
     (kept,) = renderer._kernels.values()
-    renderer.spread(noise(), MAPS["even"], Aperture.disc())
+    renderer.sum_kernels(noise(), MAPS["even"], Aperture.disc())
     assert list(renderer._kernels.values()) == [kept] and renderer._kernels.popitem()[1] is kept
     np.testing.assert_allclose(kept.dense(), decompose(Aperture.disc().rasterize(float(np.float32(20.3))).kernel, 0.1, min_rank=4).dense())

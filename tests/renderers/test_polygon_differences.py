@@ -96,7 +96,7 @@ def waves(height: int, width: int, low_px: float, high_px: float) -> np.ndarray:
 def point(size: int, diameter_px: float, aperture: Aperture, renderer: PolygonDifferences = SUMS_ONLY) -> np.ndarray:
     values = np.zeros((size, size, 1), np.float32)
     values[size // 2, size // 2] = 1.0
-    return renderer.spread(values, np.full((size, size), diameter_px, np.float32), aperture)[..., 0].astype(np.float64)
+    return renderer.sum_kernels(values, np.full((size, size), diameter_px, np.float32), aperture)[..., 0].astype(np.float64)
 
 
 @pytest.mark.parametrize("name", APERTURES)
@@ -106,9 +106,9 @@ def test_the_plain_twin_agrees(name: str, side: float) -> None:
     values = (picture(20, 26) - 0.5).astype(np.float32)
     coc_px = np.float32(side) * waves(20, 26, 8.0, 26.0)
     expected = plain_scatter(values, coc_px, name)
-    np.testing.assert_allclose(SUMS_ONLY.spread(values, coc_px, APERTURES[name]), expected, atol=6e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(SUMS_ONLY.sum_kernels(values, coc_px, APERTURES[name]), expected, atol=6e-8 * np.abs(expected).max())
     single = PolygonDifferences(exact_below_px=6.0, exact_highlights=False, precision="single")
-    np.testing.assert_allclose(single.spread(values, coc_px, APERTURES[name]), expected, atol=1e-6)
+    np.testing.assert_allclose(single.sum_kernels(values, coc_px, APERTURES[name]), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "least_db"), [("octagon", 57.5), ("disc", 60.5), ("7 blades", 58.5), ("heart", 51.5), ("ring", 56.0)])
@@ -116,7 +116,7 @@ def test_near_the_exact_kernels_of_the_true_aperture(name: str, least_db: float)
     """Noise in [0, 1] under noisy diameters; the rest is rectification and corners between lattice points."""
     values, coc_px = picture(70, 90), waves(70, 90, 0.0, 30.0)
     exact = scatter(values.astype(np.float64), coc_px, APERTURES[name]).astype(np.float32)
-    assert psnr(DEFAULT.spread(values, coc_px, APERTURES[name]), exact) > least_db
+    assert psnr(DEFAULT.sum_kernels(values, coc_px, APERTURES[name]), exact) > least_db
 
 
 @pytest.mark.parametrize("diameter_px", [8.0, 9.0, 13.0, 16.0, 21.5, 40.0, -33.3])
@@ -161,19 +161,19 @@ def test_a_lamp_shows_the_true_aperture(name: str, diameter_px: float) -> None:
 def test_what_is_in_focus_stays_bit_for_bit() -> None:
     values, coc_px = picture(40, 300), np.zeros((40, 300), np.float32)
     coc_px[:, :100] = np.linspace(-1.0, 1.0, 100)
-    np.testing.assert_array_equal(DEFAULT.spread(values, coc_px, APERTURES["disc"]), values)
+    np.testing.assert_array_equal(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"]), values)
     coc_px[:, 200:] = 25.0
-    np.testing.assert_array_equal(RECTIFIED.spread(values, coc_px, APERTURES["disc"])[:, :180], values[:, :180])
-    np.testing.assert_allclose(DEFAULT.spread(values, coc_px, APERTURES["disc"])[:, :180], values[:, :180], atol=1e-7)
+    np.testing.assert_array_equal(RECTIFIED.sum_kernels(values, coc_px, APERTURES["disc"])[:, :180], values[:, :180])
+    np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])[:, :180], values[:, :180], atol=1e-7)
 
 
 def test_it_is_linear() -> None:
     one, two = picture(40, 50, seed=1), picture(40, 50, seed=2)
     coc_px = waves(40, 50, 0.0, 25.0)
     disc = APERTURES["disc"]
-    both = SUMS_ONLY.spread(one + 3.0 * two, coc_px, disc)
-    np.testing.assert_allclose(both, SUMS_ONLY.spread(one, coc_px, disc) + 3.0 * SUMS_ONLY.spread(two, coc_px, disc), atol=2e-6)
-    np.testing.assert_array_equal(DEFAULT.spread(4.0 * one, coc_px, disc), 4.0 * DEFAULT.spread(one, coc_px, disc))
+    both = SUMS_ONLY.sum_kernels(one + 3.0 * two, coc_px, disc)
+    np.testing.assert_allclose(both, SUMS_ONLY.sum_kernels(one, coc_px, disc) + 3.0 * SUMS_ONLY.sum_kernels(two, coc_px, disc), atol=2e-6)
+    np.testing.assert_array_equal(DEFAULT.sum_kernels(4.0 * one, coc_px, disc), 4.0 * DEFAULT.sum_kernels(one, coc_px, disc))
 
 
 @pytest.mark.parametrize("renderer", [SUMS_ONLY, DEFAULT], ids=["sums only", "default"])
@@ -182,8 +182,8 @@ def test_a_moved_picture_gives_a_moved_result(renderer: PolygonDifferences) -> N
     values, coc_px = np.zeros((120, 130, 4), np.float32), np.zeros((120, 130), np.float32)
     values[30:70, 40:80], coc_px[30:70, 40:80] = picture(40, 40), waves(40, 40, 0.0, 22.0)
     values[50, 60] = values[33, 43] = 1e3
-    result = renderer.spread(values, coc_px, APERTURES["heart"])
-    moved = renderer.spread(np.roll(values, (5, 11), (0, 1)), np.roll(coc_px, (5, 11), (0, 1)), APERTURES["heart"])
+    result = renderer.sum_kernels(values, coc_px, APERTURES["heart"])
+    moved = renderer.sum_kernels(np.roll(values, (5, 11), (0, 1)), np.roll(coc_px, (5, 11), (0, 1)), APERTURES["heart"])
     np.testing.assert_allclose(moved, np.roll(result, (5, 11), (0, 1)), rtol=2e-6, atol=2e-6)
 
 
@@ -203,7 +203,7 @@ def test_a_focus_pull_does_not_pop(name: str, from_px: float, to_px: float, rend
 def test_an_even_field_stays_even(name: str) -> None:
     values = np.full((150, 150, 4), 0.7, np.float32)
     for coc_px in (6.5, 23.4, -37.0):
-        inside = DEFAULT.spread(values, np.full((150, 150), coc_px, np.float32), APERTURES[name])[25:-25, 25:-25]
+        inside = DEFAULT.sum_kernels(values, np.full((150, 150), coc_px, np.float32), APERTURES[name])[25:-25, 25:-25]
         np.testing.assert_allclose(inside, 0.7, rtol=1e-5)
 
 
@@ -215,43 +215,43 @@ def test_lights_of_1e5_leave_their_surroundings_alone() -> None:
     coc_px[30, 40] = 8.0
     expected = plain_scatter(values, coc_px, "octagon")
     automatic = PolygonDifferences(exact_below_px=6.0, exact_highlights=False)
-    error = np.abs(automatic.spread(values, coc_px, APERTURES["octagon"]) - expected)
+    error = np.abs(automatic.sum_kernels(values, coc_px, APERTURES["octagon"]) - expected)
     assert (error / expected).max() < 1e-6
     single = PolygonDifferences(exact_below_px=6.0, exact_highlights=False, precision="single")
-    assert (np.abs(single.spread(values, coc_px, APERTURES["octagon"]) - expected) / expected).max() > 1e-3, "why it is not used here"
+    assert (np.abs(single.sum_kernels(values, coc_px, APERTURES["octagon"]) - expected) / expected).max() > 1e-3, "why it is not used here"
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_the_same_bits_for_any_number_of_threads(precision) -> None:  # type: ignore[no-untyped-def]
     values, coc_px = picture(500, 300), waves(500, 300, 0.0, 30.0)
     values[200:210, 40] = 500.0
-    one, three = (PolygonDifferences(threads=n, precision=precision).spread(values, coc_px, APERTURES["disc"]) for n in (1, 3))
+    one, three = (PolygonDifferences(threads=n, precision=precision).sum_kernels(values, coc_px, APERTURES["disc"]) for n in (1, 3))
     np.testing.assert_array_equal(one, three)
-    np.testing.assert_array_equal(one, PolygonDifferences(precision=precision).spread(values, coc_px, APERTURES["disc"]))
+    np.testing.assert_array_equal(one, PolygonDifferences(precision=precision).sum_kernels(values, coc_px, APERTURES["disc"]))
 
 
 def test_calls_from_several_threads_do_not_meet() -> None:
     pictures = [(picture(100 + 20 * i, 400, seed=i), waves(100 + 20 * i, 400, 0.0, 10.0 + 5.0 * i)) for i in range(6)]
     renderer = PolygonDifferences(threads=2)
-    alone = [renderer.spread(values, coc_px, APERTURES["disc"]) for values, coc_px in pictures]
+    alone = [renderer.sum_kernels(values, coc_px, APERTURES["disc"]) for values, coc_px in pictures]
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda each: renderer.spread(*each, APERTURES["disc"]), 3 * pictures))
+        together = list(pool.map(lambda each: renderer.sum_kernels(*each, APERTURES["disc"]), 3 * pictures))
     for expected, result in zip(3 * alone, together, strict=True):
         np.testing.assert_array_equal(result, expected)
 
 
 def test_bands_and_parts_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     values, coc_px = picture(200, 700, seed=3), waves(200, 700, 0.0, 12.0)
-    whole = DEFAULT.spread(values, coc_px, APERTURES["disc"])
+    whole = DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])
     monkeypatch.setattr(_polygon_bands, "BAND_ROWS", 16)
     monkeypatch.setattr(_polygon_bands, "RING_BYTES", 1)
-    np.testing.assert_allclose(DEFAULT.spread(values, coc_px, APERTURES["disc"]), whole, atol=2e-6)
+    np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"]), whole, atol=2e-6)
 
 
 def test_tiles_with_a_margin_make_the_same_picture() -> None:
     values, coc_px = picture(90, 140, seed=4), waves(90, 140, 0.0, 20.0)
-    whole = DEFAULT.spread(values, coc_px, APERTURES["octagon"])
-    left, right = (DEFAULT.spread(values[:, part], coc_px[:, part], APERTURES["octagon"]) for part in (slice(0, 83), slice(57, 140)))
+    whole = DEFAULT.sum_kernels(values, coc_px, APERTURES["octagon"])
+    left, right = (DEFAULT.sum_kernels(values[:, part], coc_px[:, part], APERTURES["octagon"]) for part in (slice(0, 83), slice(57, 140)))
     np.testing.assert_allclose(np.concatenate([left[:, :70], right[:, 13:]], axis=1), whole, atol=2e-6)
 
 
@@ -261,7 +261,7 @@ def test_any_number_of_channels_goes_the_same_way(channels: int) -> None:
     values, coc_px = picture(60, 50, channels), waves(60, 50, 0.0, 20.0)
     values[30, 20, 0] = 900.0
     values[..., -1] = -2.0 * values[..., 0]
-    result = DEFAULT.spread(values, coc_px, APERTURES["ring"])
+    result = DEFAULT.sum_kernels(values, coc_px, APERTURES["ring"])
     assert result.shape == values.shape and result.dtype == np.float32
     np.testing.assert_allclose(result[..., -1], (-2.0 if channels > 1 else 1.0) * result[..., 0], rtol=1e-5, atol=1e-5)
 
@@ -271,24 +271,24 @@ def test_pixels_without_light_have_no_say() -> None:
     values[140:160, 100:130], coc_px[140:160, 100:130] = picture(20, 30), waves(20, 30, 0.0, 25.0)
     coc_px[0, 0], coc_px[0, 1] = np.inf, 1e6
     inside = np.s_[120:180, 80:150]
-    result = DEFAULT.spread(values, coc_px, APERTURES["disc"])
-    small = DEFAULT.spread(np.ascontiguousarray(values[inside]), np.nan_to_num(coc_px[inside]), APERTURES["disc"])
+    result = DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])
+    small = DEFAULT.sum_kernels(np.ascontiguousarray(values[inside]), np.nan_to_num(coc_px[inside]), APERTURES["disc"])
     np.testing.assert_allclose(result[inside], small, atol=2e-6)
     assert result.sum() == pytest.approx(values.sum(), rel=1e-5)
-    assert not DEFAULT.spread(np.zeros_like(values), coc_px, APERTURES["disc"]).any()
+    assert not DEFAULT.sum_kernels(np.zeros_like(values), coc_px, APERTURES["disc"]).any()
 
 
 def test_light_beyond_the_border_is_lost() -> None:
     values, coc_px = picture(50, 40), np.full((50, 40), 30.0, np.float32)
     padded = np.pad(values, ((20, 20), (20, 20), (0, 0)))
-    expected = DEFAULT.spread(padded, np.full(padded.shape[:2], 30.0, np.float32), APERTURES["octagon"])[20:-20, 20:-20]
-    np.testing.assert_allclose(DEFAULT.spread(values, coc_px, APERTURES["octagon"]), expected, atol=2e-6)
+    expected = DEFAULT.sum_kernels(padded, np.full(padded.shape[:2], 30.0, np.float32), APERTURES["octagon"])[20:-20, 20:-20]
+    np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["octagon"]), expected, atol=2e-6)
 
 
 def test_mistakes_are_named() -> None:
     values, coc_px = picture(10, 10), np.full((10, 10), np.nan, np.float32)
     with pytest.raises(InputError, match="finite circle of confusion"):
-        DEFAULT.spread(values, coc_px, APERTURES["disc"])
+        DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])
     with pytest.raises(InputError, match="exact_below_px"):
         PolygonDifferences(exact_below_px=0.5)
 
@@ -310,8 +310,8 @@ def test_sparse_light_is_spread_like_any() -> None:
     sparse = (np.abs(y - 200 - 120 * np.sin(x / 80.0)) < 12) | (np.hypot(y - 40, x - 400) < 9) | (np.hypot(y - 380, x - 20) < 5)
     renderer = PolygonDifferences(exact_highlights=False, precision="double")
     octagon = APERTURES["octagon"]
-    parts = [renderer.spread(np.where(mask[..., None], values, 0.0).astype(np.float32), coc_px, octagon) for mask in (sparse, ~sparse)]
-    np.testing.assert_allclose(parts[0] + parts[1], renderer.spread(values, coc_px, octagon), atol=3e-7)
+    parts = [renderer.sum_kernels(np.where(mask[..., None], values, 0.0).astype(np.float32), coc_px, octagon) for mask in (sparse, ~sparse)]
+    np.testing.assert_allclose(parts[0] + parts[1], renderer.sum_kernels(values, coc_px, octagon), atol=3e-7)
     assert 0.0 < sparse.mean() < 0.2
 
 

@@ -52,7 +52,7 @@ def test_the_plain_twin_agrees(name: str, diameter_px: float) -> None:
     values = picture(20, 26)
     aperture = {"octagon": OCTAGON, "heart": HEART}[name]
     expected = plainly_halved(values, diameter_px, name)
-    reached = HALVED.spread(values, np.full((20, 26), diameter_px, np.float32), aperture)
+    reached = HALVED.sum_kernels(values, np.full((20, 26), diameter_px, np.float32), aperture)
     np.testing.assert_allclose(reached, np.maximum(expected, 0.0), atol=3e-7 * expected.max())
 
 
@@ -61,7 +61,7 @@ def test_a_texture_looks_as_at_full_resolution(aperture: Aperture) -> None:
     """Noise in [0, 1] under 20 to 220 px. From 64 px on kernels are 32 cells and wider; their rims, softened by about a cell, are all
     that differs: as much as rectified kernels are off anyway."""
     values, coc_px = picture(360, 420), hills(360, 420, 20.0, 220.0)
-    full, halved = FULL.spread(values, coc_px, aperture), HALVED.spread(values, coc_px, aperture)
+    full, halved = FULL.sum_kernels(values, coc_px, aperture), HALVED.sum_kernels(values, coc_px, aperture)
     assert psnr(halved, full) > 59.0
     assert np.abs(halved.sum() / full.sum() - 1.0) < 1e-3  # rims lie elsewhere beyond the frame
 
@@ -72,7 +72,7 @@ def test_light_stays_in_place_on_odd_and_even_pixels(place: tuple[int, int], dia
     """A point that is no highlight: all of its light, and the centre of it, which half a cell would move by 0.5 px or more."""
     values = np.zeros((300, 300, 1), np.float32)
     values[place] = 1.0
-    spread = HALVED.spread(values, np.full((300, 300), diameter_px, np.float32), OCTAGON)[..., 0].astype(np.float64)
+    spread = HALVED.sum_kernels(values, np.full((300, 300), diameter_px, np.float32), OCTAGON)[..., 0].astype(np.float64)
     y, x = np.mgrid[:300, :300]
     assert spread.sum() == pytest.approx(1.0, abs=1e-5)
     assert ((spread * y).sum(), (spread * x).sum()) == pytest.approx(place, abs=2e-3)
@@ -81,7 +81,7 @@ def test_light_stays_in_place_on_odd_and_even_pixels(place: tuple[int, int], dia
 def test_an_even_field_stays_even() -> None:
     for diameter_px in (65.0, 70.0, 90.0, -230.0):
         values, coc_px = np.full((401, 433, 4), 0.7, np.float32), np.full((401, 433), diameter_px, np.float32)
-        inside = HALVED.spread(values, coc_px, OCTAGON)[130:-130, 130:-130]
+        inside = HALVED.sum_kernels(values, coc_px, OCTAGON)[130:-130, 130:-130]
         np.testing.assert_allclose(inside, 0.7, rtol=1e-5)
 
 
@@ -93,7 +93,7 @@ def test_edges_of_depth_are_not_halved() -> None:
     values[:, :142] = 0.0
     coc_px[:, 148:152] = np.linspace(4.0, 80.0, 4)
     values[:, 142:147] = values[:, 153:158] = 0.0
-    np.testing.assert_allclose(HALVED.spread(values, coc_px, OCTAGON), FULL.spread(values, coc_px, OCTAGON), atol=1e-8)
+    np.testing.assert_allclose(HALVED.sum_kernels(values, coc_px, OCTAGON), FULL.sum_kernels(values, coc_px, OCTAGON), atol=1e-8)
 
 
 def test_diameters_of_pixels_without_light_do_not_matter() -> None:
@@ -103,13 +103,13 @@ def test_diameters_of_pixels_without_light_do_not_matter() -> None:
     wild = even.copy()
     empty = ~values.any(axis=2)
     wild[empty] = np.random.default_rng(3).uniform(-500.0, 500.0, int(empty.sum()))
-    np.testing.assert_allclose(HALVED.spread(values, wild, OCTAGON), HALVED.spread(values, even, OCTAGON), rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(HALVED.sum_kernels(values, wild, OCTAGON), HALVED.sum_kernels(values, even, OCTAGON), rtol=1e-5, atol=1e-8)
 
 
 def test_highlights_are_spread_whole_at_full_resolution() -> None:
     values, coc_px = np.full((300, 300, 4), 1e-3, np.float32), np.full((300, 300), 100.0, np.float32)
     values[150, 151] = 50.0
-    lamp = RENDERER.spread(values, coc_px, OCTAGON) - RENDERER.spread(np.full_like(values, 1e-3), coc_px, OCTAGON)
+    lamp = RENDERER.sum_kernels(values, coc_px, OCTAGON) - RENDERER.sum_kernels(np.full_like(values, 1e-3), coc_px, OCTAGON)
     kernel = 49.999 * OCTAGON.rasterize(100.0).kernel
     reach = kernel.shape[0] // 2
     seen = lamp[150 - reach : 151 + reach, 151 - reach : 152 + reach, 0]
@@ -118,7 +118,7 @@ def test_highlights_are_spread_whole_at_full_resolution() -> None:
 
 def test_threads_do_not_change_a_bit() -> None:
     values, coc_px = picture(640, 700), hills(640, 700, 10.0, 150.0)
-    one, three = (PolygonDifferences(halve_from_px=64.0, threads=threads).spread(values, coc_px, OCTAGON) for threads in (1, 3))
+    one, three = (PolygonDifferences(halve_from_px=64.0, threads=threads).sum_kernels(values, coc_px, OCTAGON) for threads in (1, 3))
     np.testing.assert_array_equal(one, three)
 
 

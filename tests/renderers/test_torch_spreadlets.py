@@ -190,21 +190,21 @@ def test_sums_for_plain_apertures_are_those_of_the_cpu(aperture: Aperture, integ
 def test_the_combined_bank_is_that_of_the_cpu() -> None:
     """Whole Laplacians and taps are exact on both: what differs is the rounding to single precision, of values up to 1000."""
     values, coc_px, motion = picture(6, lamp=1e5), slope_px(-20.0, 20.0), motion_px()
-    known = LaplacianSpreadlets(combined(), sparsification=None).spread_bank(values, coc_px, Place(motion_px=motion))
-    found = TorchSpreadlets(combined(), "cpu", None).spread(layer_of(values, coc_px, motion)).numpy()
+    known = LaplacianSpreadlets(combined(), sparsification=None).sum_bank_kernels(values, coc_px, Place(motion_px=motion))
+    found = TorchSpreadlets(combined(), "cpu", None).sum_kernels(layer_of(values, coc_px, motion)).numpy()
     np.testing.assert_allclose(found, known, rtol=3e-6, atol=3e-6)
 
 
 def test_sparse_points_differ_by_their_far_field_only() -> None:
     """Sparse points reach a little farther than they should, up to a border that lies elsewhere."""
     values, coc_px, motion = picture(7), slope_px(-20.0, 20.0), motion_px()
-    known = LaplacianSpreadlets(combined()).spread_bank(values, coc_px, Place(motion_px=motion))
+    known = LaplacianSpreadlets(combined()).sum_bank_kernels(values, coc_px, Place(motion_px=motion))
     on_device = TorchSpreadlets(combined(), "cpu")
-    found = on_device.spread(layer_of(values, coc_px, motion))
+    found = on_device.sum_kernels(layer_of(values, coc_px, motion))
     np.testing.assert_allclose(found.numpy(), known, atol=1e-4)
-    rest = on_device.spread(layer_of(picture(8, lamp=30.0), -coc_px, motion[::-1].copy()))
+    rest = on_device.sum_kernels(layer_of(picture(8, lamp=30.0), -coc_px, motion[::-1].copy()))
     assert not torch.equal(rest, found)
-    again = on_device.spread(layer_of(values, coc_px, motion))
+    again = on_device.sum_kernels(layer_of(values, coc_px, motion))
     assert torch.equal(again, found), "what was asked in between changes no bit"
 
 
@@ -221,8 +221,8 @@ def chromatic() -> PsfBank:
 
 def test_a_bank_of_three_colours_is_that_of_the_cpu() -> None:
     values, coc_px = picture(9), slope_px(2.0, 38.0)
-    known = LaplacianSpreadlets(chromatic(), sparsification=None).spread_bank(values, coc_px, Place())
-    found = TorchSpreadlets(chromatic(), "cpu", None).spread(layer_of(values, coc_px)).numpy()
+    known = LaplacianSpreadlets(chromatic(), sparsification=None).sum_bank_kernels(values, coc_px, Place())
+    found = TorchSpreadlets(chromatic(), "cpu", None).sum_kernels(layer_of(values, coc_px)).numpy()
     assert found.shape == (*SIZE, 6), "a coverage for each colour"
     np.testing.assert_allclose(found, known, atol=3e-6)
 
@@ -232,7 +232,7 @@ def test_light_is_kept_but_for_what_the_glass_absorbs() -> None:
     values = np.zeros((90, 96, 4), np.float32)
     values[40:50, 40:56] = picture(10)[24:34, :16]
     for size, coc_px in ((0, 10.0), (1, 30.0)):
-        found = TorchSpreadlets(chromatic(), "cpu", None).spread(layer_of(values, np.full((90, 96), coc_px, np.float32)))
+        found = TorchSpreadlets(chromatic(), "cpu", None).sum_kernels(layer_of(values, np.full((90, 96), coc_px, np.float32)))
         light, sent = found.numpy().astype(np.float64).sum(axis=(0, 1)), values.astype(np.float64).sum(axis=(0, 1))
         np.testing.assert_allclose(light[:3], sent[:3] * chromatic().throughput[size], rtol=1e-5)
         np.testing.assert_allclose(light[3:], sent[3], rtol=1e-5)
@@ -247,7 +247,7 @@ def two_layers() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
 
 def test_two_layers_are_laid_over_one_another() -> None:
     cpu, on_device = LaplacianSpreadlets(combined(), sparsification=None), TorchSpreadlets(combined(), "cpu", None)
-    front, behind = (cpu.spread_bank(values, coc_px, Place(motion_px=motion)) for values, coc_px, motion in two_layers())
+    front, behind = (cpu.sum_bank_kernels(values, coc_px, Place(motion_px=motion)) for values, coc_px, motion in two_layers())
     found = on_device.picture([layer_of(*each) for each in two_layers()])
     np.testing.assert_allclose(found.numpy(), front + (1.0 - np.clip(front[..., 3:], 0, 1)) * behind, atol=3e-6)
 
@@ -270,12 +270,12 @@ def test_mistakes() -> None:
     with pytest.raises(InputError, match="at least one layer"):
         on_device.picture([])
     with pytest.raises(InputError, match="needs motion"):
-        on_device.spread(replace(layer, motion_px=None))
+        on_device.sum_kernels(replace(layer, motion_px=None))
     for wrong in ({"coc_px": layer.coc_px * math.nan}, {"motion_px": layer.motion_px / 0.0}):
         with pytest.raises(InputError, match="finite circle of confusion"):
-            on_device.spread(replace(layer, **wrong))
+            on_device.sum_kernels(replace(layer, **wrong))
     with pytest.raises(InputError, match="light must be finite"):
-        on_device.spread(replace(layer, rgba=layer.rgba * math.inf))
+        on_device.sum_kernels(replace(layer, rgba=layer.rgba * math.inf))
     with pytest.raises(InputError, match="'exact'"):
         add_light_on("cpu")(picture(), picture(), np.zeros(SIZE, np.int32), some_points(), "pyramid", 1)
     with pytest.raises(InputError, match="3 x 3"):

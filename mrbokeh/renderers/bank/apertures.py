@@ -17,8 +17,8 @@ from jaxtyping import Float, Float64, Int64
 from mrbokeh.layering.psf_over_field import Plane
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.aperture_shapes import WeightedOutlines, net_area, outlines_of
+from mrbokeh.renderers.bank.blending import SHARP_PX, Shares
 from mrbokeh.renderers.bank.lattice import SIDES, Around, BankLattice, between
-from mrbokeh.renderers.bank.spread import SHARP_PX, Shares
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 

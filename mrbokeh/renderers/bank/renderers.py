@@ -21,9 +21,9 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf import Psf
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.bank.apertures import BankApertures, TurnedApertures, grown
-from mrbokeh.renderers.bank.bank_optics import BankOptics
+from mrbokeh.renderers.bank.bank_psf import BankPsf
+from mrbokeh.renderers.bank.blending import AnchorKernels, BlendedTables, SideSum, blend_colours, scatter_side, sum_openings
 from mrbokeh.renderers.bank.lattice import SIDES, Around, BankLattice
-from mrbokeh.renderers.bank.spread import AnchorKernels, BlendedTables, SpreadSide, scatter_side, spread_by_bank, spread_shares
 from mrbokeh.renderers.bank.tables import Place
 from mrbokeh.renderers.kernels.low_rank_kernel import Levels, LowRankKernel
 from mrbokeh.system.console import track
@@ -111,13 +111,13 @@ class BankRenderer:
     """What a renderer does in place of spreading by the lens's aperture."""
 
     tables: BlendedTables
-    spread_side: SpreadSide
+    sum_side: SideSum
 
     def render(self, layers: Sequence[Layer], lens: Lens, layering: Layering) -> Layer:
-        return render_layers(layers, lens, BankOptics.of(layers, lens, self.tables, self.spread), layering)
+        return render_layers(layers, lens, BankPsf.of(layers, lens, self.tables, self.sum_bank_kernels), layering)
 
-    def spread(self, values: Channels, coc_px: Plane, place: Place) -> Channels:
-        return spread_by_bank(self.tables, self.spread_side, values, coc_px, place)
+    def sum_bank_kernels(self, values: Channels, coc_px: Plane, place: Place) -> Channels:
+        return blend_colours(self.tables, self.sum_side, values, coc_px, place)
 
 
 def by_scatter(bank: PsfBank) -> BankRenderer:
@@ -144,7 +144,7 @@ class _ByPolygons:
     inner: Inner
 
     def __call__(self, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels:
-        return spread_shares(values, coc_px, self.apertures.shares(coc_px, side, channel, around), self.inner)
+        return sum_openings(values, coc_px, self.apertures.shares(coc_px, side, channel, around), self.inner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,4 +158,4 @@ class _ByLowRank:
         shares = (
             (share, KernelOpening(self.kernels, side, anchor, channel, self.terms, self.kept)) for anchor, share in around.by_anchor()
         )
-        return spread_shares(values, coc_px, shares, self.inner)
+        return sum_openings(values, coc_px, shares, self.inner)

@@ -242,7 +242,7 @@ def extents(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: 
 
 
 @njit(cache=True, nogil=True)
-def spread_px(sums: np.ndarray, window: np.ndarray, sigma_x_px: float) -> tuple[float, float]:
+def blur_px(sums: np.ndarray, window: np.ndarray, sigma_x_px: float) -> tuple[float, float]:
     """Standard deviations of the blur of the mean sample along its axes, the longer first."""
     r, m_x, m_y = sums[1] / sums[0], sums[3] / sums[0], sums[4] / sums[0]
     out_xx = sigma_x_px**2 + r * r * window[0] + window[3] * m_x * m_x

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS, extents, morton, slope_distance, spread_px
+from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS, blur_px, extents, morton, slope_distance
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, BLOCKS_ACROSS, Choice, Light, Partitions
 from mrbokeh.system.kernels import njit
 
@@ -218,7 +218,7 @@ def faint_rows(rows: np.ndarray, held: np.ndarray, light: Light, choice: Choice)
     if choice.faint > 0.0:
         typical = (held[:, 2].sum() / held[:, 0].sum()) ** 2
         for row in range(len(rows)):
-            sigma_u, sigma_v = spread_px(rows[row], light.window, choice.sigma_x_px)
+            sigma_u, sigma_v = blur_px(rows[row], light.window, choice.sigma_x_px)
             most = choice.faint * light.per_pixel * 4.0 * math.pi * sigma_u * sigma_v
             faint[row] = held[row, 0] <= most and held[row, 1] <= most * typical
     return faint if not faint.all() else np.zeros(len(rows), np.bool_)

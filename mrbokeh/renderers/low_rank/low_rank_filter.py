@@ -78,34 +78,34 @@ class LowRankFilter:
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         if self._of_bank is None or not layers:
-            return render_layers(layers, lens, self.spread, self.layering)
+            return render_layers(layers, lens, self.sum_kernels, self.layering)
         return self._of_bank.render(layers, lens, self.layering)
 
     @cached_property
     def _of_bank(self) -> BankRenderer | None:
-        return None if self.bank is None else by_low_rank(self.bank, self.terms, self.spread)
+        return None if self.bank is None else by_low_rank(self.bank, self.terms, self.sum_kernels)
 
-    def spread(
+    def sum_kernels(
         self,
         values: Float32[np.ndarray, "height width channels"],
         coc_px: Float32[np.ndarray, "height width"],
         aperture: Aperture | KernelOpening,
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.Spread."""
+        """See mrbokeh.layering.psf_over_field.KernelSum."""
         if values.shape[2] > _MOST_CHANNELS:
             parts = [values[..., at : at + _MOST_CHANNELS] for at in range(0, values.shape[2], _MOST_CHANNELS)]
-            return np.concatenate([self.spread(np.ascontiguousarray(part), coc_px, aperture) for part in parts], axis=2)
+            return np.concatenate([self.sum_kernels(np.ascontiguousarray(part), coc_px, aperture) for part in parts], axis=2)
         from mrbokeh.renderers.kernels._low_rank_numba import one_side
 
         with ThreadPoolExecutor(self.threads or cores()) as pool:
             out, diameters_px, sides, signed = _split(values, coc_px, 1.0 / aperture.unit_radius, pool.map)
             for sign in sides:
-                self._spread_side(out, values, one_side(diameters_px, sign), coc_px, aperture, sign, pool.map)
+                self._add_side(out, values, one_side(diameters_px, sign), coc_px, aperture, sign, pool.map)
         if sides and not signed.all():
             np.maximum(out, np.where(signed, -np.inf, 0.0).astype(np.float32), out=out)
         return out
 
-    def _spread_side(
+    def _add_side(
         self,
         out: Float32[np.ndarray, "height width channels"],
         values: Float32[np.ndarray, "height width channels"],
@@ -225,6 +225,6 @@ def tilt_shift(
     around = ((margin, margin), (margin, margin))
     values = np.dstack([rgb, np.ones_like(coc_px)])
     wide = np.pad(values, (*around, (0, 0)), mode="symmetric"), np.pad(coc_px, around, mode="symmetric")
-    spread = LowRankFilter(relative_error=0.0, max_rank=rank, threads=threads).spread(*wide, aperture)
+    spread = LowRankFilter(relative_error=0.0, max_rank=rank, threads=threads).sum_kernels(*wide, aperture)
     inside = spread[margin : margin + coc_px.shape[0], margin : margin + coc_px.shape[1]]
     return inside[..., :3] / np.maximum(inside[..., 3:], np.float32(_LEAST_COVERAGE))

@@ -215,7 +215,7 @@ def cut_negative(row: np.ndarray, nonnegative: np.ndarray) -> None:
 
 
 @compiled
-def spread_parts(
+def splat_parts(
     picture: Picture, corners: Corners, sums: Sums, exact: Exact, ring: Ring, scratch: Scratch, target: Target, parts: np.ndarray
 ) -> None:
     """Add the spread light of parts (N, 4) of a picture, each first row, end row, left, right, to the target, whose band holds the
@@ -223,11 +223,11 @@ def spread_parts(
     for k in range(parts.shape[0]):
         first, end, left, right = parts[k, 0], parts[k, 1], parts[k, 2], parts[k, 3]
         here = Ring(ring.planes, ring.plane_elements, ring.light_plane, ring.rows, ring.stride, ring.margin, left)
-        _spread_part(picture, corners, sums, exact, here, scratch, target, first, end, right)
+        _splat_part(picture, corners, sums, exact, here, scratch, target, first, end, right)
 
 
 @compiled
-def _spread_part(
+def _splat_part(
     picture: Picture,
     corners: Corners,
     sums: Sums,

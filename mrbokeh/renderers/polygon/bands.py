@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from mrbokeh.renderers.kernels._vectors_numba import CHUNK_PX
-from mrbokeh.renderers.polygon._differences_numba import settle, spread_parts
+from mrbokeh.renderers.polygon._differences_numba import settle, splat_parts
 from mrbokeh.renderers.polygon._ring_numba import ALIASED_ROWS, BLOCK_ROWS, GUARD, Corners, Picture, Ring, Scratch, Target, lay_out
 from mrbokeh.renderers.polygon._survey_numba import TILE_PX, find_parts
 from mrbokeh.renderers.polygon.surveyed_light import NO_HIGHLIGHTS, SurveyedLight, halves_of
@@ -108,7 +108,7 @@ def parts_of(
 
 
 @dataclass(frozen=True)
-class Workshop:
+class BandRunner:
     """What all pictures of a call have in common. halve_from_px: see mrbokeh.renderers.polygon.surveyed_light; inf for never."""
 
     tables: ApertureTables
@@ -118,16 +118,16 @@ class Workshop:
     memory: ZeroedMemory
     halve_from_px: float
 
-    def spread_four(self, light: SurveyedLight, highlights: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "height width 4"]:
+    def sum_resolutions(self, light: SurveyedLight, highlights: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "height width 4"]:
         """A picture of four channels, the blurriest parts at half the resolution, and of those the blurriest at half of that."""
         halves = halves_of(light, highlights, self.halve_from_px, self.pool)
         half = np.zeros((0, 0), np.float32)
         if halves.half is not None:
-            half = self.spread_four(halves.half, NO_HIGHLIGHTS)
+            half = self.sum_resolutions(halves.half, NO_HIGHLIGHTS)
             half = half.reshape(len(half), -1)
-        return self._spread(halves.kept, highlights, halves.share, half)
+        return self._sum_bands(halves.kept, highlights, halves.share, half)
 
-    def _spread(
+    def _sum_bands(
         self,
         light: SurveyedLight,
         highlights: Float32[np.ndarray, "_ _"],
@@ -145,7 +145,7 @@ class Workshop:
         strays = np.zeros((len(edges), 2, margin if len(bands) > 1 else 0, flat.shape[1]), np.float32)
         targets = [Target(flat, above, below, *rows) for (above, below), rows in zip(strays, edges, strict=True)]
         picture = Picture(light.values, light.coc_px, highlights, halved, nonnegative, light.largest_of_tile_px)
-        self._spread_bands(picture, list(zip(bands, targets, strict=False)), margin)
+        self._run_bands(picture, list(zip(bands, targets, strict=False)), margin)
         starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
         pieces = strays.reshape(2 * len(edges), *strays.shape[2:])
 
@@ -156,7 +156,7 @@ class Workshop:
         list(self.pool.map(finish, range(0, len(out), SETTLED_ROWS)))
         return out
 
-    def _spread_bands(self, picture: Picture, bands: list[tuple[Band, Target]], margin: int) -> None:
+    def _run_bands(self, picture: Picture, bands: list[tuple[Band, Target]], margin: int) -> None:
         waiting, lock = iter(bands), Lock()
         width = max((int((band.parts[:, 3] - band.parts[:, 2]).max()) for band, _ in bands), default=0)
         tables = self.tables
@@ -171,7 +171,7 @@ class Workshop:
                 if piece is None:
                     break
                 band, target = piece
-                spread_parts(picture, corners, tables.sums, tables.exact, ring, scratch, target, band.parts)
+                splat_parts(picture, corners, tables.sums, tables.exact, ring, scratch, target, band.parts)
             self.memory.give_back(planes)
 
         list(self.pool.map(lambda _: work(), range(min(self.threads, len(bands)))))

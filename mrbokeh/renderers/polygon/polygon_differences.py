@@ -100,20 +100,20 @@ class PolygonDifferences:
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         if self._of_bank is None or not layers:
-            return render_layers(layers, lens, self.spread, self.layering)
+            return render_layers(layers, lens, self.sum_kernels, self.layering)
         return self._of_bank.render(layers, lens, self.layering)
 
     @cached_property
     def _of_bank(self) -> BankRenderer | None:
         if self.bank is None:
             return None
-        return by_polygons(self.bank, self.apertures or fit_apertures(BankLattice(self.bank)), self.spread, self.tables_of)
+        return by_polygons(self.bank, self.apertures or fit_apertures(BankLattice(self.bank)), self.sum_kernels, self.tables_of)
 
-    def spread(
+    def sum_kernels(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.Spread."""
-        from mrbokeh.renderers.polygon.bands import Workshop
+        """See mrbokeh.layering.psf_over_field.KernelSum."""
+        from mrbokeh.renderers.polygon.bands import BandRunner
         from mrbokeh.renderers.polygon.surveyed_light import NO_HIGHLIGHTS, SurveyedLight
 
         threads = self.threads or cores()
@@ -127,8 +127,8 @@ class PolygonDifferences:
                 self.precision == "auto" and light.tiles.contrast * light.pixels**0.5 > _SINGLE_PRECISION * 2e6**0.5
             )
             dtype = np.float64 if double else np.float32
-            workshop = Workshop(tables, dtype, pool, threads, self._memory, self.halve_from_px)
-            spreads = [workshop.spread_four(light.group(first), share) for first in range(0, values.shape[2], 4)]
+            runner = BandRunner(tables, dtype, pool, threads, self._memory, self.halve_from_px)
+            spreads = [runner.sum_resolutions(light.group(first), share) for first in range(0, values.shape[2], 4)]
         return spreads[0] if values.shape[2] == 4 else np.ascontiguousarray(np.concatenate(spreads, axis=2)[..., : values.shape[2]])
 
     def tables_of(self, aperture: Aperture) -> "ApertureTables":

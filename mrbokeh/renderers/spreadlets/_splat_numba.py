@@ -57,7 +57,9 @@ def add_up(sums: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.n
 
 
 @njit(cache=True, nogil=True)
-def find_lamps(found: np.ndarray, most: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.ndarray, limits: np.ndarray) -> None:
+def mark_highlights(
+    found: np.ndarray, most: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.ndarray, limits: np.ndarray
+) -> None:
     """Mark the sparse pixels with a channel beyond its limit (C,); no other light is larger than most (C,), NaN if some is NaN.
 
     Stretches without anything beyond the limits are passed in vectors, whatever their codes.

@@ -13,7 +13,7 @@ dithers that spread evenly; modes are kept and solved in single precision. Pixel
 tap instead (`mrbokeh.renderers.spreadlets.laplacian_spreadlets`), which keeps the whole numbers fine. Measured: within 7e-6 of double precision, as
 a share of the mean, at 960 x 540 and 1e-5 at 1400 x 1400. Whole Laplacians, pyramids and light that is not finite take double precision.
 
-Lamps: pixels so much brighter than the mean that they are splatted tap by tap, so that the rest can be summed in whole numbers.
+Highlights: pixels so much brighter than the mean that they are splatted tap by tap, so that the rest can be summed in whole numbers.
 
 At most one pixel in as many outshines the mean so many times in one channel: all of their taps are a small share of dense splatting,
 whatever the picture.
@@ -33,7 +33,7 @@ from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import PsfBank
-from mrbokeh.renderers.bank.bank_optics import BankOptics
+from mrbokeh.renderers.bank.bank_psf import BankPsf
 from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.renderers.kernels.laplacian_tables import DENSE, KernelTables, Points, kind_of, stands_out, used_codes
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, Sparsification, Spreadlets
@@ -50,16 +50,16 @@ Codes = Int[np.ndarray, "height width"]
 Values = Float32[np.ndarray, "height width channels"]
 
 
-class Lamps(NamedTuple):
+class Highlights(NamedTuple):
     """Which pixels are lamps, and how large light of the other pixels with sparse kernels is at most in each channel, without sign."""
 
     found: Bool[np.ndarray, "height width"]
     largest: Float32[np.ndarray, " channels"]
 
 
-def lamps_among(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Lamps:
+def highlights_among(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Highlights:
     """The lamps among pixels whose code (-1 for none) is sparse."""
-    from mrbokeh.renderers.spreadlets._splat_numba import find_lamps
+    from mrbokeh.renderers.spreadlets._splat_numba import mark_highlights
 
     limits = (OUTSHINES_MEAN * _mean(values, codes, sparse)).astype(np.float32)
     starts = range(0, len(codes), _ROWS_AT_ONCE)
@@ -67,11 +67,11 @@ def lamps_among(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]
 
     def find(band: int) -> None:
         rows = slice(starts[band], starts[band] + _ROWS_AT_ONCE)
-        find_lamps(found[rows], largest[band], values[rows], codes[rows], sparse, limits)
+        mark_highlights(found[rows], largest[band], values[rows], codes[rows], sparse, limits)
 
     with workers(codes.size) as pool:
         list(pool.map(find, range(len(starts))))
-    return Lamps(found, largest.max(axis=0))
+    return Highlights(found, largest.max(axis=0))
 
 
 def _mean(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Float64[np.ndarray, " channels"]:
@@ -86,13 +86,13 @@ def _mean(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> F
     return sums
 
 
-def lamps_among_plainly(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Lamps:
-    """The plain twin of `lamps_among`."""
+def highlights_among_plainly(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Highlights:
+    """The plain twin of `highlights_among`."""
     mine, light = (codes >= 0) & sparse[codes], np.abs(values)
     some = light[::_EVERY][mine[::_EVERY]]
     limits = OUTSHINES_MEAN * (some if some.size else light[mine]).mean(axis=0, dtype=np.float64)
     found = mine & (light > limits.astype(np.float32)).any(axis=2)
-    return Lamps(found, light[mine & ~found].max(axis=0, initial=0.0))
+    return Highlights(found, light[mine & ~found].max(axis=0, initial=0.0))
 
 
 _MOST_KEPT_BYTES = 1 << 27
@@ -137,37 +137,37 @@ class LaplacianSpreadlets:
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         if self._bank_tables is None or not layers:
-            return render_layers(layers, lens, self.spread, self.layering)
-        return render_layers(layers, lens, BankOptics.of(layers, lens, self._bank_tables, self.spread_bank), self.layering)
+            return render_layers(layers, lens, self.sum_kernels, self.layering)
+        return render_layers(layers, lens, BankPsf.of(layers, lens, self._bank_tables, self.sum_bank_kernels), self.layering)
 
     def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
         """A picture from noisy samples: each gives its light to the whole PSF of the point that it saw (Section 6.2, Fig. 7)."""
         return reconstructed(samples, lens, self)
 
-    def spread(
+    def sum_kernels(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.Spread."""
-        return self._spread(values, coc_px, aperture, densely=False)
+        """See mrbokeh.layering.psf_over_field.KernelSum."""
+        return self._sum(values, coc_px, aperture, densely=False)
 
-    def spread_densely(
+    def sum_kernels_densely(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
         """The same with all taps of the same kernels and no Laplacian: what is fast in `spread` is measured against this."""
-        return self._spread(values, coc_px, aperture, densely=True)
+        return self._sum(values, coc_px, aperture, densely=True)
 
-    def spread_bank(
+    def sum_bank_kernels(
         self,
         values: Float32[np.ndarray, "height width channels"],
         coc_px: Float32[np.ndarray, "height width"],
         place: Place,
         densely: bool = False,
     ) -> Float32[np.ndarray, "height width channels_out"]:
-        """The sum over all pixels of value times the bank's kernel: R, G, B, coverage, then others, as in layering.psf_over_field.Optics.
+        """The sum over all pixels of value times the bank's kernel: R, G, B, coverage, then others, as in layering.psf_over_field.PsfField.
 
         Coverage, three times for a bank of three colours, and others take kernels scaled to sum to 1: light that is absorbed
         darkens what is seen, but is no hole in it. Others go with green. What a bank of one colour is given may also be colour
-        alone, of up to three channels. Circles and what gets lost as in mrbokeh.layering.psf_over_field.Spread. densely: all taps of the
+        alone, of up to three channels. Circles and what gets lost as in mrbokeh.layering.psf_over_field.KernelSum. densely: all taps of the
         same kernels.
         """
         tables = self._bank_tables
@@ -192,7 +192,7 @@ class LaplacianSpreadlets:
         each = [summed([c], others if c == 1 else [3], c) for c in range(3)]
         return np.concatenate([*(light[..., :1] for light in each), *(light[..., 1:2] for light in each), each[1][..., 2:]], axis=2)
 
-    def _spread(self, values: np.ndarray, coc_px: np.ndarray, aperture: Aperture, densely: bool) -> np.ndarray:
+    def _sum(self, values: np.ndarray, coc_px: np.ndarray, aperture: Aperture, densely: bool) -> np.ndarray:
         sharp = np.zeros_like(values)
         codes = self._tables.codes(sharp, values, coc_px, aperture)
         kinds = {int(code): densely or kind_of(int(code)) == DENSE for code in used_codes(codes)}
@@ -212,7 +212,7 @@ class LaplacianSpreadlets:
         sparse = np.zeros(base, np.bool_)
         sparse[[code for code, dense in kinds.items() if not dense]] = True
         if self._sums_whole_numbers and sparse.any():
-            found, largest = lamps_among(values, codes, sparse)
+            found, largest = highlights_among(values, codes, sparse)
             where = np.nonzero(found)
             if where[0].size:
                 codes = codes.copy()

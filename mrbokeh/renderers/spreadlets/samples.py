@@ -16,7 +16,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.layering import Layering
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.layering.motion import drawn_out
-from mrbokeh.layering.psf_over_field import Frame, spread_light
+from mrbokeh.layering.psf_over_field import Frame, blur_colours
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.bank.tables import Place
@@ -33,8 +33,8 @@ class _Renderer(Protocol):
     def layering(self) -> Layering: ...
     @property
     def bank(self) -> object: ...
-    def spread(self, values: Channels, coc_px: Plane, aperture: Aperture) -> Channels: ...
-    def spread_bank(self, values: Channels, coc_px: Plane, place: Place) -> Channels: ...
+    def sum_kernels(self, values: Channels, coc_px: Plane, aperture: Aperture) -> Channels: ...
+    def sum_bank_kernels(self, values: Channels, coc_px: Plane, place: Place) -> Channels: ...
 
 
 def reconstructed(samples: LightFieldSamples, lens: Lens, renderer: _Renderer) -> Layer:
@@ -49,7 +49,7 @@ def reconstructed(samples: LightFieldSamples, lens: Lens, renderer: _Renderer) -
     inside = np.s_[margin : margin + samples.height_px, margin : margin + samples.width_px]
     for each in np.unique(index):
         rounds = _rounds(samples, coc_px, at_px, index == each, margin)
-        light = np.sum([_spread(*piece, samples, lens, renderer, margin)[inside] for piece in rounds], axis=0)
+        light = np.sum([_blur_round(*piece, samples, lens, renderer, margin)[inside] for piece in rounds], axis=0)
         weight = np.maximum(light[..., 3:], 0.0)  # one for all colours, or one for each
         share = np.minimum(weight / np.float32(samples.per_pixel), 1.0 - taken)
         colour += share * light[..., :3] / np.maximum(weight, _NOTHING_TAKEN)
@@ -77,21 +77,21 @@ def _rounds(
         yield values, circles, motion
 
 
-def _spread(
+def _blur_round(
     values: Channels, coc_px: Plane, motion_px: np.ndarray, samples: LightFieldSamples, lens: Lens, renderer: _Renderer, margin: int
 ) -> np.ndarray:
     """Light through the aperture, drawn out along its path before, or through the kernels of the bank."""
     if renderer.bank is None:
         moving, circles = drawn_out(values, coc_px, motion_px) if motion_px.any() else (values, coc_px)
         frame = Frame(samples.width_px, samples.height_px, -margin, -margin)
-        return spread_light(renderer.spread, moving, circles, lens.aperture, frame, renderer.layering.field_cells)
+        return blur_colours(renderer.sum_kernels, moving, circles, lens.aperture, frame, renderer.layering.field_cells)
     half_diagonal_px = 0.5 * np.hypot(samples.width_px, samples.height_px)
     rows, columns = np.indices(coc_px.shape) + 0.5 - margin
     field_xy = np.stack([columns - 0.5 * samples.width_px, rows - 0.5 * samples.height_px], axis=2) / half_diagonal_px
     dioptres = 1.0 / lens.focus_distance_m - coc_px / lens.coc_px_per_dioptre(samples.width_px)
     with np.errstate(divide="ignore"):
         depth_m = np.where(dioptres > 0.0, 1.0 / dioptres, np.inf)
-    return renderer.spread_bank(values, coc_px, Place(motion_px, field_xy, depth_m))
+    return renderer.sum_bank_kernels(values, coc_px, Place(motion_px, field_xy, depth_m))
 
 
 def _nearest_m(samples: LightFieldSamples) -> Plane:

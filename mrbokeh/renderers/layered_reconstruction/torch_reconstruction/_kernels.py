@@ -16,7 +16,7 @@ from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANC
 from mrbokeh.renderers.layered_reconstruction._tile_data import packed_pupil
 from mrbokeh.renderers.layered_reconstruction._windows_numba import LEAST_SCALE_PX, STRIPS_FOR_PX
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._jobs import Task
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import Number, Slopes, Spread, axes, sheared_axes
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import Covariance, Number, Slopes, axes, sheared_axes
 
 _LEAST_VARIANCE = 0.04
 _LEAST_SHARE = 1e-6
@@ -137,20 +137,20 @@ _WITHIN_A_PIXEL = 0.04
 _LEAST_WEIGHT = 1e-6
 
 
-def less_pixel(v: Spread) -> Spread:
+def less_pixel(v: Covariance) -> Covariance:
     """The covariance without what a pixel as a bin adds."""
-    return Spread(
+    return Covariance(
         (v.xx - PIXEL_VARIANCE).clamp(min=_LEAST_GAUSSIAN_VARIANCE), v.xy, (v.yy - PIXEL_VARIANCE).clamp(min=_LEAST_GAUSSIAN_VARIANCE)
     )
 
 
-def gaussian_guards(v: Spread, support: float) -> Int64[Tensor, "jobs 2"]:
+def gaussian_guards(v: Covariance, support: float) -> Int64[Tensor, "jobs 2"]:
     """Pixels beyond the tile along x and y; a Gaussian that ends within its pixel needs none."""
     both = torch.stack([v.xx, v.yy], dim=1)
     return torch.where(both > _WITHIN_A_PIXEL, torch.ceil(support * torch.sqrt(both)), 0.0).long()
 
 
-def direct_kernels(v: Spread, guard: Int64[Tensor, "group 2"], offset: Offsets) -> Kernels:
+def direct_kernels(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offsets) -> Kernels:
     """The Gaussian sampled at pixels, sum 1."""
     x, y = offset[None, None, :].double(), offset[None, :, None].double()
     xx, xy, yy = (each[:, None, None] for each in v)
@@ -161,7 +161,7 @@ def direct_kernels(v: Spread, guard: Int64[Tensor, "group 2"], offset: Offsets) 
     return torch.where((det > 1e-9) & (guard.amax(dim=1) > 0)[:, None, None], kernel / kernel.sum(dim=(1, 2), keepdim=True), point)
 
 
-def sheared_kernels(v: Spread, guard: Int64[Tensor, "group 2"], offset: Offsets) -> Kernels:
+def sheared_kernels(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offsets) -> Kernels:
     """The plain Gaussian along (beta, 1), linear between the pixels of a row; a Gaussian within its pixel is a point."""
     weights, beta = _sheared_weights(v, guard, offset)
     tent = (1.0 - (offset - beta[:, None, None] * offset[None, :, None]).abs()).clamp(min=0.0)
@@ -170,7 +170,7 @@ def sheared_kernels(v: Spread, guard: Int64[Tensor, "group 2"], offset: Offsets)
 
 
 def recursive_rows(
-    planes: Float32[Tensor, "group planes side side2"], v: Spread, task: Task, guard: Int64[Tensor, "group 2"], passes: int
+    planes: Float32[Tensor, "group planes side side2"], v: Covariance, task: Task, guard: Int64[Tensor, "group 2"], passes: int
 ) -> Float32[Tensor, "group planes side side2"]:
     """Eq. 10 along x, beyond the borders of each job nothing.
 
@@ -195,7 +195,7 @@ def feedback(variance_px2: Number) -> Number:
     return q - torch.sqrt(q * q - 1.0)
 
 
-def _variance_along_x(v: Spread, guard: Int64[Tensor, "group 2"]) -> tuple[Number, Tensor]:
+def _variance_along_x(v: Covariance, guard: Int64[Tensor, "group 2"]) -> tuple[Number, Tensor]:
     """What is left for the filter along x once linear interpolation has added its own, and where that is nothing."""
     most = int(guard.amax())
     offset = torch.arange(-most, most + 1, device=guard.device)
@@ -208,7 +208,7 @@ def _variance_along_x(v: Spread, guard: Int64[Tensor, "group 2"]) -> tuple[Numbe
     return torch.where(is_point, 1.0, variance), is_point
 
 
-def _sheared_weights(v: Spread, guard: Int64[Tensor, "group 2"], offset: Offsets) -> tuple[Float64[Tensor, "group size"], Number]:
+def _sheared_weights(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offsets) -> tuple[Float64[Tensor, "group size"], Number]:
     """Weights of rows along the sheared axis, and its beta."""
     _, s_v, beta = sheared_axes(*axes(v))
     is_point = (s_v <= 1e-3) | (guard.amax(dim=1) == 0)

@@ -13,7 +13,7 @@ from torch import Tensor
 from mrbokeh.renderers.layered_reconstruction._partitions_numba import LOOK_BACK, WIDEST_PX
 from mrbokeh.renderers.layered_reconstruction._settings import Settings
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import Rows, extents, slope_distance, spread_px
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import Rows, blur_px, extents, slope_distance
 from mrbokeh.system.torch_device import has_triton
 
 
@@ -136,7 +136,7 @@ def faint_rows(rows: Rows, light: TileLight, settings: Settings) -> Bool[Tensor,
     tiles = len(rows.first) - 1
     of_tiles = rows.light.new_zeros((tiles, 3)).index_add_(0, rows.tile, rows.light)
     typical = (of_tiles[:, 2] / of_tiles[:, 0]) ** 2
-    sigma_u, sigma_v = spread_px(rows.sums, light.window, settings.sigma_x_px)
+    sigma_u, sigma_v = blur_px(rows.sums, light.window, settings.sigma_x_px)
     most = settings.faint * light.per_pixel * 4.0 * math.pi * sigma_u * sigma_v
     faint = (rows.light[:, 0] <= most) & (rows.light[:, 1] <= most * typical[rows.tile])
     any_seen = torch.zeros(tiles, dtype=torch.int64, device=faint.device).index_add_(0, rows.tile, (~faint).long()) > 0

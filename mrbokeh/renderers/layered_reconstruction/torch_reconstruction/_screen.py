@@ -30,7 +30,7 @@ from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._kernels impo
     window_guards,
 )
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import Slopes, Spread, screen_covariance
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import Covariance, Slopes, screen_covariance
 from mrbokeh.system.errors import InputError
 
 FILTERS = ("windows", "sheared", "direct")
@@ -119,7 +119,7 @@ class ScreenFilter:
             for line in lines:
                 yield line * pupil
 
-    def _covariance(self, slopes: Slopes) -> Spread:
+    def _covariance(self, slopes: Slopes) -> Covariance:
         return less_pixel(screen_covariance(slopes, self.window, self.settings.sigma_x_px))
 
 

@@ -32,7 +32,7 @@ class Slopes(NamedTuple):
     kappa_t: Number
 
 
-class Spread(NamedTuple):
+class Covariance(NamedTuple):
     """A symmetric matrix of two by two."""
 
     xx: Number
@@ -61,15 +61,15 @@ def sheared_slopes(sums: Sums, window: Window, sigma_x_px: float, bandwidth: flo
     return Slopes(r, m_x, m_y, kappa_u, 1.0 / (1.0 + bandwidth**2 * d_tt * trace_m))
 
 
-def screen_covariance(slopes: Slopes, window: Window, sigma_x_px: float) -> Spread:
+def screen_covariance(slopes: Slopes, window: Window, sigma_x_px: float) -> Covariance:
     """Of the Gaussian over the screen."""
     lens = slopes.kappa_u * (2.0 - slopes.kappa_u) * slopes.r**2
     shutter = slopes.kappa_t * (2.0 - slopes.kappa_t) * window[3]
     xx = sigma_x_px**2 + lens * window[0] + shutter * slopes.m_x**2
-    return Spread(xx, lens * window[1] + shutter * slopes.m_x * slopes.m_y, sigma_x_px**2 + lens * window[2] + shutter * slopes.m_y**2)
+    return Covariance(xx, lens * window[1] + shutter * slopes.m_x * slopes.m_y, sigma_x_px**2 + lens * window[2] + shutter * slopes.m_y**2)
 
 
-def axes(v: Spread) -> tuple[Number, Number, Number]:
+def axes(v: Covariance) -> tuple[Number, Number, Number]:
     """(sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
     middle, half = 0.5 * (v.xx + v.yy), torch.hypot(0.5 * (v.xx - v.yy), v.xy)
     return torch.sqrt(middle + half), torch.sqrt((middle - half).clamp(min=0.0)), 0.5 * torch.atan2(2.0 * v.xy, v.xx - v.yy)
@@ -90,7 +90,7 @@ def extents(sums: Sums, window: Window, sigma_x_px: float, bandwidth: float) -> 
     return sigma_u, sigma_v
 
 
-def spread_px(sums: Sums, window: Window, sigma_x_px: float) -> tuple[Number, Number]:
+def blur_px(sums: Sums, window: Window, sigma_x_px: float) -> tuple[Number, Number]:
     """Standard deviations of the blur of the mean sample along its axes, the longer first."""
     r, m_x, m_y = (sums[..., k] / sums[..., 0] for k in (1, 3, 4))
     sigma_u, sigma_v, _ = axes(_blur(r, m_x, m_y, window, sigma_x_px)[0])
@@ -107,9 +107,9 @@ def slope_distance(one: Sums, other: Sums, window: Window, sigma_x_px: float) ->
     return torch.sqrt(lens + shutter)
 
 
-def _blur(r: Number, m_x: Number, m_y: Number, window: Window, sigma_x_px: float) -> tuple[Spread, Number]:
+def _blur(r: Number, m_x: Number, m_y: Number, window: Window, sigma_x_px: float) -> tuple[Covariance, Number]:
     """The blur of the mean sample (what of the spectrum passes pupil, shutter and pixel), and its determinant."""
-    out = Spread(
+    out = Covariance(
         sigma_x_px**2 + r * r * window[0] + window[3] * m_x * m_x,
         r * r * window[1] + window[3] * m_x * m_y,
         sigma_x_px**2 + r * r * window[2] + window[3] * m_y * m_y,

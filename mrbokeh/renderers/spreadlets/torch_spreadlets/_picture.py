@@ -70,17 +70,17 @@ class TorchSpreadlets:
             raise InputError("nothing to render: expected at least one layer, got none")
         result: Channels | None = None
         for layer in reversed(layers):
-            light = self.spread(layer.continued(continued_px) if continued_px else layer)
+            light = self.sum_kernels(layer.continued(continued_px) if continued_px else layer)
             height, width, _ = light.shape
             light = light[continued_px : height - continued_px, continued_px : width - continued_px]
             result = light if result is None else over(light, result)
         assert result is not None
         return torch.cat([result[..., :3], result[..., 3:].mean(dim=2, keepdim=True)], dim=2)
 
-    def spread(self, layer: DeviceLayer) -> Channels:
+    def sum_kernels(self, layer: DeviceLayer) -> Channels:
         """The sum over all pixels of light times kernel: R, G, B and coverage, or three coverages for a bank of three colours.
 
-        See LaplacianSpreadlets.spread_bank, with which this agrees to rounding where Laplacians are whole. The
+        See LaplacianSpreadlets.sum_bank_kernels, with which this agrees to rounding where Laplacians are whole. The
         far field of sparse points feels the border, which lies elsewhere here (2e-4 in a picture up to 4).
         """
         lit = (layer.rgba != 0).any(dim=2)

@@ -31,15 +31,15 @@ _BEYOND_PX, _BEYOND = 1.0, 1.05  # how far the largest kernel stands for larger 
 
 
 @dataclass(frozen=True)
-class BankOptics:
-    """See mrbokeh.layering.psf_over_field.Optics.
+class BankPsf:
+    """See mrbokeh.layering.psf_over_field.PsfField.
 
-    spread_bank: the sum of kernels (LaplacianSpreadlets). motion: the channels that hold it, if there are any, and farthest_px:
+    sum_bank_kernels: the sum of kernels (LaplacianSpreadlets). motion: the channels that hold it, if there are any, and farthest_px:
     how far light moves at most. A bank without motion gets its light drawn out along its path before, as an aperture does.
     """
 
     tables: BankTables
-    spread_bank: Callable[[Channels, Plane, Place], Channels]
+    sum_bank_kernels: Callable[[Channels, Plane, Place], Channels]
     lens: Lens
     size: tuple[int, int]
     motion: slice | None
@@ -47,10 +47,10 @@ class BankOptics:
 
     @classmethod
     def of(
-        cls, layers: Sequence[Layer], lens: Lens, tables: BankTables, spread_bank: Callable[[Channels, Plane, Place], Channels]
-    ) -> "BankOptics":
+        cls, layers: Sequence[Layer], lens: Lens, tables: BankTables, sum_bank_kernels: Callable[[Channels, Plane, Place], Channels]
+    ) -> "BankPsf":
         """For these layers and what they need."""
-        return cls(tables, spread_bank, lens, layers[0].alpha.shape, motion_channels(layers[0].extra), farthest_px(layers))
+        return cls(tables, sum_bank_kernels, lens, layers[0].alpha.shape, motion_channels(layers[0].extra), farthest_px(layers))
 
     @property
     def coverages(self) -> int:
@@ -83,14 +83,14 @@ class BankOptics:
             reach = max(reach, self._reach_px(part.pixels.coc_px[who], motion_px, places // width, places % width, frame))
         return reach
 
-    def spread(self, values: Channels, coc_px: Plane, frame: Frame) -> Channels:
+    def blur(self, values: Channels, coc_px: Plane, frame: Frame) -> Channels:
         motion_px = None
         if self.motion is not None and self.tables.holds_motion:
             motion_px = motion_of(values[..., self.motion], values[..., 3])
         elif self.motion is not None and self.farthest_px > 0:
             values, coc_px = moved(values, coc_px, self.motion)
         rows_columns = np.indices(coc_px.shape)
-        return self.spread_bank(values, coc_px, self._place(coc_px, motion_px, rows_columns[0], rows_columns[1], frame))
+        return self.sum_bank_kernels(values, coc_px, self._place(coc_px, motion_px, rows_columns[0], rows_columns[1], frame))
 
     def _reach_px(
         self,

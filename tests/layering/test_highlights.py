@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrbokeh.layering.highlights import find_lights, lights, without_lights
+from mrbokeh.layering.highlights import find_highlights, mark_highlights, without_highlights
 
 
 def picture(seed: int, size: tuple[int, int]) -> np.ndarray:
@@ -22,7 +22,7 @@ def test_a_light_is_four_times_as_bright_as_most_of_the_25_pixels_around(size: t
     brightness = values[..., :3].max(axis=2)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(brightness, 2, mode="edge"), (5, 5)).reshape(*size, 25)
     expected = (4.0 * around < brightness[..., None]).sum(axis=2) >= 13
-    np.testing.assert_array_equal(lights(values), expected)
+    np.testing.assert_array_equal(find_highlights(values), expected)
     assert size[0] < 40 or 50 < expected.sum() < 300
 
 
@@ -30,13 +30,13 @@ def test_lights_do_not_depend_on_the_bands_they_are_looked_for_in() -> None:
     values = picture(5, (40, 61))
     in_bands = np.empty((40, 61), np.bool_)
     for top, bottom in ((0, 1), (1, 4), (4, 39), (39, 40)):
-        find_lights(in_bands, values, top, bottom)
-    np.testing.assert_array_equal(in_bands, lights(values))
+        mark_highlights(in_bands, values, top, bottom)
+    np.testing.assert_array_equal(in_bands, find_highlights(values))
 
 
 def test_the_median_of_the_surroundings_takes_the_place_of_a_light() -> None:
     values = np.full((9, 9, 4), 0.25, np.float32)
-    assert without_lights(values) is values
+    assert without_highlights(values) is values
     values[4, 4, :3] = 100.0
-    np.testing.assert_array_equal(without_lights(values), np.full((9, 9, 4), 0.25, np.float32))
+    np.testing.assert_array_equal(without_highlights(values), np.full((9, 9, 4), 0.25, np.float32))
     assert values[4, 4, 0] == 100.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.layer import Layer, clear, opaque
-from mrbokeh.layering.padded_layers import Pixels, Sheet, coc_px_of, sheet_of
+from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import CallingThread
@@ -29,7 +29,7 @@ def test_an_opaque_layer_goes_on_as_its_border_and_one_with_holes_as_nothing(mar
     for alpha, mode in ((1.0, "edge"), (0.5, "constant")):
         source = layer(alpha, extra)
         coc_px = coc_px_of(source, LENS)
-        sheet = sheet_of(source, coc_px, margin, CallingThread())
+        sheet = pad_layer(source, coc_px, margin, CallingThread())
         values = np.concatenate([source.rgb, source.alpha[..., None], *source.extra.values()], axis=2)
         np.testing.assert_array_equal(sheet.values, np.pad(values, (*around, (0, 0)), mode=mode))
         np.testing.assert_array_equal(sheet.coc_px, np.pad(coc_px, around, mode=mode))
@@ -40,7 +40,7 @@ def test_a_lamp_on_the_border_does_not_go_on_as_a_bar() -> None:
     rgb = np.full((*SIZE, 3), 0.5, np.float32)
     rgb[0, 8] = rgb[11, 0] = 100.0
     source = opaque(rgb, np.full(SIZE, 4.0, np.float32))
-    sheet = sheet_of(source, coc_px_of(source, LENS), 4, CallingThread())
+    sheet = pad_layer(source, coc_px_of(source, LENS), 4, CallingThread())
     np.testing.assert_array_equal(sheet.values[4:16, 4:21, :3], rgb)
     outside = np.ones(sheet.coc_px.shape, bool)
     outside[4:16, 4:21] = False
@@ -64,7 +64,7 @@ def test_pixels_that_cover_nothing_have_no_circle_of_confusion_and_need_no_depth
 def test_covered_pixels_of_a_sheet() -> None:
     values = np.zeros((3, 4, 5), np.float32)
     values[1, 2], values[2, 0] = 0.5, 0.25
-    sheet = Sheet(values, np.arange(12, dtype=np.float32).reshape(3, 4), False)
+    sheet = PaddedLayer(values, np.arange(12, dtype=np.float32).reshape(3, 4), False)
     pixels = Pixels.covered(sheet)
     np.testing.assert_array_equal(pixels.places, [6, 8])
     np.testing.assert_array_equal(pixels.coc_px, [6.0, 8.0])

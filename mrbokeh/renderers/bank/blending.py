@@ -1,7 +1,7 @@
 """Light through a bank of kernels: every pixel's light is divided among the kernels around it, and each share is spread by its own.
 
 Places in the frame share in proportion (bilinearly), so that nothing jumps where one cell of the bank ends; the shares of a
-pixel sum to 1, so no light is lost or doubled. Renderers differ in how a side of the focus is spread (`SpreadSide`).
+pixel sum to 1, so no light is lost or doubled. Renderers differ in how a side of the focus is spread (`SideSum`).
 
 The plain twin of all that spread by a bank: every pixel throws its light over the exact kernels around it, blended.
 """
@@ -30,7 +30,7 @@ Shares = Iterator[tuple[Plane | None, Any]]
 
 
 @runtime_checkable
-class SpreadSide(Protocol):
+class SideSum(Protocol):
     """The sum over pixels on one side of the focus (signed diameters coc_px) of value times kernel of a channel of the bank.
 
     Kernels sum to 1 here. A pixel without any value has no say. Same size out; light that leaves the frame is lost.
@@ -41,7 +41,7 @@ class SpreadSide(Protocol):
 
 @dataclass
 class BlendedTables(BankTables):
-    """What mrbokeh.renderers.bank.bank_optics.BankOptics asks of a bank whose kernels are blended with those of the cells beside.
+    """What mrbokeh.renderers.bank.bank_psf.BankPsf asks of a bank whose kernels are blended with those of the cells beside.
 
     unit_radius: how far apertures that stand for the kernels reach, 0 if none do.
     """
@@ -107,8 +107,8 @@ def _without_border(kernel: Float64[np.ndarray, "_ _ channels"]) -> Float64[np.n
     return np.ascontiguousarray(kernel[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1])
 
 
-def spread_by_bank(tables: BlendedTables, spread_side: SpreadSide, values: Channels, coc_px: Plane, place: Place) -> Channels:
-    """R, G, B, coverage (for a bank of three colours three times), others; as LaplacianSpreadlets.spread_bank has it."""
+def blend_colours(tables: BlendedTables, sum_side: SideSum, values: Channels, coc_px: Plane, place: Place) -> Channels:
+    """R, G, B, coverage (for a bank of three colours three times), others; as LaplacianSpreadlets.sum_bank_kernels has it."""
     lit = not_black(values)
     if not np.isfinite(coc_px[lit]).all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
@@ -125,7 +125,7 @@ def spread_by_bank(tables: BlendedTables, spread_side: SpreadSide, values: Chann
             mine = picked if len(sides) == 1 and passed is None else picked * here[..., None]
             if passed is not None:
                 mine[..., :colours] *= passed[..., None]
-            seen = spread_side(mine, coc_px, side, channel, around)
+            seen = sum_side(mine, coc_px, side, channel, around)
             total = seen if total is None else total + seen
         assert total is not None
         return total
@@ -137,13 +137,13 @@ def spread_by_bank(tables: BlendedTables, spread_side: SpreadSide, values: Chann
     return np.concatenate([*(light[..., :1] for light in each), *(light[..., 1:2] for light in each), each[1][..., 2:]], axis=2)
 
 
-def spread_shares(values: Channels, coc_px: Plane, shares: Shares, spread: Callable[..., Channels]) -> Channels:
+def sum_openings(values: Channels, coc_px: Plane, shares: Shares, kernel_sum: Callable[..., Channels]) -> Channels:
     """What is sharp, and every share spread within the window that its light reaches."""
     blurred = not_black(values) & (np.abs(coc_px) > SHARP_PX)
     total = np.where(blurred[..., None], np.float32(0.0), values)
     for share, opening in shares:
         if share is None:
-            return spread(np.ascontiguousarray(values), coc_px, opening)
+            return kernel_sum(np.ascontiguousarray(values), coc_px, opening)
         mine = blurred & (share > 0)
         rows, columns = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
         if not rows.size:
@@ -152,7 +152,7 @@ def spread_shares(values: Channels, coc_px: Plane, shares: Shares, spread: Calla
         ends = ((each[0], each[-1] + 1, length) for each, length in zip((rows, columns), mine.shape, strict=True))
         window = tuple(slice(max(0, first - reach), min(length, stop + reach)) for first, stop, length in ends)
         part = values[window] * np.where(mine[window], share[window], np.float32(0.0))[..., None]
-        total[window] += spread(np.ascontiguousarray(part), np.ascontiguousarray(coc_px[window]), opening)
+        total[window] += kernel_sum(np.ascontiguousarray(part), np.ascontiguousarray(coc_px[window]), opening)
     return total
 
 
@@ -173,7 +173,7 @@ def _passed(lattice: BankLattice, coc_px: Plane, side: int, channel: int, around
 
 
 def scatter_side(kernels: AnchorKernels, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels:
-    """See SpreadSide; kernels are blended over place (bilinearly) and diameter (linearly), summed in float64."""
+    """See SideSum; kernels are blended over place (bilinearly) and diameter (linearly), summed in float64."""
     from mrbokeh.renderers.bank._scatter_numba import scatter_blended
 
     lattice = kernels.lattice
