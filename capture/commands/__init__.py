@@ -1,1 +1,1 @@
-"""The commands of `mrbokeh capture`, one file each."""
+"""Commands of `mrbokeh capture`, one file each."""

@@ -50,7 +50,14 @@ def dataset_command(
     if not scenes:
         raise InputError("expected the folders of scenes, got none: mrbokeh capture dataset SCENE... --out DATASET --licence TEXT")
     writing = StackWriting(copy, coc_maps, reblur_by(renderer))
-    plan = DatasetPlan(licence_text(licence), tuple(test or ()), test_share, seed, radiance_scale, writing)
+    plan = DatasetPlan(
+        licence=licence_text(licence),
+        test=tuple(test or ()),
+        test_share=test_share,
+        seed=seed,
+        radiance_scale=radiance_scale,
+        writing=writing,
+    )
     with kept_when_interrupted(f"finished stacks are kept in {out}", overwrite):
         dataset = write_dataset(scenes, out, plan, overwrite)
     train, held_out = len(dataset.records("train")), len(dataset.records("test"))
@@ -64,7 +71,7 @@ def dataset_command(
 
 
 def _slices_held_out(dataset: "FocalStackDataset") -> str:
-    """What a data set of one stack is tested on, in words."""
+    """Say what a data set of one stack is tested on."""
     if len(dataset.stacks) > 1:
         return ""
     slices = ", ".join(str(index) for index in dataset.stacks[0].held_out_slices)
@@ -72,7 +79,7 @@ def _slices_held_out(dataset: "FocalStackDataset") -> str:
 
 
 def licence_text(text_or_file: str) -> str:
-    """The text of a file where there is one of that name, else the text itself."""
+    """Return the text of a file where there is one of that name, else the text itself."""
     path = Path(text_or_file)
     try:
         return path.read_text(encoding="utf-8") if text_or_file and path.is_file() else text_or_file

@@ -57,7 +57,7 @@ def ingest_command(
 
 
 def parse_white_balance(text: str) -> tuple[float, float, float] | None:
-    """ "camera" to None, "R,G,B" to three multipliers with green at 1."""
+    """Parse "camera" to None, "R,G,B" to three multipliers with green at 1."""
     if text.strip().lower() == "camera":
         return None
     try:

@@ -47,15 +47,15 @@ def matchmove_command(
     format_of_name(out)
     printed = None if board is None else read_board(board)
     settings = MatchmoveSettings(
-        keyframes,
-        camera_model,
-        mapper,
-        max_image_size,
-        printed,
-        overwrite,
-        None if ground is None else parse_ground(ground),
-        None if ruler is None else parse_ruler(ruler),
-        None if distance is None else parse_frame_distance(distance),
+        keyframes=keyframes,
+        camera_model=camera_model,
+        mapper=mapper,
+        max_image_size_px=max_image_size,
+        board=printed,
+        overwrite=overwrite,
+        ground=None if ground is None else parse_ground(ground),
+        ruler=None if ruler is None else parse_ruler(ruler),
+        distance=None if distance is None else parse_frame_distance(distance),
     )
     folder = work or out.with_name(f"{out.stem}_matchmove")
     with kept_when_interrupted(f"keyframes and COLMAP's files, as far as they are finished, are kept in {folder}", overwrite):

@@ -75,7 +75,7 @@ def plan_command(
 def planned_for(
     path: Path | None, focal_length: float | None, f_number: float | None, sensor_width: float | None, focus_m: float
 ) -> "Lens":
-    """The lens of a file, or of three numbers; an f-number goes before the file's."""
+    """Return the lens of a file, or of three numbers; an f-number goes before the file's."""
     from dataclasses import replace
 
     from mrbokeh.optics.lens import Lens
@@ -102,7 +102,7 @@ def range_from(origin: str, near_m: float, far_m: float, lens: "Lens") -> "Focus
 
 
 def rounded_to(plan: "FocusPlan", text: str) -> "FocusPlan":
-    """--scale: marks count from the film plane, as they are engraved."""
+    """Round a plan to the marks of --scale, which count from the film plane, as they are engraved."""
     from capture.tether.focus_plan import on_scale
     from mrbokeh.optics.lens import lens_distance_m
 

@@ -38,7 +38,15 @@ def poses_command(
     from capture.poses.colmap_matches import median_parallax_deg
     from mrbokeh.system.console import kept_when_interrupted
 
-    settings = PoseSettings(mapper, camera_model, cameras, max_image_size, seed, threads, overwrite)
+    settings = PoseSettings(
+        mapper=mapper,
+        camera_model=camera_model,
+        cameras=cameras,
+        max_image_size_px=max_image_size,
+        seed=seed,
+        threads=threads,
+        overwrite=overwrite,
+    )
     if scene is not None and images is None and out is None:
         where, find = scene / "reconstruction", partial(find_scene_poses, scene)
     elif scene is None and images is not None and out is not None:

@@ -78,7 +78,7 @@ def process_command(
 
 
 def _is_of_use(stacks: "Sequence[FocalStack]") -> bool:
-    """Whether one is merged, or may be once the first, at which merging stopped, is mended."""
+    """Return whether one is merged, or may be once the first, at which merging stopped, is mended."""
     from capture.stacks.stack_description import FEWEST_TO_MERGE
 
     return any(each.merged for each in stacks) or any(len(each) >= FEWEST_TO_MERGE for each in stacks[1:])

@@ -83,7 +83,17 @@ def shoot_command(
             watch(driver, parse_spot(spot))
         if targets:
             given = measured(driver, targets, out, home=home, backlash=backlash, settle=settle, step=sweep_step, again=overwrite)
-        options = ShootOptions(settings, given, by_hand, backlash, settle, parse_spot(spot), check, planned_distances, overwrite)
+        options = ShootOptions(
+            settings=settings,
+            focus_steps=given,
+            by_hand=by_hand,
+            backlash_steps=backlash,
+            settle_s=settle,
+            spot=parse_spot(spot),
+            check=check,
+            planned_distances=planned_distances,
+            overwrite=overwrite,
+        )
         log = shoot(planned, driver, out, options, Surroundings(say=typer.echo))
     typer.echo(f"{len(log.slices)} slices in {out}. Next: mrbokeh capture ingest {out} --out SCENE")
 

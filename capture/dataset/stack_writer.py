@@ -1,13 +1,7 @@
-"""One stack into the data set: its files, its exclusion masks, and the record of both.
+"""Stacks of a data set, one at a time: files, exclusion masks, circles of confusion if asked for, and the record of all.
 
-Signed circle of confusion of every slice: computed when asked for, written only where somebody wants files.
-
-Depth and lens say it all, so that a data set carries no maps unless asked: 30 of 24 megapixels are 1.4 GB per stack. Half precision keeps
-11 bits: at 100 px of blur a step is 0.06 px.
-
-How bright the pictures of a data set are: a histogram of radiance that takes pictures in bands and never holds them all.
-
-Files into the data set: hard links where the disk allows it, copies elsewhere; and their hashes.
+Depth and lens say all about blur, so that a data set carries no maps unless asked: 30 of 24 megapixels are 1.4 GB per stack. Half
+precision keeps 11 bits: at 100 px of blur a step is 0.06 px.
 """
 
 import hashlib
@@ -36,35 +30,31 @@ from mrbokeh.system.errors import InputError
 CHANNEL = "coc_px"
 COC_FOLDER = "coc"
 _COMMENT = "signed diameter of the circle of confusion in pixels of the registered slice: + behind the focus, - in front"
-
-
-def coc_maps(stack: FocalStack) -> Iterator[Float32[np.ndarray, "height width"]]:
-    """(H, W) per slice, in order; one at a time."""
-    depth_m = stack.depth_m()
-    return (stack.coc_px(index, depth_m) for index in range(len(stack)))
-
-
-def largest_coc_px(stack: FocalStack, counted: Bool[np.ndarray, "height width"]) -> float:
-    """The largest diameter over all slices among counted pixels."""
-    return max(float(np.abs(coc_px[counted]).max(initial=0.0)) for coc_px in coc_maps(stack))
-
-
-def write_coc_maps(stack: FocalStack, folder: Path) -> list[Path]:
-    """folder/00.exr and so on, half precision; existing ones are kept."""
-    paths = [folder / f"{index:02d}.exr" for index in range(len(stack))]
-    for path, coc_px in zip(paths, coc_maps(stack), strict=True):
-        if not path.exists():
-            write_exr(path, ExrPart({CHANNEL: coc_px.astype(np.float16)}, attributes={"comments": _COMMENT}))
-    return paths
-
-
 QUANTILES = ("0.5", "0.99", "0.999", "0.9999")
 _LOWEST_STOP, _STOPS, _PER_STOP = -16, 40, 128
+_CHUNK_BYTES = 1 << 20
+RECORD_NAME = "record.json"
+_ROWS_AT_ONCE = 256
+
+Mask = Bool[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class StackWriting:
+    """Settings of writing. copy: files instead of hard links. with_coc: signed CoC maps as files. widest_px: for finding movement."""
+
+    copy: bool = False
+    with_coc: bool = False
+    reblur: Reblur = field(default_factory=Reblur)
+    widest_px: int = 960
 
 
 @dataclass
 class RadianceHistogram:
-    """Of the largest channel of pixels, in steps of 1/128 stop (0.5 %); below 2^-16 all are one. largest: exact."""
+    """Histogram of the largest channel of pixels, in steps of 1/128 stop (0.5 %); below 2^-16 all are one.
+
+    Takes pictures in bands and never holds them all. largest: exact.
+    """
 
     largest: float = 0.0
     _counts: Int64[np.ndarray, " bins"] = field(default_factory=lambda: np.zeros(_STOPS * _PER_STOP, np.int64))
@@ -77,7 +67,7 @@ class RadianceHistogram:
             self._counts += np.bincount(np.minimum(steps.astype(np.int64), len(self._counts) - 1), minlength=len(self._counts))
 
     def quantile(self, share: float) -> float:
-        """The upper edge of the step below which this share of the pixels lies."""
+        """Return the upper edge of the step below which this share of the pixels lies."""
         total = int(self._counts.sum())
         if total == 0:
             return 0.0
@@ -88,48 +78,8 @@ class RadianceHistogram:
         return RadianceRange(self.largest, {each: self.quantile(float(each)) for each in quantiles})
 
 
-_CHUNK_BYTES = 1 << 20
-
-
-def place(source: Path, target: Path, *, copy: bool = False) -> None:
-    """Give the file a second name, or copy it. A link costs no space, and is safe: all of mrbokeh's files are replaced, never changed."""
-    with atomic_path(target) as temporary:
-        temporary.unlink(missing_ok=True)
-        if copy:
-            shutil.copyfile(source, temporary)
-            return
-        try:
-            os.link(source, temporary)
-        except OSError:
-            shutil.copyfile(source, temporary)
-
-
-def record_of(path: Path) -> FileRecord:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            digest.update(chunk)
-    return FileRecord(digest.hexdigest(), path.stat().st_size)
-
-
-RECORD_NAME = "record.json"
-_ROWS_AT_ONCE = 256
-
-Mask = Bool[np.ndarray, "height width"]
-
-
-@dataclass(frozen=True)
-class StackWriting:
-    """How stacks are written. copy: files instead of hard links. with_coc: signed CoC maps as files. widest_px: for finding movement."""
-
-    copy: bool = False
-    with_coc: bool = False
-    reblur: Reblur = field(default_factory=Reblur)
-    widest_px: int = 960
-
-
 def require_usable(stack: FocalStack) -> None:
-    """Raises InputError naming what a stack lacks to be learned from."""
+    """Raise InputError naming what a stack lacks to be learned from."""
     if not (stack.merged and stack.registered):
         raise InputError(f"{stack.folder} is not registered and merged yet: run `mrbokeh capture merge` on it, or name another scene")
     if not stack.is_metric:
@@ -162,20 +112,20 @@ def write_stack(stack: FocalStack, out: Path, name: str, part: Part, writing: St
 
 
 def source_files(stack: FocalStack) -> dict[str, Path]:
-    """What a stack of the data set consists of, by its path in the folder: nothing that was only needed on the way."""
+    """Return the files of a stack in the data set, by their paths in its folder: nothing that was only needed on the way."""
     paths = [STACK_FILE, *(each.path for each in stack.slices), *(each.name for each in (stack.all_in_focus_path, stack.depth_path))]
     return {relative: stack.folder / relative for relative in [*paths, stack.exclusion_path.name]}
 
 
 def _ensure_exclusions(stack: FocalStack, writing: StackWriting) -> None:
-    """`mrbokeh capture report` has made them, or they are made now."""
+    """Write exclusion masks, unless `mrbokeh capture report` has made them."""
     if not has_fresh_exclusions(stack):
         findings = examine(StackView(stack, writing.widest_px), writing.reblur)
         write_exclusions(stack, exclusion_masks(stack, findings.moving))
 
 
 def _signature(sources: dict[str, Path], writing: StackWriting) -> dict[str, Any]:
-    """Changes when a source does."""
+    """Return what changes when a source does."""
     stats = {relative: path.stat() for relative, path in sources.items()}
     return {"with_coc": writing.with_coc} | {relative: [each.st_size, each.st_mtime_ns] for relative, each in stats.items()}
 
@@ -200,14 +150,65 @@ def _measured(stack: FocalStack, name: str, part: Part, files: dict[str, Any]) -
     histogram = RadianceHistogram()
     for path in (stack.all_in_focus_path, *(stack.folder / each.path for each in stack.slices)):
         _add_picture(histogram, stack, path)
-    return StackRecord(name, part, len(stack), width, height, largest_px, histogram.radiance_range(), shares, files)
+    return StackRecord(
+        name=name,
+        part=part,
+        slices=len(stack),
+        width_px=width,
+        height_px=height,
+        largest_coc_px=largest_px,
+        radiance=histogram.radiance_range(),
+        excluded_shares=shares,
+        files=files,
+    )
 
 
 def _add_picture(histogram: RadianceHistogram, stack: FocalStack, path: Path) -> None:
-    """In bands of rows: of a picture only what the file holds, in half precision, is in memory at once."""
+    """Add a picture in bands of rows: only what the file holds, in half precision, is in memory at once."""
     channels = read_exr(path)[0].channels
     for top in range(0, channels["R"].shape[0], _ROWS_AT_ONCE):
         rows = slice(top, top + _ROWS_AT_ONCE)
         rgb = stack.to_rec709(np.stack([channels[each][rows] for each in "RGB"], axis=-1).astype(np.float32))
         valid = channels[VALID][rows] > 0.5 if VALID in channels else np.ones(rgb.shape[:2], bool)
         histogram.add(rgb, valid)
+
+
+def coc_maps(stack: FocalStack) -> Iterator[Float32[np.ndarray, "height width"]]:
+    """Return (H, W) signed circles of confusion for each slice, in order; one at a time."""
+    depth_m = stack.depth_m()
+    return (stack.coc_px(index, depth_m) for index in range(len(stack)))
+
+
+def largest_coc_px(stack: FocalStack, counted: Bool[np.ndarray, "height width"]) -> float:
+    """Return the largest diameter over all slices among counted pixels."""
+    return max(float(np.abs(coc_px[counted]).max(initial=0.0)) for coc_px in coc_maps(stack))
+
+
+def write_coc_maps(stack: FocalStack, folder: Path) -> list[Path]:
+    """Write folder/00.exr and so on, in half precision; existing ones are kept."""
+    paths = [folder / f"{index:02d}.exr" for index in range(len(stack))]
+    for path, coc_px in zip(paths, coc_maps(stack), strict=True):
+        if not path.exists():
+            write_exr(path, ExrPart({CHANNEL: coc_px.astype(np.float16)}, attributes={"comments": _COMMENT}))
+    return paths
+
+
+def place(source: Path, target: Path, *, copy: bool = False) -> None:
+    """Give the file a second name, or copy it. A link costs no space, and is safe: all of mrbokeh's files are replaced, never changed."""
+    with atomic_path(target) as temporary:
+        temporary.unlink(missing_ok=True)
+        if copy:
+            shutil.copyfile(source, temporary)
+            return
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)
+
+
+def record_of(path: Path) -> FileRecord:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            digest.update(chunk)
+    return FileRecord(digest.hexdigest(), path.stat().st_size)

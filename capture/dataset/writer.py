@@ -1,9 +1,4 @@
-"""`mrbokeh capture dataset`: the stacks of some scenes as one data set. Stacks are written one by one, pictures read one by one.
-
-Which stacks are for training and which for testing: whole viewpoints, the same ones on every machine; of a single one some slices.
-
-Whether a data set is what its manifest says.
-"""
+"""`mrbokeh capture dataset`: the stacks of some scenes as one data set. Stacks are written one by one, pictures read one by one."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -27,39 +22,6 @@ from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
-
-def split_by_viewpoint(names: Sequence[str], test: Sequence[str] = (), test_share: float = 0.2, seed: int = 0) -> dict[str, Part]:
-    """The part of each stack. names: SCENE/VIEW.
-
-    test: names (or VIEW alone) to test on; without any, those whose hash with the seed is smallest, test_share of all and at least one
-    where there are two. Raises InputError where a name is unknown or nothing is left to train on.
-    """
-    unknown = [name for name in test if not any(_is_called(full, name) for full in names)]
-    if unknown:
-        raise InputError(f"cannot test on {', '.join(unknown)}: expected viewpoints among {', '.join(sorted(names))}")
-    if test:
-        apart = {full for full in names if any(_is_called(full, name) for name in test)}
-    else:
-        if not 0.0 <= test_share < 1.0:
-            raise InputError(f"the share of test viewpoints must lie in [0, 1), got {test_share:g}")
-        count = max(1, round(test_share * len(names))) if len(names) > 1 and test_share > 0 else 0
-        apart = set(sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).hexdigest())[:count])
-    if len(apart) == len(names):
-        raise InputError(f"all {len(names)} viewpoints are for testing, none is left to train on: test on fewer or give more scenes")
-    return {name: "test" if name in apart else "train" for name in names}
-
-
-def slices_of_a_single_stack(stacks: Mapping[str, FocalStack], test_share: float = 0.2) -> dict[str, tuple[int, ...]]:
-    """Slices held out inside the stack where it is the only one and something is to be tested on; {} where viewpoints are split."""
-    if len(stacks) > 1 or test_share == 0.0:
-        return {}
-    return {name: slices_to_hold_out(stack) for name, stack in stacks.items()}
-
-
-def _is_called(full: str, name: str) -> bool:
-    return name in (full, full.rsplit("/", 1)[-1])
-
-
 UNFINISHED_NAME = "unfinished.json"
 MAXIMUM = "maximum"
 METRES_GUESSED = "metres_guessed"
@@ -68,7 +30,7 @@ METRES_GUESSED = "metres_guessed"
 
 @dataclass(frozen=True)
 class DatasetPlan:
-    """licence: the text. test, test_share, seed: see `split_by_viewpoint`.
+    """Plan of a data set. licence: the text. test, test_share, seed: see `split_by_viewpoint`.
 
     radiance_scale: "maximum", a share of the pixels such as "0.9999" (what is brighter lies beyond 1 in the network's range), or a
     radiance such as "radiance 12.5".
@@ -108,7 +70,7 @@ def write_dataset(scenes: Sequence[Path], out: Path, plan: DatasetPlan, overwrit
         "split_by": "slices of one stack" if apart else "names" if plan.test else "hash of seed and name",
         METRES_GUESSED: [name for name, stack in stacks.items() if not stack.metres_known],
     }
-    dataset = FocalStackDataset(out, plan.licence, scale, records, metadata)
+    dataset = FocalStackDataset(folder=out, licence=plan.licence, radiance_scale=scale, stacks=records, metadata=metadata)
     (out / "LICENCE.txt").write_text(plan.licence.rstrip() + "\n", encoding="utf-8")
     write_focal_stack_dataset(dataset)
     (out / UNFINISHED_NAME).unlink()
@@ -116,7 +78,7 @@ def write_dataset(scenes: Sequence[Path], out: Path, plan: DatasetPlan, overwrit
 
 
 def named_stacks(scenes: Sequence[Path]) -> dict[str, FocalStack]:
-    """By SCENE/VIEW. Raises InputError where two would have one name."""
+    """Return stacks by SCENE/VIEW. Raises InputError if two would have one name."""
     named: dict[str, FocalStack] = {}
     for scene in scenes:
         for stack in find_focal_stacks(scene):
@@ -129,7 +91,7 @@ def named_stacks(scenes: Sequence[Path]) -> dict[str, FocalStack]:
 
 
 def radiance_scale(records: Sequence[StackRecord], choice: str) -> float:
-    """One number for the whole data set; a share is answered by the stack in which it is brightest."""
+    """Return one number for the whole data set; a share is answered by the stack in which it is brightest."""
     try:
         if choice == MAXIMUM:
             scale = max(each.radiance.largest for each in records)
@@ -156,8 +118,40 @@ def _claim(out: Path, overwrite: bool) -> None:
     write_json(out / UNFINISHED_NAME, {"what": f"a data set being written; {FILE_NAME} comes last"})
 
 
+def split_by_viewpoint(names: Sequence[str], test: Sequence[str] = (), test_share: float = 0.2, seed: int = 0) -> dict[str, Part]:
+    """Return the part (training or test) of each stack: whole viewpoints, the same ones on every machine. names: SCENE/VIEW.
+
+    test: names (or VIEW alone) to test on; without any, those whose hash with the seed is smallest, test_share of all and at least one
+    where there are two. Raises InputError if a name is unknown or nothing is left to train on.
+    """
+    unknown = [name for name in test if not any(_is_called(full, name) for full in names)]
+    if unknown:
+        raise InputError(f"cannot test on {', '.join(unknown)}: expected viewpoints among {', '.join(sorted(names))}")
+    if test:
+        apart = {full for full in names if any(_is_called(full, name) for name in test)}
+    else:
+        if not 0.0 <= test_share < 1.0:
+            raise InputError(f"the share of test viewpoints must lie in [0, 1), got {test_share:g}")
+        count = max(1, round(test_share * len(names))) if len(names) > 1 and test_share > 0 else 0
+        apart = set(sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).hexdigest())[:count])
+    if len(apart) == len(names):
+        raise InputError(f"all {len(names)} viewpoints are for testing, none is left to train on: test on fewer or give more scenes")
+    return {name: "test" if name in apart else "train" for name in names}
+
+
+def slices_of_a_single_stack(stacks: Mapping[str, FocalStack], test_share: float = 0.2) -> dict[str, tuple[int, ...]]:
+    """Return slices held out inside the stack where it is the only one and something is to be tested on; {} where viewpoints are split."""
+    if len(stacks) > 1 or test_share == 0.0:
+        return {}
+    return {name: slices_to_hold_out(stack) for name, stack in stacks.items()}
+
+
+def _is_called(full: str, name: str) -> bool:
+    return name in (full, full.rsplit("/", 1)[-1])
+
+
 def verify(dataset: FocalStackDataset) -> list[str]:
-    """What is wrong, one sentence each; [] where every file is there with its size and hash."""
+    """Return what is wrong, one sentence each; [] where every file is there with its size and hash."""
     return [trouble for record in track(dataset.stacks, "verify") for trouble in file_troubles(dataset, record, _sha256)]
 
 

@@ -1,1 +1,1 @@
-"""The slices of one stack into an all-in-focus picture and depth."""
+"""Focal stacks merged: registered slices, depth from focus, all-in-focus pictures, and metres."""

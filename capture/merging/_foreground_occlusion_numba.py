@@ -1,4 +1,4 @@
-"""What nearer surfaces out of focus put over a pixel, gathered over their circles of confusion; compiled."""
+"""Compiled gathering of nearer surfaces out of focus over their circles of confusion."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from mrbokeh.system.kernels import njit
 
 
 @njit(cache=True, fastmath=True)
-def gather_nearer(
+def gather_foreground(
     dioptres: np.ndarray,
     rgb: np.ndarray,
     focus_dioptre: float,

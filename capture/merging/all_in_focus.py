@@ -16,10 +16,6 @@ from capture.merging.focus_volume import Blocks, FocusVolume, block_detail
 from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.system.console import track
 
-Rgb = Float32[np.ndarray, "height width 3"]
-Plane = Float32[np.ndarray, "height width"]
-BlockMask = Bool[np.ndarray, "rows columns"]
-
 NARROW_CROSSOVER = 0.5
 # Up to this blur between neighbouring slices both are sharp enough to be mixed anywhere between them.
 SHARP_STEP_COC_PX = 2.0
@@ -33,123 +29,14 @@ _CLOSE_PX = 3
 # The coarsest band changes slices within about 2^(BANDS + 1) pixels.
 BANDS = 4
 
-
-def crossover_of(step_coc_px: float) -> float:
-    """Return the share of a step to cross over in; step_coc_px: the circle of confusion of one slice's focus in the next slice."""
-    return float(np.clip(SHARP_STEP_COC_PX / max(step_coc_px, 1e-6), NARROW_CROSSOVER, 1.0))
-
-
-def slice_weight(focus_index: Plane, index: int, crossover: float = NARROW_CROSSOVER) -> Plane:
-    """Return how much slice `index` gives to each pixel: all near its own focus, crossing over half way to the next slice.
-
-    The weights of all slices sum to 1. The cross-over takes the given share of a step, where both slices are about equally
-    sharp, so that it lessens the noise there and leaves no seam; 1 is linear interpolation.
-    """
-    distance = np.abs(focus_index - np.float32(index))
-    distance *= np.float32(-1.0 / crossover)
-    distance += np.float32(0.5 / crossover + 0.5)
-    return np.clip(distance, 0.0, 1.0, out=distance)
-
-
-def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float = NARROW_CROSSOVER, bands: int = BANDS) -> Rgb:
-    """Blend registered slices by `slice_weight`, read one at a time; bands: 0 mixes pixels, without regard to seams."""
-    blend = BandBlend(focus_index.shape, bands)
-    for index, rgb in enumerate(registered):
-        blend.add(rgb, slice_weight(focus_index, index, crossover))
-    return blend.result()
-
-
-def sharp_all_in_focus(
-    slices: Callable[[], Iterable[Rgb]], focus_index: Plane, volume: FocusVolume, crossover: float = NARROW_CROSSOVER
-) -> Rgb:
-    """Blend registered slices, and again where a block has lost detail that one of them has.
-
-    The focus index is smooth over places that decide little; where a slice shows clearly more detail than came out, pixels are taken
-    from their sharpest slice, and if that does not help, the block from its own. slices: gives a fresh pass over them.
-    """
-    blend, taken = BandBlend(focus_index.shape), focus_index
-    for index, rgb in enumerate(track(slices(), "all in focus", len(volume.energies))):
-        blend.add(rgb, slice_weight(focus_index, index, crossover))
-
-    def blended_as(wanted: Plane) -> Rgb:
-        nonlocal taken
-        for index, rgb in enumerate(slices()):
-            blend.change(rgb, slice_weight(wanted, index, crossover) - slice_weight(taken, index, crossover))
-        taken = wanted
-        return blend.result()
-
-    picture = blend.result()
-    pixels, blocks = _sharpest_pixels(volume), _sharpest_blocks(volume)
-    for choice, around_px in ((pixels, _AROUND_PX), (blocks, _AROUND_PX), (blocks, _CLOSE_PX)):
-        lost, before = _lost_blocks(picture, volume), taken
-        if not lost.any():
-            break
-        proposed = blended_as(_taken_from(choice, lost, before, around_px))
-        # Beside strong edges a block may gain the blurred rim of a slice, and its neighbours lose what they had.
-        helped = _helped(lost, _lost_blocks(proposed, volume), _moved_blocks(picture, proposed))
-        if helped.any() and (helped != lost).any():
-            proposed = blended_as(_taken_from(choice, helped, before, around_px))
-            helped &= _lost_blocks(proposed, volume).sum() < lost.sum()
-        picture = proposed if helped.any() else blended_as(before)
-    return picture
-
-
-def painted(picture: Rgb, slices: Iterable[tuple[Rgb, Plane]], share: Plane, bands: int = BANDS) -> Rgb:
-    """Blend slices into a picture, each by its share (H, W); what lies beyond the reach of the bands stays bit for bit.
-
-    share: the sum of all shares, within 0 to 1.
-    """
-    blend = BandBlend(share.shape, bands)
-    blend.add(picture, np.float32(1.0) - share)
-    for rgb, own in slices:
-        if own.any():
-            blend.add(rgb, own)
-    return np.where(blend.reached(share)[..., None], blend.result(), picture)
-
-
-def _helped(lost: BlockMask, still_lost: BlockMask, moved: BlockMask) -> BlockMask:
-    """Return the lost blocks that another choice of slices mends without harm to a block beside them, in detail or in brightness."""
-    harmed = cv2.dilate(((still_lost & ~lost) | moved).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return lost & ~still_lost & ~harmed
-
-
-def _moved_blocks(before: Rgb, after: Rgb) -> BlockMask:
-    rows, columns = (max(side // BLOCK_PX, 1) for side in before.shape[:2])
-    change = cv2.subtract(*(cv2.sqrt(np.maximum(each[: rows * BLOCK_PX, : columns * BLOCK_PX], 0.0)) for each in (before, after)))
-    return np.abs(cv2.resize(change, (columns, rows), interpolation=cv2.INTER_AREA)).max(axis=2) > LARGEST_MOVE
-
-
-def _lost_blocks(merged: Rgb, volume: FocusVolume) -> BlockMask:
-    sharpest = np.max(volume.details, axis=0)
-    return (sharpest > 0.5 * np.median(sharpest)) & (block_detail(np.sqrt(np.maximum(merged, 0.0))) < KEPT_DETAIL * sharpest)
-
-
-def _taken_from(choice: Plane, lost: BlockMask, focus_index: Plane, around_px: int) -> Plane:
-    """Return the focus index with another choice in the lost blocks and around them."""
-    chosen = np.where(_per_pixel(lost.astype(np.float32), focus_index.shape) > 0, choice, np.float32(-1.0))
-    around = cv2.dilate(chosen, np.ones((2 * around_px + 1,) * 2, np.uint8))
-    chosen = np.where(chosen >= 0, chosen, around)
-    return np.where(chosen >= 0, chosen, focus_index)
-
-
-def _sharpest_pixels(volume: FocusVolume) -> Plane:
-    return volume.enlarged(volume.energies.argmax(axis=0).astype(np.float32), 0.0)
-
-
-def _sharpest_blocks(volume: FocusVolume) -> Plane:
-    return _per_pixel(np.argmax(volume.details, axis=0).astype(np.float32), volume.shape)
-
-
-def _per_pixel(blocks: Blocks, shape: tuple[int, ...]) -> Plane:
-    """Return the value of its block for each pixel; what is cut off from the blocks belongs to the last ones."""
-    grown = np.kron(blocks, np.ones((BLOCK_PX, BLOCK_PX), np.float32))
-    missing = [(0, max(full - size, 0)) for full, size in zip(shape, grown.shape, strict=True)]
-    return np.pad(grown, missing, "edge")[: shape[0], : shape[1]]
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+BlockMask = Bool[np.ndarray, "rows columns"]
 
 
 @dataclass
 class BandBlend:
-    """A weighted sum of pictures under construction, band by band in the square root of light. The weights of all must sum to 1.
+    """Weighted sum of pictures under construction, band by band in the square root of light. The weights of all must sum to 1.
 
     shape: (H, W). darkest, brightest: the extremes of all slices per pixel and channel.
     """
@@ -209,7 +96,7 @@ class BandBlend:
         return self._sums
 
     def _box(self, weight: Plane) -> tuple[slice, slice] | None:
-        """Return what a picture changes: its weights, as far as the coarsest band carries them, on the grid of that band."""
+        """Return the window that a picture changes: its weights, as far as the coarsest band carries them, on the grid of that band."""
         step, (height, width) = 1 << self.bands, self.shape[:2]
         x, y, across, down = cv2.boundingRect((weight != 0.0).view(np.uint8))
         if not across:
@@ -218,3 +105,116 @@ class BandBlend:
         top, left = (max(first - reach, 0) // step * step for first in (y, x))
         bottom, right = (-(-(end + reach) // step) * step for end in (y + down, x + across))
         return slice(top, min(bottom, height)), slice(left, min(right, width))
+
+
+def sharp_all_in_focus(
+    slices: Callable[[], Iterable[Rgb]], focus_index: Plane, volume: FocusVolume, crossover: float = NARROW_CROSSOVER
+) -> Rgb:
+    """Blend registered slices, and again where a block has lost detail that one of them has.
+
+    The focus index is smooth over places that decide little; where a slice shows clearly more detail than came out, pixels are taken
+    from their sharpest slice, and if that does not help, the block from its own. slices: gives a fresh pass over them.
+    """
+    blend, taken = BandBlend(focus_index.shape), focus_index
+    for index, rgb in enumerate(track(slices(), "all in focus", len(volume.energies))):
+        blend.add(rgb, slice_weight(focus_index, index, crossover))
+
+    def blended_as(wanted: Plane) -> Rgb:
+        nonlocal taken
+        for index, rgb in enumerate(slices()):
+            blend.change(rgb, slice_weight(wanted, index, crossover) - slice_weight(taken, index, crossover))
+        taken = wanted
+        return blend.result()
+
+    picture = blend.result()
+    pixels, blocks = _sharpest_pixels(volume), _sharpest_blocks(volume)
+    for choice, around_px in ((pixels, _AROUND_PX), (blocks, _AROUND_PX), (blocks, _CLOSE_PX)):
+        lost, before = _lost_blocks(picture, volume), taken
+        if not lost.any():
+            break
+        proposed = blended_as(_taken_from(choice, lost, before, around_px))
+        # Beside strong edges a block may gain the blurred rim of a slice, and its neighbours lose what they had.
+        helped = _helped(lost, _lost_blocks(proposed, volume), _moved_blocks(picture, proposed))
+        if helped.any() and (helped != lost).any():
+            proposed = blended_as(_taken_from(choice, helped, before, around_px))
+            helped &= _lost_blocks(proposed, volume).sum() < lost.sum()
+        picture = proposed if helped.any() else blended_as(before)
+    return picture
+
+
+def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float = NARROW_CROSSOVER, bands: int = BANDS) -> Rgb:
+    """Blend registered slices by `slice_weight`, read one at a time; bands: 0 mixes pixels, without regard to seams."""
+    blend = BandBlend(focus_index.shape, bands)
+    for index, rgb in enumerate(registered):
+        blend.add(rgb, slice_weight(focus_index, index, crossover))
+    return blend.result()
+
+
+def painted(picture: Rgb, slices: Iterable[tuple[Rgb, Plane]], share: Plane, bands: int = BANDS) -> Rgb:
+    """Blend slices into a picture, each by its share (H, W); what lies beyond the reach of the bands stays bit for bit.
+
+    share: the sum of all shares, within 0 to 1.
+    """
+    blend = BandBlend(share.shape, bands)
+    blend.add(picture, np.float32(1.0) - share)
+    for rgb, own in slices:
+        if own.any():
+            blend.add(rgb, own)
+    return np.where(blend.reached(share)[..., None], blend.result(), picture)
+
+
+def slice_weight(focus_index: Plane, index: int, crossover: float = NARROW_CROSSOVER) -> Plane:
+    """Return how much slice `index` gives to each pixel: all near its own focus, crossing over half way to the next slice.
+
+    The weights of all slices sum to 1. The cross-over takes the given share of a step, where both slices are about equally
+    sharp, so that it lessens the noise there and leaves no seam; 1 is linear interpolation.
+    """
+    distance = np.abs(focus_index - np.float32(index))
+    distance *= np.float32(-1.0 / crossover)
+    distance += np.float32(0.5 / crossover + 0.5)
+    return np.clip(distance, 0.0, 1.0, out=distance)
+
+
+def crossover_of(step_coc_px: float) -> float:
+    """Return the share of a step to cross over in; step_coc_px: the circle of confusion of one slice's focus in the next slice."""
+    return float(np.clip(SHARP_STEP_COC_PX / max(step_coc_px, 1e-6), NARROW_CROSSOVER, 1.0))
+
+
+def _helped(lost: BlockMask, still_lost: BlockMask, moved: BlockMask) -> BlockMask:
+    """Return the lost blocks that another choice of slices mends without harm to a block beside them, in detail or in brightness."""
+    harmed = cv2.dilate(((still_lost & ~lost) | moved).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return lost & ~still_lost & ~harmed
+
+
+def _moved_blocks(before: Rgb, after: Rgb) -> BlockMask:
+    rows, columns = (max(side // BLOCK_PX, 1) for side in before.shape[:2])
+    change = cv2.subtract(*(cv2.sqrt(np.maximum(each[: rows * BLOCK_PX, : columns * BLOCK_PX], 0.0)) for each in (before, after)))
+    return np.abs(cv2.resize(change, (columns, rows), interpolation=cv2.INTER_AREA)).max(axis=2) > LARGEST_MOVE
+
+
+def _lost_blocks(merged: Rgb, volume: FocusVolume) -> BlockMask:
+    sharpest = np.max(volume.details, axis=0)
+    return (sharpest > 0.5 * np.median(sharpest)) & (block_detail(np.sqrt(np.maximum(merged, 0.0))) < KEPT_DETAIL * sharpest)
+
+
+def _taken_from(choice: Plane, lost: BlockMask, focus_index: Plane, around_px: int) -> Plane:
+    """Return the focus index with another choice in the lost blocks and around them."""
+    chosen = np.where(_per_pixel(lost.astype(np.float32), focus_index.shape) > 0, choice, np.float32(-1.0))
+    around = cv2.dilate(chosen, np.ones((2 * around_px + 1,) * 2, np.uint8))
+    chosen = np.where(chosen >= 0, chosen, around)
+    return np.where(chosen >= 0, chosen, focus_index)
+
+
+def _sharpest_pixels(volume: FocusVolume) -> Plane:
+    return volume.enlarged(volume.energies.argmax(axis=0).astype(np.float32), 0.0)
+
+
+def _sharpest_blocks(volume: FocusVolume) -> Plane:
+    return _per_pixel(np.argmax(volume.details, axis=0).astype(np.float32), volume.shape)
+
+
+def _per_pixel(blocks: Blocks, shape: tuple[int, ...]) -> Plane:
+    """Return the value of its block for each pixel; what is cut off from the blocks belongs to the last ones."""
+    grown = np.kron(blocks, np.ones((BLOCK_PX, BLOCK_PX), np.float32))
+    missing = [(0, max(full - size, 0)) for full, size in zip(shape, grown.shape, strict=True)]
+    return np.pad(grown, missing, "edge")[: shape[0], : shape[1]]

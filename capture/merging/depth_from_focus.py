@@ -1,6 +1,6 @@
 """Depth from focus: in which slice, and between which two, every pixel is sharp, and how sure that is.
 
-Semi-global aggregation of label costs along eight directions (Hirschmueller 2008), row by row in NumPy: nothing compiles first.
+Labels are aggregated semi-globally along eight directions (Hirschmueller 2008), row by row in NumPy: nothing compiles first.
 """
 
 from dataclasses import dataclass
@@ -11,49 +11,6 @@ from jaxtyping import Bool, Float32, Int, UInt8
 
 from capture.merging.focus_volume import FocusVolume, Volume, share_above
 from capture.merging.lights import Lights
-
-Costs = Float32[np.ndarray, "labels height width"]
-
-
-def aggregate_costs(costs: Costs, small: float, large: float) -> Costs:
-    """Return the sums over eight paths: a step by one label along a path costs `small`, any larger step `large`."""
-    total = _swept(np.ascontiguousarray(costs.transpose(0, 2, 1)), (0,), small, large)
-    return _swept(costs, (1, 0, -1), small, large, np.ascontiguousarray(total.transpose(0, 2, 1)))
-
-
-def _swept(costs: Costs, moves: tuple[int, ...], small: float, large: float, total: Costs | None = None) -> Costs:
-    """Return `total` with the path costs of both ways along the rows."""
-    total = np.zeros_like(costs) if total is None else total
-    for way in (slice(None), slice(None, None, -1)):
-        _sweep(costs[:, way], moves, small, large, total[:, way])
-    return total
-
-
-def _sweep(costs: Costs, moves: tuple[int, ...], small: float, large: float, total: Costs) -> None:
-    """Add the path costs from row to row, for paths that come from as many columns to the left as each of `moves` says."""
-    labels, height, width = costs.shape
-    # One column and one label more on either side: paths begin at 0 beyond the picture, and there are no labels beyond the last.
-    before, path = (np.zeros((len(moves), labels + 2, width + 2), np.float32) for _ in range(2))
-    for each in (before, path):
-        each[:, [0, -1]] = np.inf
-    stepped = np.empty((len(moves), labels, width), np.float32)
-    for row in range(height):
-        for index, move in enumerate(moves):
-            came = before[index, :, 1 - move : 1 - move + width]
-            goes = path[index, 1:-1, 1:-1]
-            np.minimum(came[:-2], came[2:], out=stepped[index])
-            stepped[index] += small
-            np.minimum(stepped[index], came[1:-1], out=goes)
-        inner = path[:, 1:-1, 1:-1]
-        np.minimum(inner, large, out=inner)
-        inner += costs[:, row]
-        total[:, row] += inner.sum(axis=0)
-        inner -= inner.min(axis=1, keepdims=True)
-        before, path = path, before
-
-
-Plane = Float32[np.ndarray, "height width"]
-Labels = Int[np.ndarray, "height width"]
 
 # A jump of the depth by more than one slice costs as much as this many e-folds of focus energy.
 SMALL_STEP_COST = 0.3
@@ -85,11 +42,16 @@ WINDOW_REACH_PX = 6
 # Neighbouring pixels whose depths differ by more slices than this belong to two surfaces.
 SURFACE_STEP = 1.5
 
+Costs = Float32[np.ndarray, "labels height width"]
+Plane = Float32[np.ndarray, "height width"]
+Labels = Int[np.ndarray, "height width"]
+
 
 @dataclass(frozen=True)
 class FocusMap:
-    """focus_index (H, W): fractional index of the slice in which the surface is sharp: its depth.
+    """Depth from focus, as slice indices.
 
+    focus_index: (H, W) fractional index of the slice in which the surface is sharp.
     confidence: (H, W) in [0, 1], 0 where the index is a guess from the surroundings.
     """
 
@@ -98,7 +60,7 @@ class FocusMap:
 
 
 def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "height width"] | None = None) -> FocusMap:
-    """Semi-global labelling (Hirschmueller 2008) of log focus energies, then a parabola through the peak.
+    """Label log focus energies semi-globally (Hirschmueller 2008), then fit a parabola through each peak.
 
     Where there is no detail, that of the surroundings decides: beside a sharp edge every other slice shows light that the edge spreads.
     Energies within the reach of a light have no say, but the light's own pixels are known to be sharp in its sharpest slice.
@@ -120,6 +82,38 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     confidence = np.where(vetoed(by_light, saturated), 0.0, trust).astype(np.float32)
     index[lights.core] = lights.focus_index[lights.zone[lights.core] - 1]
     return FocusMap(index, confidence)
+
+
+def aggregate_costs(costs: Costs, small: float, large: float) -> Costs:
+    """Return the sums over eight paths: a step by one label along a path costs `small`, any larger step `large`."""
+    total = _swept(np.ascontiguousarray(costs.transpose(0, 2, 1)), (0,), small, large)
+    return _swept(costs, (1, 0, -1), small, large, np.ascontiguousarray(total.transpose(0, 2, 1)))
+
+
+def peak_parabola(log_energies: Volume, labels: np.ndarray) -> tuple[Plane, Plane]:
+    """Return (offset in [-0.5, 0.5], curvature >= 0) of the parabola through each label and its two neighbours.
+
+    The first and last slice have a neighbour on one side only: their offset is 0 and their curvature half the drop to it.
+    """
+    last = log_energies.shape[0] - 1
+
+    def at(index: np.ndarray) -> Plane:
+        return np.take_along_axis(log_energies, np.clip(index, 0, last)[None], axis=0)[0]
+
+    before, centre, after = at(labels - 1), at(labels), at(labels + 1)
+    curvature = np.maximum(2 * centre - before - after, 0)
+    interior = (labels > 0) & (labels < last)
+    offset = np.where(interior, 0.5 * (after - before) / np.maximum(curvature, 1e-3), 0.0)
+    return np.clip(offset, -0.5, 0.5).astype(np.float32), np.where(interior, curvature, 0.5 * curvature).astype(np.float32)
+
+
+def vetoed(by_light: Labels, saturated: Bool[np.ndarray, "height width"] | None) -> Bool[np.ndarray, "height width"]:
+    """Return where energy is that of rims: within the reach of lights (`by_light` >= 0) and beside pixels that are full."""
+    if saturated is None or not saturated.any():
+        return by_light >= 0
+    size = 2 * SATURATION_REACH_PX + 1
+    near = cv2.dilate(saturated.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    return (by_light >= 0) | (near > 0)
 
 
 def _plainness(volume: FocusVolume) -> Plane:
@@ -178,17 +172,8 @@ def _let_lights_decide(costs: Volume, by_light: Labels, core: Bool[np.ndarray, "
     costs[:, core] = LARGEST_COST * (np.arange(len(costs))[:, None] != by_light[core])
 
 
-def vetoed(by_light: Labels, saturated: Bool[np.ndarray, "height width"] | None) -> Bool[np.ndarray, "height width"]:
-    """Return where energy is that of rims: within the reach of lights (`by_light` >= 0) and beside pixels that are full."""
-    if saturated is None or not saturated.any():
-        return by_light >= 0
-    size = 2 * SATURATION_REACH_PX + 1
-    near = cv2.dilate(saturated.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-    return (by_light >= 0) | (near > 0)
-
-
 def _confidence(volume: FocusVolume, labels: np.ndarray) -> Plane:
-    """Return what is high where the energy has one sharp peak under the label, and 0 where all slices look alike.
+    """Return a confidence that is high where the energy has one sharp peak under the label, and 0 where all slices look alike.
 
     Energies are taken as they are: averaged over slices every peak is flatter.
     """
@@ -201,24 +186,38 @@ def _confidence(volume: FocusVolume, labels: np.ndarray) -> Plane:
 
 
 def _share_of_one_surface(index: Plane) -> Plane:
-    """1 where the window of the energy sees one surface, down to 1/4 where it sees a jump of SURFACE_STEP slices or more."""
+    """Return 1 where the window of the energy sees one surface, down to 1/4 where it sees a jump of SURFACE_STEP slices or more."""
     box = np.ones((2 * WINDOW_REACH_PX + 1,) * 2, np.uint8)
     jump = cv2.dilate(index, box) - cv2.erode(index, box)
     return (1.0 - 0.75 * np.clip(jump / SURFACE_STEP - 0.5, 0.0, 1.0)).astype(np.float32)
 
 
-def peak_parabola(log_energies: Volume, labels: np.ndarray) -> tuple[Plane, Plane]:
-    """(offset in [-0.5, 0.5], curvature >= 0) of the parabola through each label and its two neighbours.
+def _swept(costs: Costs, moves: tuple[int, ...], small: float, large: float, total: Costs | None = None) -> Costs:
+    """Return `total` with the path costs of both ways along the rows."""
+    total = np.zeros_like(costs) if total is None else total
+    for way in (slice(None), slice(None, None, -1)):
+        _sweep(costs[:, way], moves, small, large, total[:, way])
+    return total
 
-    The first and last slice have a neighbour on one side only: their offset is 0 and their curvature half the drop to it.
-    """
-    last = log_energies.shape[0] - 1
 
-    def at(index: np.ndarray) -> Plane:
-        return np.take_along_axis(log_energies, np.clip(index, 0, last)[None], axis=0)[0]
-
-    before, centre, after = at(labels - 1), at(labels), at(labels + 1)
-    curvature = np.maximum(2 * centre - before - after, 0)
-    interior = (labels > 0) & (labels < last)
-    offset = np.where(interior, 0.5 * (after - before) / np.maximum(curvature, 1e-3), 0.0)
-    return np.clip(offset, -0.5, 0.5).astype(np.float32), np.where(interior, curvature, 0.5 * curvature).astype(np.float32)
+def _sweep(costs: Costs, moves: tuple[int, ...], small: float, large: float, total: Costs) -> None:
+    """Add the path costs from row to row, for paths that come from as many columns to the left as each of `moves` says."""
+    labels, height, width = costs.shape
+    # One column and one label more on either side: paths begin at 0 beyond the picture, and there are no labels beyond the last.
+    before, path = (np.zeros((len(moves), labels + 2, width + 2), np.float32) for _ in range(2))
+    for each in (before, path):
+        each[:, [0, -1]] = np.inf
+    stepped = np.empty((len(moves), labels, width), np.float32)
+    for row in range(height):
+        for index, move in enumerate(moves):
+            came = before[index, :, 1 - move : 1 - move + width]
+            goes = path[index, 1:-1, 1:-1]
+            np.minimum(came[:-2], came[2:], out=stepped[index])
+            stepped[index] += small
+            np.minimum(stepped[index], came[1:-1], out=goes)
+        inner = path[:, 1:-1, 1:-1]
+        np.minimum(inner, large, out=inner)
+        inner += costs[:, row]
+        total[:, row] += inner.sum(axis=0)
+        inner -= inner.min(axis=1, keepdims=True)
+        before, path = path, before

@@ -9,13 +9,6 @@ from jaxtyping import Bool, Float32, UInt8
 
 from capture.stacks.slice_looks import detail_of_blocks
 
-Rgb = Float32[np.ndarray, "height width 3"]
-Plane = Float32[np.ndarray, "height width"]
-Mask = Bool[np.ndarray, "height width"]
-Volume = Float32[np.ndarray, "slices height width"]
-Blocks = Float32[np.ndarray, "rows columns"]
-Light = UInt8[np.ndarray, "height width"]
-
 _LAPLACIAN = np.array([[0, 1, 0], [1, -4, 1], [0, 1, 0]], np.float32)
 # The window of the energy is wide enough that every second pixel holds all of it.
 LEAST_SHRINK = 2
@@ -31,11 +24,19 @@ _EVERY_PX = 3
 # Near black and white codes are crushed and clipped: what little noise is left there is no measure of certainty.
 _LEAST_OF_MEDIAN = 0.25
 
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Volume = Float32[np.ndarray, "slices height width"]
+Blocks = Float32[np.ndarray, "rows columns"]
+Light = UInt8[np.ndarray, "height width"]
+
 
 @dataclass(frozen=True)
 class FocusVolume:
-    """energies (slices, h, w): local energy of fine detail in every slice, over that of noise at this brightness.
+    """Focus energies of a stack.
 
+    energies (slices, h, w): local energy of fine detail in every slice, over that of noise at this brightness.
     lights (slices, h, w): mean over the channels of the square root of light, 255 at display white. shape: (H, W) of the pictures,
     h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
     """
@@ -113,19 +114,13 @@ def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
     return _energy(np.sqrt(np.maximum(rgb, 0.0)), window_px)
 
 
-def _energy(encoded: Rgb, window_px: float = 2.5) -> Plane:
-    detail = cv2.filter2D(cv2.GaussianBlur(encoded, (0, 0), 0.7), -1, _LAPLACIAN)  # Five times faster here than cv2.Laplacian.
-    squared = cv2.transform(cv2.multiply(detail, detail, dst=detail), np.ones((1, 3)))
-    return cv2.GaussianBlur(squared, (0, 0), window_px)
-
-
 def block_detail(encoded: Rgb) -> Blocks:
     """Return the fine detail of a picture in square roots of light by blocks, those at its border included."""
     return detail_of_blocks(cv2.transform(encoded, np.array([[0.2126, 0.7152, 0.0722]])))
 
 
 def noise_floors(energies: Volume, levels: list[Light]) -> Float32[np.ndarray, " levels"]:
-    """Return the energy that noise alone has at each brightness (square root of light, in _LEVELS steps): what the smoothest places show.
+    """Return the energy of noise alone at each brightness (square root of light, in _LEVELS steps), measured in the smoothest places.
 
     Compression and clipping leave less noise in the dark and at white than in between, by a factor of ten in real JPEG: with one
     floor for all, the noise of a defocused, brighter slice outshouts the sharp slice in the dark.
@@ -141,13 +136,19 @@ def noise_floors(energies: Volume, levels: list[Light]) -> Float32[np.ndarray, "
     return np.maximum(floors, max(_LEAST_OF_MEDIAN * np.median(list(lows.values())), 1e-9)).astype(np.float32)
 
 
-def _well_filled(level: UInt8[np.ndarray, " pixels"]) -> list[int]:
-    return np.flatnonzero(np.bincount(level, minlength=_LEVELS) >= _FEWEST_PIXELS).tolist()
-
-
 def share_above(energy: Plane, half_at: float) -> Plane:
     """Return 0 to 1 with the energy, one half at `half_at`."""
     return (energy / (energy + np.float32(half_at))).astype(np.float32)
+
+
+def _energy(encoded: Rgb, window_px: float = 2.5) -> Plane:
+    detail = cv2.filter2D(cv2.GaussianBlur(encoded, (0, 0), 0.7), -1, _LAPLACIAN)  # Five times faster here than cv2.Laplacian.
+    squared = cv2.transform(cv2.multiply(detail, detail, dst=detail), np.ones((1, 3)))
+    return cv2.GaussianBlur(squared, (0, 0), window_px)
+
+
+def _well_filled(level: UInt8[np.ndarray, " pixels"]) -> list[int]:
+    return np.flatnonzero(np.bincount(level, minlength=_LEVELS) >= _FEWEST_PIXELS).tolist()
 
 
 def _reduced_size(shape: tuple[int, ...], count: int) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights
 from capture.merging.merged_pictures import depth_m_of, write_readable_pictures
 from capture.merging.metres.relative_stack import as_stated, in_focus_order, with_solved_blur
-from capture.merging.preferred_side import PREFERRED, Seen, Side, with_preferred
+from capture.merging.preferred_side import PREFERRED, Side, with_preferred
 from capture.merging.registration.alignment import register_stack
 from capture.merging.registration.registered_slices import IngestedSlices, RegisteredSlices, newer, source_path
 from capture.merging.registration.registration_file import FILE_NAME as REGISTRATION_NAME
@@ -51,7 +51,7 @@ def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None 
 
 
 def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> FocalStack:
-    """Register, find depth, merge; stack.json is written last. An interrupted run goes on with what is there, unless told to overwrite."""
+    """Register, find depth and merge; stack.json is written last. An interrupted run goes on, unless told to overwrite."""
     with told_when_full(stack.all_in_focus_path):
         return _merged(stack, overwrite, registration, prefer)
 
@@ -84,7 +84,7 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
         merged = with_solved_blur(merged, slices, sharp, focus)
     if prefer is not None:
         rims = vetoed(lights.slice_index(), slices.saturated)
-        merged, sharp = with_preferred(merged, sharp, slices.passing, Seen(volume, focus.focus_index, rims), prefer)
+        merged, sharp = with_preferred(merged, sharp, slices.passing, volume, focus.focus_index, rims, prefer)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
     codes = depth_codes(merged)
     write_readable_pictures(merged, sharp, codes)
@@ -99,7 +99,7 @@ def _with_highlights(stack: FocalStack, restored: Sequence[RestoredLight]) -> Fo
 
 
 def _require_a_sweep(stack: FocalStack) -> None:
-    """Neighbours in order must be neighbours in focus."""
+    """Refuse slices of which neighbours in order are not neighbours in focus."""
     if len(stack) < FEWEST_SLICES:
         count = "1 slice" if len(stack) == 1 else f"{len(stack)} slices"
         raise InputError(f"{stack.folder} has {count}: merging needs at least {FEWEST_SLICES}, focused at different distances")
@@ -117,7 +117,7 @@ def _crossover(stack: FocalStack, width_px: int) -> float:
 
 
 def _registration_of(stack: FocalStack, ingested: IngestedSlices, overwrite: bool, given: Path | None) -> Registration:
-    """As given, as an interrupted run has left it, or found out; in every case it is written beside stack.json."""
+    """Return the registration as given, as an interrupted run has left it, or computed; it is always written beside stack.json."""
     own, sources = stack.folder / REGISTRATION_NAME, [stack.folder / source_path(each) for each in stack.slices]
     if given is None and not overwrite and newer(own, *sources):
         return read_registration(own, len(stack))
@@ -135,7 +135,7 @@ def _registered(stack: FocalStack, ingested: IngestedSlices, sources: Sequence[P
 
 
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:
-    """The merged stack in the geometry of its reference: lens focused there, camera of that focus."""
+    """Return the merged stack in the geometry of its reference: lens focused there, camera of that focus."""
     reference = slices.registration.reference
     metadata = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)} | {DEPTH_SOURCE: FROM_FOCUS}
     changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference, metadata=metadata)
@@ -146,6 +146,6 @@ def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStac
 
 
 def _breathed(camera: Camera, lens: Lens) -> Camera:
-    """The camera with the focal length that the lens has at its focus."""
+    """Return the camera with the focal length that the lens has at its focus."""
     focal_px = lens.focal_px(camera.width_px)
     return replace(camera, focal_px=(focal_px, focal_px))

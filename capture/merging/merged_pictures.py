@@ -1,10 +1,6 @@
-"""What a photographer takes along from a merged stack: the all-in-focus picture as TIFF, PNG and, of RAW, DNG, and its depth in colours.
+"""Files of a merged stack: the all-in-focus picture as TIFF, PNG and, for RAW, DNG; its depth in colours; changed places of depth.exr.
 
 PNG, TIFF and depth stand upright as the cameras' orientation says; DNG says so in its header, and the EXR stay as the sensor saw them.
-
-TIFF of one picture with 16 bits a channel and any tags: little-endian, one strip, not compressed, which takes a tenth of LZW's time.
-
-Places of a merged stack that are said to lie in another slice: what depth.exr says of them then.
 """
 
 import math
@@ -31,113 +27,31 @@ _CODES = {BYTE: "B", ASCII: "B", SHORT: "H", LONG: "I", RATIONAL: "I", UNDEFINED
 _PARTS = {RATIONAL: 2, SRATIONAL: 2}
 _HEADER_BYTES, _ENTRY_BYTES, _INLINE_BYTES = 8, 12, 4
 _LARGEST_BYTES = 2**32 - 2**20
-
-
-@dataclass(frozen=True)
-class TiffTag:
-    """kind: one of the types of TIFF 6.0. values: whole numbers; of fractions numerators and denominators in turn."""
-
-    kind: int
-    values: tuple[int, ...]
-
-    def packed(self) -> tuple[int, bytes]:
-        """(count, bytes) as the directory has them."""
-        return len(self.values) // _PARTS.get(self.kind, 1), struct.pack(f"<{len(self.values)}{_CODES[self.kind]}", *self.values)
-
-
-def text_tag(text: str) -> TiffTag:
-    return TiffTag(ASCII, (*text.encode("ascii", "replace"), 0))
-
-
-def fractions_tag(values: Sequence[float], denominator: int, kind: int = SRATIONAL) -> TiffTag:
-    return TiffTag(kind, tuple(each for value in values for each in (round(value * denominator), denominator)))
-
-
-def write_tiff(path: Path, pixels: UInt16[np.ndarray, "height width 3"], tags: Mapping[int, TiffTag]) -> None:
-    """Write red, green and blue, atomically. tags: by their numbers, beside those that say where the pixels are; photometry is among them.
-
-    Raises InputError for what is larger than the 4 GB of TIFF.
-    """
-    if pixels.nbytes > _LARGEST_BYTES:
-        raise InputError(f"{path}: a picture of {pixels.shape[1]}x{pixels.shape[0]} px is larger than a TIFF can be (4 GB)")
-    height, width, channels = pixels.shape
-    all_tags = {
-        256: TiffTag(LONG, (width,)),
-        257: TiffTag(LONG, (height,)),
-        258: TiffTag(SHORT, (16,) * channels),
-        259: TiffTag(SHORT, (1,)),
-        273: TiffTag(LONG, (_HEADER_BYTES,)),
-        277: TiffTag(SHORT, (channels,)),
-        278: TiffTag(LONG, (height,)),
-        279: TiffTag(LONG, (pixels.nbytes,)),
-        284: TiffTag(SHORT, (1,)),
-        **tags,
-    }
-    directory_at = _HEADER_BYTES + pixels.nbytes
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(struct.pack("<2sHI", b"II", 42, directory_at))
-        file.write(np.ascontiguousarray(pixels, "<u2").data)
-        file.write(_directory(all_tags, directory_at))
-
-
-def _directory(tags: Mapping[int, TiffTag], at: int) -> bytes:
-    """Entries in rising order, then the values that do not fit into them, at even places."""
-    values_at = at + 2 + _ENTRY_BYTES * len(tags) + 4
-    entries, beyond = b"", b""
-    for number in sorted(tags):
-        count, packed = tags[number].packed()
-        if len(packed) <= _INLINE_BYTES:
-            place = packed.ljust(_INLINE_BYTES, b"\x00")
-        else:
-            place = struct.pack("<I", values_at + len(beyond))
-            beyond += packed + b"\x00" * (len(packed) % 2)
-        entries += struct.pack("<HHI", number, tags[number].kind, count) + place
-    return struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0) + beyond
-
-
 _OF_SLICES = {POSITION: SLICE_POSITION, POSITION_ERROR: SLICE_POSITION_ERROR}
 _LEAST_DIOPTRES = 1e-6
-
-Plane = Float32[np.ndarray, "height width"]
-Channels = dict[str, Float[np.ndarray, "height width"]]
-
-
-def depth_m_of(stack: FocalStack, focus_index: Plane) -> Plane | None:
-    """Return the focus index in metres, interpolated in dioptres; None where a focus distance is unknown."""
-    if not stack.is_metric:
-        return None
-    dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
-    interpolated = np.interp(focus_index, np.arange(len(stack)), dioptres)
-    return (1.0 / np.maximum(interpolated, _LEAST_DIOPTRES)).astype(np.float32)
-
-
-def replaced_depth(
-    stack: FocalStack,
-    channels: Mapping[str, Float[np.ndarray, "height width"]],
-    index: Plane,
-    confidence: Plane,
-    where: Bool[np.ndarray, "height width"],
-) -> Channels:
-    """Return the channels of depth.exr with another focus index and confidence in some places, and all that follows from the index."""
-    new: dict[str, Plane | None] = {"focus_index": index, "confidence": confidence, "Z": depth_m_of(stack, index)}
-    for channel, key in _OF_SLICES.items():
-        values = [each.metadata.get(key) for each in stack.slices]
-        known = channel in channels and None not in values
-        new[channel] = np.interp(index, np.arange(len(stack)), np.array(values, float)).astype(np.float32) if known else None
-    changed = {name: np.where(where, plane, channels[name]) for name, plane in new.items() if plane is not None and name in channels}
-    return dict(channels) | changed
-
-
 PNG_NAME, TIFF_NAME, DNG_NAME, DEPTH_NAME = "all_in_focus.png", "all_in_focus.tif", "all_in_focus.dng", "depth.png"
-
 _SOFTWARE = "mrbokeh"
 _RGB, _LINEAR_RAW, _D65 = 2, 34892, 21
 _TOP = 65535
 _BRIGHTEST = 4.0
 _MATRIX_DENOMINATOR, _FINE_DENOMINATOR = 10000, 1000000
 
+Plane = Float32[np.ndarray, "height width"]
+Channels = dict[str, Float[np.ndarray, "height width"]]
 Rgb = Float32[np.ndarray, "height width 3"]
 Rgb8 = UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True)
+class TiffTag:
+    """A field of a TIFF directory. kind: a type of TIFF 6.0. values: whole numbers; fractions as numerators and denominators in turn."""
+
+    kind: int
+    values: tuple[int, ...]
+
+    def packed(self) -> tuple[int, bytes]:
+        """Return (count, bytes) for the directory."""
+        return len(self.values) // _PARTS.get(self.kind, 1), struct.pack(f"<{len(self.values)}{_CODES[self.kind]}", *self.values)
 
 
 def write_readable_pictures(stack: FocalStack, camera_rgb: Rgb | None = None, depth_rgb8: Rgb8 | None = None) -> None:
@@ -169,6 +83,32 @@ def readable_names(stack: FocalStack) -> list[str]:
     """Return the names of the files that a merge of this stack writes for people."""
     is_raw = stack.rec709_from_camera is not None and stack.metadata.get("white_balance") is not None
     return [PNG_NAME, TIFF_NAME, *([DNG_NAME] if is_raw else []), DEPTH_NAME]
+
+
+def depth_m_of(stack: FocalStack, focus_index: Plane) -> Plane | None:
+    """Return the focus index in metres, interpolated in dioptres; None where a focus distance is unknown."""
+    if not stack.is_metric:
+        return None
+    dioptres = [1.0 / distance for distance in stack.focus_distances_m if distance is not None]
+    interpolated = np.interp(focus_index, np.arange(len(stack)), dioptres)
+    return (1.0 / np.maximum(interpolated, _LEAST_DIOPTRES)).astype(np.float32)
+
+
+def replaced_depth(
+    stack: FocalStack,
+    channels: Mapping[str, Float[np.ndarray, "height width"]],
+    index: Plane,
+    confidence: Plane,
+    where: Bool[np.ndarray, "height width"],
+) -> Channels:
+    """Return the channels of depth.exr with another focus index and confidence in some places, and all that follows from the index."""
+    new: dict[str, Plane | None] = {"focus_index": index, "confidence": confidence, "Z": depth_m_of(stack, index)}
+    for channel, key in _OF_SLICES.items():
+        values = [each.metadata.get(key) for each in stack.slices]
+        known = channel in channels and None not in values
+        new[channel] = np.interp(index, np.arange(len(stack)), np.array(values, float)).astype(np.float32) if known else None
+    changed = {name: np.where(where, plane, channels[name]) for name, plane in new.items() if plane is not None and name in channels}
+    return dict(channels) | changed
 
 
 def write_linear_dng(
@@ -217,3 +157,54 @@ def _srgb_profile() -> bytes:
     from PIL import ImageCms
 
     return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+def write_tiff(path: Path, pixels: UInt16[np.ndarray, "height width 3"], tags: Mapping[int, TiffTag]) -> None:
+    """Write red, green and blue of 16 bits atomically: little-endian, one strip, uncompressed, which takes a tenth of LZW's time.
+
+    tags: by their numbers, beside those that say where the pixels are; photometry is among them. Raises InputError for what is larger
+    than the 4 GB of TIFF.
+    """
+    if pixels.nbytes > _LARGEST_BYTES:
+        raise InputError(f"{path}: a picture of {pixels.shape[1]}x{pixels.shape[0]} px is larger than a TIFF can be (4 GB)")
+    height, width, channels = pixels.shape
+    all_tags = {
+        256: TiffTag(LONG, (width,)),
+        257: TiffTag(LONG, (height,)),
+        258: TiffTag(SHORT, (16,) * channels),
+        259: TiffTag(SHORT, (1,)),
+        273: TiffTag(LONG, (_HEADER_BYTES,)),
+        277: TiffTag(SHORT, (channels,)),
+        278: TiffTag(LONG, (height,)),
+        279: TiffTag(LONG, (pixels.nbytes,)),
+        284: TiffTag(SHORT, (1,)),
+        **tags,
+    }
+    directory_at = _HEADER_BYTES + pixels.nbytes
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(struct.pack("<2sHI", b"II", 42, directory_at))
+        file.write(np.ascontiguousarray(pixels, "<u2").data)
+        file.write(_directory(all_tags, directory_at))
+
+
+def _directory(tags: Mapping[int, TiffTag], at: int) -> bytes:
+    """Return the entries in rising order, then the values that do not fit into them, at even places."""
+    values_at = at + 2 + _ENTRY_BYTES * len(tags) + 4
+    entries, beyond = b"", b""
+    for number in sorted(tags):
+        count, packed = tags[number].packed()
+        if len(packed) <= _INLINE_BYTES:
+            place = packed.ljust(_INLINE_BYTES, b"\x00")
+        else:
+            place = struct.pack("<I", values_at + len(beyond))
+            beyond += packed + b"\x00" * (len(packed) % 2)
+        entries += struct.pack("<HHI", number, tags[number].kind, count) + place
+    return struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0) + beyond
+
+
+def text_tag(text: str) -> TiffTag:
+    return TiffTag(ASCII, (*text.encode("ascii", "replace"), 0))
+
+
+def fractions_tag(values: Sequence[float], denominator: int, kind: int = SRATIONAL) -> TiffTag:
+    return TiffTag(kind, tuple(each for value in values for each in (round(value * denominator), denominator)))

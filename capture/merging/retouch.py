@@ -1,7 +1,4 @@
-"""A merged stack retouched by hand: where a mask is white, picture and depth are those of one slice, without merging anew.
-
-Masks that people paint in any picture editor: what is white in them, as the sensor saw it.
-"""
+"""Merged stacks retouched by hand: where a mask is white, picture and depth are those of one slice, without merging anew."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,66 +25,13 @@ _ALPHA, _COLOURS = 3, 3
 _PAINTED = (0.1, 0.9)
 _LARGEST_UNPAINTED = 0.6
 """Share of pixels that are neither black nor white: soft brushes leave rims, a photograph is nearly all between."""
-
-Plane = Float32[np.ndarray, "height width"]
-
-
-def read_mask(path: Path, shape: tuple[int, int], orientation: int) -> Plane:
-    """Return how white each pixel is, 0 to 1, as the sensor saw it. shape: (H, W) there; orientation: what brings that upright, by EXIF.
-
-    A mask is of the size of the upright picture or of that of the sensor. Where these are the same, PNG and TIFF stand upright and EXR
-    does not, as the pictures of a stack do. What is transparent is black.
-    """
-    require_suffix(path, MASK_SUFFIXES, "--mask")
-    if not path.is_file():
-        raise InputError(f"--mask: expected a picture at {path}, but there is no such file")
-    is_exr = path.suffix.lower() == ".exr"
-    white = _of_exr(path) if is_exr else upright(_of_codes(path), stored_orientation(path))
-    if not np.isfinite(white).all():
-        raise InputError(f"{path}: {int((~np.isfinite(white)).sum())} pixels are NaN or infinite: paint the mask from 0 (black) to 1")
-    white = np.clip(white, 0.0, 1.0).astype(np.float32)
-    between = float(((white > _PAINTED[0]) & (white < _PAINTED[1])).mean())
-    if between > _LARGEST_UNPAINTED:
-        raise InputError(
-            f"{path}: {between:.0%} of it is neither black nor white: expected white strokes on black, not the photograph itself"
-        )
-    upright_shape = upright(np.empty(shape, np.bool_), orientation).shape
-    if white.shape == upright_shape and not (is_exr and white.shape == shape):
-        return as_stored(white, orientation)
-    if white.shape != shape:
-        size, expected = (f"{each[1]} x {each[0]}" for each in (white.shape, upright_shape))
-        raise InputError(f"{path} has {size} px, but the stack's pictures have {expected} px: paint the mask over all_in_focus.png")
-    return white
-
-
-def _of_codes(path: Path) -> Plane:
-    pixels = stored_pixels(path)
-    if pixels.dtype.kind != "f" and pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path} stores {pixels.dtype}: expected a mask of 8 or 16 bits, or of float")
-    top = np.float32(1.0 if pixels.dtype.kind == "f" else np.iinfo(pixels.dtype).max)
-    shares = pixels.astype(np.float32) / top
-    if shares.ndim == 2:
-        return shares
-    white = shares[..., :_COLOURS].mean(axis=2)
-    return np.asarray(white * shares[..., _ALPHA] if shares.shape[2] > _ALPHA else white, np.float32)
-
-
-def _of_exr(path: Path) -> Plane:
-    """Colour, which EXR has multiplied by alpha already, else the only channel."""
-    part = read_exr(path)[0]
-    if set("RGB") <= part.channels.keys():
-        return np.asarray(part.stacked("RGB").mean(axis=2), np.float32)
-    if len(part.channels) > 1 and "Y" not in part.channels:
-        raise InputError(f"{path}: expected a mask in R, G, B, in Y or in one channel, but it has {', '.join(sorted(part.channels))}")
-    return np.asarray(part.channels.get("Y", next(iter(part.channels.values()))), np.float32)
-
-
 RETOUCHES = "retouches"
 """Key in a stack's metadata: which slice was put where a mask is white, in the order of the calls (slice, source, mask, share)."""
 PAINTED_CONFIDENCE = 0.5
 """Confidence of a depth that a mask states: it is that of the slice, while the surface under a coarse mask may lean."""
 _HALF = 0.5
 
+Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]
 
 
@@ -95,7 +39,8 @@ Rgb = Float32[np.ndarray, "height width 3"]
 class Retouch:
     """A slice and where it is painted in.
 
-    mask: the file as the user named it. share: (H, W) how much of the slice each pixel takes, in 0 to 1."""
+    mask: the file as the user named it. share: (H, W) of the slice in each pixel, 0 to 1.
+    """
 
     index: int
     mask: Path
@@ -128,10 +73,6 @@ def retouch_scene(scene: Path, slices: Sequence[int], masks: Sequence[Path]) -> 
     return changed
 
 
-def _outputs(stack: FocalStack) -> list[Path]:
-    return [stack.all_in_focus_path, stack.depth_path, *(stack.folder / name for name in (*readable_names(stack), SHEET_NAME))]
-
-
 def retouches_of(stack: FocalStack) -> list[dict[str, object]]:
     return list(stack.metadata.get(RETOUCHES) or [])
 
@@ -141,24 +82,56 @@ def retouches_text(stack: FocalStack) -> str:
     return ", ".join(f"slice {each['slice']} by {each['mask']}" for each in retouches_of(stack))
 
 
+def retouched_stacks(stacks: Sequence[FocalStack]) -> dict[Path, str]:
+    """Return what was painted into stacks, by their folders."""
+    return {stack.folder: text for stack in stacks if (text := retouches_text(stack))}
+
+
 def stacks_before(scene: Path) -> list[FocalStack]:
-    """Return the stacks of a scene as they are before a command works on them; nothing where it has none, which the command says itself."""
+    """Return the stacks of a scene before a command works on them; none where it has none, which the command says itself."""
     try:
         return find_focal_stacks(scene)
     except InputError:
         return []
 
 
-def retouched_stacks(stacks: Sequence[FocalStack]) -> dict[Path, str]:
-    """Return what was painted into stacks, by their folders."""
-    return {stack.folder: text for stack in stacks if (text := retouches_text(stack))}
-
-
 def bands_of(share: Plane) -> int:
-    """Return how many bands fit into what is white: through a stroke that is narrower than a band, what it covers would shine."""
+    """Return how many bands fit into what is white: in a stroke that is narrower than a band, what it covers would shine through."""
     inside = np.pad((share >= _HALF).astype(np.uint8), 1)
     radius_px = float(cv2.distanceTransform(inside, cv2.DIST_L2, 3).max())
     return int(np.clip(np.log2(max(radius_px, 1.0)), 0, BANDS))
+
+
+def read_mask(path: Path, shape: tuple[int, int], orientation: int) -> Plane:
+    """Return how white each pixel is, 0 to 1, as the sensor saw it. shape: (H, W) there; orientation: what brings that upright, by EXIF.
+
+    A mask is of the size of the upright picture or of that of the sensor. Where these are the same, PNG and TIFF stand upright and EXR
+    does not, as the pictures of a stack do. What is transparent is black.
+    """
+    require_suffix(path, MASK_SUFFIXES, "--mask")
+    if not path.is_file():
+        raise InputError(f"--mask: expected a picture at {path}, but there is no such file")
+    is_exr = path.suffix.lower() == ".exr"
+    white = _of_exr(path) if is_exr else upright(_of_codes(path), stored_orientation(path))
+    if not np.isfinite(white).all():
+        raise InputError(f"{path}: {int((~np.isfinite(white)).sum())} pixels are NaN or infinite: paint the mask from 0 (black) to 1")
+    white = np.clip(white, 0.0, 1.0).astype(np.float32)
+    between = float(((white > _PAINTED[0]) & (white < _PAINTED[1])).mean())
+    if between > _LARGEST_UNPAINTED:
+        raise InputError(
+            f"{path}: {between:.0%} of it is neither black nor white: expected white strokes on black, not the photograph itself"
+        )
+    upright_shape = upright(np.empty(shape, np.bool_), orientation).shape
+    if white.shape == upright_shape and not (is_exr and white.shape == shape):
+        return as_stored(white, orientation)
+    if white.shape != shape:
+        size, expected = (f"{each[1]} x {each[0]}" for each in (white.shape, upright_shape))
+        raise InputError(f"{path} has {size} px, but the stack's pictures have {expected} px: paint the mask over all_in_focus.png")
+    return white
+
+
+def _outputs(stack: FocalStack) -> list[Path]:
+    return [stack.all_in_focus_path, stack.depth_path, *(stack.folder / name for name in (*readable_names(stack), SHEET_NAME))]
 
 
 def _only_merged(scene: Path) -> FocalStack:
@@ -188,3 +161,25 @@ def _retouch(stack: FocalStack, index: int, path: Path) -> Retouch:
 def _record(stack: FocalStack, each: Retouch) -> dict[str, object]:
     source = stack.slices[each.index].metadata.get("source", stack.slices[each.index].path)
     return {"slice": each.index, "source": source, "mask": each.mask.name, "share": float(each.share.mean())}
+
+
+def _of_codes(path: Path) -> Plane:
+    pixels = stored_pixels(path)
+    if pixels.dtype.kind != "f" and pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path} stores {pixels.dtype}: expected a mask of 8 or 16 bits, or of float")
+    top = np.float32(1.0 if pixels.dtype.kind == "f" else np.iinfo(pixels.dtype).max)
+    shares = pixels.astype(np.float32) / top
+    if shares.ndim == 2:
+        return shares
+    white = shares[..., :_COLOURS].mean(axis=2)
+    return np.asarray(white * shares[..., _ALPHA] if shares.shape[2] > _ALPHA else white, np.float32)
+
+
+def _of_exr(path: Path) -> Plane:
+    """Return the colour, which EXR has multiplied by alpha already, else the only channel."""
+    part = read_exr(path)[0]
+    if set("RGB") <= part.channels.keys():
+        return np.asarray(part.stacked("RGB").mean(axis=2), np.float32)
+    if len(part.channels) > 1 and "Y" not in part.channels:
+        raise InputError(f"{path}: expected a mask in R, G, B, in Y or in one channel, but it has {', '.join(sorted(part.channels))}")
+    return np.asarray(part.channels.get("Y", next(iter(part.channels.values()))), np.float32)

@@ -1,1 +1,1 @@
-"""One photograph: decoding RAW and pictures to linear light, and what its metadata tells."""
+"""Single photographs: RAW and pictures decoded to linear light, and what their metadata tells."""

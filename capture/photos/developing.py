@@ -1,17 +1,13 @@
-"""One photograph of any kind to linear light at the size asked for.
-
-A photograph for compositing: developed to Rec.709, turned upright, with its lens and exposure from its metadata.
-"""
+"""Photographs of any kind to linear light at the size asked for; for compositing also upright in Rec.709, with lens and exposure."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float32
 
 from capture.photos.libraw import dilated, resized_share
 from capture.photos.metadata import read_metadata
-from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.raw import RAW_SUFFIXES, DecodedPhoto, Photosites, decode_raw
 from mrbokeh.images.color import convert
 from mrbokeh.images.exif import cut_from_px, known_orientation, quarter_turns, stored_orientation, upright
@@ -30,7 +26,7 @@ def is_raw(path: Path) -> bool:
 def develop(
     path: Path, white_balance: tuple[float, float, float] | None, *, half_size: bool = False, max_width: int | None = None
 ) -> DecodedPhoto:
-    """A photograph in linear light, the way up in which it is stored (EXIF orientation is not applied).
+    """Return a photograph in linear light, the way up in which it is stored (EXIF orientation is not applied).
 
     RAW through `decode_raw` in camera RGB; PNG, TIFF, JPEG and WebP as sRGB, EXR and HDR as they are, both in Rec.709. Smaller
     sizes are area averages of light, and of the share that is saturated.
@@ -42,6 +38,32 @@ def develop(
         if half_size:
             decoded = _no_wider(decoded, max(1, decoded.rgb.shape[1] // 2))
     return decoded if max_width is None else _no_wider(decoded, max_width)
+
+
+def read_photograph(path: Path) -> Photograph:
+    """Read a photograph for compositing. White balance is the camera's own; EXR and HDR are taken as they are."""
+    decoded, metadata = develop(path, None), read_metadata(path)
+    rgb = decoded.rgb if decoded.rec709_from_camera is None else convert(decoded.rgb, np.array(decoded.rec709_from_camera))
+    orientation = known_orientation(metadata.orientation or stored_orientation(path))
+    turns = quarter_turns(orientation)
+    stored_height_px, stored_width_px = rgb.shape[:2]
+    sensor = metadata.sensor
+    sensor_width_mm = None if sensor is None else sensor.width_mm(decoded.photosites.width, decoded.photosites.height)
+    if sensor_width_mm is not None and turns % 2:
+        sensor_width_mm *= stored_height_px / stored_width_px
+    # A camera set to another shape cuts its JPEG only, and RAW has margins.
+    whole_px = None if is_raw(path) else cut_from_px((stored_width_px, stored_height_px), metadata.taken_size_px)
+    return Photograph(
+        rgb=upright(rgb, orientation),
+        focal_length_mm=metadata.focal_length_mm,
+        f_number=metadata.f_number,
+        focus_distance_m=metadata.focus_distance_m,
+        sensor_width_mm=sensor_width_mm,
+        exposure_time_s=metadata.exposure_time_s,
+        iso=metadata.iso,
+        orientation=orientation,
+        cut_from_px=whole_px[::-1] if whole_px is not None and turns % 2 else whole_px,
+    )
 
 
 def _picture(path: Path) -> DecodedPhoto:
@@ -58,9 +80,7 @@ def _picture(path: Path) -> DecodedPhoto:
 
 
 def _encoded(path: Path) -> DecodedPhoto:
-    """Full is the largest code in any channel (TIFF of floats: 1)."""
-    import cv2
-
+    """Decode a picture whose codes are display-encoded; full is the largest code in any channel (TIFF of floats: 1)."""
     codes = stored_rgb(path)[..., :3]
     is_float = codes.dtype.kind == "f"
     rgb = codes.astype(np.float32) if is_float else linear_from_codes(codes, "srgb", path)
@@ -71,44 +91,10 @@ def _encoded(path: Path) -> DecodedPhoto:
 
 
 def _no_wider(decoded: DecodedPhoto, width: int) -> DecodedPhoto:
-    """Area averages in linear light, so that small lights keep their energy."""
+    """Average over areas in linear light, so that small lights keep their energy."""
     height_now, width_now = decoded.rgb.shape[:2]
     if width_now <= width:
         return decoded
     height = max(1, round(height_now * width / width_now))
-    return replace(decoded, rgb=_reduced(decoded.rgb, width, height), saturated=resized_share(decoded.saturated, width, height))
-
-
-def _reduced(rgb: Float32[np.ndarray, "height width 3"], width: int, height: int) -> Float32[np.ndarray, "new_height new_width 3"]:
-    import cv2
-
-    return cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def read_photograph(path: Path) -> Photograph:
-    """White balance is the camera's own; EXR and HDR are taken as they are."""
-    decoded, metadata = develop(path, None), read_metadata(path)
-    rgb = decoded.rgb if decoded.rec709_from_camera is None else convert(decoded.rgb, np.array(decoded.rec709_from_camera))
-    orientation = known_orientation(metadata.orientation or stored_orientation(path))
-    turns = quarter_turns(orientation)
-    stored_height_px, stored_width_px = rgb.shape[:2]
-    sensor_width_mm = _sensor_width_mm(metadata, decoded.photosites.width, decoded.photosites.height)
-    if sensor_width_mm is not None and turns % 2:
-        sensor_width_mm *= stored_height_px / stored_width_px
-    # A camera set to another shape cuts its JPEG only, and RAW has margins.
-    whole_px = None if is_raw(path) else cut_from_px((stored_width_px, stored_height_px), metadata.taken_size_px)
-    return Photograph(
-        upright(rgb, orientation),
-        metadata.focal_length_mm,
-        metadata.f_number,
-        metadata.focus_distance_m,
-        sensor_width_mm,
-        metadata.exposure_time_s,
-        metadata.iso,
-        orientation,
-        whole_px[::-1] if whole_px is not None and turns % 2 else whole_px,
-    )
-
-
-def _sensor_width_mm(metadata: PhotoMetadata, width_px: int, height_px: int) -> float | None:
-    return None if metadata.sensor is None else metadata.sensor.width_mm(width_px, height_px)
+    rgb = cv2.resize(decoded.rgb, (width, height), interpolation=cv2.INTER_AREA)
+    return replace(decoded, rgb=rgb, saturated=resized_share(decoded.saturated, width, height))

@@ -1,6 +1,4 @@
-"""FocusReading: a focus distance as somebody stated it, and the way from there to the distance from the lens; numbers in exiv2's tags.
-
-The focus distance that a photograph states: EXIF, Canon, Nikon and Olympus maker notes, XMP; and how far to trust it.
+"""Focus distances that photographs state, in EXIF, Canon, Nikon and Olympus maker notes and XMP, and how far to trust them.
 
 Cameras count from the film plane, are coarse (Nikon: steps of 5.9 %) and use sentinels: 0 for "unknown", all ones for "infinity", which
 may be anything beyond their last code (`SentinelReading`).
@@ -13,12 +11,18 @@ from typing import ClassVar
 
 from mrbokeh.optics.lens import MM_PER_M, lens_distance_m
 
+UINT32_MAX = 0xFFFFFFFF
+UINT16_MAX = 0xFFFF
+UINT8_MAX = 0xFF
+_CM_PER_M = 100.0
+_CANON_INFINITY_CM = 65535.0
+
 Tags = Mapping[str, str]
 
 
 @dataclass(frozen=True)
 class FocusReading:
-    """A focus distance with the interval it stands for; 0 < nearest_m <= distance_m <= farthest_m, inf allowed.
+    """Focus distance with the interval it stands for; 0 < nearest_m <= distance_m <= farthest_m, inf allowed.
 
     origin: where the distance is counted from, "film_plane" or "lens".
     source: the tag and the number it held, as text.
@@ -33,12 +37,16 @@ class FocusReading:
     origin: str
     source: str
 
+    @classmethod
+    def from_film_plane(cls, distance_m: float, nearest_m: float, farthest_m: float, source: str) -> "FocusReading":
+        return cls(distance_m, nearest_m, farthest_m, origin="film_plane", source=source)
+
     def lens_distance_m(self, focal_length_mm: float | None, hiatus_mm: float = 0.0) -> float | None:
-        """Distance from the front principal plane, or None where the focal length is needed and unknown or no lens of it fits."""
+        """Return the distance from the front principal plane; None if the focal length is needed and unknown, or no lens of it fits."""
         return self._from_lens(self.distance_m, focal_length_mm, hiatus_mm)
 
     def lens_interval_m(self, focal_length_mm: float | None, hiatus_mm: float = 0.0) -> tuple[float, float] | None:
-        """(nearest, farthest) from the front principal plane; None where the distance itself is not known from there."""
+        """Return (nearest, farthest) from the front principal plane; None where the distance itself is not known from there."""
         distance_m = self.lens_distance_m(focal_length_mm, hiatus_mm)
         farthest_m = self._from_lens(self.farthest_m, focal_length_mm, hiatus_mm)
         if distance_m is None or farthest_m is None:
@@ -56,88 +64,27 @@ class FocusReading:
 
 @dataclass(frozen=True)
 class SentinelReading(FocusReading):
-    """Infinity by a number that stands for it (0xFFFFFFFF, 655.35 m): cameras write it for all that lies beyond their last code, be that
-    3 m or 30 m, and where they do not know. A value to start from; the photographs of its stack bound it (`capture.stacks.slice_files`).
+    """Infinity by a number that stands for it (0xFFFFFFFF, 655.35 m).
+
+    Cameras write it for all that lies beyond their last code, be that 3 m or 30 m, and where they do not know. It is a value to start
+    from; the photographs of its stack bound it (`capture.stacks.slice_files`).
     """
 
     is_sentinel: ClassVar[bool] = True
 
 
-def at_infinity(source: str) -> SentinelReading:
-    return SentinelReading(math.inf, math.inf, math.inf, "film_plane", source)
-
-
-def rational(text: str | None) -> tuple[int, int] | None:
-    """(numerator, denominator) of "17/10", of "17" or of the first number of several; None where there is no number."""
-    if not text or not text.split():
-        return None
-    numerator, _, denominator = text.split()[0].partition("/")
-    try:
-        return int(numerator), int(denominator or 1)
-    except ValueError:
-        return None
-
-
-def number(text: str | None) -> float | None:
-    """The first number of a tag as float; None for nothing, 0/0 and x/0."""
-    parts = rational(text)
-    return None if parts is None or parts[1] == 0 else parts[0] / parts[1]
-
-
-UINT32_MAX = 0xFFFFFFFF
-UINT16_MAX = 0xFFFF
-UINT8_MAX = 0xFF
-_CM_PER_M = 100.0
-_CANON_INFINITY_CM = 65535.0
+def at_infinity(source: str) -> FocusReading:
+    return SentinelReading.from_film_plane(math.inf, math.inf, math.inf, source)
 
 
 def read_focus(tags: Tags) -> FocusReading | None:
-    """The focus distance stated by exiv2's tags, from the most to the least trustworthy source; None where unknown."""
+    """Return the focus distance stated by exiv2's tags, from the most to the least trustworthy source; None where unknown."""
     readers: tuple[Callable[[Tags], FocusReading | None], ...] = (_canon_interval, _subject_distance, _nikon, _olympus, _canon_shot, _adobe)
     return next((reading for reader in readers if (reading := reader(tags)) is not None), None)
 
 
-def _subject_distance(tags: Tags) -> FocusReading | None:
-    return _rational_distance(tags, ("Exif.Photo.SubjectDistance", "Exif.Image.SubjectDistance"))
-
-
-def _adobe(tags: Tags) -> FocusReading | None:
-    """Adobe's converters copy the maker note's distance here."""
-    return _rational_distance(tags, ("Xmp.aux.ApproximateFocusDistance",))
-
-
-def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | None:
-    """Metres as a fraction, good to half a unit of its last digit; 0 and 0/0 are unknown, 0xFFFFFFFF is a sentinel for infinity."""
-    for name in names:
-        parts = rational(tags.get(name))
-        if parts is None or parts[0] <= 0:
-            continue
-        numerator, denominator = parts
-        source = f"{name} = {tags[name]}"
-        if numerator == UINT32_MAX:
-            return at_infinity(source)
-        if denominator > 0:
-            return FocusReading(
-                numerator / denominator, (numerator - 0.5) / denominator, (numerator + 0.5) / denominator, "film_plane", source
-            )
-    return None
-
-
-def _canon_interval(tags: Tags) -> FocusReading | None:
-    """Canon file info: the farthest and the nearest distance in cm. The middle is taken in dioptres, in which blur is linear."""
-    names = ("Exif.CanonFi.FocusDistanceUpper", "Exif.CanonFi.FocusDistanceLower")
-    farthest_cm, nearest_cm = (_unsigned(tags, name) for name in names)
-    source = f"Exif.CanonFi.FocusDistanceLower, Upper = {nearest_cm:g}, {farthest_cm:g} cm"
-    return canon_reading(nearest_cm / _CM_PER_M, farthest_cm / _CM_PER_M, source)
-
-
-def _unsigned(tags: Tags, name: str) -> float:
-    """Canon's distances are unsigned numbers of 16 bits in arrays that exiv2 reads as signed: -1 is 65535. 0 where there is none."""
-    return (number(tags.get(name)) or 0.0) % (UINT16_MAX + 1)
-
-
 def canon_reading(nearest_m: float, farthest_m: float, source: str) -> FocusReading | None:
-    """Between two distances in metres: an upper one of 0 says nothing, 655.35 is infinity, a lower one of 0 is missing.
+    """Return a reading between two distances in metres: an upper one of 0 says nothing, 655.35 is infinity, a lower one of 0 is missing.
 
     Infinity with a finite lower end is an interval; without one it is a sentinel.
     """
@@ -148,11 +95,66 @@ def canon_reading(nearest_m: float, farthest_m: float, source: str) -> FocusRead
     if math.isinf(nearest_m):
         return at_infinity(source)
     middle_dioptres = 0.5 * (1.0 / nearest_m + 1.0 / farthest_m)
-    return FocusReading(1.0 / middle_dioptres, nearest_m, farthest_m, "film_plane", source)
+    return FocusReading.from_film_plane(1.0 / middle_dioptres, nearest_m, farthest_m, source)
+
+
+def rational(text: str | None) -> tuple[int, int] | None:
+    """Return (numerator, denominator) of "17/10", of "17" or of the first number of several; None where there is no number."""
+    if not text or not text.split():
+        return None
+    numerator, _, denominator = text.split()[0].partition("/")
+    try:
+        return int(numerator), int(denominator or 1)
+    except ValueError:
+        return None
+
+
+def number(text: str | None) -> float | None:
+    """Return the first number of a tag as float; None for nothing, 0/0 and x/0."""
+    parts = rational(text)
+    return None if parts is None or parts[1] == 0 else parts[0] / parts[1]
+
+
+def _subject_distance(tags: Tags) -> FocusReading | None:
+    return _rational_distance(tags, ("Exif.Photo.SubjectDistance", "Exif.Image.SubjectDistance"))
+
+
+def _adobe(tags: Tags) -> FocusReading | None:
+    """Read the maker note's distance where Adobe's converters copy it."""
+    return _rational_distance(tags, ("Xmp.aux.ApproximateFocusDistance",))
+
+
+def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | None:
+    """Read metres as a fraction, good to half a unit of its last digit; 0 and 0/0 are unknown, 0xFFFFFFFF is a sentinel for infinity."""
+    for name in names:
+        parts = rational(tags.get(name))
+        if parts is None or parts[0] <= 0:
+            continue
+        numerator, denominator = parts
+        source = f"{name} = {tags[name]}"
+        if numerator == UINT32_MAX:
+            return at_infinity(source)
+        if denominator > 0:
+            distance_m, nearest_m, farthest_m = ((numerator + digit) / denominator for digit in (0.0, -0.5, 0.5))
+            return FocusReading.from_film_plane(distance_m, nearest_m, farthest_m, source)
+    return None
+
+
+def _canon_interval(tags: Tags) -> FocusReading | None:
+    """Read the farthest and the nearest distance in cm from Canon's file info. The middle is taken in dioptres, in which blur is linear."""
+    names = ("Exif.CanonFi.FocusDistanceUpper", "Exif.CanonFi.FocusDistanceLower")
+    farthest_cm, nearest_cm = (_unsigned(tags, name) for name in names)
+    source = f"Exif.CanonFi.FocusDistanceLower, Upper = {nearest_cm:g}, {farthest_cm:g} cm"
+    return canon_reading(nearest_cm / _CM_PER_M, farthest_cm / _CM_PER_M, source)
+
+
+def _unsigned(tags: Tags, name: str) -> float:
+    """Return a distance of Canon's: 16 bits without sign, in arrays that exiv2 reads as signed (-1 is 65535). 0 where there is none."""
+    return (number(tags.get(name)) or 0.0) % (UINT16_MAX + 1)
 
 
 def _canon_shot(tags: Tags) -> FocusReading | None:
-    """Canon shot info: cm, but mm in the PowerShots that write CRW.
+    """Read Canon's shot info: cm, but mm in the PowerShots that write CRW.
 
     exiv2 and exiftool read cm throughout. A G2's JPEG says 1.50 m in EXIF and 1503 here; an S40 that fills its frame
     (7.1 mm lens, 7.26 mm sensor) with a box of 0.2 m says 188.
@@ -165,11 +167,11 @@ def _canon_shot(tags: Tags) -> FocusReading | None:
         return at_infinity(f"{name} = {value:g}")
     in_mm = tags.get("mime_type") == "image/x-canon-crw" and "PowerShot" in tags.get("Exif.Image.Model", "")
     per_m, unit = (MM_PER_M, "mm") if in_mm else (_CM_PER_M, "cm")
-    return FocusReading(value / per_m, (value - 0.5) / per_m, (value + 0.5) / per_m, "film_plane", f"{name} = {value:g} {unit}")
+    return FocusReading.from_film_plane(value / per_m, (value - 0.5) / per_m, (value + 0.5) / per_m, f"{name} = {value:g} {unit}")
 
 
 def _nikon(tags: Tags) -> FocusReading | None:
-    """Nikon lens data: d = 0.01 * 10^(v / 40) m with an 8-bit v; Z lenses add 8 bits of fraction: d = 2^((v / 256 - 80) / 12) m.
+    """Read Nikon's lens data: d = 0.01 * 10^(v / 40) m with an 8-bit v; Z lenses add 8 bits of fraction: d = 2^((v / 256 - 80) / 12) m.
 
     The first from exiv2, the second from exiftool (Nikon.pm, LensData0800); both make 1 m of 80. 0 and all ones are unknown.
     """
@@ -178,7 +180,7 @@ def _nikon(tags: Tags) -> FocusReading | None:
         if value is not None and 0 < value < (UINT16_MAX if units > 1 else UINT8_MAX):
             code, half_step = value / units, 0.5 / units
             nearest_m, distance_m, farthest_m = (metres_of(each) for each in (code - half_step, code, code + half_step))
-            return FocusReading(distance_m, nearest_m, farthest_m, "film_plane", f"Exif.Nikon{name} = {value:g}")
+            return FocusReading.from_film_plane(distance_m, nearest_m, farthest_m, f"Exif.Nikon{name} = {value:g}")
     return None
 
 
@@ -199,7 +201,7 @@ _NIKON_CODES = (
 
 
 def _olympus(tags: Tags) -> FocusReading | None:
-    """Olympus: the numerator counts mm whatever the denominator says (E-1 writes 1, E-300 writes 10); 0xFFFFFFFF: infinity."""
+    """Read Olympus' distance: the numerator counts mm whatever the denominator says (E-1: 1, E-300: 10); 0xFFFFFFFF is infinity."""
     name = "Exif.OlympusFi.FocusDistance"
     parts = rational(tags.get(name))
     if parts is None or parts[0] <= 0:
@@ -207,4 +209,5 @@ def _olympus(tags: Tags) -> FocusReading | None:
     if parts[0] == UINT32_MAX:
         return at_infinity(f"{name} = {tags[name]}")
     distance_m = parts[0] / MM_PER_M
-    return FocusReading(distance_m, distance_m - 0.5 / MM_PER_M, distance_m + 0.5 / MM_PER_M, "film_plane", f"{name} = {tags[name]}")
+    half_m = 0.5 / MM_PER_M
+    return FocusReading.from_film_plane(distance_m, distance_m - half_m, distance_m + half_m, f"{name} = {tags[name]}")

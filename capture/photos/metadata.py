@@ -1,7 +1,4 @@
-"""What a photograph tells about how it was taken: through pyexiv2, then for what is still open exiftool and exifread.
-
-Files cut short in copying: decoders notice most of them, but lossy tiles of a DNG can go missing without a word.
-"""
+"""Shooting data of photographs: through pyexiv2, then exiftool and exifread for what is still open; and files cut short in copying."""
 
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
@@ -14,15 +11,16 @@ from capture.photos.sensor_metadata import read_sensor, stated_size_px
 from mrbokeh.system.errors import InputError
 
 _NO_MESSAGES = 4
+_BLOCKS = (("TileOffsets", "TileByteCounts"), ("StripOffsets", "StripByteCounts"))
 
 
 def read_metadata(path: Path) -> PhotoMetadata:
-    """The shooting data of a photograph; all None where the file has none or cannot be read."""
+    """Return the shooting data of a photograph; all None where the file has none or cannot be read."""
     return read_metadata_of([path])[0]
 
 
 def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda: None) -> list[PhotoMetadata]:
-    """The shooting data of photographs; `advance` is called after each."""
+    """Return the shooting data of photographs; `advance` is called after each."""
     found = []
     for path in paths:
         found.append(metadata_from_tags(read_tags(path)))
@@ -35,12 +33,8 @@ def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda
     return found
 
 
-def _has_gaps(metadata: PhotoMetadata) -> bool:
-    return None in (metadata.focal_length_mm, metadata.f_number, metadata.focus, metadata.exposure_time_s)
-
-
 def read_tags(path: Path) -> dict[str, str]:
-    """EXIF, maker note and XMP tags by exiv2's names, with "mime_type", "width_px" and "height_px"; empty if unreadable."""
+    """Return EXIF, maker note and XMP tags by exiv2's names, with "mime_type", "width_px" and "height_px"; empty if unreadable."""
     try:
         import pyexiv2
     except ImportError:
@@ -57,7 +51,7 @@ def read_tags(path: Path) -> dict[str, str]:
 
 
 def metadata_from_tags(tags: Tags) -> PhotoMetadata:
-    """Shooting data from exiv2's tags."""
+    """Return shooting data from exiv2's tags."""
     focal_length_mm = _focal_length_mm(tags)
     width_px, height_px = number(tags.get("width_px")), number(tags.get("height_px"))
     size_px = (int(width_px), int(height_px)) if width_px and height_px else None
@@ -78,19 +72,38 @@ def metadata_from_tags(tags: Tags) -> PhotoMetadata:
     )
 
 
+def require_whole_tiff(path: Path) -> None:
+    """Raise InputError if a TIFF-like file (DNG and most RAW) speaks of pixels that lie behind its end.
+
+    Decoders notice most files cut short, but lossy tiles of a DNG can go missing without a word.
+    """
+    if not path.is_file():
+        raise InputError(f"expected a photograph at {path}, but there is no such file")
+    size, tags = path.stat().st_size, read_tags(path)
+    for offsets_name, counts_name in _BLOCKS:
+        for key, offsets in tags.items():
+            group, _, name = key.rpartition(".")
+            if name == offsets_name and (end := _end(offsets, tags.get(f"{group}.{counts_name}", ""))) > size:
+                raise InputError(f"{path} is cut short: it has {size} bytes, its pixels reach to {end}. Copy it again")
+
+
+def _has_gaps(metadata: PhotoMetadata) -> bool:
+    return None in (metadata.focal_length_mm, metadata.f_number, metadata.focus, metadata.exposure_time_s)
+
+
 def _first_positive(tags: Tags, *names: str) -> float | None:
     values = (number(tags.get(name)) for name in names)
     return next((value for value in values if value is not None and value > 0), None)
 
 
 def _from_apex(tags: Tags, name: str, power: float) -> float | None:
-    """APEX values are logarithms: f-number = 2^(Av / 2), exposure time = 2^-Tv."""
+    """Convert an APEX value, which is a logarithm: f-number = 2^(Av / 2), exposure time = 2^-Tv."""
     value = number(tags.get(name))
     return None if value is None else 2.0 ** (value * power)
 
 
 def _focal_length_mm(tags: Tags) -> float | None:
-    """EXIF; else Canon's maker note, which counts in units that CanonCs.Lens (longest, shortest, units per mm) explains."""
+    """Read EXIF; else Canon's maker note, which counts in units that CanonCs.Lens (longest, shortest, units per mm) explains."""
     stated = _first_positive(tags, "Exif.Photo.FocalLength", "Exif.Image.FocalLength")
     canon, lens = tags.get("Exif.Canon.FocalLength", "").split(), tags.get("Exif.CanonCs.Lens", "").split()
     if stated or len(canon) < 2 or len(lens) != 3:
@@ -100,7 +113,7 @@ def _focal_length_mm(tags: Tags) -> float | None:
 
 
 def _iso(tags: Tags) -> float | None:
-    """EXIF; else Nikon's maker note "0 400"."""
+    """Read EXIF; else Nikon's maker note "0 400"."""
     nikon = tags.get("Exif.Nikon3.ISOSpeed", "").split() or [""]
     return _first_positive(tags, "Exif.Photo.ISOSpeedRatings", "Exif.Image.ISOSpeedRatings") or number(nikon[-1]) or None
 
@@ -120,21 +133,6 @@ def _microseconds(digits: str | None) -> int:
 
 def _text(tags: Mapping[str, str], *names: str) -> str | None:
     return next((tags[name].strip() for name in names if tags.get(name, "").strip()), None)
-
-
-_BLOCKS = (("TileOffsets", "TileByteCounts"), ("StripOffsets", "StripByteCounts"))
-
-
-def require_whole_tiff(path: Path) -> None:
-    """Raise InputError where a TIFF-like file (DNG and most RAW) speaks of pixels that lie behind its end."""
-    if not path.is_file():
-        raise InputError(f"expected a photograph at {path}, but there is no such file")
-    size, tags = path.stat().st_size, read_tags(path)
-    for offsets_name, counts_name in _BLOCKS:
-        for key, offsets in tags.items():
-            group, _, name = key.rpartition(".")
-            if name == offsets_name and (end := _end(offsets, tags.get(f"{group}.{counts_name}", ""))) > size:
-                raise InputError(f"{path} is cut short: it has {size} bytes, its pixels reach to {end}. Copy it again")
 
 
 def _end(offsets: str, counts: str) -> int:

@@ -1,4 +1,4 @@
-"""Which files are photographs: folders are searched, files that are named are taken, RAW goes before the JPEG of the same shot."""
+"""Files that are photographs: folders are searched, files that are named are taken, RAW goes before the JPEG of the same shot."""
 
 import re
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ PHOTO_SUFFIXES = (*RAW_SUFFIXES, *ENCODED_SUFFIXES, *LINEAR_SUFFIXES)
 
 @dataclass(frozen=True)
 class SkippedFile:
-    """A file that was left out, and why, in words. raw: taken in its place, or None."""
+    """File that was left out, and why, in words. raw: taken in its place, or None."""
 
     path: Path
     reason: str
@@ -33,19 +33,19 @@ class PhotoFolder:
 
     @property
     def label(self) -> str:
-        """The folder's name with those of its parents below `top`, as a name for a stack."""
+        """Return the folder's name with those of its parents below `top`, as a name for a stack."""
         below = self.folder.relative_to(self.top).parts
         name = "_".join(below) or self.folder.name or "stack"
         return re.sub(r"[^\w.-]+", "_", name).strip("._") or "stack"
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sorts IMG_9 before IMG_10, and numbers before words."""
+    """Return a key that sorts IMG_9 before IMG_10, and numbers before words."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in re.split(r"(\d+)", path.name) if part]
 
 
 def find_photos(given: Sequence[Path], scene: Path) -> tuple[list[PhotoFolder], list[SkippedFile]]:
-    """Photographs under the given files and folders, folder by folder, and what was left out. The scene itself is not searched."""
+    """Find photographs under the given files and folders, folder by folder, and what was left out. The scene itself is not searched."""
     found: dict[Path, Path] = {}
     skipped: list[SkippedFile] = []
     for path in (Path(each).resolve() for each in given):
@@ -82,7 +82,7 @@ def no_photographs(given: Sequence[Path], folders: Sequence[PhotoFolder], sideca
 
 
 def _photos_under(top: Path, scene: Path) -> tuple[list[Path], list[SkippedFile]]:
-    """Photographs below a folder, without hidden files, our own scene and other focal stacks' folders.
+    """Find photographs below a folder, without hidden files, our own scene and other focal stacks' folders.
 
     Beside photographs, EXR and HDR files are taken for somebody's results and left out. HEIC is found, but cannot be read.
     """
@@ -100,7 +100,7 @@ def _photos_under(top: Path, scene: Path) -> tuple[list[Path], list[SkippedFile]
 
 
 def _raw_before_jpeg(paths: list[Path]) -> tuple[list[Path], list[SkippedFile]]:
-    """Cameras store RAW and JPEG of the same shot side by side; the JPEG is left out."""
+    """Leave out the JPEG where a camera has stored RAW and JPEG of the same shot side by side."""
     raw = {path.stem: path for path in paths if path.suffix.lower() in RAW_SUFFIXES}
     doubles = {path for path in paths if path.suffix.lower() not in RAW_SUFFIXES and path.stem in raw}
     skipped = [SkippedFile(path, f"the same shot as {raw[path.stem].name}, which is RAW", raw[path.stem]) for path in sorted(doubles)]

@@ -1,4 +1,4 @@
-"""PhotoMetadata: how one photograph was taken."""
+"""Shooting data of one photograph."""
 
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
@@ -9,7 +9,7 @@ from capture.photos.sensor_metadata import SensorReading
 
 @dataclass(frozen=True)
 class StatedExposure:
-    """What the signal of a scene is proportional to, so far as the camera keeps its word: time_s x ISO / f-number squared.
+    """Exposure as stated: the signal of a scene is proportional to time_s x ISO / f-number squared, so far as the camera keeps its word.
 
     f_number: None with lenses that do not tell the camera, whose aperture is taken to stay as it is.
     """
@@ -18,7 +18,7 @@ class StatedExposure:
     f_number: float | None = None
 
     def gain_to(self, other: "StatedExposure") -> float | None:
-        """The factor from this exposure to another; None where only one of them states its f-number."""
+        """Return the factor from this exposure to another; None where only one of them states its f-number."""
         if self.f_number is None and other.f_number is None:
             return other.time_iso_s / self.time_iso_s
         if self.f_number is None or other.f_number is None:
@@ -28,7 +28,7 @@ class StatedExposure:
 
 @dataclass(frozen=True)
 class PhotoMetadata:
-    """The shooting data of one photograph; None is unknown.
+    """Shooting data of one photograph; None is unknown.
 
     taken_size_px: width and height of the picture that the camera took, as it states them; what is cut or resized has others.
     orientation: the EXIF tag (1 is upright), which nobody applies here.
@@ -51,7 +51,7 @@ class PhotoMetadata:
     hiatus_mm: float = 0.0
 
     def filled_from(self, other: "PhotoMetadata") -> "PhotoMetadata":
-        """What is unknown here, taken from another source."""
+        """Return the data with what is unknown here taken from another source."""
         gaps = {each.name: getattr(other, each.name) for each in fields(self) if getattr(self, each.name) is None}
         return replace(self, **gaps)
 
@@ -63,17 +63,17 @@ class PhotoMetadata:
 
     @property
     def focus_distance_m(self) -> float | None:
-        """From the front principal plane of the lens, or None."""
+        """Return the focus distance from the front principal plane of the lens, or None."""
         return None if self.focus is None else self.focus.lens_distance_m(self.focal_length_mm, self.hiatus_mm)
 
     @property
     def focus_interval_m(self) -> tuple[float, float] | None:
-        """(nearest, farthest) from there: what the statement may stand for."""
+        """Return (nearest, farthest) from there: what the statement may stand for."""
         return None if self.focus is None else self.focus.lens_interval_m(self.focal_length_mm, self.hiatus_mm)
 
 
 def parse_time(text: str | None) -> datetime | None:
-    """EXIF's "2024:05:31 12:00:00"; None for "0000:00:00 00:00:00" and the like."""
+    """Parse EXIF's "2024:05:31 12:00:00"; None for "0000:00:00 00:00:00" and the like."""
     try:
         return datetime.strptime((text or "").strip()[:19], "%Y:%m:%d %H:%M:%S")
     except ValueError:

@@ -1,9 +1,4 @@
-"""The width of the sensor from what a photograph states: pixel pitch, size of the picture it belongs to, model, 35 mm equivalent.
-
-SensorReading: how large the pixels of a sensor are, and what part of it a picture shows.
-
-Sensor sizes by camera model from lensfun's database (CC-BY-SA 3.0, in the lensfunpy wheel), for cameras whose files do not tell.
-"""
+"""Width of the sensor from what a photograph states: pixel pitch, size of the picture it belongs to, model, 35 mm equivalent."""
 
 import math
 from collections.abc import Callable
@@ -14,20 +9,30 @@ from typing import TYPE_CHECKING
 from capture.photos.focus_metadata import Tags, number, rational
 from mrbokeh.images.exif import as_it_lies, is_same_shape
 
+if TYPE_CHECKING:
+    import lensfunpy
+
 # A RAW shows a few pixels more than the JPEG of its camera; a picture that differs by more was resized or cut.
 _MARGIN = 0.05
+FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_INCH_MM = 25.4
+_PLAUSIBLE_WIDTH_MM = (1.0, 80.0)
 
 
 @dataclass(frozen=True)
 class SensorReading:
-    """Millimetres per pixel in a picture of full_size_px (width, height), if that size is known; source: the tag it came from."""
+    """Size of a sensor's pixels: millimetres per pixel in a picture of full_size_px (width, height), if that size is known.
+
+    source: the tag it came from.
+    """
 
     pitch_mm: float
     full_size_px: tuple[int, int] | None
     source: str
 
     def width_mm(self, width_px: int, height_px: int) -> float:
-        """Width on the sensor of a picture as it is stored.
+        """Return the width on the sensor of a picture as it is stored.
 
         The full size, or nearly (RAW margins): pitch times width. Another size but the same shape: the picture was
         resized and shows the full width. Another shape: it was cut out, at full resolution as far as anyone can tell.
@@ -40,16 +45,37 @@ class SensorReading:
         return self.pitch_mm * (full_width if resized and same_shape else width_px)
 
 
-if TYPE_CHECKING:
-    import lensfunpy
+def read_sensor(tags: Tags, focal_length_mm: float | None, stored_size_px: tuple[int, int] | None) -> SensorReading | None:
+    """Return the sensor by exiv2's tags: FocalPlaneXResolution, Nikon's pixel size, Canon's focal plane, the model, 35 mm equivalent.
 
-FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+    stored_size_px: (width, height) of the file, for tags that speak of the whole frame where EXIF does not state its size.
+    """
+    size_px = stated_size_px(tags) or stored_size_px
+    readers: tuple[Callable[[], SensorReading | None], ...] = (
+        lambda: _focal_plane_resolution(tags, stated_size_px(tags)),
+        lambda: _nikon_pixel_size(tags, stated_size_px(tags)),
+        lambda: _canon_focal_plane(tags, size_px),
+        lambda: sensor_of_model(tags.get("Exif.Image.Make"), tags.get("Exif.Image.Model"), size_px),
+        lambda: _film_equivalent(tags, focal_length_mm, size_px),
+    )
+    return next((reading for reader in readers if (reading := reader()) is not None and _is_plausible(reading, size_px)), None)
+
+
+def stated_size_px(tags: Tags) -> tuple[int, int] | None:
+    """Return width and height of the picture that the camera took. A reduced DNG states it as OriginalDefaultFinalSize."""
+    original = tags.get("Exif.Image.OriginalDefaultFinalSize", "").split()
+    if len(original) == 2:
+        width_px, height_px = (number(each) for each in original)
+    else:
+        width_px, height_px = number(tags.get("Exif.Photo.PixelXDimension")), number(tags.get("Exif.Photo.PixelYDimension"))
+    return (int(width_px), int(height_px)) if width_px and height_px else None
 
 
 def sensor_of_model(make: str | None, model: str | None, size_px: tuple[int, int] | None) -> SensorReading | None:
-    """The sensor of a camera whose full pictures have size_px (width, height); None where lensfun is not installed or knows it not.
+    """Return the sensor of a camera whose full pictures have size_px (width, height), by lensfun's database (CC-BY-SA 3.0, in its wheel).
 
-    The crop factor compares diagonals, rounded to about 0.5 % (Nikon D3300: 23.64 mm by it, 23.5 by the data sheet).
+    The crop factor compares diagonals, rounded to about 0.5 % (Nikon D3300: 23.64 mm by it, 23.5 by the data sheet). None where lensfun is
+    not installed or does not know the model.
     """
     database = _database() if make and model and size_px else None
     if database is None or size_px is None:
@@ -70,40 +96,9 @@ def _database() -> "lensfunpy.Database | None":
     return lensfunpy.Database()
 
 
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_INCH_MM = 25.4
-_PLAUSIBLE_WIDTH_MM = (1.0, 80.0)
-
-
-def read_sensor(tags: Tags, focal_length_mm: float | None, stored_size_px: tuple[int, int] | None) -> SensorReading | None:
-    """The sensor by exiv2's tags: FocalPlaneXResolution, Nikon's pixel size, Canon's focal plane, the model, 35 mm equivalent.
-
-    stored_size_px: (width, height) of the file, for tags that speak of the whole frame where EXIF does not state its size.
-    """
-    size_px = stated_size_px(tags) or stored_size_px
-    readers: tuple[Callable[[], SensorReading | None], ...] = (
-        lambda: _focal_plane_resolution(tags, stated_size_px(tags)),
-        lambda: _nikon_pixel_size(tags, stated_size_px(tags)),
-        lambda: _canon_focal_plane(tags, size_px),
-        lambda: sensor_of_model(tags.get("Exif.Image.Make"), tags.get("Exif.Image.Model"), size_px),
-        lambda: _film_equivalent(tags, focal_length_mm, size_px),
-    )
-    return next((reading for reader in readers if (reading := reader()) is not None and _is_plausible(reading, size_px)), None)
-
-
 def _is_plausible(reading: SensorReading, size_px: tuple[int, int] | None) -> bool:
     size_px = reading.full_size_px or size_px
     return size_px is None or _PLAUSIBLE_WIDTH_MM[0] < reading.pitch_mm * size_px[0] < _PLAUSIBLE_WIDTH_MM[1]
-
-
-def stated_size_px(tags: Tags) -> tuple[int, int] | None:
-    """Width and height of the picture that the camera took. A reduced DNG states it as OriginalDefaultFinalSize."""
-    original = tags.get("Exif.Image.OriginalDefaultFinalSize", "").split()
-    if len(original) == 2:
-        width_px, height_px = (number(each) for each in original)
-    else:
-        width_px, height_px = number(tags.get("Exif.Photo.PixelXDimension")), number(tags.get("Exif.Photo.PixelYDimension"))
-    return (int(width_px), int(height_px)) if width_px and height_px else None
 
 
 def _focal_plane_resolution(tags: Tags, size_px: tuple[int, int] | None) -> SensorReading | None:
@@ -116,13 +111,13 @@ def _focal_plane_resolution(tags: Tags, size_px: tuple[int, int] | None) -> Sens
 
 
 def _nikon_pixel_size(tags: Tags, size_px: tuple[int, int] | None) -> SensorReading | None:
-    """Nikon's maker note: micrometres per pixel."""
+    """Read micrometres per pixel from Nikon's maker note."""
     micrometres = number(tags.get("Exif.Nikon3.SensorPixelSize"))
     return SensorReading(micrometres / 1000.0, size_px, "Exif.Nikon3.SensorPixelSize") if micrometres and micrometres > 0 else None
 
 
 def _canon_focal_plane(tags: Tags, size_px: tuple[int, int] | None) -> SensorReading | None:
-    """Canon's maker note "type, focal length, width, height" in thousandths of an inch; newer bodies leave nonsense there."""
+    """Read Canon's "type, focal length, width, height" in thousandths of an inch; newer bodies leave nonsense there."""
     values = [number(each) or 0.0 for each in tags.get("Exif.Canon.FocalLength", "").split()]
     if len(values) != 4 or size_px is None or min(values[2:]) < 40 or not 1.2 < values[2] / values[3] < 1.6:
         return None
@@ -130,7 +125,7 @@ def _canon_focal_plane(tags: Tags, size_px: tuple[int, int] | None) -> SensorRea
 
 
 def _film_equivalent(tags: Tags, focal_length_mm: float | None, size_px: tuple[int, int] | None) -> SensorReading | None:
-    """FocalLengthIn35mmFilm compares diagonals with that of 36 x 24 mm (CIPA DCG-001); it is rounded to a millimetre."""
+    """Compute from FocalLengthIn35mmFilm, which compares diagonals with that of 36 x 24 mm (CIPA DCG-001), rounded to a millimetre."""
     name = "Exif.Photo.FocalLengthIn35mmFilm"
     equivalent = rational(tags.get(name))
     if not equivalent or equivalent[0] <= 0 or not focal_length_mm or size_px is None:

@@ -16,21 +16,14 @@ or, instead of the list,
     [focus_distances_m]
     "IMG_0001.NEF" = 0.5
 
-or a focus.csv.
-
-StatedFocus: a focus distance that the user gives, with the interval it stands for.
-
-The values of a lens.toml in their types, or a sentence that says what is wrong with one.
-
-focus.csv beside the photographs: focus distances by file name, for those who measured or logged them.
+or a focus.csv, for those who measured or logged the distances:
 
     file,focus_distance_m,nearest_m,farthest_m
     IMG_0001.NEF,0.50,0.48,0.52
     IMG_0002.NEF,0.60
     IMG_0003.NEF,inf
 
-nearest_m and farthest_m say between which distances the true one lies; without them it is taken as exact. Where
-distances count from is said in lens.toml (focus_origin).
+nearest_m and farthest_m say between which distances the true one lies; without them it is taken as exact.
 """
 
 import csv
@@ -46,10 +39,19 @@ from capture.photos.photo_metadata import PhotoMetadata
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.system.errors import InputError
 
+_ORIGINS = ("lens", "film_plane")
+FOCUS_FILE = "focus.csv"
+_NEEDED = ("file", "focus_distance_m")
+_COLUMNS = (*_NEEDED, "nearest_m", "farthest_m")
+LENS_FILE = "lens.toml"
+
 
 @dataclass(frozen=True)
 class StatedFocus:
-    """0 < nearest_m <= distance_m <= farthest_m, inf allowed; all equal where it is exact."""
+    """Focus distance that the user gives, with the interval it stands for.
+
+    0 < nearest_m <= distance_m <= farthest_m, inf allowed; all equal where it is exact.
+    """
 
     distance_m: float
     nearest_m: float
@@ -57,7 +59,7 @@ class StatedFocus:
 
     @classmethod
     def checked(cls, values: Sequence[object], where: str) -> "StatedFocus":
-        """From a distance, or a distance with its nearest and farthest (None: exact); InputError where they cannot be."""
+        """Check a distance, or a distance with its nearest and farthest (None: exact). Raises InputError for impossible values."""
         given = [*values, None, None][:3]
         numbers = [given[0], *(given[0] if each is None else each for each in given[1:])]
         if any(isinstance(each, bool) or not isinstance(each, (int, float)) or math.isnan(each) for each in numbers):
@@ -70,18 +72,126 @@ class StatedFocus:
         return cls(distance_m, nearest_m, farthest_m)
 
     def reading(self, origin: str, source: str) -> FocusReading:
-        return FocusReading(self.distance_m, self.nearest_m, self.farthest_m, origin, f"{source} = {self.distance_m:g} m")
+        return FocusReading(self.distance_m, self.nearest_m, self.farthest_m, origin=origin, source=f"{source} = {self.distance_m:g} m")
 
 
-def _listed(values: Sequence[object]) -> str:
-    return ", ".join(str(each) for each in values if each is not None) or "nothing"
+@dataclass(frozen=True)
+class Sidecar:
+    """Content of a lens.toml and a focus.csv; None and empty mean that they do not say.
+
+    where: the lens.toml; focus_where: the file that the distances come from; both for messages.
+    """
+
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    sensor_width_mm: float | None = None
+    blades: int | None = None
+    blade_rotation_rad: float = 0.0
+    obstruction: float = 0.0
+    focus_origin: str = "lens"
+    hiatus_mm: float = 0.0
+    focus_distances_m: tuple[StatedFocus, ...] | dict[str, StatedFocus] = ()
+    where: str = field(default="", metadata={"key": False})
+    focus_where: str = field(default="", metadata={"key": False})
+
+    @property
+    def aperture(self) -> Aperture:
+        opening = Aperture.disc() if self.blades is None else Aperture.blades(self.blades, self.blade_rotation_rad)
+        return opening.obstructed(self.obstruction)
+
+    def applied(self, names: Sequence[str], metadata: Sequence[PhotoMetadata]) -> list[PhotoMetadata]:
+        """Return the metadata of all photographs of a folder (in the order of their names), with what the sidecar says instead."""
+        focus = self._focus_readings(names)
+        merged = [
+            replace(
+                each,
+                focal_length_mm=self.focal_length_mm or each.focal_length_mm,
+                f_number=self.f_number or each.f_number,
+                hiatus_mm=self.hiatus_mm,
+            )
+            for each in metadata
+        ]
+        return [replace(each, focus=focus[name]) if name in focus else each for name, each in zip(names, merged, strict=True)]
+
+    def unmatched_names(self, names: Sequence[str]) -> list[str]:
+        """Return file names that the focus table speaks of but the folder does not have: likely mistyped."""
+        return sorted(set(self.focus_distances_m) - set(names)) if isinstance(self.focus_distances_m, dict) else []
+
+    def _focus_readings(self, names: Sequence[str]) -> dict[str, FocusReading]:
+        distances_m = self.focus_distances_m
+        if not isinstance(distances_m, dict):
+            if distances_m and len(distances_m) != len(names):
+                raise InputError(
+                    f"{self.focus_where}: focus_distances_m lists {len(distances_m)} distances, but there are {len(names)} photographs "
+                    f"({names[0]} .. {names[-1]}): give one for each, or a table [focus_distances_m] with file names"
+                )
+            distances_m = dict(zip(names, distances_m, strict=False))
+        return {name: stated.reading(self.focus_origin, Path(self.focus_where).name) for name, stated in distances_m.items()}
 
 
-_ORIGINS = ("lens", "film_plane")
+def sidecar_of(folder: Path, top: Path, given: Path | None = None) -> Sidecar:
+    """Return what lens.toml and focus.csv say of the photographs of a folder: the nearest from there upwards to `top`.
+
+    given: the one file to read instead of those of its kind that lie beside the photographs; a lens.toml stands for both.
+    """
+    is_csv = given is not None and given.suffix.lower() == ".csv"
+    toml_path = given if given is not None and not is_csv else find_sidecar(folder, top)
+    csv_path = given if is_csv else find_sidecar(folder, top, FOCUS_FILE) if given is None else None
+    sidecar = read_sidecar(toml_path) if toml_path is not None else Sidecar()
+    if csv_path is None:
+        return sidecar
+    if sidecar.focus_distances_m:
+        raise InputError(f"both {sidecar.where} and {csv_path} state focus distances: delete them from one of the two")
+    return replace(sidecar, focus_distances_m=read_focus_csv(csv_path), focus_where=str(csv_path))
+
+
+def find_sidecar(folder: Path, top: Path, file_name: str = LENS_FILE) -> Path | None:
+    """Return the nearest lens.toml from the folder of the photographs upwards to `top`, the folder that the user named."""
+    folder, top = folder.resolve(), top.resolve()
+    searched = [folder, *(parent for parent in folder.parents if parent == top or top in parent.parents)]
+    return next((each / file_name for each in searched if (each / file_name).is_file()), None)
+
+
+def read_sidecar(path: Path) -> Sidecar:
+    """Read a lens.toml. Raises InputError for unknown keys (naming the known ones) and for impossible values."""
+    try:
+        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"expected a sidecar file at {path}, but there is no such file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}") from None
+    known = [each.name for each in fields(Sidecar) if each.metadata.get("key", True)]
+    unknown = sorted(set(document) - set(known))
+    if unknown:
+        raise InputError(f"{path}: unknown key{'s' if len(unknown) > 1 else ''} {', '.join(unknown)}. Known are {', '.join(known)}")
+    return Sidecar(**{key: checked(key, value, path) for key, value in document.items()}, where=str(path), focus_where=str(path))
+
+
+def read_focus_csv(path: Path) -> dict[str, StatedFocus]:
+    """Return the distances of a focus.csv by file name. Raises InputError naming the line that is wrong."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"expected focus distances in {path}, but there is no such file") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not text in UTF-8: {error}") from None
+    rows = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    names = [name.strip() for name in rows.fieldnames or []]
+    rows.fieldnames = names
+    if not set(_NEEDED) <= set(names) or not set(names) <= set(_COLUMNS):
+        raise InputError(f"{path}: expected a first line {','.join(_COLUMNS)} (the last two may be left out), got {','.join(names)!r}")
+    result: dict[str, StatedFocus] = {}
+    for row in rows:
+        where = f"{path}, line {rows.line_num}"
+        name = (row["file"] or "").strip()
+        if not name or name in result:
+            raise InputError(f"{where}: expected the name of a file that was not named before, got {name!r}")
+        result[name] = StatedFocus.checked([_cell(row.get(column)) for column in _COLUMNS[1:]], where)
+    return result
 
 
 def checked(key: str, value: Any, path: Path) -> Any:
-    """One value in its type, or InputError."""
+    """Return a value of lens.toml in its type. Raises InputError."""
     if key == "focus_origin":
         if value not in _ORIGINS:
             raise InputError(f"{path}: focus_origin must be one of {', '.join(_ORIGINS)}, got {value!r}")
@@ -125,36 +235,8 @@ def _positive(key: str, value: Any, path: Path) -> float:
     return result
 
 
-FOCUS_FILE = "focus.csv"
-_NEEDED = ("file", "focus_distance_m")
-_COLUMNS = (*_NEEDED, "nearest_m", "farthest_m")
-
-
-def read_focus_csv(path: Path) -> dict[str, StatedFocus]:
-    """The distances of a focus.csv by file name. Raises InputError naming the line that is wrong."""
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"expected focus distances in {path}, but there is no such file") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not text in UTF-8: {error}") from None
-    rows = csv.DictReader(text.splitlines(), skipinitialspace=True)
-    names = [name.strip() for name in rows.fieldnames or []]
-    rows.fieldnames = names
-    if not set(_NEEDED) <= set(names) or not set(names) <= set(_COLUMNS):
-        raise InputError(f"{path}: expected a first line {','.join(_COLUMNS)} (the last two may be left out), got {','.join(names)!r}")
-    result: dict[str, StatedFocus] = {}
-    for row in rows:
-        where = f"{path}, line {rows.line_num}"
-        name = (row["file"] or "").strip()
-        if not name or name in result:
-            raise InputError(f"{where}: expected the name of a file that was not named before, got {name!r}")
-        result[name] = StatedFocus.checked([_cell(row.get(column)) for column in _COLUMNS[1:]], where)
-    return result
-
-
 def _cell(text: str | None) -> str | float | None:
-    """A number where it is one, else the text for the message; None for an empty cell."""
+    """Return a number where it is one, else the text for the message; None for an empty cell."""
     stripped = (text or "").strip()
     try:
         return float(stripped) if stripped else None
@@ -162,96 +244,5 @@ def _cell(text: str | None) -> str | float | None:
         return stripped
 
 
-LENS_FILE = "lens.toml"
-
-
-@dataclass(frozen=True)
-class Sidecar:
-    """The content of a lens.toml and a focus.csv; None and empty mean that they do not say.
-
-    where: the lens.toml; focus_where: the file that the distances come from; both for messages.
-    """
-
-    focal_length_mm: float | None = None
-    f_number: float | None = None
-    sensor_width_mm: float | None = None
-    blades: int | None = None
-    blade_rotation_rad: float = 0.0
-    obstruction: float = 0.0
-    focus_origin: str = "lens"
-    hiatus_mm: float = 0.0
-    focus_distances_m: tuple[StatedFocus, ...] | dict[str, StatedFocus] = ()
-    where: str = field(default="", metadata={"key": False})
-    focus_where: str = field(default="", metadata={"key": False})
-
-    @property
-    def aperture(self) -> Aperture:
-        opening = Aperture.disc() if self.blades is None else Aperture.blades(self.blades, self.blade_rotation_rad)
-        return opening.obstructed(self.obstruction)
-
-    def applied(self, names: Sequence[str], metadata: Sequence[PhotoMetadata]) -> list[PhotoMetadata]:
-        """The metadata of all photographs of a folder (in the order of their names), with what the sidecar says instead."""
-        focus = self._focus_readings(names)
-        merged = [
-            replace(
-                each,
-                focal_length_mm=self.focal_length_mm or each.focal_length_mm,
-                f_number=self.f_number or each.f_number,
-                hiatus_mm=self.hiatus_mm,
-            )
-            for each in metadata
-        ]
-        return [replace(each, focus=focus[name]) if name in focus else each for name, each in zip(names, merged, strict=True)]
-
-    def unmatched_names(self, names: Sequence[str]) -> list[str]:
-        """File names that the focus table speaks of but the folder does not have: likely mistyped."""
-        return sorted(set(self.focus_distances_m) - set(names)) if isinstance(self.focus_distances_m, dict) else []
-
-    def _focus_readings(self, names: Sequence[str]) -> dict[str, FocusReading]:
-        distances_m = self.focus_distances_m
-        if not isinstance(distances_m, dict):
-            if distances_m and len(distances_m) != len(names):
-                raise InputError(
-                    f"{self.focus_where}: focus_distances_m lists {len(distances_m)} distances, but there are {len(names)} photographs "
-                    f"({names[0]} .. {names[-1]}): give one for each, or a table [focus_distances_m] with file names"
-                )
-            distances_m = dict(zip(names, distances_m, strict=False))
-        return {name: stated.reading(self.focus_origin, Path(self.focus_where).name) for name, stated in distances_m.items()}
-
-
-def sidecar_of(folder: Path, top: Path, given: Path | None = None) -> Sidecar:
-    """What lens.toml and focus.csv say of the photographs of a folder: the nearest from there upwards to `top`.
-
-    given: the one file to read instead of those of its kind that lie beside the photographs; a lens.toml stands for both.
-    """
-    is_csv = given is not None and given.suffix.lower() == ".csv"
-    toml_path = given if given is not None and not is_csv else find_sidecar(folder, top)
-    csv_path = given if is_csv else find_sidecar(folder, top, FOCUS_FILE) if given is None else None
-    sidecar = read_sidecar(toml_path) if toml_path is not None else Sidecar()
-    if csv_path is None:
-        return sidecar
-    if sidecar.focus_distances_m:
-        raise InputError(f"both {sidecar.where} and {csv_path} state focus distances: delete them from one of the two")
-    return replace(sidecar, focus_distances_m=read_focus_csv(csv_path), focus_where=str(csv_path))
-
-
-def find_sidecar(folder: Path, top: Path, file_name: str = LENS_FILE) -> Path | None:
-    """The nearest lens.toml from the folder of the photographs upwards to `top`, the folder that the user named."""
-    folder, top = folder.resolve(), top.resolve()
-    searched = [folder, *(parent for parent in folder.parents if parent == top or top in parent.parents)]
-    return next((each / file_name for each in searched if (each / file_name).is_file()), None)
-
-
-def read_sidecar(path: Path) -> Sidecar:
-    """A lens.toml. Raises InputError for unknown keys (naming the known ones) and for values that cannot be."""
-    try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"expected a sidecar file at {path}, but there is no such file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}") from None
-    known = [each.name for each in fields(Sidecar) if each.metadata.get("key", True)]
-    unknown = sorted(set(document) - set(known))
-    if unknown:
-        raise InputError(f"{path}: unknown key{'s' if len(unknown) > 1 else ''} {', '.join(unknown)}. Known are {', '.join(known)}")
-    return Sidecar(**{key: checked(key, value, path) for key, value in document.items()}, where=str(path), focus_where=str(path))
+def _listed(values: Sequence[object]) -> str:
+    return ", ".join(str(each) for each in values if each is not None) or "nothing"

@@ -1,3 +1,3 @@
-"""What proves or disproves a focal stack, measured and put on one page."""
+"""Reports on focal stacks: what proves or disproves them, measured and put on one page."""
 
 HTML_NAME = "report.html"

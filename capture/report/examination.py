@@ -1,4 +1,4 @@
-"""One pass over a merged stack: looks at every slice, predicts it, compares, and keeps what gates, pictures and masks need."""
+"""Examination of a merged stack in one pass: looks at every slice, predicts it, compares, and keeps what gates, pictures and masks need."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -48,7 +48,7 @@ Watch = Callable[[int, Rgb, Rgb], None]
 
 
 def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Examination:
-    """Raises InputError where the stack is not merged."""
+    """Examine a stack. watch: is told each slice and its prediction. Raises InputError if the stack is not merged."""
     height, width = view.all_in_focus.shape[:2]
     found, disagreements, saturated, evidence = [], [], [], DepthEvidence()
     picture, places = PictureEvidence(), PlaceEvidence()
@@ -70,15 +70,15 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
     look = picture.look(view.stack.to_rec709(camera_rgb), camera_rgb)
     curve = focus_curve(view.focus_index, view.confidence, len(view))
     findings = StackFindings(
-        view.stack,
-        (width, height),
-        view.full_size_px,
-        tuple(found),
-        curve,
-        None if depth is None else depth.share_beyond(DEPTH_OFF_PX),
-        None if moved is None else float(moved.mean()),
-        look.findings,
-        places.places(view.full_size_px[0] / width),
+        stack=view.stack,
+        size_px=(width, height),
+        full_size_px=view.full_size_px,
+        slices=tuple(found),
+        curve=curve,
+        depth_off_share=None if depth is None else depth.share_beyond(DEPTH_OFF_PX),
+        moving_share=None if moved is None else float(moved.mean()),
+        picture=look.findings,
+        pairs=places.places(view.full_size_px[0] / width),
     )
     return Examination(findings, depth, moved, look)
 
@@ -98,25 +98,27 @@ def _examine_slice(
     evidence.add(remaining, prediction, counted)
     residual, level, per_px = (luminance(each).astype(np.float16) for each in (remaining, prediction.rgb, prediction.per_px))
     findings = SliceFindings(
-        index,
-        gain,
-        saturated,
-        float(counted.mean()),
-        float(np.abs(prediction.coc_px)[counted].max(initial=0.0)),
-        psnr(prediction.rgb, rgb, mask=counted) if counted.any() else None,
-        psnr(view.all_in_focus, rgb, mask=counted) if counted.any() else None,
-        fit,
+        index=index,
+        gain=gain,
+        saturated=saturated,
+        counted=float(counted.mean()),
+        largest_coc_px=float(np.abs(prediction.coc_px)[counted].max(initial=0.0)),
+        psnr_db=psnr(prediction.rgb, rgb, mask=counted) if counted.any() else None,
+        unblurred_db=psnr(view.all_in_focus, rgb, mask=counted) if counted.any() else None,
+        fit=fit,
     )
     return findings, Disagreement(residual, level, per_px, usable & _inside(prediction.coc_px))
 
 
 def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
-    """Three renderings. Cheaper derivatives mislead the fit near the focus, on stacks of 960x640 whose gate is 0.6 px: those at half the
+    """Predict a slice by three renderings.
+
+    Cheaper derivatives mislead the fit near the focus, on stacks of 960x640 whose gate is 0.6 px: those at half the
     resolution by up to 0.4 px of focus, differences to one side by 0.3 px.
     """
     coc_px = view.coc_px(index)
     rgb, less, more = (reblur(view.all_in_focus, coc_px + np.float32(step_px), view.aperture) for step_px in (0.0, -STEP_PX, STEP_PX))
-    return Prediction(rgb, less, more, coc_px, STEP_PX)
+    return Prediction(rgb=rgb, less=less, more=more, coc_px=coc_px, step_px=STEP_PX)
 
 
 def _unlit(disagreement: Disagreement, clipped: Mask, coc_px: Plane) -> Disagreement:
@@ -125,7 +127,7 @@ def _unlit(disagreement: Disagreement, clipped: Mask, coc_px: Plane) -> Disagree
 
 
 def _lit_by(clipped: Mask, coc_px: Plane) -> Mask:
-    """Pixels that get light of clipped ones, whose predicted discs are too dark; discs grow and shrink between slices as if they moved."""
+    """Return pixels that get light of clipped ones: their predicted discs are too dark, and change between slices as if they moved."""
     lit, radii = np.zeros(clipped.shape, bool), 0.5 * np.abs(coc_px)
     for least, largest in pairwise(_DISC_RADII_PX):
         of_these = clipped & (radii >= least) & (radii < largest)
@@ -136,7 +138,7 @@ def _lit_by(clipped: Mask, coc_px: Plane) -> Mask:
 
 
 def _inside(coc_px: Plane) -> Mask:
-    """Pixels that no light from beyond the picture reaches."""
+    """Return pixels that no light from beyond the picture reaches."""
     reach = int(min(0.5 * float(np.abs(coc_px).max()) + 2, _WIDEST_BORDER * min(coc_px.shape)))
     inside = np.zeros(coc_px.shape, bool)
     inside[reach : coc_px.shape[0] - reach, reach : coc_px.shape[1] - reach] = True

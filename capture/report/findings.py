@@ -1,10 +1,6 @@
-"""What was found of a stack, in numbers: all that gates, charts and report.json need.
+"""Findings of a stack, in numbers: all that gates, charts and report.json need, and their JSON.
 
-Where in the stack things are sharp: whether the slices reach from the nearest to the farthest thing.
-
-Whether slices follow one another as they should: in order, none missing, none twice, close enough in dioptres.
-
-Findings of a stack as JSON: with numbers that are read back exactly, or as `report.json` shows them.
+The JSON has numbers that are read back exactly, or as `report.json` shows them.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,14 +19,21 @@ from capture.stacks.slice_files import stated_by_sentinel
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.guessed_metres import STATED_DISTANCE
 
-Plane = Float32[np.ndarray, "height width"]
-
 _TRUSTED = 0.3
+_AT_THE_END = 0.1
+GAP = 1.6
+"""A step larger than this many usual ones means that a slice is missing; a rail or a lens motor steps evenly to a few percent."""
+_SAME = 0.2
+
+Plane = Float32[np.ndarray, "height width"]
+Number = Callable[[float | None], float | str | None]
 
 
 @dataclass(frozen=True)
 class FocusCurve:
-    """shares: of the pixels whose focus can be trusted, how many are sharpest in each slice. trusted: share of pixels that can be.
+    """Sharp pixels over the slices: whether the stack reaches from the nearest to the farthest thing.
+
+    shares: of the pixels whose focus can be trusted, how many are sharpest in each slice. trusted: share of pixels that can be.
     beyond_near, beyond_far: shares of them whose focus lies at the very first and last slice, so that the true one may lie beyond.
     """
 
@@ -40,31 +43,9 @@ class FocusCurve:
     beyond_far: float
 
 
-_AT_THE_END = 0.1
-
-
-def focus_curve(focus_index: Plane, confidence: Plane, slices: int, least_confidence: float = _TRUSTED) -> FocusCurve:
-    trusted = confidence >= least_confidence
-    index = focus_index[trusted]
-    if index.size == 0:
-        return FocusCurve(np.zeros(slices), 0.0, 0.0, 0.0)
-    counts = np.bincount(np.clip(np.round(index), 0, slices - 1).astype(int), minlength=slices)
-    return FocusCurve(
-        counts / index.size,
-        float(trusted.mean()),
-        float((index <= _AT_THE_END).mean()),
-        float((index >= slices - 1 - _AT_THE_END).mean()),
-    )
-
-
-GAP = 1.6
-"""A step larger than this many usual ones means that a slice is missing; a rail or a lens motor steps evenly to a few percent."""
-_SAME = 0.2
-
-
 @dataclass(frozen=True)
 class FocusSpacing:
-    """focus_dioptres: in the order of the slices. usual_step: in dioptres. largest_step: in steps of its neighbours.
+    """Spacing of the slices. focus_dioptres: in the order of the slices. usual_step: in dioptres. largest_step: in steps of its neighbours.
 
     gaps: indices of the slices after which one or more are missing. out_of_order: slices that go back. doubled: slices at the focus of
     the one before.
@@ -82,45 +63,12 @@ class FocusSpacing:
         return not (self.gaps or self.out_of_order or self.doubled)
 
 
-def focus_spacing(focus_distances_m: Sequence[float], known: Bool[np.ndarray, " slices"] | None = None) -> FocusSpacing:
-    """inf is allowed. A stack whose steps grow or shrink steadily is even too: each step is held against its neighbours.
-
-    known: where distances are; steps from and to the others are not judged. None: all of them.
-    """
-    dioptres = 1.0 / np.asarray(focus_distances_m, np.float64)
-    told = np.ones(len(dioptres), bool) if known is None else known
-    steps = np.where(told[1:] & told[:-1], np.diff(dioptres), np.nan)
-    direction = np.sign(_median(steps)) or 1.0
-    sizes = np.abs(steps)
-    usual = _median(sizes)
-    local = np.array([_around(sizes, i, usual) for i in range(len(sizes))])
-    return FocusSpacing(
-        tuple(float(each) for each in dioptres),
-        usual,
-        float(np.nanmax(sizes / np.maximum(local, 1e-12), initial=1.0)),
-        tuple(int(i) for i in np.flatnonzero(sizes > GAP * local)),
-        tuple(int(i) + 1 for i in np.flatnonzero((steps * direction < 0) & (sizes >= _SAME * local))),
-        tuple(int(i) + 1 for i in np.flatnonzero(sizes < _SAME * local)),
-    )
-
-
-def _around(sizes: np.ndarray, index: int, usual: float) -> float:
-    """The median step of up to two neighbours on either side, without the step itself."""
-    near = [sizes[i] for i in range(max(0, index - 2), min(len(sizes), index + 3)) if i != index]
-    return _median(near) if np.isfinite(near).any() else usual
-
-
-def _median(values: Sequence[float] | np.ndarray) -> float:
-    """Return the median of those that are known; 0 where none is."""
-    known = np.asarray(values, np.float64)[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else 0.0
-
-
 @dataclass(frozen=True)
 class SliceFindings:
-    """psnr_db: prediction against slice; unblurred_db: all-in-focus picture against slice (linear, clipped to 1, counted pixels).
+    """Findings of a slice. What has None as its default is so where nothing can be predicted.
 
-    gain: brightness against the all-in-focus picture. What has None as its default is so where nothing can be predicted.
+    psnr_db: prediction against slice; unblurred_db: all-in-focus picture against slice (linear, clipped to 1, counted pixels).
+    gain: brightness against the all-in-focus picture.
     """
 
     index: int
@@ -138,7 +86,7 @@ class StackFindings:
     """Findings of a merged stack at the width of the report.
 
     size_px, full_size_px: width and height of the pictures as examined and as stored. depth_off_share: of the pixels that tell, how many
-    contradict depth by more than `stack_rules.DEPTH_OFF_PX`. moving_share: of the picture. Both are None where nothing can be predicted.
+    contradict depth by more than `gates.DEPTH_OFF_PX`. moving_share: of the picture. Both are None where nothing can be predicted.
     picture: the all-in-focus picture beside its slices, at full size. pairs: how neighbouring slices lie.
     """
 
@@ -158,7 +106,7 @@ class StackFindings:
 
     @cached_property
     def spacing(self) -> FocusSpacing | None:
-        """None where focus distances are not known."""
+        """Return the spacing; None where focus distances are not known."""
         if not self.stack.is_metric:
             return None
         calibrated = np.array([STATED_DISTANCE in each.metadata for each in self.stack.slices], bool)
@@ -167,11 +115,57 @@ class StackFindings:
 
     @cached_property
     def drift(self) -> RegistrationDrift | None:
-        """None where the stack does not say how it was registered."""
+        """Return the movements that registration found; None where the stack does not say how it was registered."""
         return registration_drift(self.stack, *self.full_size_px)
 
 
-Number = Callable[[float | None], float | str | None]
+def focus_curve(focus_index: Plane, confidence: Plane, slices: int, least_confidence: float = _TRUSTED) -> FocusCurve:
+    trusted = confidence >= least_confidence
+    index = focus_index[trusted]
+    if index.size == 0:
+        return FocusCurve(np.zeros(slices), 0.0, 0.0, 0.0)
+    counts = np.bincount(np.clip(np.round(index), 0, slices - 1).astype(int), minlength=slices)
+    return FocusCurve(
+        counts / index.size,
+        float(trusted.mean()),
+        float((index <= _AT_THE_END).mean()),
+        float((index >= slices - 1 - _AT_THE_END).mean()),
+    )
+
+
+def focus_spacing(focus_distances_m: Sequence[float], known: Bool[np.ndarray, " slices"] | None = None) -> FocusSpacing:
+    """Judge whether slices follow one another in order, none missing, none twice, close enough in dioptres (inf is allowed).
+
+    A stack whose steps grow or shrink steadily is even too: each step is compared with its neighbours. known: where distances are; steps
+    from and to the others are not judged. None: all of them.
+    """
+    dioptres = 1.0 / np.asarray(focus_distances_m, np.float64)
+    told = np.ones(len(dioptres), bool) if known is None else known
+    steps = np.where(told[1:] & told[:-1], np.diff(dioptres), np.nan)
+    direction = np.sign(_median(steps)) or 1.0
+    sizes = np.abs(steps)
+    usual = _median(sizes)
+    local = np.array([_around(sizes, i, usual) for i in range(len(sizes))])
+    return FocusSpacing(
+        focus_dioptres=tuple(float(each) for each in dioptres),
+        usual_step=usual,
+        largest_step=float(np.nanmax(sizes / np.maximum(local, 1e-12), initial=1.0)),
+        gaps=tuple(int(i) for i in np.flatnonzero(sizes > GAP * local)),
+        out_of_order=tuple(int(i) + 1 for i in np.flatnonzero((steps * direction < 0) & (sizes >= _SAME * local))),
+        doubled=tuple(int(i) + 1 for i in np.flatnonzero(sizes < _SAME * local)),
+    )
+
+
+def _around(sizes: np.ndarray, index: int, usual: float) -> float:
+    """Return the median step of up to two neighbours on either side, without the step itself."""
+    near = [sizes[i] for i in range(max(0, index - 2), min(len(sizes), index + 3)) if i != index]
+    return _median(near) if np.isfinite(near).any() else usual
+
+
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    """Return the median of those that are known; 0 where none is."""
+    known = np.asarray(values, np.float64)[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 def slice_document(found: SliceFindings, number: Number) -> dict[str, Any]:
@@ -189,7 +183,7 @@ def slice_document(found: SliceFindings, number: Number) -> dict[str, Any]:
 
 
 def findings_document(findings: StackFindings) -> dict[str, Any]:
-    """All but the stack itself."""
+    """Return all findings but the stack itself."""
     curve = findings.curve
     return {
         "size_px": list(findings.size_px),
@@ -204,18 +198,18 @@ def findings_document(findings: StackFindings) -> dict[str, Any]:
 
 
 def findings_from(document: dict[str, Any], stack: FocalStack) -> StackFindings:
-    """What `findings_document` wrote; KeyError, TypeError or ValueError where it did not."""
+    """Read what `findings_document` wrote; KeyError, TypeError or ValueError where it did not."""
     curve, size_px, full_size_px = document["curve"], document["size_px"], document["full_size_px"]
     return StackFindings(
-        stack,
-        (int(size_px[0]), int(size_px[1])),
-        (int(full_size_px[0]), int(full_size_px[1])),
-        tuple(_slice_from(each) for each in document["slices"]),
-        FocusCurve(**curve | {"shares": np.asarray(curve["shares"], np.float64)}),
-        document["depth_off_share"],
-        document["moving_share"],
-        _picture_from(document["picture"]),
-        tuple(_pair_from(each) for each in document["pairs"]),
+        stack=stack,
+        size_px=(int(size_px[0]), int(size_px[1])),
+        full_size_px=(int(full_size_px[0]), int(full_size_px[1])),
+        slices=tuple(_slice_from(each) for each in document["slices"]),
+        curve=FocusCurve(**curve | {"shares": np.asarray(curve["shares"], np.float64)}),
+        depth_off_share=document["depth_off_share"],
+        moving_share=document["moving_share"],
+        picture=_picture_from(document["picture"]),
+        pairs=tuple(_pair_from(each) for each in document["pairs"]),
     )
 
 
@@ -232,7 +226,13 @@ def picture_document(found: PictureFindings, number: Number) -> dict[str, Any]:
 def _picture_from(document: dict[str, Any]) -> PictureFindings:
     width, height = document["seen_px"]
     lost, flat = _number(document["lost_share"]), _number(document["flat_detail"])
-    return PictureFindings(lost, flat, float(document["largest"]), float(document["largest_of_slices"]), (int(width), int(height)))
+    return PictureFindings(
+        lost=lost,
+        flat=flat,
+        top=float(document["largest"]),
+        slices_top=float(document["largest_of_slices"]),
+        seen_px=(int(width), int(height)),
+    )
 
 
 def pair_document(found: NeighbourPlace, number: Number) -> dict[str, Any]:
@@ -251,14 +251,14 @@ def _change_document(change: Change, number: Number) -> dict[str, Any]:
 def _slice_from(document: dict[str, Any]) -> SliceFindings:
     changes = document["changes"]
     return SliceFindings(
-        document["index"],
-        float(document["gain"]),
-        document["saturated_share"],
-        document["counted_share"],
-        document["largest_coc_px"],
-        _number(document["psnr_db"]),
-        _number(document["unblurred_psnr_db"]),
-        None if changes is None else SliceFit(**{name: _change_from(changes[name]) for name in NAMES}),
+        index=document["index"],
+        gain=float(document["gain"]),
+        saturated=document["saturated_share"],
+        counted=document["counted_share"],
+        largest_coc_px=document["largest_coc_px"],
+        psnr_db=_number(document["psnr_db"]),
+        unblurred_db=_number(document["unblurred_psnr_db"]),
+        fit=None if changes is None else SliceFit(**{name: _change_from(changes[name]) for name in NAMES}),
     )
 
 

@@ -1,8 +1,4 @@
-"""Gates: what a stack must reach to be trusted, each with its number, its limit, the reason and the remedy.
-
-Numbers as JSON takes them, which has neither nan nor infinity.
-
-What the gates of one stack ask, and their limits.
+"""Gates: what a stack must reach to be trusted, each with its number, its limit, the reason and the remedy; and the rules for one stack.
 
 Limits were set between what right stacks reach and what faulty ones show (tests/views/test_reblur.py): on traced stacks with truth the
 fit of a right one finds focus within 0.1 px, blur within 1 %, place within 0.03 px and exposure within 0.1 %. A tenth of f-number too
@@ -26,17 +22,17 @@ from capture.report.picture_sharpness import KEPT_DETAIL
 
 
 def exact(value: float | None) -> float | str | None:
-    """Write what is not finite as a word, which `float` reads."""
+    """Write a number for JSON, which has neither nan nor infinity: what is not finite becomes a word that `float` reads."""
     return value if value is None or abs(value) < float("inf") else str(float(value))
 
 
 def finite(value: float | None) -> float | None:
-    """Write null for what is not finite."""
+    """Write a number for JSON: null for what is not finite."""
     return value if value is not None and abs(value) < float("inf") else None
 
 
 class Verdict(StrEnum):
-    """absent: what the gate looks at is not there (yet), which neither passes nor fails."""
+    """Verdict of a gate. absent: what the gate looks at is not there (yet), which neither passes nor fails."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -45,7 +41,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Gate:
-    """One question to a stack or scene.
+    """Answer to one question about a stack or scene.
 
     name: short. where: the stack, or "scene". measured: the number as text with its unit. value: the number, None where absent.
     limit: what was wanted, as text. why: why it matters. advice: what to do where it fails, or to bring about what is absent.
@@ -70,7 +66,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Rule:
-    """What a gate asks of every stack; `judge` makes gates of it."""
+    """Question that a gate asks of every stack; `judge` makes gates of it."""
 
     name: str
     limit: str
@@ -78,11 +74,29 @@ class Rule:
     advice: str
 
     def judge(self, where: str, value: float, measured: str, passed: bool) -> Gate:
-        return Gate(self.name, where, Verdict.PASSED if passed else Verdict.FAILED, measured, value, self.limit, self.why, self.advice)
+        return Gate(
+            name=self.name,
+            where=where,
+            verdict=Verdict.PASSED if passed else Verdict.FAILED,
+            measured=measured,
+            value=value,
+            limit=self.limit,
+            why=self.why,
+            advice=self.advice,
+        )
 
     def absent(self, where: str, missing: str) -> Gate:
-        """missing: what is not there and how to make it."""
-        return Gate(self.name, where, Verdict.ABSENT, missing, None, self.limit, self.why, self.advice)
+        """Return a gate that was not judged. missing: what is not there and how to make it."""
+        return Gate(
+            name=self.name,
+            where=where,
+            verdict=Verdict.ABSENT,
+            measured=missing,
+            value=None,
+            limit=self.limit,
+            why=self.why,
+            advice=self.advice,
+        )
 
 
 def failed(gates: Sequence[Gate]) -> list[Gate]:
@@ -94,7 +108,7 @@ def absent(gates: Sequence[Gate]) -> list[Gate]:
 
 
 def tally(gates: Sequence[Gate]) -> str:
-    """How many were judged, how many of them failed, and the names of those that were not."""
+    """Say how many were judged, how many of them failed, and the names of those that were not."""
     names = absent_names(gates)
     return f"{counts(gates)}: {names}" if names else counts(gates)
 
@@ -105,7 +119,7 @@ def absent_names(gates: Sequence[Gate]) -> str:
 
 
 def verdict_lines(gates: Sequence[Gate]) -> list[str]:
-    """A line for each gate that failed, with what to do, and one for each reason why some were not judged."""
+    """Return a line for each gate that failed, with what to do, and one for each reason why some were not judged."""
     lines = [f"failed: {each.where}: {each.name}: {each.measured} (wanted: {each.limit}). {each.advice}" for each in failed(gates)]
     reasons: dict[str, list[str]] = {}
     for each in absent(gates):

@@ -1,7 +1,4 @@
-"""Pictures of the report as JPEG in memory.
-
-The worst places of a merged picture: crops at 100 % of it and of the slices that it was made from.
-"""
+"""Pictures of the report as JPEG in memory: slices, maps, and the worst places of a merged picture at 100 %."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,10 +17,6 @@ from mrbokeh.images.color import display_rgb8
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.html_page import inline_figure
 
-Rgb = Float32[np.ndarray, "height width 3"]
-Plane = Float32[np.ndarray, "height width"]
-Mask = Bool[np.ndarray, "height width"]
-
 WIDEST_PX = 480
 _QUALITY = 82
 _DIFFERENCE_GAIN = 5.0
@@ -31,11 +24,18 @@ _DEPTH_SPAN_PX = 3.0
 _CROP_QUALITY = 95
 _MOST_CONTRAST = 8.0
 _MARK = (255, 0, 200)
+CROP_PX = 160
+MOST_PLACES = 3
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Crop = Float32[np.ndarray, "crop_height crop_width 3"]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """An encoded picture and what it shows."""
+    """Encoded picture and what it shows."""
 
     jpeg: bytes
     caption: str
@@ -44,8 +44,30 @@ class Shown:
         return inline_figure(self.jpeg, "jpeg", self.caption)
 
 
+@dataclass(frozen=True)
+class Place:
+    """Block to look at. gate: whose. at_px: x, y of its first pixel. text: what is wrong. slices: index, and what it is to the place."""
+
+    gate: str
+    at_px: tuple[int, int]
+    text: str
+    slices: tuple[tuple[int, str], ...]
+
+    @property
+    def caption(self) -> str:
+        return f"x {self.at_px[0]}, y {self.at_px[1]}: {self.text}"
+
+
+@dataclass(frozen=True)
+class ShownPlace:
+    """Place with its crops."""
+
+    place: Place
+    pictures: tuple[Shown, ...]
+
+
 def shown(rgb: Rgb, caption: str) -> Shown:
-    """rgb: linear; shrunk to 480 px in linear light."""
+    """Encode a picture. rgb: linear; shrunk to 480 px in linear light."""
     height, width = rgb.shape[:2]
     if width > WIDEST_PX:
         rgb = cv2.resize(rgb, (WIDEST_PX, round(height * WIDEST_PX / width)), interpolation=cv2.INTER_AREA)
@@ -53,7 +75,7 @@ def shown(rgb: Rgb, caption: str) -> Shown:
 
 
 def slice_triple(index: int, rgb: Rgb, prediction: Rgb) -> list[Shown]:
-    """A slice, its prediction, and their difference."""
+    """Show a slice, its prediction, and their difference."""
     difference = np.clip(0.2 + _DIFFERENCE_GAIN * (rgb - prediction), 0.0, 1.0).astype(np.float32)
     return [
         shown(rgb, f"slice {index}"),
@@ -62,8 +84,25 @@ def slice_triple(index: int, rgb: Rgb, prediction: Rgb) -> list[Shown]:
     ]
 
 
+def stack_maps(view: StackView, moving: Mask | None, depth_off_px: Plane | None) -> list[Shown]:
+    """Show the all-in-focus picture, depth, confidence; what moved and where slices contradict depth, if anybody knows."""
+    pictures = [
+        shown(view.all_in_focus, "all in focus"),
+        shown(depth_picture(view.stack), "depth: near is red, far is blue, grey where it is a guess"),
+        Shown(_coloured(view.confidence, cv2.COLORMAP_VIRIDIS), "confidence of depth: dark is none, yellow is full"),
+    ]
+    if moving is not None:
+        tinted = np.where(moving[..., None], np.array([0.9, 0.05, 0.6]), 0.6 * view.all_in_focus).astype(np.float32)
+        pictures.append(shown(tinted, f"what moved during the stack ({moving.mean():.2%})"))
+    if depth_off_px is not None:
+        level = 0.5 + depth_off_px / (2.0 * _DEPTH_SPAN_PX)
+        caption = f"where slices contradict depth: red and blue are {_DEPTH_SPAN_PX:g} px of blur or more, green is none"
+        pictures.append(Shown(_coloured(level.astype(np.float32), cv2.COLORMAP_JET), caption))
+    return pictures
+
+
 def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *, enhance: bool, overlay: bool) -> list[Shown]:
-    """Crops at 100 %, each with its name; block: x, y and side of a square to be framed in all of them.
+    """Show crops at 100 %, each with its name; block: x, y and side of a square to be framed in all of them.
 
     enhance: raise the contrast of all alike, until what lies around the square in the first fills the range. overlay: add the last two
     crops in red and cyan.
@@ -87,28 +126,32 @@ def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *
     ]
 
 
+def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[NeighbourPlace]) -> list[Place]:
+    """Return up to three places for a gate that fails, one where none does. focus_index: which slice each pixel was taken from."""
+    return [*_lost(look), *_seams(look, focus_index), *_brightest(look), *_farthest_apart(pairs)]
+
+
+def shown_places(stack: FocalStack, picture: Rgb, places: Sequence[Place]) -> list[ShownPlace]:
+    """Cut crops of the all-in-focus picture and of the slices, each of which is read once."""
+    cuts: dict[tuple[int, int], Crop] = {}
+    for index in sorted({index for place in places for index, _ in place.slices}):
+        rgb = stack.slice_rgb(index)
+        for number, place in enumerate(places):
+            cuts[number, index] = _cut(rgb, place.at_px)[0]
+    shown = []
+    for number, place in enumerate(places):
+        crop, inside_px = _cut(picture, place.at_px)
+        named = [("all in focus", crop), *((name, cuts[number, index]) for index, name in place.slices)]
+        pictures = crops_shown(named, (*inside_px, BLOCK_PX), enhance=place.gate == SEAMS.name, overlay=place.gate == PLACES.name)
+        shown.append(ShownPlace(place, tuple(pictures)))
+    return shown
+
+
 def _framed_jpeg(rgb8: np.ndarray, block: tuple[int, int, int]) -> bytes:
-    """Without loss of colour, and with a frame that leaves the square itself free."""
+    """Encode without loss of colour, and with a frame that leaves the square itself free."""
     x, y, side = block
     framed = cv2.rectangle(np.ascontiguousarray(rgb8), (x - 1, y - 1), (x + side, y + side), _MARK, 1)
     return _jpeg(framed, _CROP_QUALITY)
-
-
-def stack_maps(view: StackView, moving: Mask | None, depth_off_px: Plane | None) -> list[Shown]:
-    """All in focus, depth, confidence; what moved and where slices contradict depth, if anybody knows."""
-    pictures = [
-        shown(view.all_in_focus, "all in focus"),
-        shown(depth_picture(view.stack), "depth: near is red, far is blue, grey where it is a guess"),
-        Shown(_coloured(view.confidence, cv2.COLORMAP_VIRIDIS), "confidence of depth: dark is none, yellow is full"),
-    ]
-    if moving is not None:
-        tinted = np.where(moving[..., None], np.array([0.9, 0.05, 0.6]), 0.6 * view.all_in_focus).astype(np.float32)
-        pictures.append(shown(tinted, f"what moved during the stack ({moving.mean():.2%})"))
-    if depth_off_px is not None:
-        level = 0.5 + depth_off_px / (2.0 * _DEPTH_SPAN_PX)
-        caption = f"where slices contradict depth: red and blue are {_DEPTH_SPAN_PX:g} px of blur or more, green is none"
-        pictures.append(Shown(_coloured(level.astype(np.float32), cv2.COLORMAP_JET), caption))
-    return pictures
 
 
 def _coloured(level: Plane, colours: int) -> bytes:
@@ -122,55 +165,6 @@ def _jpeg(rgb8: np.ndarray, quality: int = _QUALITY) -> bytes:
     sampling = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if quality > _QUALITY else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
     return cv2.imencode(".jpg", np.ascontiguousarray(rgb8[..., ::-1]), options)[1].tobytes()
-
-
-Crop = Float32[np.ndarray, "crop_height crop_width 3"]
-
-CROP_PX = 160
-MOST_PLACES = 3
-
-
-@dataclass(frozen=True)
-class Place:
-    """A block to look at. gate: whose. at_px: x, y of its first pixel. text: what is wrong. slices: index, and what it is to the place."""
-
-    gate: str
-    at_px: tuple[int, int]
-    text: str
-    slices: tuple[tuple[int, str], ...]
-
-    @property
-    def caption(self) -> str:
-        return f"x {self.at_px[0]}, y {self.at_px[1]}: {self.text}"
-
-
-@dataclass(frozen=True)
-class ShownPlace:
-    """A place and its crops."""
-
-    place: Place
-    pictures: tuple[Shown, ...]
-
-
-def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[NeighbourPlace]) -> list[Place]:
-    """Up to three places for a gate that fails, one where none does. focus_index: which slice each pixel was taken from."""
-    return [*_lost(look), *_seams(look, focus_index), *_brightest(look), *_farthest_apart(pairs)]
-
-
-def shown_places(stack: FocalStack, picture: Rgb, places: Sequence[Place]) -> list[ShownPlace]:
-    """Crops of the all-in-focus picture and of the slices, each of which is read once."""
-    cuts: dict[tuple[int, int], Crop] = {}
-    for index in sorted({index for place in places for index, _ in place.slices}):
-        rgb = stack.slice_rgb(index)
-        for number, place in enumerate(places):
-            cuts[number, index] = _cut(rgb, place.at_px)[0]
-    shown = []
-    for number, place in enumerate(places):
-        crop, inside_px = _cut(picture, place.at_px)
-        named = [("all in focus", crop), *((name, cuts[number, index]) for index, name in place.slices)]
-        pictures = crops_shown(named, (*inside_px, BLOCK_PX), enhance=place.gate == SEAMS.name, overlay=place.gate == PLACES.name)
-        shown.append(ShownPlace(place, tuple(pictures)))
-    return shown
 
 
 def _lost(look: PictureLook) -> list[Place]:
@@ -203,7 +197,7 @@ def _seams(look: PictureLook, focus_index: Plane) -> list[Place]:
 
 
 def _brightest(look: PictureLook) -> list[Place]:
-    """The largest values of the picture, beside the slice that is brightest there."""
+    """Find the largest values of the picture, beside the slice that is brightest there."""
     too_bright = look.findings.top_ratio > LARGEST_TOP
     places = []
     for row, column in _spread_out(look.brightest, too_bright):
@@ -226,7 +220,7 @@ def _farthest_apart(pairs: Sequence[NeighbourPlace]) -> list[Place]:
 
 
 def _spread_out(badness: Float32[np.ndarray, "rows columns"], failing: bool) -> list[tuple[int, int]]:
-    """Row and column of the worst blocks, no two of them in one crop: three where the gate fails, else one."""
+    """Return row and column of the worst blocks, no two of them in one crop: three where the gate fails, else one."""
     left, found = badness.astype(np.float64), []
     apart = CROP_PX // BLOCK_PX
     for _ in range(MOST_PLACES if failing else 1):
@@ -239,7 +233,7 @@ def _spread_out(badness: Float32[np.ndarray, "rows columns"], failing: bool) -> 
 
 
 def _merged_from(focus_index: Plane, at_px: tuple[int, int]) -> list[int]:
-    """The two slices that most of a block and what lies around it were taken from, or the one."""
+    """Return the two slices that most of a block and what lies around it were taken from, or the one."""
     x, y = at_px
     around = focus_index[max(y - BLOCK_PX // 2, 0) : y + 3 * BLOCK_PX // 2, max(x - BLOCK_PX // 2, 0) : x + 3 * BLOCK_PX // 2]
     indices, counts = np.unique(np.round(around).astype(int), return_counts=True)
@@ -247,7 +241,7 @@ def _merged_from(focus_index: Plane, at_px: tuple[int, int]) -> list[int]:
 
 
 def _cut(rgb: Rgb, at_px: tuple[int, int]) -> tuple[Crop, tuple[int, int]]:
-    """CROP_PX around a block, inside the picture, and x, y of the block in it."""
+    """Return CROP_PX around a block, inside the picture, and x, y of the block in it."""
     height, width = rgb.shape[:2]
     left, top = (
         int(np.clip(corner + BLOCK_PX // 2 - CROP_PX // 2, 0, max(size - CROP_PX, 0)))

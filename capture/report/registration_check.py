@@ -1,10 +1,8 @@
-"""How far neighbouring slices lie off one another, measured in the registered pictures themselves.
+"""Displacements of neighbouring slices, measured in the registered pictures themselves, and movements as registration found them.
 
 Patches that are sharp in both slices are found again by normalised cross-correlation, which blur by an even kernel leaves in place, and
 one similarity is fitted to their displacements (Cauchy's weights). Patches that are blurred in one of the two are left out: where the
 opening is cut off, blurred things move with the focus, and no registration could help that.
-
-How the slices of a stack moved against one another, as registration found it.
 """
 
 import json
@@ -21,11 +19,6 @@ from capture.merging.registration.plane_transforms import Transform, middle_of, 
 from capture.report.picture_sharpness import display_luminance
 from mrbokeh.stacks.focal_stack import FocalStack
 
-Rgb = Float32[np.ndarray, "height width 3"]
-Plane = Float32[np.ndarray, "height width"]
-Mask = Bool[np.ndarray, "height width"]
-Displacements = Float64[np.ndarray, "patches 2"]
-
 HALF_PX, SEARCH_PX = 24, 8
 _BAND_PX = (0.8, 3.0)
 _CELLS = (10, 15)
@@ -38,11 +31,17 @@ _ROUNDS = 20
 _LEAST_SCATTER_PX = 0.05
 _SURELY = 3.0
 """Standard errors by which nothing lies apart by chance."""
+FILE_NAME = "registration.json"
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Displacements = Float64[np.ndarray, "patches 2"]
 
 
 @dataclass(frozen=True)
 class NeighbourPlace:
-    """The place of slice first + 1 against slice first.
+    """Displacement of slice first + 1 against slice first.
 
     off_px: root mean square of the fitted displacements, in pixels of the stored pictures; None where too few patches are sharp in both.
     error_px: its standard error. place_px: x, y of the middle of the patch to look at, in pixels of the stored pictures.
@@ -54,17 +53,17 @@ class NeighbourPlace:
     place_px: tuple[int, int]
 
     def exceeds(self, limit_px: float) -> bool:
-        """Whether they lie farther apart than the limit, and not by chance."""
+        """Return whether they lie farther apart than the limit, and not by chance."""
         return self.off_px is not None and self.off_px > max(limit_px, _SURELY * self.error_px)
 
     def rank(self) -> tuple[bool, float]:
-        """Larger for a pair that is farther apart, above all where that is no chance."""
+        """Return what is larger for a pair that is farther apart, above all where that is no chance."""
         return self.exceeds(0.0), -1.0 if self.off_px is None else self.off_px
 
 
 @dataclass
 class PlaceEvidence:
-    """Takes the slices one after the other, all at one size, and holds two of them at a time."""
+    """Evidence of the slices, taken one after the other, all at one size; two are held at a time."""
 
     _last: tuple[Plane, Mask, Plane] | None = None
     _sharpest: Plane | None = None
@@ -82,10 +81,73 @@ class PlaceEvidence:
         self._last = (fine, usable, energy)
 
     def places(self, stored_per_px: float = 1.0) -> tuple[NeighbourPlace, ...]:
-        """Every pair of neighbours. stored_per_px: how many pixels of the stored pictures a pixel of those added is."""
+        """Return the displacement of every pair of neighbours. stored_per_px: pixels of the stored pictures for each of those added."""
         if self._sharpest is None:
             return ()
         return tuple(_place(index, each, self._sharpest, stored_per_px) for index, each in enumerate(self._pairs))
+
+
+@dataclass(frozen=True)
+class RegistrationDrift:
+    """Movements of slices against the reference.
+
+    shift_px: (N, 2) of the picture's middle, right and down. rotation_rad, magnification: (N,).
+    correlations: of each pair of neighbours, () where they are not known. width_px: of the pictures.
+    residuals_px: how far a corner lies off by the worst pair that a slice was registered with; None where no pair held, () if not known.
+    """
+
+    shift_px: Float[np.ndarray, "slices 2"]
+    rotation_rad: Float[np.ndarray, " slices"]
+    magnification: Float[np.ndarray, " slices"]
+    correlations: tuple[float, ...]
+    width_px: int
+    residuals_px: tuple[float | None, ...] = ()
+
+    @property
+    def largest_jump_px(self) -> float:
+        """Return the largest move between neighbours that a steady drift does not explain: half the second difference of the shift."""
+        if len(self.shift_px) < 3:
+            return 0.0
+        bends = self.shift_px[1:-1] - 0.5 * (self.shift_px[:-2] + self.shift_px[2:])
+        return float(np.hypot(*bends.T).max())
+
+    @property
+    def least_correlation(self) -> float | None:
+        return min(self.correlations) if self.correlations else None
+
+
+def registration_drift(stack: FocalStack, width_px: int, height_px: int) -> RegistrationDrift | None:
+    """Return the movements as registration found them; None where the stack is not registered or does not say how."""
+    found = [each.metadata.get("reference_from_slice") for each in stack.slices]
+    if not stack.registered or any(each is None for each in found):
+        return None
+    document = _document(stack)
+    transforms = [np.asarray(each, np.float64) for each in found]
+    return drift_of(transforms, width_px, height_px, _numbers(document, "correlations"), _numbers(document, "residuals_px"))
+
+
+def drift_of(
+    reference_from_slice: Sequence[Transform],
+    width_px: int,
+    height_px: int,
+    correlations: Sequence[float | None] = (),
+    residuals_px: Sequence[float | None] = (),
+) -> RegistrationDrift:
+    middle = np.array([[0.5 * width_px, 0.5 * height_px], [0.5 * width_px + 1.0, 0.5 * height_px]])
+    ends = np.stack([moved(each, middle) for each in reference_from_slice])
+    shift_px, along = ends[:, 0] - middle[0], ends[:, 1] - ends[:, 0]
+    magnification = np.array([scale_of(each, middle_of((width_px, height_px))) for each in reference_from_slice])
+    rotation_rad = np.arctan2(along[:, 1], along[:, 0])
+    known = [float(each) for each in correlations if each is not None]
+    all_known = tuple(known) if len(known) == len(correlations) else ()
+    return RegistrationDrift(
+        shift_px=shift_px,
+        rotation_rad=rotation_rad,
+        magnification=magnification,
+        correlations=all_known,
+        width_px=width_px,
+        residuals_px=tuple(residuals_px),
+    )
 
 
 @dataclass(frozen=True)
@@ -102,7 +164,7 @@ class _Patches:
 
 
 def _whole_patches(usable: Mask) -> Mask:
-    """Middles of patches that lie within the picture with room to search, and on usable pixels alone."""
+    """Return middles of patches that lie within the picture with room to search, and on usable pixels alone."""
     reach = HALF_PX + SEARCH_PX
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return cv2.erode(usable.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
@@ -174,7 +236,7 @@ def _stored(at: Float64[np.ndarray, "2"], stored_per_px: float) -> tuple[int, in
 
 
 def _fitted(patches: _Patches) -> tuple[Displacements, float]:
-    """The displacements of the similarity that fits the patches best, and the standard error of their root mean square."""
+    """Return the displacements of the similarity that fits the patches best, and the standard error of their root mean square."""
     count = len(patches.at)
     x, y = ((patches.at - 0.5 * np.array(patches.size_px)) / (0.5 * np.hypot(*patches.size_px))).T
     one, none = np.ones(count), np.zeros(count)
@@ -193,64 +255,6 @@ def _fitted(patches: _Patches) -> tuple[Displacements, float]:
     return (columns @ change).reshape(2, count).T, float(np.sqrt(2.0 * variance.mean()))
 
 
-FILE_NAME = "registration.json"
-
-
-@dataclass(frozen=True)
-class RegistrationDrift:
-    """Per slice, against the reference. shift_px: (N, 2) of the picture's middle, right and down. rotation_rad, magnification: (N,).
-
-    correlations: of each pair of neighbours, () where they are not known. width_px: of the pictures.
-    residuals_px: how far a corner lies off by the worst pair that a slice was registered with; None where no pair held, () if not known.
-    """
-
-    shift_px: Float[np.ndarray, "slices 2"]
-    rotation_rad: Float[np.ndarray, " slices"]
-    magnification: Float[np.ndarray, " slices"]
-    correlations: tuple[float, ...]
-    width_px: int
-    residuals_px: tuple[float | None, ...] = ()
-
-    @property
-    def largest_jump_px(self) -> float:
-        """The largest move between neighbours that a steady drift does not explain: half the second difference of the shift."""
-        if len(self.shift_px) < 3:
-            return 0.0
-        bends = self.shift_px[1:-1] - 0.5 * (self.shift_px[:-2] + self.shift_px[2:])
-        return float(np.hypot(*bends.T).max())
-
-    @property
-    def least_correlation(self) -> float | None:
-        return min(self.correlations) if self.correlations else None
-
-
-def registration_drift(stack: FocalStack, width_px: int, height_px: int) -> RegistrationDrift | None:
-    """None where the stack is not registered or does not say how."""
-    found = [each.metadata.get("reference_from_slice") for each in stack.slices]
-    if not stack.registered or any(each is None for each in found):
-        return None
-    document = _document(stack)
-    transforms = [np.asarray(each, np.float64) for each in found]
-    return drift_of(transforms, width_px, height_px, _numbers(document, "correlations"), _numbers(document, "residuals_px"))
-
-
-def drift_of(
-    reference_from_slice: Sequence[Transform],
-    width_px: int,
-    height_px: int,
-    correlations: Sequence[float | None] = (),
-    residuals_px: Sequence[float | None] = (),
-) -> RegistrationDrift:
-    middle = np.array([[0.5 * width_px, 0.5 * height_px], [0.5 * width_px + 1.0, 0.5 * height_px]])
-    ends = np.stack([moved(each, middle) for each in reference_from_slice])
-    shift_px, along = ends[:, 0] - middle[0], ends[:, 1] - ends[:, 0]
-    magnification = np.array([scale_of(each, middle_of((width_px, height_px))) for each in reference_from_slice])
-    rotation_rad = np.arctan2(along[:, 1], along[:, 0])
-    known = [float(each) for each in correlations if each is not None]
-    all_known = tuple(known) if len(known) == len(correlations) else ()
-    return RegistrationDrift(shift_px, rotation_rad, magnification, all_known, width_px, tuple(residuals_px))
-
-
 def _document(stack: FocalStack) -> dict[str, Any]:
     try:
         document = json.loads((stack.folder / FILE_NAME).read_text(encoding="utf-8"))
@@ -260,7 +264,7 @@ def _document(stack: FocalStack) -> dict[str, Any]:
 
 
 def _numbers(document: dict[str, Any], name: str) -> list[float | None]:
-    """A list of numbers or null; empty where the document has none."""
+    """Return a list of numbers or null; empty where the document has none."""
     values = document.get(name)
     if not isinstance(values, list) or not all(each is None or isinstance(each, int | float) for each in values):
         return []

@@ -1,4 +1,4 @@
-"""What was found of a stack, kept in its folder: an interrupted report goes on, and pictures wait on disk until a page is written.
+"""Findings of a stack kept in its folder: an interrupted report goes on, and pictures wait on disk until a page is written.
 
 STACK/report holds found.json, the pictures of the page as JPEG, and moving.png. found.json comes last and names what it was found from.
 """
@@ -33,7 +33,7 @@ VERSION = 3
 
 @dataclass(frozen=True)
 class KeptPicture:
-    """A JPEG file and what it shows."""
+    """JPEG file and what it shows."""
 
     path: Path
     caption: str
@@ -44,7 +44,7 @@ class KeptPicture:
 
 @dataclass(frozen=True)
 class KeptPlace:
-    """A place where the merged picture is worst for a gate. at_px: x, y of the first pixel of a block."""
+    """Place where the merged picture is worst for a gate. at_px: x, y of the first pixel of a block."""
 
     gate: str
     at_px: tuple[int, int]
@@ -62,7 +62,7 @@ class KeptExamination:
     moving_path: Path | None
 
     def moving(self) -> Mask | None:
-        """(H, W) at the width of the report."""
+        """Return (H, W) at the width of the report."""
         if self.moving_path is None:
             return None
         levels = cv2.imread(str(self.moving_path), cv2.IMREAD_GRAYSCALE)
@@ -72,7 +72,7 @@ class KeptExamination:
 
 
 def signature_of(stack: FocalStack, reblur: Reblur, widest_px: int) -> Signature:
-    """Changes when something does that findings depend on."""
+    """Return what changes when something does that findings depend on."""
     names = [STACK_FILE, REGISTRATION_FILE, stack.all_in_focus_path.name, stack.depth_path.name, *(each.path for each in stack.slices)]
     files = {name: _state(stack.folder / name) for name in names}
     return {"version": VERSION, "width_px": widest_px, "renderer": reblur.identity, "files": files}
@@ -81,7 +81,7 @@ def signature_of(stack: FocalStack, reblur: Reblur, widest_px: int) -> Signature
 def keep(
     stack: FocalStack, signature: Signature, examination: Examination, pictures: Sequence[Shown], places: Sequence[ShownPlace]
 ) -> KeptExamination:
-    """signature: taken before the stack was examined. Replaces what was kept before."""
+    """Write what was found, in place of what was kept before. signature: taken before the stack was examined."""
     folder = stack.folder / FOLDER
     _forget(folder)
     listed = _written(folder, "picture", pictures)
@@ -103,7 +103,7 @@ def keep(
 
 
 def kept(stack: FocalStack, signature: Signature) -> KeptExamination | None:
-    """None where nothing is kept that was found in just this way; what cannot be read, or misses a picture, is found again."""
+    """Return what was found in just this way, else None; what cannot be read, or misses a picture, is found again."""
     path = stack.folder / FOLDER / JSON_NAME
     try:
         document = read_json(path, "the findings of a stack")
@@ -132,7 +132,7 @@ def _pictures_from(listed: list[dict[str, Any]], folder: Path) -> tuple[KeptPict
 
 
 def _written(folder: Path, name: str, pictures: Sequence[Shown]) -> list[dict[str, Any]]:
-    """Files and captions of what was written."""
+    """Write pictures and return their files and captions."""
     listed = [{"file": f"{name}_{number:02d}.jpg", "caption": each.caption} for number, each in enumerate(pictures)]
     for entry, each in zip(listed, pictures, strict=True):
         _write(folder / entry["file"], each.jpeg)
@@ -140,13 +140,13 @@ def _written(folder: Path, name: str, pictures: Sequence[Shown]) -> list[dict[st
 
 
 def _forget(folder: Path) -> None:
-    """found.json first, so that it never stands beside pictures that are not its own."""
+    """Delete found.json first, so that it never stands beside pictures that are not its own."""
     for path in (folder / JSON_NAME, folder / MOVING_NAME, *folder.glob("picture_*.jpg")):
         path.unlink(missing_ok=True)
 
 
 def _state(path: Path) -> list[int] | None:
-    """Size and time of a file; None where there is none."""
+    """Return size and time of a file; None where there is none."""
     if not path.is_file():
         return None
     status = path.stat()

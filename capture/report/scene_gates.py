@@ -1,4 +1,4 @@
-"""The gates of a whole scene: viewpoints placed, points consistent, and two scales that agree."""
+"""Gates of a whole scene: viewpoints placed, points consistent, and two scales that agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,14 +47,14 @@ SCENE_RULES = (MERGED, PLACED, REPROJECTION, SCALES)
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """model and scales are None where they are not there; scales: metres per unit by method."""
+    """Camera poses of a scene; model and scales are None where they are not there. scales: metres per unit by method."""
 
     model: SparseModel | None
     scales: dict[str, float] | None
 
     @property
     def disagreement(self) -> float | None:
-        """The largest ratio of two scales, minus 1; None where there are not two."""
+        """Return the largest ratio of two scales, minus 1; None where there are not two."""
         if self.scales is None or len(self.scales) < 2:
             return None
         return max(self.scales.values()) / min(self.scales.values()) - 1.0
@@ -68,7 +68,7 @@ def read_reconstruction(scene: Path) -> Reconstruction:
 
 
 def scales_in(document: dict[str, Any]) -> dict[str, float]:
-    """Every method's answer, or the one that is used."""
+    """Return every method's answer, or the one that is used."""
     answers = document.get("answers", [])
     entries = answers.values() if isinstance(answers, dict) else answers
     found = {str(each["method"]): float(each["metres_per_unit"]) for each in entries if isinstance(each, dict)}

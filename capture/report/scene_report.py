@@ -1,11 +1,4 @@
-"""`report.html` and `report.json` of a scene.
-
-Cameras and points in 3D: a canvas that is turned by mouse or finger, without any library.
-
-`report.html`: the whole report as one page.
-
-`--strict`: which gates make a command fail, and which absent ones the user allows.
-"""
+"""`mrbokeh capture report`: report.html and report.json of a scene, and which of its gates make `--strict` fail."""
 
 import html
 import json
@@ -36,46 +29,6 @@ from mrbokeh.system.html_page import cell, section, table, write_page
 
 MOST_POINTS = 4000
 _CORNERS = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
-
-
-def poses_view(model: SparseModel) -> str:
-    """HTML of the view. Lengths are in metres where the scale is known, else in the model's unit."""
-    data = json.dumps(scene_of(model), separators=(",", ":")).replace("</", "<\\/")
-    return (
-        f'<canvas id="poses" width="900" height="520" style="touch-action:none;background:#14171c;border-radius:6px"></canvas>'
-        f'<p class="muted">Drag to turn, wheel or two fingers to zoom, double click to start over.</p>'
-        f'<script type="application/json" id="poses-data">{data}</script><script>{_SCRIPT}</script>'
-    )
-
-
-def scene_of(model: SparseModel) -> dict[str, Any]:
-    """What the canvas draws, about the median point: cameras as a centre and four corners of the picture, and some of the points."""
-    model = model.scaled() if model.metres_per_unit is not None else model
-    centres = np.array([each.centre for each in model.views]).reshape(-1, 3)
-    points = (
-        model.points[np.linspace(0, len(model.points) - 1, min(len(model.points), MOST_POINTS)).astype(int)]
-        if len(model.points)
-        else model.points
-    )
-    everything = np.concatenate([centres, points])
-    middle = np.median(everything, axis=0) if len(everything) else np.zeros(3)
-    reach = float(np.percentile(np.linalg.norm(everything - middle, axis=1), 90)) if len(everything) else 1.0
-    size = 0.12 * max(reach, 1e-9)
-    return {
-        "unit": "m" if model.metres_per_unit is not None else "units",
-        "reach": max(reach, 1e-9),
-        "cameras": [_camera(each, middle, size) for each in model.views],
-        "points": np.round((points - middle) / max(reach, 1e-9), 4).ravel().tolist(),
-    }
-
-
-def _camera(view: SparseView, middle: np.ndarray, size: float) -> dict[str, Any]:
-    camera = view.camera
-    corners_px = np.array(_CORNERS) * [camera.width_px, camera.height_px]
-    corners = camera.unproject(corners_px, np.full(4, size))
-    return {"name": view.name, "centre": (view.centre - middle).tolist(), "corners": (corners - middle).tolist()}
-
-
 _SCRIPT = """
 (() => {
   const data = JSON.parse(document.getElementById('poses-data').textContent), canvas = document.getElementById('poses');
@@ -128,8 +81,6 @@ _SCRIPT = """
   draw();
 })();
 """
-
-
 MOST_WITH_PICTURES = 12
 _STYLE = """
 details { margin: 1rem 0; border-top: 1px solid #ddd; padding-top: .6rem; } summary { cursor: pointer; padding: .3rem 0; }
@@ -144,10 +95,15 @@ details { margin: 1rem 0; border-top: 1px solid #ddd; padding-top: .6rem; } summ
   .gates td.wanted::before { content: "wanted: "; } .gates td.why { color: #667; font-size: 13px; }
 }
 """
+JSON_NAME = "report.json"
+FORMAT, VERSION = "mrbokeh-capture-report", 2
+GATE_NAMES = tuple(each.name for each in (*SCENE_RULES, *STACK_RULES))
 
 
 @dataclass(frozen=True)
 class SceneReport:
+    """Report of a scene."""
+
     scene: Path
     gates: tuple[Gate, ...]
     stacks: tuple[ExaminedStack, ...]
@@ -163,7 +119,7 @@ class SceneReport:
 
     @property
     def passed(self) -> bool:
-        """No gate failed, and those that look at the all-in-focus picture were judged, in every stack."""
+        """Return whether no gate failed, and those that look at the all-in-focus picture were judged, in every stack."""
         looked_at = all(
             any(gate.name == rule.name and gate.verdict is Verdict.PASSED for gate in each.gates)
             for each in self.stacks
@@ -172,8 +128,117 @@ class SceneReport:
         return bool(self.stacks) and looked_at and not self.failures
 
 
+def report_scene(scene: Path, reblur: Reblur | None = None, widest_px: int = DEFAULT_WIDTH_PX, *, overwrite: bool = False) -> SceneReport:
+    """Examine every merged stack; writes report.html, report.json and each stack's exclusion.exr. Stacks not merged fail a gate.
+
+    What was found of a stack is kept in its folder and used again while nothing changed that it depends on, unless overwrite is set.
+    """
+    stacks = find_focal_stacks(scene)
+    reconstruction = read_reconstruction(scene)
+    examined = [examine_stack(stack, reblur or Reblur(), widest_px, overwrite=overwrite) for stack in stacks if stack.merged]
+    gates = (merged_gate(stacks), *scene_gates(reconstruction), *(gate for each in examined for gate in each.gates))
+    report = SceneReport(scene, gates, tuple(examined), reconstruction)
+    write_json(scene / JSON_NAME, report_document(report))
+    write_html(report)
+    return report
+
+
+def examine_stack(stack: FocalStack, reblur: Reblur, widest_px: int, *, overwrite: bool = False) -> ExaminedStack:
+    """Return findings, gates and pictures of a merged stack, found now or before; its exclusion.exr is made fresh."""
+    signature = signature_of(stack, reblur, widest_px)
+    found = None if overwrite else kept(stack, signature)
+    reused = found is not None
+    if found is None:
+        view = StackView(stack, widest_px)
+        examination, pictures = _examine(view, reblur)
+        write_exclusions(stack, exclusion_masks(stack, examination.moving))
+        found = keep(stack, signature, examination, pictures, _places(view, examination))
+    elif not has_fresh_exclusions(stack):
+        write_exclusions(stack, exclusion_masks(stack, found.moving()))
+    return ExaminedStack(
+        findings=found.findings, gates=stack_gates(found.findings), pictures=found.pictures, places=found.places, reused=reused
+    )
+
+
+def _places(view: StackView, examination: Examination) -> list[ShownPlace]:
+    look = examination.look
+    return shown_places(view.stack, look.picture, worst_places(look, view.stack.focus_index(), examination.findings.pairs))
+
+
+def _examine(view: StackView, reblur: Reblur) -> tuple[Examination, list[Shown]]:
+    """Examine a stack, and keep pictures of it as a whole, then three each of some slices."""
+    triples: dict[int, list[Shown]] = {}
+
+    def watch(index: int, rgb: Any, prediction: Any) -> None:
+        triples[index] = slice_triple(index, rgb, prediction)
+
+    examination = examine(view, reblur, watch)
+    depth_off_px = None if examination.depth is None else examination.depth.off_px
+    of_slices = [picture for index in shown_slices(examination.findings) for picture in triples.get(index, [])]
+    return examination, [*stack_maps(view, examination.moving, depth_off_px), *of_slices]
+
+
+def shown_slices(findings: StackFindings) -> list[int]:
+    """Return the nearest, a middle, the farthest and the worst one."""
+    count = len(findings.slices)
+    known = [each for each in findings.slices if each.psnr_db is not None]
+    worst = [min(known, key=lambda each: each.psnr_db or 0.0).index] if known else []
+    return sorted({0, count // 2, count - 1, *worst})
+
+
+def require_gates(allow_absent: Sequence[str], strict: bool) -> tuple[str, ...]:
+    """Return the names of gates as the report writes them. Raises InputError for a name that is none, and if nothing is strict."""
+    if allow_absent and not strict:
+        raise InputError(
+            "--allow-absent says which gates --strict may leave unjudged, but --strict is not given: add it, or leave both out"
+        )
+    known = {name.casefold(): name for name in GATE_NAMES}
+    for name in allow_absent:
+        if name.strip().casefold() not in known:
+            listed = ", ".join(f'"{each}"' for each in GATE_NAMES)
+            raise InputError(f'--allow-absent "{name}": expected the name of a gate as the report shows it: {listed}')
+    return tuple(known[name.strip().casefold()] for name in allow_absent)
+
+
+def unmet(report: SceneReport, allowed: Sequence[str]) -> list[Gate]:
+    """Return gates that failed, and those that could not be judged although nobody allowed that."""
+    return [*report.failures, *(each for each in report.absences if each.name not in allowed)]
+
+
+def report_document(report: SceneReport) -> dict[str, Any]:
+    """Return what machines read: every gate, and the numbers of every slice."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "made_by": f"mrbokeh {__version__}",
+        "passed": report.passed,
+        "judged": len(report.gates) - len(report.absences),
+        "failed": len(report.failures),
+        "absent": len(report.absences),
+        "gates": [each.as_json() for each in report.gates],
+        "scales_metres_per_unit": report.reconstruction.scales,
+        "stacks": {each.findings.name: _stack_document(each) for each in report.stacks},
+    }
+
+
+def _stack_document(examined: ExaminedStack) -> dict[str, Any]:
+    findings, drift = examined.findings, examined.findings.drift
+    return {
+        "examined_width_px": findings.size_px[0],
+        "moving_share": findings.moving_share,
+        "sharp_shares": findings.curve.shares.tolist(),
+        "registration_shift_px": None if drift is None else drift.shift_px.tolist(),
+        "registration_magnification": None if drift is None else drift.magnification.tolist(),
+        "registration_residuals_px": None if drift is None else list(drift.residuals_px),
+        "picture": picture_document(findings.picture, finite),
+        "neighbours": [pair_document(each, finite) for each in findings.pairs],
+        "worst_places": [{"gate": each.gate, "at_px": list(each.at_px), "what": each.caption} for each in examined.places],
+        "slices": [slice_document(each, finite) for each in findings.slices],
+    }
+
+
 def write_html(report: SceneReport) -> None:
-    """One file in the folder of the scene, with all pictures inside."""
+    """Write one file in the folder of the scene, with all pictures inside."""
     failures = report.failures
     kind = "missed" if failures else "met" if report.passed else "muted"
     unseen = "" if failures or report.passed else " Not passed: not all gates of the all-in-focus pictures could be judged."
@@ -207,115 +272,42 @@ def _stack_sections(stacks: Sequence[ExaminedStack]) -> list[str]:
     return [stack_section(each, with_pictures=rank < MOST_WITH_PICTURES) for rank, each in enumerate(ranked)]
 
 
-JSON_NAME = "report.json"
-FORMAT, VERSION = "mrbokeh-capture-report", 2
+def poses_view(model: SparseModel) -> str:
+    """Return HTML of cameras and points in 3D: a canvas that is turned by mouse or finger, without any library.
 
-
-def report_scene(scene: Path, reblur: Reblur | None = None, widest_px: int = DEFAULT_WIDTH_PX, *, overwrite: bool = False) -> SceneReport:
-    """Examine every merged stack; writes report.html, report.json and each stack's exclusion.exr. Stacks not merged fail a gate.
-
-    What was found of a stack is kept in its folder and used again while nothing changed that it depends on, unless overwrite is set.
+    Lengths are in metres where the scale is known, else in the model's unit.
     """
-    stacks = find_focal_stacks(scene)
-    reconstruction = read_reconstruction(scene)
-    examined = [examine_stack(stack, reblur or Reblur(), widest_px, overwrite=overwrite) for stack in stacks if stack.merged]
-    gates = (merged_gate(stacks), *scene_gates(reconstruction), *(gate for each in examined for gate in each.gates))
-    report = SceneReport(scene, gates, tuple(examined), reconstruction)
-    write_json(scene / JSON_NAME, report_document(report))
-    write_html(report)
-    return report
+    data = json.dumps(scene_of(model), separators=(",", ":")).replace("</", "<\\/")
+    return (
+        f'<canvas id="poses" width="900" height="520" style="touch-action:none;background:#14171c;border-radius:6px"></canvas>'
+        f'<p class="muted">Drag to turn, wheel or two fingers to zoom, double click to start over.</p>'
+        f'<script type="application/json" id="poses-data">{data}</script><script>{_SCRIPT}</script>'
+    )
 
 
-def examine_stack(stack: FocalStack, reblur: Reblur, widest_px: int, *, overwrite: bool = False) -> ExaminedStack:
-    """Findings, gates and pictures of a merged stack, found now or before; sees to it that its exclusion.exr is fresh."""
-    signature = signature_of(stack, reblur, widest_px)
-    found = None if overwrite else kept(stack, signature)
-    reused = found is not None
-    if found is None:
-        view = StackView(stack, widest_px)
-        examination, pictures = _examine(view, reblur)
-        write_exclusions(stack, exclusion_masks(stack, examination.moving))
-        found = keep(stack, signature, examination, pictures, _places(view, examination))
-    elif not has_fresh_exclusions(stack):
-        write_exclusions(stack, exclusion_masks(stack, found.moving()))
-    return ExaminedStack(found.findings, stack_gates(found.findings), found.pictures, found.places, reused)
-
-
-def _places(view: StackView, examination: Examination) -> list[ShownPlace]:
-    look = examination.look
-    return shown_places(view.stack, look.picture, worst_places(look, view.stack.focus_index(), examination.findings.pairs))
-
-
-def _examine(view: StackView, reblur: Reblur) -> tuple[Examination, list[Shown]]:
-    """Examine a stack, and keep pictures of it as a whole, then three each of some slices."""
-    triples: dict[int, list[Shown]] = {}
-
-    def watch(index: int, rgb: Any, prediction: Any) -> None:
-        triples[index] = slice_triple(index, rgb, prediction)
-
-    examination = examine(view, reblur, watch)
-    depth_off_px = None if examination.depth is None else examination.depth.off_px
-    of_slices = [picture for index in shown_slices(examination.findings) for picture in triples.get(index, [])]
-    return examination, [*stack_maps(view, examination.moving, depth_off_px), *of_slices]
-
-
-def shown_slices(findings: StackFindings) -> list[int]:
-    """The nearest, a middle, the farthest and the worst one."""
-    count = len(findings.slices)
-    known = [each for each in findings.slices if each.psnr_db is not None]
-    worst = [min(known, key=lambda each: each.psnr_db or 0.0).index] if known else []
-    return sorted({0, count // 2, count - 1, *worst})
-
-
-def report_document(report: SceneReport) -> dict[str, Any]:
-    """What machines read: every gate, and the numbers of every slice."""
+def scene_of(model: SparseModel) -> dict[str, Any]:
+    """Return what the canvas draws, about the median point: cameras as a centre and four corners of the picture, and some of the points."""
+    model = model.scaled() if model.metres_per_unit is not None else model
+    centres = np.array([each.centre for each in model.views]).reshape(-1, 3)
+    points = (
+        model.points[np.linspace(0, len(model.points) - 1, min(len(model.points), MOST_POINTS)).astype(int)]
+        if len(model.points)
+        else model.points
+    )
+    everything = np.concatenate([centres, points])
+    middle = np.median(everything, axis=0) if len(everything) else np.zeros(3)
+    reach = float(np.percentile(np.linalg.norm(everything - middle, axis=1), 90)) if len(everything) else 1.0
+    size = 0.12 * max(reach, 1e-9)
     return {
-        "format": FORMAT,
-        "version": VERSION,
-        "made_by": f"mrbokeh {__version__}",
-        "passed": report.passed,
-        "judged": len(report.gates) - len(report.absences),
-        "failed": len(report.failures),
-        "absent": len(report.absences),
-        "gates": [each.as_json() for each in report.gates],
-        "scales_metres_per_unit": report.reconstruction.scales,
-        "stacks": {each.findings.name: _stack_document(each) for each in report.stacks},
+        "unit": "m" if model.metres_per_unit is not None else "units",
+        "reach": max(reach, 1e-9),
+        "cameras": [_camera(each, middle, size) for each in model.views],
+        "points": np.round((points - middle) / max(reach, 1e-9), 4).ravel().tolist(),
     }
 
 
-def _stack_document(examined: ExaminedStack) -> dict[str, Any]:
-    findings, drift = examined.findings, examined.findings.drift
-    return {
-        "examined_width_px": findings.size_px[0],
-        "moving_share": findings.moving_share,
-        "sharp_shares": findings.curve.shares.tolist(),
-        "registration_shift_px": None if drift is None else drift.shift_px.tolist(),
-        "registration_magnification": None if drift is None else drift.magnification.tolist(),
-        "registration_residuals_px": None if drift is None else list(drift.residuals_px),
-        "picture": picture_document(findings.picture, finite),
-        "neighbours": [pair_document(each, finite) for each in findings.pairs],
-        "worst_places": [{"gate": each.gate, "at_px": list(each.at_px), "what": each.caption} for each in examined.places],
-        "slices": [slice_document(each, finite) for each in findings.slices],
-    }
-
-
-GATE_NAMES = tuple(each.name for each in (*SCENE_RULES, *STACK_RULES))
-
-
-def require_gates(allow_absent: Sequence[str], strict: bool) -> tuple[str, ...]:
-    """Names of gates as the report writes them. Raises InputError for a name that is none, and where nothing is strict."""
-    if allow_absent and not strict:
-        raise InputError(
-            "--allow-absent says which gates --strict may leave unjudged, but --strict is not given: add it, or leave both out"
-        )
-    known = {name.casefold(): name for name in GATE_NAMES}
-    for name in allow_absent:
-        if name.strip().casefold() not in known:
-            listed = ", ".join(f'"{each}"' for each in GATE_NAMES)
-            raise InputError(f'--allow-absent "{name}": expected the name of a gate as the report shows it: {listed}')
-    return tuple(known[name.strip().casefold()] for name in allow_absent)
-
-
-def unmet(report: SceneReport, allowed: Sequence[str]) -> list[Gate]:
-    """Gates that failed, and those that could not be judged although nobody allowed that."""
-    return [*report.failures, *(each for each in report.absences if each.name not in allowed)]
+def _camera(view: SparseView, middle: np.ndarray, size: float) -> dict[str, Any]:
+    camera = view.camera
+    corners_px = np.array(_CORNERS) * [camera.width_px, camera.height_px]
+    corners = camera.unproject(corners_px, np.full(4, size))
+    return {"name": view.name, "centre": (view.centre - middle).tolist(), "corners": (corners - middle).tolist()}

@@ -1,7 +1,4 @@
-"""The gates of one stack; stack_rules says what they ask and why.
-
-Gates that need neither lens nor focus distances: the all-in-focus picture beside its slices, and the slices beside one another.
-"""
+"""Gates of one stack; `capture.report.gates` says what they ask and why."""
 
 from collections.abc import Callable, Sequence
 
@@ -57,6 +54,25 @@ from capture.report.slice_fit import Change
 from mrbokeh.stacks.guessed_metres import metres_facts
 
 
+def stack_gates(findings: StackFindings) -> list[Gate]:
+    """Judge a stack; its gates come in the order in which to read them, those that need neither lens nor focus distances first."""
+    return [
+        *picture_gates(findings),
+        _spacing(findings),
+        _range(findings),
+        _texture(findings),
+        _registration(findings),
+        _saturation(findings),
+        _exposure(findings),
+        _residual(findings),
+        _focus(findings),
+        _blur(findings),
+        _place(findings),
+        _depth(findings),
+        _motion(findings),
+    ]
+
+
 def picture_gates(findings: StackFindings) -> list[Gate]:
     return [_sharp(findings), _seams(findings), _light(findings), _places(findings)]
 
@@ -85,14 +101,14 @@ def _light(findings: StackFindings) -> Gate:
 
 
 def largest_supported(findings: StackFindings) -> float:
-    """The largest value that the flux of discs in the slices speaks for, as merging left it in the metadata; 0 where it left none."""
+    """Return the largest value that the flux of discs in the slices supports, as merging left it in the metadata; 0 where it left none."""
     drawn = findings.stack.metadata.get(HIGHLIGHTS)
     value = drawn.get("largest_supported") if isinstance(drawn, dict) else None
     return float(value) if isinstance(value, int | float) else 0.0
 
 
 def _places(findings: StackFindings) -> Gate:
-    """Pairs of neighbours as they lie, else as the registration left them; those that nobody measured are named."""
+    """Judge pairs of neighbours as they lie, else as the registration left them; those that nobody measured are named."""
     if not findings.pairs:
         return PLACES.absent(findings.name, "there are no neighbouring slices to compare: photograph more than one")
     width_px = findings.full_size_px[0]
@@ -132,25 +148,6 @@ def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourPlac
         if each not in measured and None not in both:
             known[each.first] = min(float(value or 0.0) for value in both)
     return known
-
-
-def stack_gates(findings: StackFindings) -> list[Gate]:
-    """Judge a stack; its gates come in the order in which to read them."""
-    return [
-        *picture_gates(findings),
-        _spacing(findings),
-        _range(findings),
-        _texture(findings),
-        _registration(findings),
-        _saturation(findings),
-        _exposure(findings),
-        _residual(findings),
-        _focus(findings),
-        _blur(findings),
-        _place(findings),
-        _depth(findings),
-        _motion(findings),
-    ]
 
 
 def _spacing(findings: StackFindings) -> Gate:
@@ -237,7 +234,7 @@ def _blur(findings: StackFindings) -> Gate:
 
 
 def mean_change(changes: list[Change], floor: float = 0.02) -> Change:
-    """Weighted by certainty; floor: what a slice is off by itself, so that a very sure one does not decide alone."""
+    """Average changes by certainty. floor: what a slice is off by itself, so that a very sure one does not decide alone."""
     weights = np.array([1.0 / (each.error**2 + floor**2) for each in changes])
     values = np.array([each.value for each in changes])
     return Change(float((weights * values).sum() / weights.sum()), float(weights.sum() ** -0.5))
@@ -277,7 +274,7 @@ def _motion(findings: StackFindings) -> Gate:
 
 
 def _worst(rule: Rule, findings: StackFindings, change_of: Callable[..., Change], limit: float, text: Callable[[float], str]) -> Gate:
-    """The slice that exceeds a limit farthest; else the one with the largest number that is known."""
+    """Judge the slice that exceeds a limit farthest; else the one with the largest number that is known."""
     known = _known(findings, change_of)
     if not known:
         return rule.absent(findings.name, NO_PREDICTION)
@@ -286,11 +283,11 @@ def _worst(rule: Rule, findings: StackFindings, change_of: Callable[..., Change]
 
 
 def _solved_or_stated(findings: StackFindings, solved: Rule, stated: Rule) -> Rule:
-    """The rule for what merging solved from the slices, or for what files state."""
+    """Return the rule for what merging solved from the slices, or for what files state."""
     return solved if metres_facts(findings.stack) else stated
 
 
 def _known(findings: StackFindings, change_of: Callable[..., Change]) -> list[tuple[int, Change]]:
-    """Changes that the slices tell, each with the number of its slice."""
+    """Return changes that the slices tell, each with the number of its slice."""
     changes = [(each.index, change_of(each.fit)) for each in findings.slices if each.fit is not None]
     return [pair for pair in changes if np.isfinite(pair[1].error)]

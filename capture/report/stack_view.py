@@ -1,6 +1,7 @@
-"""A merged stack as the report looks at it: registered pictures at a bounded width, read one at a time.
+"""View of a merged stack for the report: registered pictures at a bounded width, read one at a time, and predictions of its slices.
 
-Re-blur: the all-in-focus picture through the circles of confusion of a slice. Where stack, depth and lens are right, it is the slice.
+A slice is predicted by re-blurring: the all-in-focus picture through its circles of confusion. Where stack, depth and lens are right, the
+prediction is the slice.
 """
 
 from collections.abc import Callable
@@ -21,17 +22,18 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.focal_stack import FocalStack
 
+DEFAULT_WIDTH_PX = 960
+_UNTOUCHED = 0.999
+_LEAST_PX = 1e-3
+
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 
-DEFAULT_WIDTH_PX = 960
-_UNTOUCHED = 0.999
-
 
 @dataclass(frozen=True)
 class StoredSlice:
-    """A slice as its file has it: in Rec.709, in the RGB of the file, and its masks."""
+    """Slice as its file has it: in Rec.709, in the RGB of the file, and its masks."""
 
     rgb: Rgb
     camera_rgb: Rgb
@@ -57,7 +59,7 @@ class StackView:
         return self._shrunk(self.stack.all_in_focus())
 
     def stored(self, index: int) -> "StoredSlice":
-        """A slice at the size of its file. The last one that was asked for is held."""
+        """Return a slice at the size of its file. The last one that was asked for is held."""
         return self._read(index)
 
     def slice_rgb(self, index: int) -> Rgb:
@@ -92,19 +94,19 @@ class StackView:
 
     @cached_property
     def full_size_px(self) -> tuple[int, int]:
-        """Width and height of the pictures as they are stored."""
+        """Return width and height of the pictures as they are stored."""
         height, width = self.stack.depth_confidence().shape
         return width, height
 
     @cached_property
     def dioptres(self) -> Plane:
-        """1 / metres. Raises InputError where focus distances are unknown."""
+        """Return 1 / metres. Raises InputError if focus distances are unknown."""
         depth_m = self._sampled(self.stack.depth_m())
         return (1.0 / np.maximum(depth_m, 1e-3)).astype(np.float32)
 
     @cached_property
     def optics(self) -> SliceOptics:
-        """Blur in pixels of these pictures. Raises InputError where the lens or a focus distance is unknown."""
+        """Return the blur in pixels of these pictures. Raises InputError if the lens or a focus distance is unknown."""
         return SliceOptics.of_stack(self.stack, self.width_px)
 
     @property
@@ -112,7 +114,7 @@ class StackView:
         return self.optics.aperture
 
     def coc_px(self, index: int) -> Plane:
-        """Signed diameters, in pixels of these pictures."""
+        """Return signed diameters, in pixels of these pictures."""
         return self.optics.coc_px(index, self.dioptres)
 
     @cached_property
@@ -121,7 +123,7 @@ class StackView:
 
     @property
     def is_explained(self) -> bool:
-        """Whether there is all that a prediction of the slices needs."""
+        """Return whether there is all that a prediction of the slices needs."""
         return self.stack.merged and self.stack.registered and self.stack.is_metric and self.stack.lens is not None
 
     def _shrunk(self, picture: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
@@ -136,17 +138,14 @@ class StackView:
         return plane if size is None else cv2.resize(plane, size, interpolation=cv2.INTER_NEAREST).astype(np.float32)
 
     def _size(self, picture: np.ndarray) -> tuple[int, int] | None:
-        """(width, height) to shrink to, None where the picture is small enough."""
+        """Return (width, height) to shrink to, None where the picture is small enough."""
         height, width = picture.shape[:2]
         return None if width <= self.widest_px else (self.widest_px, round(height * self.widest_px / width))
 
 
-_LEAST_PX = 1e-3
-
-
 @dataclass(frozen=True)
 class Reblur:
-    """Predicts slices by a renderer of mrbokeh, occlusion and hidden background as it does them.
+    """Prediction of slices by a renderer of mrbokeh, with its occlusion and hidden background.
 
     name: what the user calls the renderer, which tells whether predictions that are kept would come out the same; "" for its repr.
     """
@@ -159,7 +158,7 @@ class Reblur:
         return self.name or repr(self.renderer)
 
     def __call__(self, all_in_focus: Rgb, coc_px: Plane, aperture: Aperture) -> Rgb:
-        """coc_px: signed diameters, in pixels of the picture."""
+        """Blur a picture. coc_px: signed diameters, in pixels of the picture."""
         largest_px = float(np.abs(coc_px).max(initial=0.0))
         if largest_px < _LEAST_PX:
             return all_in_focus
@@ -179,12 +178,18 @@ def reblur_by(name: str) -> Reblur:
 
 
 def lens_with_growth(px_per_dioptre: float, width_px: int, aperture: Aperture) -> Lens:
-    """A lens focused at 1 m whose circle of confusion grows so fast: renderers take depth and lens, and maps come without either."""
-    lens = Lens(50.0, 2.0, 1.0, 36.0, aperture)
-    return Lens(50.0, 2.0, 1.0, 36.0 * lens.coc_px_per_dioptre(width_px) / px_per_dioptre, aperture)
+    """Return a lens focused at 1 m whose circle of confusion grows so fast: renderers take depth and lens, and maps come without either."""
+    lens = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=1.0, sensor_width_mm=36.0, aperture=aperture)
+    return Lens(
+        focal_length_mm=50.0,
+        f_number=2.0,
+        focus_distance_m=1.0,
+        sensor_width_mm=36.0 * lens.coc_px_per_dioptre(width_px) / px_per_dioptre,
+        aperture=aperture,
+    )
 
 
 def depth_with(coc_px: Plane, lens: Lens) -> Plane:
-    """(H, W) metres at which the lens has these diameters, none of which is larger than its growth per dioptre."""
+    """Return (H, W) metres at which the lens has these diameters, none of which is larger than its growth per dioptre."""
     dioptres = 1.0 / lens.focus_distance_m - coc_px.astype(np.float64) / lens.coc_px_per_dioptre(coc_px.shape[1])
     return (1.0 / dioptres).astype(np.float32)

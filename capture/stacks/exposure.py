@@ -1,19 +1,16 @@
 """Exposure differences within a focal stack and between the stacks of a scene, from what defocus leaves alone: the light of large areas.
 
-One gain between two pictures of a scene, fitted together with the scale and the shift between them.
-
 Blur moves light around but conserves it, so that heavily blurred slices differ by focus breathing (a small scale and
 shift) and by one gain. Both are fitted together, or breathing would pass for exposure: log R(A x + t) = log S(x) + log g,
 Gauss-Newton with Tukey's weights on pictures 96 px long, over the centre only, since vignetting changes with focus and blur
 brings in light from outside at the borders.
-
-The gain that brings a stack to the exposure of its session: as metadata state it, else as the pictures of both overlap.
 """
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
@@ -37,11 +34,16 @@ _LEAST_SPREAD = 1e-3
 _FEWEST_PIXELS = 200
 _TINY = 1e-9
 _PULL = (1e-4, 1e-4, 1e-4)
+_DEAD_ZONE = 0.01
+_RESIDUAL_LIMIT = 1.26
+_UNSTATED_LIMIT = 2.0
+_LARGEST_SPREAD = 0.08
+_OVERLAP_DEAD_ZONE = 0.03
 
 
 @dataclass(frozen=True)
 class LowFrequency:
-    """A slice reduced to large areas. luminance: (h, w) linear, positive; usable: (h, w) neither saturated nor black."""
+    """Slice reduced to large areas. luminance: (h, w) linear, positive; usable: (h, w) neither saturated nor black."""
 
     luminance: Float32[np.ndarray, "h w"]
     usable: Bool[np.ndarray, "h w"]
@@ -49,8 +51,9 @@ class LowFrequency:
 
 @dataclass(frozen=True)
 class GainFit:
-    """gain: brings the slice's light to the reference's. log_scale, shift (a share of half the long side): between the pictures.
+    """Fit of one gain between two pictures, with the scale and the shift between them.
 
+    gain: brings the slice's light to the reference's. shift: a share of half the long side.
     spread: what is left of the difference, as the standard deviation (by the median) of the logarithm of light.
     likeness: correlation of the logarithms of both where they overlap, 1 for the same scene however bright.
     """
@@ -62,132 +65,9 @@ class GainFit:
     likeness: float
 
 
-def low_frequency(
-    rgb: Float32[np.ndarray, "height width 3"],
-    saturated: Float32[np.ndarray, "height width"] | Bool[np.ndarray, "height width"],
-    rec709_from_camera: Matrix3x3 | None = None,
-) -> LowFrequency:
-    """Area averages of a slice on a grid LONG_SIDE_PX long, and which of them are free of saturated photosites.
-
-    rec709_from_camera: from the RGB of the slice, None where that is Rec.709.
-    """
-    import cv2
-
-    scale = LONG_SIDE_PX / max(rgb.shape[:2])
-    size = max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale))
-    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    light = luminance(small if rec709_from_camera is None else convert(small, np.array(rec709_from_camera)))
-    full = cv2.resize(saturated.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    # What is saturated here is spread over its neighbours in the other slices.
-    full = cv2.dilate(full, np.ones((5, 5), np.uint8))
-    floor = max(1e-3 * float(np.median(light)), 1e-7)
-    return LowFrequency(np.maximum(light, floor), (full <= _LARGEST_SATURATED_SHARE) & (light > floor))
-
-
-def fit_gain(reference: LowFrequency, slice_: LowFrequency) -> GainFit | None:
-    """The gain between two pictures, or None where too little of both is usable."""
-    if reference.luminance.shape != slice_.luminance.shape:
-        return None
-    parameters, spread, likeness = np.zeros(4), 0.0, 0.0
-    for sigma_px, smallest_step in _STAGES:
-        for _ in range(_STEPS):
-            found = _gauss_newton_step(reference, slice_, parameters, sigma_px)
-            if found is None:
-                return None
-            step, spread, likeness = found
-            parameters = parameters + step
-            parameters[1] = np.clip(parameters[1], -LARGEST_SCALE_CHANGE, LARGEST_SCALE_CHANGE)
-            if np.abs(step).max() < smallest_step:
-                break
-    return GainFit(float(np.exp(parameters[0])), float(parameters[1]), spread, float(np.hypot(*parameters[2:])), likeness)
-
-
-def _gauss_newton_step(
-    reference: LowFrequency, slice_: LowFrequency, parameters: Float64[np.ndarray, "4"], sigma_px: float
-) -> tuple[Float64[np.ndarray, "4"], float, float] | None:
-    """One weighted step for (log gain, log scale, shift x, shift y); the spread and the likeness before it.
-
-    Shifts are shares of half the long side.
-    """
-    light, usable, x, y = _breathed(reference, parameters)
-    mask = (usable & slice_.usable).astype(np.float64)
-    share = _blurred(mask, sigma_px)
-    inside = (np.hypot(x / np.abs(x).max(), y / np.abs(y).max()) < _CENTRE_RADIUS) & (share > 0.5) & (mask > 0)
-    if np.count_nonzero(inside) < _FEWEST_PIXELS:
-        return None
-    # Both are averaged over the same usable pixels, so that a saturated lamp in one is missing in both.
-    reference_light, slice_light = (_blurred(each * mask, sigma_px) / np.maximum(share, 1e-6) for each in (light, slice_.luminance))
-    reference_log, slice_log = np.log(np.maximum(reference_light, _TINY)), np.log(np.maximum(slice_light, _TINY))
-    slope_y, slope_x = np.gradient(reference_log, y[1, 0] - y[0, 0], x[0, 1] - x[0, 0])
-    jacobian = np.stack([np.full_like(x, -1.0), slope_x * x + slope_y * y, slope_x, slope_y], axis=-1)[inside]
-    error = (reference_log - slice_log)[inside] - parameters[0]
-    # Flare and a wrong black level matter most in the dark.
-    trust = slice_light[inside] / (slice_light[inside] + 0.1 * np.median(slice_light[inside]))
-    likeness = correlation(reference_log[inside], slice_log[inside])
-    return _weighted_solution(jacobian, -error, trust * _tukey(error)), _spread(error), likeness
-
-
-def correlation(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> float:
-    """Pearson's; 0 where one of them does not vary."""
-    first, second = first - first.mean(), second - second.mean()
-    scale = math.sqrt(float(first @ first) * float(second @ second))
-    return float(first @ second) / scale if scale > _TINY else 0.0
-
-
-def _breathed(
-    low: LowFrequency, parameters: Float64[np.ndarray, "4"]
-) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-    """(light, usable) scaled and shifted, and the grid (x, y) from the centre in units of half the long side."""
-    import cv2
-
-    height, width = low.luminance.shape
-    half = max(height, width) / 2.0
-    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2.0) / half, (np.arange(height) + 0.5 - height / 2.0) / half)
-    scale = math.exp(parameters[1])
-    map_x = ((x * scale + parameters[2]) * half + width / 2.0 - 0.5).astype(np.float32)
-    map_y = ((y * scale + parameters[3]) * half + height / 2.0 - 0.5).astype(np.float32)
-    light = cv2.remap(low.luminance, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    usable = cv2.remap(low.usable.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return light.astype(np.float64), usable > 0.99, x, y
-
-
-def _blurred(values: Float[np.ndarray, "h w"], sigma_px: float) -> Float64[np.ndarray, "h w"]:
-    """Nothing lies outside. By OpenCV, which takes a tenth of SciPy's time for pictures so small."""
-    import cv2
-
-    side = 2 * round(4.0 * sigma_px) + 1
-    return cv2.GaussianBlur(np.asarray(values, np.float64), (side, side), sigma_px, borderType=cv2.BORDER_CONSTANT)
-
-
-def _spread(error: Float64[np.ndarray, " n"]) -> float:
-    return _MAD_TO_SIGMA * float(np.median(np.abs(error - np.median(error))))
-
-
-def _tukey(error: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Tukey's biweight around the median: what lies far off (moving things, spread highlights) counts nothing."""
-    spread = max(_spread(error), _LEAST_SPREAD)
-    return np.clip(1.0 - ((error - np.median(error)) / (_TUKEY * spread)) ** 2, 0.0, None) ** 2
-
-
-def _weighted_solution(
-    jacobian: Float64[np.ndarray, "n 4"], target: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
-) -> Float64[np.ndarray, "4"]:
-    """Least squares with a slight pull of scale and shift towards no change, for pictures without structure."""
-    normal = jacobian.T @ (jacobian * weights[:, None])
-    normal[np.diag_indices(4)] += weights.sum() * np.array([0.0, *_PULL])
-    return np.linalg.solve(normal, jacobian.T @ (target * weights))
-
-
-_DEAD_ZONE = 0.01
-_RESIDUAL_LIMIT = 1.26
-_UNSTATED_LIMIT = 2.0
-_LARGEST_SPREAD = 0.08
-_OVERLAP_DEAD_ZONE = 0.03
-
-
 @dataclass(frozen=True)
 class ExposureGain:
-    """The factor that brings a slice to the exposure of the session.
+    """Gain that brings a slice to the exposure of the session.
 
     session: brings the reference of the stack there, 1 where neither metadata nor pictures tell.
     The others bring the slice to that reference. session_from: what told: "metadata", "overlap" (pictures) or "nothing".
@@ -207,12 +87,12 @@ class ExposureGain:
 
     @property
     def was_limited(self) -> bool:
-        """More was measured than applied, by more than the error of measurement."""
+        """Return whether more was measured than applied, by more than the error of measurement."""
         return self.measured is not None and abs(math.log(self.measured / self.residual)) > math.log1p(_DEAD_ZONE)
 
 
 def evened_out(reference: LowFrequency, slice_: LowFrequency, stated: float | None) -> ExposureGain:
-    """The gain to apply. stated: the ratio of exposures according to metadata, or None where they do not tell.
+    """Return the gain to apply. stated: the ratio of exposures according to metadata, or None where they do not tell.
 
     Of the measured rest, what lies within the error of measurement (1 %) is not applied; and no more than a third of
     a stop where metadata spoke, one stop where it did not: beyond that the pictures show different things.
@@ -227,13 +107,13 @@ def evened_out(reference: LowFrequency, slice_: LowFrequency, stated: float | No
 
 
 def measure_gain(reference: LowFrequency, slice_: LowFrequency) -> float | None:
-    """The gain g that brings the slice's light to the reference's, or None where too little of both is usable."""
+    """Return the gain that brings the slice's light to the reference's, or None where too little of both is usable."""
     fit = fit_gain(reference, slice_)
     return None if fit is None else fit.gain
 
 
 def overlap_gain(reference: LowFrequency, other: LowFrequency) -> float | None:
-    """The gain between two viewpoints of a scene whose files state no exposure; None where they show too different things.
+    """Return the gain between two viewpoints of a scene whose files state no exposure; None where they show too different things.
 
     Parallax is no blur: it is trusted only where little is left once gain, scale and shift are taken out. On traced views of
     equal exposure that is so in 6 of 10 pairs, off by 1 % at most; the other four would be off by 9 to 16 %.
@@ -262,8 +142,124 @@ def gain_to_session(decoded: DecodedPhoto, light: LowFrequency, stated: float | 
     return ExposureGain(session_from="nothing") if measured is None else ExposureGain(session=measured, session_from="overlap")
 
 
+def low_frequency(
+    rgb: Float32[np.ndarray, "height width 3"],
+    saturated: Float32[np.ndarray, "height width"] | Bool[np.ndarray, "height width"],
+    rec709_from_camera: Matrix3x3 | None = None,
+) -> LowFrequency:
+    """Return area averages of a slice on a grid LONG_SIDE_PX long, and which of them are free of saturated photosites.
+
+    rec709_from_camera: from the RGB of the slice, None where that is Rec.709.
+    """
+    scale = LONG_SIDE_PX / max(rgb.shape[:2])
+    size = max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale))
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    light = luminance(small if rec709_from_camera is None else convert(small, np.array(rec709_from_camera)))
+    full = cv2.resize(saturated.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    # What is saturated here is spread over its neighbours in the other slices.
+    full = cv2.dilate(full, np.ones((5, 5), np.uint8))
+    floor = max(1e-3 * float(np.median(light)), 1e-7)
+    return LowFrequency(np.maximum(light, floor), (full <= _LARGEST_SATURATED_SHARE) & (light > floor))
+
+
+def fit_gain(reference: LowFrequency, slice_: LowFrequency) -> GainFit | None:
+    """Fit the gain between two pictures; None where too little of both is usable."""
+    if reference.luminance.shape != slice_.luminance.shape:
+        return None
+    parameters, spread, likeness = np.zeros(4), 0.0, 0.0
+    for sigma_px, smallest_step in _STAGES:
+        for _ in range(_STEPS):
+            found = _gauss_newton_step(reference, slice_, parameters, sigma_px)
+            if found is None:
+                return None
+            step, spread, likeness = found
+            parameters = parameters + step
+            parameters[1] = np.clip(parameters[1], -LARGEST_SCALE_CHANGE, LARGEST_SCALE_CHANGE)
+            if np.abs(step).max() < smallest_step:
+                break
+    return GainFit(
+        gain=float(np.exp(parameters[0])),
+        log_scale=float(parameters[1]),
+        spread=spread,
+        shift=float(np.hypot(*parameters[2:])),
+        likeness=likeness,
+    )
+
+
+def correlation(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> float:
+    """Return Pearson's correlation; 0 where one of them does not vary."""
+    first, second = first - first.mean(), second - second.mean()
+    scale = math.sqrt(float(first @ first) * float(second @ second))
+    return float(first @ second) / scale if scale > _TINY else 0.0
+
+
+def _gauss_newton_step(
+    reference: LowFrequency, slice_: LowFrequency, parameters: Float64[np.ndarray, "4"], sigma_px: float
+) -> tuple[Float64[np.ndarray, "4"], float, float] | None:
+    """Return one weighted step for (log gain, log scale, shift x, shift y), and the spread and the likeness before it.
+
+    Shifts are shares of half the long side.
+    """
+    light, usable, x, y = _breathed(reference, parameters)
+    mask = (usable & slice_.usable).astype(np.float64)
+    share = _blurred(mask, sigma_px)
+    inside = (np.hypot(x / np.abs(x).max(), y / np.abs(y).max()) < _CENTRE_RADIUS) & (share > 0.5) & (mask > 0)
+    if np.count_nonzero(inside) < _FEWEST_PIXELS:
+        return None
+    # Both are averaged over the same usable pixels, so that a saturated lamp in one is missing in both.
+    reference_light, slice_light = (_blurred(each * mask, sigma_px) / np.maximum(share, 1e-6) for each in (light, slice_.luminance))
+    reference_log, slice_log = np.log(np.maximum(reference_light, _TINY)), np.log(np.maximum(slice_light, _TINY))
+    slope_y, slope_x = np.gradient(reference_log, y[1, 0] - y[0, 0], x[0, 1] - x[0, 0])
+    jacobian = np.stack([np.full_like(x, -1.0), slope_x * x + slope_y * y, slope_x, slope_y], axis=-1)[inside]
+    error = (reference_log - slice_log)[inside] - parameters[0]
+    # Flare and a wrong black level matter most in the dark.
+    trust = slice_light[inside] / (slice_light[inside] + 0.1 * np.median(slice_light[inside]))
+    likeness = correlation(reference_log[inside], slice_log[inside])
+    return _weighted_solution(jacobian, -error, trust * _tukey(error)), _spread(error), likeness
+
+
+def _breathed(
+    low: LowFrequency, parameters: Float64[np.ndarray, "4"]
+) -> tuple[Float64[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
+    """Return (light, usable) scaled and shifted, and the grid (x, y) from the centre in units of half the long side."""
+    height, width = low.luminance.shape
+    half = max(height, width) / 2.0
+    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2.0) / half, (np.arange(height) + 0.5 - height / 2.0) / half)
+    scale = math.exp(parameters[1])
+    map_x = ((x * scale + parameters[2]) * half + width / 2.0 - 0.5).astype(np.float32)
+    map_y = ((y * scale + parameters[3]) * half + height / 2.0 - 0.5).astype(np.float32)
+    light = cv2.remap(low.luminance, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    usable = cv2.remap(low.usable.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return light.astype(np.float64), usable > 0.99, x, y
+
+
+def _blurred(values: Float[np.ndarray, "h w"], sigma_px: float) -> Float64[np.ndarray, "h w"]:
+    """Blur, with nothing outside. OpenCV takes a tenth of SciPy's time for pictures so small."""
+    side = 2 * round(4.0 * sigma_px) + 1
+    return cv2.GaussianBlur(np.asarray(values, np.float64), (side, side), sigma_px, borderType=cv2.BORDER_CONSTANT)
+
+
+def _spread(error: Float64[np.ndarray, " n"]) -> float:
+    return _MAD_TO_SIGMA * float(np.median(np.abs(error - np.median(error))))
+
+
+def _tukey(error: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Return Tukey's biweight around the median: what lies far off (moving things, spread highlights) counts nothing."""
+    spread = max(_spread(error), _LEAST_SPREAD)
+    return np.clip(1.0 - ((error - np.median(error)) / (_TUKEY * spread)) ** 2, 0.0, None) ** 2
+
+
+def _weighted_solution(
+    jacobian: Float64[np.ndarray, "n 4"], target: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, "4"]:
+    """Solve by least squares with a slight pull of scale and shift towards no change, for pictures without structure."""
+    normal = jacobian.T @ (jacobian * weights[:, None])
+    normal[np.diag_indices(4)] += weights.sum() * np.array([0.0, *_PULL])
+    return np.linalg.solve(normal, jacobian.T @ (target * weights))
+
+
 def _light_of_stack(folder: Path) -> LowFrequency | None:
-    """The large areas of a stack's first slice; None where it is not there (any more)."""
+    """Return the large areas of a stack's first slice; None where it is not there (any more)."""
     try:
         stack = read_focal_stack(folder)
         path = stack.folder / stack.slices[0].metadata.get("ingested", stack.slices[0].path)

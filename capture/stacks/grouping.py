@@ -28,7 +28,7 @@ class Grouping(StrEnum):
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph with its shooting data, the sidecar's word already taken into account."""
+    """Photograph with its shooting data, what the sidecar says already taken into account."""
 
     path: Path
     metadata: PhotoMetadata
@@ -41,7 +41,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class PhotoGroup:
-    """The photographs of one stack, in the order of their names, and the name that the stack gets.
+    """Photographs of one stack, in the order of their names, and the name that the stack gets.
 
     aside: of other cameras; taken only where the others cannot be used. remarks: what a reader of the stack should know.
     """
@@ -74,7 +74,7 @@ def group_photos(folders: Sequence[tuple[str, Sequence[Photo]]], grouping: Group
 
 
 def split_at_pauses(photos: Sequence[Photo]) -> list[list[Photo]]:
-    """A new stack after a pause of at least 20 s that is also five times as long as the usual one."""
+    """Begin a new stack after a pause of at least 20 s that is also five times as long as the usual one."""
     times = [photo.metadata.taken_at for photo in photos]
     unknown = [photo.path.name for photo, time in zip(photos, times, strict=True) if time is None]
     if unknown:
@@ -89,7 +89,7 @@ def split_at_pauses(photos: Sequence[Photo]) -> list[list[Photo]]:
 
 
 def split_into_sweeps(photos: Sequence[Photo]) -> list[list[Photo]]:
-    """A new stack where the focus turns back: a sweep goes one way, near to far or far to near; standing still is no turn."""
+    """Begin a new stack where the focus turns back: a sweep goes one way, near to far or far to near; standing still is no turn."""
     distances_m = [photo.focus_distance_m for photo in photos]
     unknown = [photo.path.name for photo, distance in zip(photos, distances_m, strict=True) if distance is None]
     if unknown:
@@ -109,14 +109,14 @@ def split_into_sweeps(photos: Sequence[Photo]) -> list[list[Photo]]:
 
 
 def in_focus_order(photos: Sequence[Photo]) -> list[Photo]:
-    """Nearest focus first where every distance is known, else as they come."""
+    """Sort nearest focus first where every distance is known, else leave the order."""
     if any(photo.focus_distance_m is None for photo in photos):
         return list(photos)
     return sorted(photos, key=lambda photo: photo.focus_distance_m or 0.0)
 
 
 def by_camera(group: PhotoGroup) -> list[PhotoGroup]:
-    """A stack for each camera that took two photographs or more, since cameras share neither lens nor exposure.
+    """Make a stack for each camera that took two photographs or more, since cameras share neither lens nor exposure.
 
     The one that took most keeps the name of the group, and what belongs to no stack lies aside in it: single photographs of other cameras,
     and developed pictures that name no camera where most do (typically a merged result beside its sources). RAW without a name stays: it
@@ -170,7 +170,7 @@ def _cut(photos: Sequence[Photo], cuts: Sequence[bool]) -> list[list[Photo]]:
 
 
 def _with_unique_names(groups: list[PhotoGroup]) -> list[PhotoGroup]:
-    """Folders of the same name in different places get a number."""
+    """Number the folders of the same name in different places."""
     seen: dict[str, int] = {}
     result = []
     for group in groups:

@@ -32,7 +32,10 @@ from mrbokeh.system.errors import InputError
 
 @dataclass(frozen=True)
 class IngestSettings:
-    """grouping: what makes a stack. sidecar: a lens.toml or focus.csv for all photographs instead of those beside them."""
+    """Settings of a call.
+
+    grouping: what makes a stack. sidecar: a lens.toml or focus.csv for all photographs, in place of those beside them.
+    """
 
     grouping: Grouping = Grouping.folder
     development: Development = field(default_factory=Development)
@@ -42,7 +45,7 @@ class IngestSettings:
 
 @dataclass(frozen=True)
 class IngestReport:
-    """All stacks of a call, and the files that belong to none. no_photographs: what else lies beside the photographs."""
+    """Stacks of a call, and the files that belong to none. no_photographs: what else lies beside the photographs."""
 
     stacks: tuple[StackReport, ...]
     skipped: tuple[SkippedFile, ...]
@@ -76,7 +79,7 @@ def _ingested(given: Sequence[Path], scene: Path, settings: IngestSettings) -> I
 
 
 def photos_of_folder(folder: PhotoFolder, sidecar_path: Path | None = None, advance: Callable[[], None] = lambda: None) -> list[Photo]:
-    """The photographs of a folder with their shooting data, lens.toml and focus.csv taken into account."""
+    """Return the photographs of a folder with their shooting data, lens.toml and focus.csv taken into account."""
     sidecar = sidecar_of(folder.folder, folder.top, sidecar_path)
     found = zip(folder.paths, read_metadata_of(folder.paths, advance), strict=True)
     metadata = [own.filled_from(read_raw_metadata(photo)) if is_raw(photo) else own for photo, own in found]
@@ -110,7 +113,7 @@ def ingest_group(group: PhotoGroup, session: Session, settings: IngestSettings, 
 def _developed(
     group: PhotoGroup, choice: CameraChoice, session: Session, settings: IngestSettings, advance: Callable[[], None] = lambda: None
 ) -> StackWork:
-    """All photographs of a group that can be developed."""
+    """Develop all photographs of a group that can be developed."""
     work = stack_work(session.scene / group.name, settings.development, choice, overwrite=settings.overwrite)
     work.remarks = group.remarks
     for photo in in_focus_order(group.photos):
@@ -120,7 +123,7 @@ def _developed(
 
 
 def _of_what_lies_aside(group: PhotoGroup, unusable: StackWork, session: Session, settings: IngestSettings) -> StackWork:
-    """A stack of what other cameras took, where too little of the usual one's photographs can be used."""
+    """Make a stack of what other cameras took, where too little of the usual one's photographs can be used."""
     unusable.give_up()
     left_out = [SkippedFile(each.photo.path, "too few photographs of its camera can be used") for each in unusable.finished]
     remark = f"{len(group.aside)} photographs of other cameras are taken, because too few of the usual one's can be used"
@@ -132,7 +135,7 @@ def _of_what_lies_aside(group: PhotoGroup, unusable: StackWork, session: Session
 
 
 def _without_their_raw(skipped: Sequence[SkippedFile], reports: Sequence[StackReport]) -> list[SkippedFile]:
-    """A picture beside RAW that turned out to be unusable might be wanted after all: it is not taken, but it is said."""
+    """Tell how to take a picture beside RAW that turned out to be unusable: it might be wanted after all."""
     unusable = {each.path.resolve() for report in reports for each in report.skipped}
     return [
         replace(each, reason=f"{each.reason} but cannot be used: copy {each.raw.name} again, or move it elsewhere to take this one")
@@ -154,7 +157,7 @@ _MOST_NAMED = 5
 
 
 def print_report(report: IngestReport, console: Console) -> None:
-    """One line for each stack, then remarks and skipped files with their reasons."""
+    """Print one line for each stack, then remarks and skipped files with their reasons."""
     table = Table("stack", "slices", "size", "focus (from the lens)", "lens", "skipped")
     for each in report.stacks:
         table.add_row(*_cells(each))
@@ -177,7 +180,7 @@ def _some_names(paths: Sequence[Path]) -> str:
 
 
 def focus_text(stack: FocalStack) -> str:
-    """The range of focus distances: "0.4 .. 2.1 m", "... inf", "unknown"."""
+    """Return the range of focus distances: "0.4 .. 2.1 m", "... inf", "unknown"."""
     known = [distance for distance in stack.focus_distances_m if distance is not None]
     if not known:
         return "unknown"

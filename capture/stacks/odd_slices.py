@@ -1,4 +1,4 @@
-"""Which photographs do not belong among the slices of a stack: of another size, blown, twice the same, of another scene; in words."""
+"""Photographs that do not belong among the slices of a stack: of another size, blown, twice the same, of another scene."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ Odd = dict[int, str]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A developed photograph that might become a slice."""
+    """Developed photograph that might become a slice."""
 
     photo: Photo
     look: SliceLook
@@ -90,9 +90,9 @@ def strangers(candidates: Sequence[Candidate]) -> Odd:
 
 
 def _scenes(looks: Sequence[SliceLook]) -> list[list[int]]:
-    """Indices of what hangs together: first each with the one before it, then what that leaves apart with some of every other scene.
+    """Return indices that hang together: first each with the one before it, then what that leaves apart with some of every other scene.
 
-    Many scenes are not asked: that is a folder of stacks, not a stack with one or two strangers.
+    Many scenes are not compared: that is a folder of stacks, not a stack with one or two strangers.
     """
     scenes: list[list[int]] = []
     for index, look in enumerate(looks):
@@ -110,7 +110,7 @@ def _scenes(looks: Sequence[SliceLook]) -> list[list[int]]:
 
 
 def _hang_together(looks: Sequence[SliceLook], scene: Sequence[int], other: Sequence[int]) -> bool:
-    """Asked of the pairs that lie nearest to each other in the order of the slices: their blur differs least."""
+    """Compare the pairs that lie nearest to each other in the order of the slices: their blur differs least."""
     pairs = sorted(((first, second) for first in scene for second in other), key=lambda pair: abs(pair[0] - pair[1]))
     return any(one_scene(looks[first], looks[second]) for first, second in pairs[:_ASKED_OF_EACH])
 

@@ -1,9 +1,7 @@
-"""What all stacks of a scene share, kept in SCENE/session.json: one white balance and one exposure scale for each camera.
+"""Choices that all stacks of a scene share, kept in SCENE/session.json: one white balance and one exposure scale for each camera.
 
 A network learns one lens from many stacks, so equal light must be equal numbers in all of them. The choice is made once,
 by the first call of ingest, and later calls into the same scene reuse it.
-
-A scene that a refused command has begun: it is taken away, so that a run with other photographs finds nothing of it.
 """
 
 import shutil
@@ -34,7 +32,7 @@ _SAME = 1e-3
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """What holds for all photographs of one camera in a scene.
+    """Choices for all photographs of one camera in a scene.
 
     white_balance: multipliers of red, green, blue, green being 1, or None without RAW; its source: the file it came from, or "given".
     exposure: the one to which all slices are brought, or None where no photograph states it.
@@ -50,7 +48,7 @@ class CameraChoice:
 
 @dataclass
 class Session:
-    """The choices of a scene, by camera model ("" where it is unknown)."""
+    """Choices of a scene, by camera model ("" where it is unknown)."""
 
     scene: Path
     cameras: dict[str, CameraChoice] = field(default_factory=dict)
@@ -59,17 +57,11 @@ class Session:
         return self.cameras.get(camera_of(photos), CameraChoice())
 
 
-def camera_of(photos: Sequence[Photo]) -> str:
-    """The model that took most of the photographs, "" where none says."""
-    named = Counter(photo.metadata.camera_model for photo in photos if photo.metadata.camera_model)
-    return named.most_common(1)[0][0] if named else ""
-
-
 def open_session(scene: Path, groups: Sequence[PhotoGroup], white_balance: WhiteBalance | None, *, overwrite: bool) -> Session:
-    """The session of a scene with what these photographs add to it, written back. white_balance: the one asked for, or None.
+    """Return the session of a scene with what these photographs add to it, written back. white_balance: the one asked for, or None.
 
     overwrite: choose anew, unless the scene has stacks that are not made again now: they share the old choice.
-    Raises InputError where the white balance asked for is not the one that the scene has.
+    Raises InputError if the white balance asked for is not the one that the scene has.
     """
     others = {path.parent.name for path in scene.glob(f"*/{STACK_FILE_NAME}")} - {group.name for group in groups}
     session = Session(scene) if overwrite and not others else read_session(scene)
@@ -84,7 +76,7 @@ def open_session(scene: Path, groups: Sequence[PhotoGroup], white_balance: White
 
 
 def read_session(scene: Path) -> Session:
-    """The session of a scene; an empty one where there is none yet."""
+    """Read the session of a scene; an empty one where there is none yet."""
     path = scene / FILE_NAME
     if not path.is_file():
         return Session(scene)
@@ -102,6 +94,32 @@ def write_session(session: Session) -> None:
     write_json(session.scene / FILE_NAME, {"format": FORMAT, "version": VERSION, "cameras": cameras})
 
 
+def camera_of(photos: Sequence[Photo]) -> str:
+    """Return the model that took most of the photographs, "" where none says."""
+    named = Counter(photo.metadata.camera_model for photo in photos if photo.metadata.camera_model)
+    return named.most_common(1)[0][0] if named else ""
+
+
+@contextmanager
+def taken_away_when_refused(scene: Path, is_kept: Callable[[Sequence[FocalStack]], bool]) -> Iterator[None]:
+    """Take away what a block that raises InputError has put into a scene, so that a run with other photographs finds nothing of it.
+
+    All stays where the scene was begun before, where its new stacks (by name) are to be kept, and where a full disk stopped the work: that
+    can go on.
+    """
+    before = set(scene.iterdir()) if scene.is_dir() else None
+    try:
+        yield
+    except DiskFullError:
+        raise
+    except InputError:
+        made = set(scene.iterdir()) - (before or set()) if scene.is_dir() else set()
+        stacks = [read_focal_stack(each) for each in sorted(made) if (each / STACK_FILE_NAME).is_file()]
+        if scene / FILE_NAME in made and not is_kept(stacks):
+            _take_away(scene, made, with_folder=before is None)
+        raise
+
+
 def _choice(document: dict[str, Any]) -> CameraChoice:
     balance, exposure = document["white_balance"], document["exposure"]
     read = {
@@ -112,7 +130,7 @@ def _choice(document: dict[str, Any]) -> CameraChoice:
 
 
 def _completed(choice: CameraChoice, groups: Sequence[PhotoGroup], wanted: WhiteBalance | None) -> CameraChoice:
-    """A choice with the gaps filled: the white balance of the first RAW that opens, the exposure of the first slice."""
+    """Fill the gaps of a choice: the white balance of the first RAW that opens, the exposure of the first slice."""
     if choice.white_balance is None:
         model = camera_of([photo for group in groups for photo in group.photos])
         own = (photo for group in groups for photo in group.photos if photo.metadata.camera_model in (model, None, ""))
@@ -144,26 +162,6 @@ def _require_same(scene: Path, choice: CameraChoice, wanted: WhiteBalance | None
             f"all stacks of {scene} share the white balance {has} (from {choice.white_balance_source}), but {asked} was asked for: leave "
             f"--white-balance out, give another --out, or ingest all photographs of the scene with --overwrite"
         )
-
-
-@contextmanager
-def taken_away_when_refused(scene: Path, is_kept: Callable[[Sequence[FocalStack]], bool]) -> Iterator[None]:
-    """Take away what a block that raises InputError has put into a scene.
-
-    All stays where the scene was begun before, where its new stacks (by name) are to be kept, and where a full disk stopped the work: that
-    can go on.
-    """
-    before = set(scene.iterdir()) if scene.is_dir() else None
-    try:
-        yield
-    except DiskFullError:
-        raise
-    except InputError:
-        made = set(scene.iterdir()) - (before or set()) if scene.is_dir() else set()
-        stacks = [read_focal_stack(each) for each in sorted(made) if (each / STACK_FILE_NAME).is_file()]
-        if scene / FILE_NAME in made and not is_kept(stacks):
-            _take_away(scene, made, with_folder=before is None)
-        raise
 
 
 def _take_away(scene: Path, made: set[Path], *, with_folder: bool) -> None:

@@ -1,15 +1,10 @@
 """Slices on disk: EXR files that carry a record of what they were made from, so that an interrupted ingest goes on where it was.
 
-A full disk in one clear line: no half file, and what is finished stays.
-
-What stack.json keeps of each photograph: shooting data, focus as stated, exposure and white balance as applied.
-
-Slices whose camera stated infinity by a sentinel: taken as infinity to start from, but not known.
-
-How far they may be off follows from the stack alone: such a slice comes after all those that state real distances, since a camera
-writes the sentinel for what lies beyond its last code. So its distance lies anywhere from the farthest real one to infinity. The
-hyperfocal distance would be a narrower bound, but depends on what blur one calls sharp and on nothing that the camera has said.
-A distance of a lens.toml or focus.csv is no sentinel, `inf` included.
+stack.json keeps of each photograph its shooting data, focus as stated, exposure and white balance as applied. Some cameras state
+infinity by a sentinel: taken as infinity to start from, but not known. How far such slices may be off follows from the stack alone: they
+come after all those that state real distances, since a camera writes the sentinel for what lies beyond its last code. So the distance
+lies anywhere from the farthest real one to infinity. The hyperfocal distance would be a narrower bound, but depends on what blur one calls
+sharp and on nothing that the camera has said. A distance of a lens.toml or focus.csv is no sentinel, `inf` included.
 """
 
 import errno
@@ -35,10 +30,12 @@ from mrbokeh.system.errors import InputError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _MIB = 2**20
+FOLDER = "slices"
+_ATTRIBUTE = "mrbokehIngest"
 
 
 class DiskFullError(InputError):
-    """Nothing can be written any more; going on with the next file would not help."""
+    """Error that stops all work: nothing can be written any more, and going on with the next file would not help."""
 
 
 @contextmanager
@@ -60,24 +57,8 @@ def told_when_full(path: Path, needed_bytes: int = 0) -> Iterator[None]:
         raise DiskFullError(_message(path)) from None
 
 
-def _existing(path: Path) -> Path:
-    return next(each for each in (path, *path.parents) if each.exists())
-
-
-def _message(path: Path) -> str:
-    free_mib = shutil.disk_usage(_existing(path)).free / _MIB
-    return (
-        f"the disk of {path.parent} is full ({free_mib:.0f} MiB left): make room or give another --out, then run the same command again; "
-        f"finished slices are kept"
-    )
-
-
-FOLDER = "slices"
-_ATTRIBUTE = "mrbokehIngest"
-
-
 def source_record(path: Path) -> dict[str, Any]:
-    """Name, size and time of change of a photograph: whether it is still the file that a slice was made from."""
+    """Return name, size and time of change of a photograph: whether it is still the file that a slice was made from."""
     status = path.stat()
     return {"source": path.name, "source_size_bytes": status.st_size, "source_mtime_ns": status.st_mtime_ns}
 
@@ -97,7 +78,7 @@ def write_slice(
 
 
 def read_slice_record(path: Path) -> dict[str, Any] | None:
-    """The record of a slice, from its header; None for other files."""
+    """Read the record of a slice from its header; None for other files."""
     import OpenEXR
 
     try:
@@ -109,7 +90,7 @@ def read_slice_record(path: Path) -> dict[str, Any] | None:
 
 
 def find_slices(stack_folder: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """The slices that ingest left in a stack's folder, finished or interrupted, with their records."""
+    """Find the slices that ingest left in a stack's folder, finished or interrupted, with their records."""
     paths = sorted((stack_folder / FOLDER).glob("*.exr"))
     return [(path, record) for path in paths if not path.name.startswith(".") and (record := read_slice_record(path)) is not None]
 
@@ -130,13 +111,8 @@ def arrange_slices(stack_folder: Path, chosen: Sequence[Path]) -> list[Path]:
     return final
 
 
-def _delete(paths: Iterable[Path]) -> None:
-    for path in list(paths):
-        path.unlink(missing_ok=True)
-
-
 def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> dict[str, Any]:
-    """JSON-ready metadata of a slice. Distances that may be infinite are given in dioptres (1/m), for which JSON has numbers.
+    """Return JSON-ready metadata of a slice. Distances that may be infinite are given in dioptres (1/m), for which JSON has numbers.
 
     saturated_fraction: share of the photosites that were full. saturation_level: the value of a full grey in the slice.
     """
@@ -165,10 +141,10 @@ def slice_metadata(photo: Photo, decoded: DecodedPhoto, gain: ExposureGain) -> d
 
 
 def focus_record(metadata: PhotoMetadata) -> dict[str, Any] | None:
-    """The focus distance as the file stated it, and counted from the lens; intervals are what the statement may stand for.
+    """Return the focus distance as the file stated it, and counted from the lens; intervals are what the statement may stand for.
 
     The lens's are None where its focal length is unknown or no lens of that length focuses so near. sentinel: nothing is known of this
-    distance but what the rest of the stack tells (`capture.stacks.slice_files`).
+    distance but what the rest of the stack tells (`bounded_focus_records`).
     """
     focus = metadata.focus
     if focus is None:
@@ -187,8 +163,9 @@ def focus_record(metadata: PhotoMetadata) -> dict[str, Any] | None:
 
 
 def bounded_focus_records(metadata: Sequence[PhotoMetadata]) -> list[dict[str, Any] | None]:
-    """`focus_record` of the photographs of a stack; intervals of sentinels reach from infinity to the farthest real distance from the
-    lens, and are None where there is none.
+    """Return `focus_record` of the photographs of a stack, with the intervals of sentinels bounded by the stack.
+
+    They reach from infinity to the farthest real distance from the lens, and are None where there is none.
     """
     known_m = [distance for each in metadata if not _by_sentinel(each) and (distance := each.focus_distance_m) and math.isfinite(distance)]
     interval = [0.0, 1.0 / max(known_m)] if known_m else None
@@ -197,10 +174,27 @@ def bounded_focus_records(metadata: Sequence[PhotoMetadata]) -> list[dict[str, A
     return [record | bounded if record is not None and _by_sentinel(each) else record for each, record in records]
 
 
+def stated_by_sentinel(stack: FocalStack) -> Bool[np.ndarray, " slices"]:
+    """Return the slices whose camera stated no distance but a sentinel, whatever a calibration has found since."""
+    return np.array([bool((each.metadata.get("focus") or {}).get("sentinel", False)) for each in stack.slices], bool)
+
+
+def _existing(path: Path) -> Path:
+    return next(each for each in (path, *path.parents) if each.exists())
+
+
+def _message(path: Path) -> str:
+    free_mib = shutil.disk_usage(_existing(path)).free / _MIB
+    return (
+        f"the disk of {path.parent} is full ({free_mib:.0f} MiB left): make room or give another --out, then run the same command again; "
+        f"finished slices are kept"
+    )
+
+
+def _delete(paths: Iterable[Path]) -> None:
+    for path in list(paths):
+        path.unlink(missing_ok=True)
+
+
 def _by_sentinel(metadata: PhotoMetadata) -> bool:
     return metadata.focus is not None and metadata.focus.is_sentinel
-
-
-def stated_by_sentinel(stack: FocalStack) -> Bool[np.ndarray, " slices"]:
-    """The slices whose camera stated no distance but a sentinel, whatever a calibration has found since."""
-    return np.array([bool((each.metadata.get("focus") or {}).get("sentinel", False)) for each in stack.slices], bool)

@@ -1,16 +1,14 @@
-"""What slices look like from afar: whether two are the same photograph, whether one shows nothing, and whether two show one scene.
+"""Looks of slices from afar: whether two are the same photograph, whether one shows nothing, and whether two show one scene.
 
 Defocus, breathing, a tint and another exposure leave the light of large areas alike: on 90 photographed stacks neighbours correlate by 0.97
-or more, strangers by 0.9 at most. Where hands moved the camera far between two slices, features that match tell instead.
-
-Fine detail of pictures, block by block: what tells copies of a photograph, and how sharp a merged picture is beside its slices.
-
-Callers choose how light is encoded, and which blocks count.
+or more, strangers by 0.9 at most. Where hands moved the camera far between two slices, features that match tell instead. Fine detail, block
+by block, tells copies of a photograph; merging and the report use it to say how sharp a picture is beside its slices.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
@@ -21,27 +19,6 @@ from mrbokeh.images.color import convert, luminance
 
 BLOCK_PX = 24
 DETAIL_SIGMA_PX = 1.5
-
-Plane = Float32[np.ndarray, "height width"]
-Blocks = Float32[np.ndarray, "rows columns"]
-
-
-def detail_of_blocks(plane: Plane) -> Blocks:
-    """Return the root mean square of what a Gaussian of DETAIL_SIGMA_PX takes from each block (see `block_means`)."""
-    import cv2
-
-    fine = cv2.subtract(plane, cv2.GaussianBlur(plane, (0, 0), DETAIL_SIGMA_PX))
-    return np.sqrt(block_means(cv2.multiply(fine, fine)))
-
-
-def block_means(plane: Plane) -> Blocks:
-    """Return means over blocks of BLOCK_PX; what is left at the right and below is cut off, and a smaller plane is one block."""
-    import cv2
-
-    rows, columns = (max(side // BLOCK_PX, 1) for side in plane.shape)
-    return cv2.resize(plane[: rows * BLOCK_PX, : columns * BLOCK_PX], (columns, rows), interpolation=cv2.INTER_AREA)
-
-
 _LONG_SIDE_PX = 1000
 _FEATURE_SIDE_PX = 480
 _NOISE_CODES = 0.3
@@ -61,12 +38,15 @@ _FEWEST_MATCHES = 16
 _LEAST_AGREEING = 0.35
 _LARGEST_SCALE = 1.3
 
+Plane = Float32[np.ndarray, "height width"]
+Blocks = Float32[np.ndarray, "rows columns"]
+
 
 @dataclass(frozen=True)
 class SliceLook:
-    """A photograph before its exposure was evened out. light: its large areas; codes: its luminance to the power 1/2, 0 to 255.
+    """Look of a photograph before its exposure was evened out.
 
-    full: share of its photosites that were full.
+    light: its large areas; codes: its luminance to the power 1/2, 0 to 255. full: share of its photosites that were full.
     """
 
     light: LowFrequency
@@ -75,9 +55,7 @@ class SliceLook:
 
     @cached_property
     def features(self) -> tuple[Float32[np.ndarray, "points 2"], Float32[np.ndarray, "points 128"]]:
-        """Points that SIFT finds, in pixels of a picture 480 px long, and what they look like."""
-        import cv2
-
+        """Return points that SIFT finds, in pixels of a picture 480 px long, and their descriptors."""
         shrink = min(1.0, _FEATURE_SIDE_PX / max(self.codes.shape))
         small = cv2.resize(self.codes, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if shrink < 1.0 else self.codes
         points, described = cv2.SIFT.create(_MOST_FEATURES).detectAndCompute(small, None)
@@ -87,7 +65,7 @@ class SliceLook:
 
     @property
     def brightest(self) -> float:
-        """Linear light that 1 % of the picture exceeds."""
+        """Return the linear light that 1 % of the picture exceeds."""
         return float(np.percentile(self.light.luminance, 99))
 
 
@@ -101,9 +79,7 @@ def look_at(
     rec709_from_camera: Matrix3x3 | None,
     full: float,
 ) -> SliceLook:
-    """rgb: in the RGB that rec709_from_camera leads from, None where it is Rec.709."""
-    import cv2
-
+    """Reduce a picture to its look. rgb: in the RGB that rec709_from_camera leads from, None where it is Rec.709."""
     # A whole number, for which area averages take a third of the time.
     shrink = max(1, round(max(rgb.shape[:2]) / _LONG_SIDE_PX))
     size = max(1, rgb.shape[1] // shrink), max(1, rgb.shape[0] // shrink)
@@ -114,7 +90,7 @@ def look_at(
 
 
 def same_photograph(first: SliceLook, second: SliceLook) -> bool:
-    """Identical, or all but (a copy that was compressed again): the detail of blocks differs by 3 % at most, as do hardly any codes.
+    """Return whether two are identical, or all but (a copy that was compressed again): detail of blocks within 3 %, hardly any other codes.
 
     Neighbours of a finely stepped sweep differ more: where one sharpens by less, it adds nothing to the other.
     """
@@ -134,7 +110,7 @@ def same_photograph(first: SliceLook, second: SliceLook) -> bool:
 
 
 def one_scene(first: SliceLook, second: SliceLook) -> bool:
-    """Whether two photographs of one size may show the same thing; True where that cannot be told."""
+    """Return whether two photographs of one size may show the same thing; True where that cannot be told."""
     likeness = _likeness(first.light, second.light)
     if likeness >= _ALIKE:
         return True
@@ -142,8 +118,20 @@ def one_scene(first: SliceLook, second: SliceLook) -> bool:
     return likeness >= _UNLIKE if told is None else told
 
 
+def detail_of_blocks(plane: Plane) -> Blocks:
+    """Return the root mean square of what a Gaussian of DETAIL_SIGMA_PX takes from each block (see `block_means`)."""
+    fine = cv2.subtract(plane, cv2.GaussianBlur(plane, (0, 0), DETAIL_SIGMA_PX))
+    return np.sqrt(block_means(cv2.multiply(fine, fine)))
+
+
+def block_means(plane: Plane) -> Blocks:
+    """Return means over blocks of BLOCK_PX; what is left at the right and below is cut off, and a smaller plane is one block."""
+    rows, columns = (max(side // BLOCK_PX, 1) for side in plane.shape)
+    return cv2.resize(plane[: rows * BLOCK_PX, : columns * BLOCK_PX], (columns, rows), interpolation=cv2.INTER_AREA)
+
+
 def _likeness(first: LowFrequency, second: LowFrequency) -> float:
-    """Correlation of the logarithm of large areas, as they lie or after the best scale and shift."""
+    """Return the correlation of the logarithm of large areas, as they lie or after the best scale and shift."""
     as_it_lies = _correlation(first, second)
     if as_it_lies >= _ALIKE:
         return as_it_lies
@@ -152,9 +140,7 @@ def _likeness(first: LowFrequency, second: LowFrequency) -> float:
 
 
 def _correlation(first: LowFrequency, second: LowFrequency) -> float:
-    """Over what is usable in both, over all of it where that is too little."""
-    import cv2
-
+    """Correlate what is usable in both, or all of it where that is too little."""
     both = first.usable & second.usable
     if np.count_nonzero(both) < _FEWEST_USABLE:
         both = np.ones_like(both)
@@ -163,9 +149,7 @@ def _correlation(first: LowFrequency, second: LowFrequency) -> float:
 
 
 def _features_agree(first: SliceLook, second: SliceLook) -> bool | None:
-    """Whether enough SIFT features lie as one similarity has them; None where a picture has too few of them."""
-    import cv2
-
+    """Return whether enough SIFT features lie as one similarity has them; None where a picture has too few of them."""
     (points, described), (others, others_described) = first.features, second.features
     if min(len(points), len(others)) < _FEWEST_FEATURES:
         return None

@@ -1,4 +1,4 @@
-"""The slices of one focal stack: develop each photograph, even out its exposure, write it; go on where an earlier run stopped."""
+"""Slices of one focal stack: develop each photograph, even out its exposure, write it; go on where an earlier run stopped."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ _MADE = "made_"
 
 @dataclass(frozen=True)
 class Development:
-    """How photographs are developed. white_balance: multipliers of red, green, blue, or None for the session's."""
+    """Settings of developing. white_balance: multipliers of red, green, blue, or None for the session's."""
 
     white_balance: WhiteBalance | None = None
     half_size: bool = False
@@ -40,7 +40,7 @@ class Development:
 
 @dataclass(frozen=True)
 class FinishedSlice:
-    """A slice on disk. record: what it was made from ("request") and what came out ("size_px", "metadata", ...)."""
+    """Slice on disk. record: what it was made from ("request") and what came out ("size_px", "metadata", ...)."""
 
     photo: Photo
     path: Path
@@ -49,7 +49,7 @@ class FinishedSlice:
 
 @dataclass
 class StackWork:
-    """The slices of a stack while they are made; one picture is in memory at a time.
+    """Slices of a stack while they are made; one picture is in memory at a time.
 
     choice: white balance and exposure, which the stack shares with all others of its scene. The first photograph that can
     be developed is the reference for the exposure of the rest, and its primaries are those of the stack.
@@ -85,7 +85,7 @@ class StackWork:
     def leave_out_what_is_odd(self, *, sizes_only: bool) -> bool:
         """Name and leave out slices that do not belong (`capture.stacks.odd_slices`). True if the first is left out.
 
-        Raises InputError where no more than half of the slices belong together.
+        Raises InputError if no more than half of the slices belong together.
         """
         first = self.finished[0]
         self._leave_out(odd_sizes([(each.photo.path.name, tuple(each.record["size_px"])) for each in self.finished]))
@@ -98,7 +98,7 @@ class StackWork:
         self.finished = [each for index, each in enumerate(self.finished) if index not in odd]
 
     def with_another_reference(self) -> "StackWork":
-        """The slice that gave the exposure was left out: the others evened out again, relative to the first of them."""
+        """Even out the slices again, relative to the first of them, after the one that gave the exposure was left out."""
         again = stack_work(self.folder, self.development, self.choice, overwrite=False)
         again.skipped, again.remarks = [*self.skipped], self.remarks
         for each in self.finished:
@@ -125,7 +125,7 @@ class StackWork:
         return self._looks[finished.path]
 
     def _request(self, photo: Photo) -> dict[str, Any]:
-        """Everything that the pixels of the slice depend on."""
+        """Return everything that the pixels of the slice depend on."""
         reference = self.finished[0].photo if self.finished else photo
         return {
             **source_record(photo.path),
@@ -140,7 +140,7 @@ class StackWork:
 
     @property
     def rec709_from_camera(self) -> Matrix3x3 | None:
-        """The matrix from the RGB of the finished slices; None where that is Rec.709."""
+        """Return the matrix from the RGB of the finished slices; None where that is Rec.709."""
         matrix = self.finished[0].record["rec709_from_camera"]
         return None if matrix is None else matrix3x3(matrix)
 
@@ -171,7 +171,7 @@ class StackWork:
         return develop(photo.path, self.choice.white_balance, half_size=self.development.half_size, max_width=self.development.max_width)
 
     def _gain(self, decoded: DecodedPhoto, light: LowFrequency, request: dict[str, Any]) -> ExposureGain:
-        """Relative to the reference, which is developed again if an earlier run made its slice."""
+        """Measure the gain to the reference, which is developed again if an earlier run made its slice."""
         if not self.finished:
             self._reference = light
             return gain_to_session(decoded, light, request["session_gain"], self._scale_stack())
@@ -182,13 +182,13 @@ class StackWork:
         return replace(gain, session=base["exposure_gain_session"], session_from=base["exposure_gain_session_from"])
 
     def _scale_stack(self) -> Path | None:
-        """The stack that set the scale of the session, unless it is this one."""
+        """Return the stack that set the scale of the session, unless it is this one."""
         name = self.choice.reference_stack
         return self.folder.parent / name if name and name != self.folder.name else None
 
 
 def stack_work(folder: Path, development: Development, choice: CameraChoice, *, overwrite: bool) -> StackWork:
-    """The work on a stack, with the slices of earlier runs found. Raises InputError where those were made in another size."""
+    """Return the work on a stack, with the slices of earlier runs found. Raises InputError if those were made in another size."""
     made = [] if overwrite else find_slices(folder)
     for _, record in made:
         for name in ("max_width", "half_size"):
@@ -201,7 +201,7 @@ def stack_work(folder: Path, development: Development, choice: CameraChoice, *, 
 
 
 def in_primaries(decoded: DecodedPhoto, rec709_from_camera: Matrix3x3 | None) -> Float32[np.ndarray, "height width 3"]:
-    """The photograph in the RGB that rec709_from_camera leads from: developed pictures and RAW can share a stack."""
+    """Return the photograph in the RGB that rec709_from_camera leads from: developed pictures and RAW can share a stack."""
     if decoded.rec709_from_camera == rec709_from_camera:
         return decoded.rgb
     wanted, own = (np.eye(3) if each is None else np.array(each) for each in (rec709_from_camera, decoded.rec709_from_camera))

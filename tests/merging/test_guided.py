@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture.merging.restored_lights import restored_lights, with_restored_lights
-from capture.merging.second_pass import SliceOptics, all_in_focus_from_depth, nearer_blur
+from capture.merging.second_pass import SliceOptics, all_in_focus_from_depth, foreground_occlusion
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
@@ -63,7 +63,7 @@ def photographs(aperture: Aperture) -> list[np.ndarray]:
 @pytest.mark.parametrize("aperture", [Aperture.disc(), Aperture.star(5, 0.5, 0.4)])
 def test_the_blur_of_nearer_surfaces_is_that_of_the_scatter_reference(aperture: Aperture) -> None:
     """Gathered over circles of confusion here, spread pixel by pixel there; a star tells whether it is mirrored as it must be."""
-    found = nearer_blur(2, dioptres(), truth(), optics(aperture), np.ones(SIZE, bool))
+    found = foreground_occlusion(2, dioptres(), truth(), optics(aperture), np.ones(SIZE, bool))
     expected = blur_layer(near_layer(), np.full(SIZE, PX_PER_DIOPTRE * (FAR - NEAR), np.float32), aperture)
     beside = np.s_[BORDER:-BORDER, EDGE : EDGE + 20]
     np.testing.assert_allclose(found.share[beside], expected.alpha[beside], atol=1e-4)
@@ -75,9 +75,9 @@ def test_the_blur_of_nearer_surfaces_is_that_of_the_scatter_reference(aperture: 
 def test_large_blur_is_gathered_on_a_coarser_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     import capture.merging.second_pass as module
 
-    fine = nearer_blur(2, dioptres(), truth(), optics(), np.ones(SIZE, bool))
+    fine = foreground_occlusion(2, dioptres(), truth(), optics(), np.ones(SIZE, bool))
     monkeypatch.setattr(module, "LARGEST_GATHERED_PX", 6.0)
-    coarse = nearer_blur(2, dioptres(), truth(), optics(), np.ones(SIZE, bool))
+    coarse = foreground_occlusion(2, dioptres(), truth(), optics(), np.ones(SIZE, bool))
     beside = np.s_[BORDER:-BORDER, EDGE + 1 : EDGE + 20]
     # Half the resolution: the ramp of the share over 6 px is read at most a pixel off, 1/6 of its height.
     assert 1e-4 < np.abs(coarse.share[beside] - fine.share[beside]).max() < 0.17

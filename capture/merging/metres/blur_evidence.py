@@ -1,4 +1,4 @@
-"""How well every slice fits the all-in-focus picture blurred by discs of growing diameter: what all blur is told from.
+"""Blur evidence: how well every slice fits the all-in-focus picture blurred by discs of growing diameter.
 
 Pictures are compared without their coarse light, which leaks in from afar and differs with exposure, in units of the square root of
 light, in which photons are evenly noisy. Sums over windows are kept on a grid of cells.
@@ -11,11 +11,6 @@ from itertools import pairwise
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-
-Rgb = Float32[np.ndarray, "height width 3"]
-Plane = Float32[np.ndarray, "height width"]
-Mask = Bool[np.ndarray, "height width"]
-Small = Float32[np.ndarray, "rows columns"]
 
 LARGEST_WORKING_PX = 0.6e6
 """Larger pictures are compared at this size."""
@@ -31,11 +26,17 @@ _DARK = 0.02
 _LEAST_KNOWN = 0.3
 _MEAN_OF_CHANNELS = np.full((1, 3), 1.0 / 3.0, np.float32)
 
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Small = Float32[np.ndarray, "rows columns"]
+
 
 @dataclass(frozen=True)
 class BlurEvidence:
-    """errors (cells, slices, rungs): mean squared difference between a slice and the blurred picture; -1 where the slice has no data.
+    """Misfits of slices to the blurred picture, on a grid of cells.
 
+    errors (cells, slices, rungs): mean squared difference between a slice and the blurred picture; -1 where the slice has no data.
     gaps (cells, rungs - 1): the same between neighbouring rungs. diameters_px: of the rungs, in pixels of the stack.
     shape: (rows, columns) of the grid of cells. full: (H, W) of the stack, which was compared `shrink` times smaller.
     """
@@ -48,7 +49,7 @@ class BlurEvidence:
     shrink: float
 
     def at_cells(self, plane: np.ndarray) -> np.ndarray:
-        """(cells,) a picture's value in the middle of each cell."""
+        """Return (cells,) a picture's value in the middle of each cell."""
         rows, columns = (
             np.minimum((np.arange(n) + 0.5) * full / n, full - 1).astype(int) for n, full in zip(self.shape, self.full, strict=True)
         )
@@ -56,7 +57,7 @@ class BlurEvidence:
 
     @property
     def texture(self) -> Float32[np.ndarray, " cells"]:
-        """What the widest blur takes away: upper bound of what can be told from a cell."""
+        """Return the detail that the widest blur takes away: an upper bound of what can be told from a cell."""
         return self.gaps.sum(axis=1)
 
 
@@ -67,7 +68,7 @@ def blur_evidence(
     valid: Callable[[int], Mask] | None = None,
     excluded: Mask | None = None,
 ) -> tuple[BlurEvidence, BlurEvidence]:
-    """(fine, wide): compare every slice, read once, with every rung; wide: on a smaller picture, for larger blur.
+    """Compare every slice, read once, with every rung; return (fine, wide), the latter on a smaller picture, for larger blur.
 
     excluded: (H, W) what is saturated in some slice.
     """
@@ -84,7 +85,10 @@ def blur_evidence(
 
 @dataclass(frozen=True)
 class _Comparison:
-    """ladder: the all-in-focus picture blurred to every rung, without its coarse light; usable: share of a pixel that is not excluded."""
+    """Slices compared at one size.
+
+    ladder: the all-in-focus picture blurred to every rung, without its coarse light; usable: share of a pixel that is not excluded.
+    """
 
     ladder: tuple[Small, ...]
     light: Float32[np.ndarray, "cell_rows cell_columns"]
@@ -101,7 +105,8 @@ class _Comparison:
         grid = (size[0] // _CELL_PX, size[1] // _CELL_PX)
         usable = np.ones_like(grey) if excluded is None else _resized((~excluded).astype(np.float32), size)
         errors = np.empty((grid[0] * grid[1], count, len(ladder)), np.float32)
-        return cls(ladder, _summed(grey, grid) + np.float32(_DARK), usable, errors, shrink, excluded is not None)
+        light = _summed(grey, grid) + np.float32(_DARK)
+        return cls(ladder=ladder, light=light, usable=usable, errors=errors, shrink=shrink, excludes=excluded is not None)
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -123,7 +128,12 @@ class _Comparison:
         gaps = [self._mean_square(cv2.subtract(a, b), self.usable, share).ravel() for a, b in pairwise(self.ladder)]
         diameters_px = np.array(DIAMETERS_PX) * self.shrink
         return BlurEvidence(
-            self.errors, np.stack(gaps, axis=1), diameters_px, (self.light.shape[0], self.light.shape[1]), full, self.shrink
+            errors=self.errors,
+            gaps=np.stack(gaps, axis=1),
+            diameters_px=diameters_px,
+            shape=(self.light.shape[0], self.light.shape[1]),
+            full=full,
+            shrink=self.shrink,
         )
 
     def _mean_square(self, difference: Small, weight: Small, share: np.ndarray) -> np.ndarray:
@@ -138,7 +148,7 @@ def _whole_cells(length_px: float) -> int:
 
 
 def _resized(plane: Plane, size: tuple[int, int]) -> Small:
-    """What is a few pixels larger is cut, for resampling would blur it."""
+    """Average over areas; a few pixels too many are cut off, for resampling would blur."""
     if max(plane.shape[1] - size[0], plane.shape[0] - size[1]) < _CELL_PX:
         return np.ascontiguousarray(plane[: size[1], : size[0]])
     return cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
@@ -164,5 +174,5 @@ def _coarse(plane: Plane) -> Plane:
 
 
 def _summed(plane: Plane, grid: tuple[int, int]) -> Small:
-    """Means over windows about every cell."""
+    """Return means over windows about every cell."""
     return cv2.GaussianBlur(cv2.resize(plane, grid, interpolation=cv2.INTER_AREA), (0, 0), _WINDOW_CELLS)

@@ -1,7 +1,4 @@
-"""Lengths and distances in a stack that its user knows, and the options of `mrbokeh capture scale` that tell them.
-
-Metres of a merged stack that are other than merging left them: depth.exr, stack.json and the pictures of them follow.
-"""
+"""Lengths and distances in a stack that its user knows (options of `mrbokeh capture scale`), and the files of stacks with other metres."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,7 +20,7 @@ NEAREST_OPTION = "--nearest"
 
 @dataclass(frozen=True)
 class KnownLength:
-    """metres between what is seen at two pixels."""
+    """Metres between what is seen at two pixels."""
 
     x1: float
     y1: float
@@ -45,7 +42,7 @@ class KnownLength:
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """metres from the lens, along its axis, to what is seen at a pixel."""
+    """Metres from the lens, along its axis, to what is seen at a pixel."""
 
     x: float
     y: float
@@ -63,10 +60,6 @@ class KnownDistance:
         return f"the distance of {self.metres:g} m at pixel {self.x:g},{self.y:g}"
 
 
-def _numbers_text(*numbers: float) -> str:
-    return ",".join(f"{each:.10g}" for each in numbers)
-
-
 Fact = KnownLength | KnownDistance
 
 
@@ -78,25 +71,9 @@ def parse_known_distance(text: str) -> KnownDistance:
     return KnownDistance(*_numbers(text, 3, "--distance-at", "X,Y,METRES such as 310,220,0.35"))
 
 
-def _numbers(text: str, count: int, option: str, expected: str) -> list[float]:
-    try:
-        numbers = [float(each) for each in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not np.isfinite(numbers).all() or numbers[-1] <= 0.0:
-        raise InputError(f"{option}: expected {expected}, got {text!r}")
-    if count == 5 and numbers[:2] == numbers[2:4]:
-        raise InputError(f"{option}: expected two different pixels, got the same one twice in {text!r}")
-    return numbers
-
-
 def told_facts(stack: FocalStack) -> list[Fact]:
     """Return the lengths and distances that were told of a stack."""
     return [_fact(each) for each in metres_facts(stack).get(TOLD, ())]
-
-
-def _fact(document: Mapping[str, float]) -> Fact:
-    return KnownLength(**document) if "x1" in document else KnownDistance(**document)
 
 
 def told_options(stack: FocalStack) -> str:
@@ -115,6 +92,38 @@ def with_known_nearest(stack: FocalStack, turned: bool) -> FocalStack:
     return replace(stack, slices=tuple(map(_turned_slice, stack.slices)) if turned else stack.slices, metadata=metadata)
 
 
+def write_changed_metres(stack: FocalStack, depth_m: Float32[np.ndarray, "height width"], turned: bool) -> None:
+    """Write the stack and its new depth, and the pictures that show them. turned: what was taken for near is far."""
+    part = read_exr(stack.depth_path)[0]
+    channels = dict(part.channels) | {"Z": depth_m}
+    if turned and POSITION in channels:
+        channels[POSITION] = -channels[POSITION]
+    write_exr(stack.depth_path, replace(part, channels=channels), compress=False)
+    write_focal_stack(stack)
+    write_depth_picture(stack)
+    write_merge_sheet(stack)
+
+
+def _numbers(text: str, count: int, option: str, expected: str) -> list[float]:
+    try:
+        numbers = [float(each) for each in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all() or numbers[-1] <= 0.0:
+        raise InputError(f"{option}: expected {expected}, got {text!r}")
+    if count == 5 and numbers[:2] == numbers[2:4]:
+        raise InputError(f"{option}: expected two different pixels, got the same one twice in {text!r}")
+    return numbers
+
+
+def _numbers_text(*numbers: float) -> str:
+    return ",".join(f"{each:.10g}" for each in numbers)
+
+
+def _fact(document: Mapping[str, float]) -> Fact:
+    return KnownLength(**document) if "x1" in document else KnownDistance(**document)
+
+
 def _known_side(record: dict[str, Any], turned: bool) -> dict[str, Any]:
     if turned:
         other = "far" if record["side"] == "near" else "near"
@@ -126,15 +135,3 @@ def _turned_slice(each: Slice) -> Slice:
     if SLICE_POSITION not in each.metadata:
         return each
     return replace(each, metadata=each.metadata | {SLICE_POSITION: -each.metadata[SLICE_POSITION]})
-
-
-def write_changed_metres(stack: FocalStack, depth_m: Float32[np.ndarray, "height width"], turned: bool) -> None:
-    """Write the stack and its new depth, and the pictures that show them. turned: what was taken for near is far."""
-    part = read_exr(stack.depth_path)[0]
-    channels = dict(part.channels) | {"Z": depth_m}
-    if turned and POSITION in channels:
-        channels[POSITION] = -channels[POSITION]
-    write_exr(stack.depth_path, replace(part, channels=channels), compress=False)
-    write_focal_stack(stack)
-    write_depth_picture(stack)
-    write_merge_sheet(stack)

@@ -1,4 +1,4 @@
-"""Where each slice is focused and where each surface lies, in pixels of blur, from the pictures alone.
+"""Focus of each slice and place of each surface, in pixels of blur, solved from the pictures alone.
 
 The circle of confusion of a surface at position u in a slice focused at u_i is |u_i - u| pixels in the registered slices: positions are
 affine in dioptres (a dioptre is as many pixels as the blur grows by), and no lens needs to be known for them. That blur grows alike in
@@ -16,12 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from capture.merging.metres.blur_evidence import BlurEvidence, blur_evidence
-
-Rgb = Float32[np.ndarray, "height width 3"]
-Plane = Float32[np.ndarray, "height width"]
-Mask = Bool[np.ndarray, "height width"]
-Cells = Int[np.ndarray, " some"]
-Positions = Float[np.ndarray, " slices"]
 
 _BLOCKS = 5
 _TOLD_SHARE = 0.9
@@ -49,11 +43,18 @@ _SPREAD_STEPS = 1.0
 _LEAST_ERROR_PX2, _LEAST_ERROR_SHARE = 0.4, 0.02
 """Blur below a pixel shows by its square alone."""
 
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+Cells = Int[np.ndarray, " some"]
+Positions = Float[np.ndarray, " slices"]
+
 
 @dataclass(frozen=True)
 class RelativeFocus:
-    """positions_px, errors_px: (slices,) where each slice is focused, increasing with its index, and the standard error to its neighbours.
+    """Positions in pixels of blur.
 
+    positions_px, errors_px: (slices,) where each slice is focused, increasing with its index, and the standard error to its neighbours.
     focus_px, error_px: (H, W) the position of the surface at each pixel. The circle of confusion there is positions_px[i] - focus_px.
     """
 
@@ -63,31 +64,11 @@ class RelativeFocus:
     error_px: Plane
 
 
-def solve_relative_focus(
-    slices: Callable[[], Iterable[Rgb]],
-    all_in_focus: Rgb,
-    focus_index: Plane,
-    confidence: Plane,
-    count: int,
-    valid: Callable[[int], Mask] | None = None,
-    excluded: Mask | None = None,
-) -> RelativeFocus:
-    """Solve registered slices, which are read once, and their all-in-focus picture.
-
-    focus_index, confidence: of the merge. valid: where slice i has data. excluded: pixels that were full in some slice.
-    """
-    fine, wide = blur_evidence(slices, all_in_focus, count, valid, excluded)
-    places = _Places.of(fine, focus_index, confidence)
-    positions, errors = _positions((places.thinned(), _Places.of(wide, focus_index, confidence).thinned()))
-    offset, cell_error = _offsets(places, positions)
-    return RelativeFocus(positions, errors, *_dense(places, positions, offset, cell_error, focus_index))
-
-
 @dataclass(frozen=True)
 class _Places:
     """Cells of the evidence, whose errors and gaps are in units of their variance.
 
-    index: fractional; nearest: slice; own: shares of the slices that their sharp picture is of, which it fits for no reason.
+    index: fractional. own: shares of the slices that their sharp picture is of, which it fits for no reason.
     """
 
     errors: Float32[np.ndarray, "cells slices rungs"]
@@ -115,10 +96,19 @@ class _Places:
         jump = (cv2.dilate(grid, box) - cv2.erode(grid, box)).ravel()
         weight = evidence.at_cells(confidence) / (1.0 + (jump / _SURFACE_STEP) ** 2) * (evidence.texture > _TEXTURED_FLOORS * floor)
         gaps = evidence.gaps / variance[:, None]
-        return cls(errors, gaps, evidence.diameters_px**2, evidence.shrink, evidence.shape, index, own, weight.astype(np.float32))
+        return cls(
+            errors=errors,
+            gaps=gaps,
+            squares_px2=evidence.diameters_px**2,
+            shrink=evidence.shrink,
+            shape=evidence.shape,
+            index=index,
+            own=own,
+            weight=weight.astype(np.float32),
+        )
 
     def thinned(self) -> "_Places":
-        """Every second or third cell of such rows: windows overlap, and slices need fewer places than surfaces do."""
+        """Keep every second or third cell and row: windows overlap, and slices need fewer places than surfaces do."""
         step = int(np.ceil(np.sqrt(len(self.index) / _ENOUGH_CELLS)))
         chosen = np.arange(len(self.index)).reshape(self.shape)[::step, ::step]
         picked = {name: getattr(self, name)[chosen.ravel()] for name in ("errors", "gaps", "index", "own", "weight")}
@@ -162,38 +152,9 @@ class _Places:
         return ((rows * _BLOCKS // self.shape[0]) * _BLOCKS + columns * _BLOCKS // self.shape[1]).ravel().astype(np.int64)
 
 
-def _positions(levels: Sequence[_Places]) -> tuple[Positions, Positions]:
-    """By least squares of the diameters of all pairs, first as they are and then of what is left of them.
-
-    Moving one slice or one surface at a time would never undo a common stretch; pairs do.
-    """
-    count = levels[0].count
-    positions, errors = _solved([_measured_whole(each) for each in levels], np.zeros(count))
-    for _ in range(_ROUNDS):
-        positions, errors = _solved([_measured_rest(each, positions) for each in levels], positions)
-    return positions, errors
-
-
-def _measured_whole(places: _Places) -> "_Diameters":
-    """The diameters in all slices of what is sharp near the middle of one."""
-    sharp = np.abs(places.index - places.nearest) <= _NEAR_A_SLICE
-    nothing = np.zeros((len(places.index), places.count))
-    return _measured(places, places.weight * sharp, nothing, nothing[:, 0], np.linspace(0.0, places.widest_px, 61))
-
-
-def _measured_rest(places: _Places, positions: Positions) -> "_Diameters":
-    """What to add to the diameters that follow from positions."""
-    offset, _ = _offsets(places, positions)
-    place = np.interp(places.index, np.arange(places.count), positions) + offset
-    base = np.abs(positions[None, :] - place[:, None])
-    own_blur = (places.own * base**2).sum(axis=1)
-    base[base > _TOLD_SHARE * places.widest_px] = np.inf
-    return _measured(places, places.weight, base, own_blur, np.linspace(-0.15, 0.15, 31) * places.widest_px)
-
-
 @dataclass(frozen=True)
 class _Diameters:
-    """Of pairs: slice, the slice in which its cells are sharp, what to add to the diameter so far, and how sure that is.
+    """Diameters of pairs: a slice, the slice in which its cells are sharp, what to add to the diameter so far, and its standard error.
 
     least_px2: error of a squared diameter, below which a small blur cannot be told.
     """
@@ -207,6 +168,55 @@ class _Diameters:
     @classmethod
     def joined(cls, parts: Sequence["_Diameters"]) -> "_Diameters":
         return cls(*(np.concatenate([getattr(each, one.name) for each in parts]) for one in fields(cls)))
+
+
+def solve_relative_focus(
+    slices: Callable[[], Iterable[Rgb]],
+    all_in_focus: Rgb,
+    focus_index: Plane,
+    confidence: Plane,
+    count: int,
+    valid: Callable[[int], Mask] | None = None,
+    excluded: Mask | None = None,
+) -> RelativeFocus:
+    """Solve registered slices, which are read once, and their all-in-focus picture.
+
+    focus_index, confidence: of the merge. valid: where slice i has data. excluded: pixels that were full in some slice.
+    """
+    fine, wide = blur_evidence(slices, all_in_focus, count, valid, excluded)
+    places = _Places.of(fine, focus_index, confidence)
+    positions, errors = _positions((places.thinned(), _Places.of(wide, focus_index, confidence).thinned()))
+    offset, cell_error = _offsets(places, positions)
+    return RelativeFocus(positions, errors, *_dense(places, positions, offset, cell_error, focus_index))
+
+
+def _positions(levels: Sequence[_Places]) -> tuple[Positions, Positions]:
+    """Solve positions by least squares of the diameters of all pairs, first as they are and then of what is left of them.
+
+    Moving one slice or one surface at a time would never undo a common stretch; pairs do.
+    """
+    count = levels[0].count
+    positions, errors = _solved([_measured_whole(each) for each in levels], np.zeros(count))
+    for _ in range(_ROUNDS):
+        positions, errors = _solved([_measured_rest(each, positions) for each in levels], positions)
+    return positions, errors
+
+
+def _measured_whole(places: _Places) -> "_Diameters":
+    """Measure the diameters in all slices of what is sharp near the middle of one."""
+    sharp = np.abs(places.index - places.nearest) <= _NEAR_A_SLICE
+    nothing = np.zeros((len(places.index), places.count))
+    return _measured(places, places.weight * sharp, nothing, nothing[:, 0], np.linspace(0.0, places.widest_px, 61))
+
+
+def _measured_rest(places: _Places, positions: Positions) -> "_Diameters":
+    """Measure the corrections to the diameters that follow from positions."""
+    offset, _ = _offsets(places, positions)
+    place = np.interp(places.index, np.arange(places.count), positions) + offset
+    base = np.abs(positions[None, :] - place[:, None])
+    own_blur = (places.own * base**2).sum(axis=1)
+    base[base > _TOLD_SHARE * places.widest_px] = np.inf
+    return _measured(places, places.weight, base, own_blur, np.linspace(-0.15, 0.15, 31) * places.widest_px)
 
 
 def _measured(
@@ -236,7 +246,7 @@ def _measured(
     one, other = np.nonzero(inside & spread & filled[None, :] & (bend > 0) & ~np.eye(places.count, dtype=bool))
     value = candidates[best] + shift
     least_px2 = np.full(len(one), _LEAST_ERROR_PX2 * places.shrink**2)
-    return _Diameters(one, other, value[one, other], error[one, other], least_px2)
+    return _Diameters(one=one, other=other, value_px=value[one, other], error_px=error[one, other], least_px2=least_px2)
 
 
 def _summed_curves(
@@ -280,7 +290,7 @@ def _offset_costs(
 
 
 def _solved(parts: Sequence[_Diameters], before: Positions) -> tuple[Positions, Positions]:
-    """Robust weighted least squares; bends of the positions over the index cost a little, so that nothing stays open."""
+    """Solve by robust weighted least squares; bends of the positions over the index cost a little, so that nothing stays open."""
     measured, count = _Diameters.joined(parts), len(before)
     sign = np.where(measured.one > measured.other, 1.0, -1.0)
     wanted = (before[measured.one] - before[measured.other]) + sign * measured.value_px
@@ -310,7 +320,7 @@ def _solved(parts: Sequence[_Diameters], before: Positions) -> tuple[Positions, 
 
 
 def _offsets(places: _Places, positions: Positions) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
-    """(what to add to the position that the focus index gives, standard error) of each cell."""
+    """Return (what to add to the position that the focus index gives, standard error) of each cell."""
     steps = np.maximum(np.gradient(positions), 0.3)
     local = np.interp(places.index, np.arange(places.count), steps)
     start = np.interp(places.index, np.arange(places.count), positions)

@@ -1,4 +1,4 @@
-"""A merged stack whose focus distances nobody stated: its blur as solved from the slices, in metres that are guessed and say so.
+"""Merged stacks whose focus distances nobody stated: blur as solved from the slices, in metres that are guessed and say so.
 
 Circles of confusion need no metres: positions in pixels of blur are affine in dioptres. Two numbers make dioptres of them, a scale and an
 offset. Stated distances, or the focal length, f-number and sensor of the lens, tell one or both; what remains is put so that the farthest
@@ -44,7 +44,7 @@ Plane = Float32[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Gauge:
-    """dioptres = offset_dioptres + position_px / px_per_dioptre, for positions that grow towards the camera.
+    """Conversion of pixels of blur, for positions that grow towards the camera: dioptres = offset_dioptres + position_px / px_per_dioptre.
 
     scale_from, offset_from: "distances", "lens" or "guess".
     """
@@ -63,7 +63,7 @@ class Gauge:
 
 
 def as_stated(stack: FocalStack) -> FocalStack:
-    """The stack with nothing in it that an earlier merge guessed, and its slices in the order in which they came."""
+    """Return the stack without anything that an earlier merge guessed, its slices in the order in which they came."""
     stack = _in_given_order(stack)
     if STATED_BEFORE not in stack.metadata:
         return stack
@@ -78,15 +78,8 @@ def as_stated(stack: FocalStack) -> FocalStack:
     )
 
 
-def _stated_slice(each: Slice) -> Slice:
-    ours = (STATED_DISTANCE, SLICE_POSITION, SLICE_POSITION_ERROR, GROWTH, GROWTH_WIDTH)
-    stated = each.metadata.get(STATED_DISTANCE)
-    metadata = {key: value for key, value in each.metadata.items() if key not in ours}
-    return replace(each, focus_distance_m=None if stated is None else float(stated), metadata=metadata)
-
-
 def in_focus_order(stack: FocalStack, ingested: IngestedSlices) -> FocalStack:
-    """The slices, as ingested, sorted by their focus where pictures say that they came in another order."""
+    """Return the stack with its slices, as ingested, sorted by their focus where pictures say that they came in another order."""
     if stack.is_metric:
         return stack
     found = focus_order(lambda index: ingested.read(stack.folder / source_path(stack.slices[index]))[0], len(stack))
@@ -97,18 +90,6 @@ def in_focus_order(stack: FocalStack, ingested: IngestedSlices) -> FocalStack:
     why = f"the slices were not in the order of their focus and have been put in it, as the pictures tell: {names}"
     reference = found.index(stack.reference)
     return replace(stack, slices=slices, reference=reference, metadata=stack.metadata | {ORDER: why})
-
-
-def _in_given_order(stack: FocalStack) -> FocalStack:
-    if ORDER not in stack.metadata:
-        return stack
-    order = sorted(range(len(stack)), key=lambda index: stack.slices[index].metadata[GIVEN_INDEX])
-    slices = tuple(
-        replace(each, metadata={key: value for key, value in each.metadata.items() if key != GIVEN_INDEX})
-        for each in (stack.slices[index] for index in order)
-    )
-    metadata = {key: value for key, value in stack.metadata.items() if key != ORDER}
-    return replace(stack, slices=slices, reference=order.index(stack.reference), metadata=metadata)
 
 
 def with_solved_blur(merged: FocalStack, slices: RegisteredSlices, all_in_focus: Rgb, focus: FocusMap) -> FocalStack:
@@ -126,21 +107,10 @@ def with_solved_blur(merged: FocalStack, slices: RegisteredSlices, all_in_focus:
     return guessed
 
 
-def told_direction(stack: FocalStack, relative: RelativeFocus) -> Direction | None:
-    """The one that two or more stated distances tell, or one at infinity, beyond which nothing lies."""
-    told = [(p, 1.0 / d) for p, d in zip(relative.positions_px, stack.focus_distances_m, strict=True) if d is not None]
-    if len({d for _, d in told}) > 1:
-        slope = np.polyfit([p for p, _ in told], [d for _, d in told], 1)[0]
-        return Direction(near_first=bool(slope < 0), source=FROM_DISTANCES, sure=True)
-    middle_px = 0.5 * (relative.positions_px[0] + relative.positions_px[-1])
-    far_last = {bool(p > middle_px) for p, d in told if d == 0.0}
-    return Direction(near_first=far_last.pop(), source=FROM_DISTANCES, sure=True) if len(far_last) == 1 else None
-
-
 def with_guessed_metres(
     stated: FocalStack, relative: RelativeFocus, direction: Direction, gauge: Gauge, size_px: tuple[int, int]
 ) -> FocalStack:
-    """The merged stack, in which nothing is guessed yet, with a focus distance for every slice, a lens that blurs as solved and a camera.
+    """Return the merged stack, in which nothing is guessed yet, with all focus distances, a camera and a lens that blurs as solved.
 
     size_px: (width, height).
     """
@@ -174,13 +144,8 @@ def with_guessed_metres(
     return replace(stated, slices=slices, lens=lens, camera=stated.camera or _camera(lens, size_px), metadata=metadata)
 
 
-def nearness_px(positions_px: Float[np.ndarray, "*batch"], direction: Direction) -> Float[np.ndarray, "*batch"]:
-    """Positions that grow towards the camera, as dioptres do."""
-    return -positions_px if direction.near_first else positions_px
-
-
 def gauge_of(stated: FocalStack, positions_px: Float[np.ndarray, " slices"], size_px: tuple[int, int]) -> Gauge:
-    """Scale and offset from what is known, else guessed. positions_px: growing towards the camera."""
+    """Return scale and offset from what is known, else guessed. positions_px: growing towards the camera."""
     told = [(float(p), 1.0 / d) for p, d in zip(positions_px, stated.focus_distances_m, strict=True) if d is not None]
     spread_px = max(float(np.ptp(positions_px)), _LEAST_RANGE_PX)
     farthest_px = float(np.min(positions_px))
@@ -207,6 +172,22 @@ def gauge_of(stated: FocalStack, positions_px: Float[np.ndarray, " slices"], siz
     return Gauge(growth, _FARTHEST_DIOPTRES - farthest_px / growth, "guess", "guess")
 
 
+def told_direction(stack: FocalStack, relative: RelativeFocus) -> Direction | None:
+    """Return the direction that two or more stated distances tell, or one at infinity, beyond which nothing lies; else None."""
+    told = [(p, 1.0 / d) for p, d in zip(relative.positions_px, stack.focus_distances_m, strict=True) if d is not None]
+    if len({d for _, d in told}) > 1:
+        slope = np.polyfit([p for p, _ in told], [d for _, d in told], 1)[0]
+        return Direction(near_first=bool(slope < 0), source=FROM_DISTANCES, sure=True)
+    middle_px = 0.5 * (relative.positions_px[0] + relative.positions_px[-1])
+    far_last = {bool(p > middle_px) for p, d in told if d == 0.0}
+    return Direction(near_first=far_last.pop(), source=FROM_DISTANCES, sure=True) if len(far_last) == 1 else None
+
+
+def nearness_px(positions_px: Float[np.ndarray, "*batch"], direction: Direction) -> Float[np.ndarray, "*batch"]:
+    """Return positions that grow towards the camera, as dioptres do."""
+    return -positions_px if direction.near_first else positions_px
+
+
 def write_relative_depth(stack: FocalStack, focus: FocusMap, relative: RelativeFocus, direction: Direction, gauge: Gauge) -> None:
     """Write depth.exr of a stack of `with_guessed_metres`: with Z in its metres, and where surfaces lie in pixels of blur."""
     position_px = nearness_px(relative.focus_px, direction).astype(np.float32)
@@ -220,8 +201,27 @@ def write_relative_depth(stack: FocalStack, focus: FocusMap, relative: RelativeF
     write_exr(stack.depth_path, ExrPart(channels), compress=False)
 
 
+def _stated_slice(each: Slice) -> Slice:
+    ours = (STATED_DISTANCE, SLICE_POSITION, SLICE_POSITION_ERROR, GROWTH, GROWTH_WIDTH)
+    stated = each.metadata.get(STATED_DISTANCE)
+    metadata = {key: value for key, value in each.metadata.items() if key not in ours}
+    return replace(each, focus_distance_m=None if stated is None else float(stated), metadata=metadata)
+
+
+def _in_given_order(stack: FocalStack) -> FocalStack:
+    if ORDER not in stack.metadata:
+        return stack
+    order = sorted(range(len(stack)), key=lambda index: stack.slices[index].metadata[GIVEN_INDEX])
+    slices = tuple(
+        replace(each, metadata={key: value for key, value in each.metadata.items() if key != GIVEN_INDEX})
+        for each in (stack.slices[index] for index in order)
+    )
+    metadata = {key: value for key, value in stack.metadata.items() if key != ORDER}
+    return replace(stack, slices=slices, reference=order.index(stack.reference), metadata=metadata)
+
+
 def _stated_growth(stated: FocalStack, width_px: int) -> float | None:
-    """Pixels of blur per dioptre of the lens that the photographs state, focused far away."""
+    """Return the pixels of blur per dioptre of the lens that the photographs state, focused far away; None where they state none."""
     facts = _stated_lens(stated)
     if facts is None:
         return None
@@ -229,13 +229,13 @@ def _stated_growth(stated: FocalStack, width_px: int) -> float | None:
 
 
 def _focuses(stated: FocalStack, dioptres: float) -> bool:
-    """Whether the stated lens can be focused so near at all."""
+    """Return whether the stated lens can be focused so near at all."""
     facts = _stated_lens(stated)
     return facts is not None and dioptres * facts["focal_length_mm"] < _NEAREST_SHARE * 1000.0
 
 
 def _stated_lens(stated: FocalStack) -> dict[str, float] | None:
-    """focal_length_mm, f_number and sensor_width_mm, where all are known."""
+    """Return focal_length_mm, f_number and sensor_width_mm, where all are known."""
     if stated.lens is not None:
         return {name: getattr(stated.lens, name) for name in _LENS_FACTS}
     facts = stated.metadata.get("optics") or {}

@@ -3,7 +3,7 @@
 Its dioptres are known up to D' = p + q D, for blur in pixels is the same with px_per_dioptre / q. The rule: what the photographs state
 stays (a stated lens fixes q = 1, a stated focus distance counts as one more fact); the facts told fix the rest by least squares of their
 relative errors; and where facts lie at one depth only, the world is scaled as a whole (p = 0), which keeps proportions that are guessed.
-So it is where a slice is stated at infinity, which stays there: then one fact gives all.
+The same holds where a slice is stated at infinity, which stays there: then one fact gives all.
 Blur looks alike on both sides of the focus: where merging had to guess which end of the sweep is near, facts at two depths tell (q < 0).
 """
 
@@ -45,16 +45,46 @@ _CONTRADICTS = 0.1
 _LEAST_DIOPTRES = 1e-6
 _GUESSED_END = "; that the "
 """Begins what merges of former versions add to why their metres are guessed: that one end was taken for near."""
-
 _Unknowns = Callable[[Float[np.ndarray, " numbers"]], tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Regauged:
-    """stack: as written. errors: by how much each fact told is missed, as a share."""
+    """A stack with other metres. stack: as written. errors: by how much each fact told is missed, as a share."""
 
     stack: FocalStack
     errors: tuple[tuple[Fact, float], ...]
+
+
+@dataclass(frozen=True)
+class _Equation:
+    """A fact, with the directions (x / z, y / z, 1) and the dioptres, as they are now, of what is at its pixels."""
+
+    fact: Fact
+    rays: Float[np.ndarray, "pixels 3"]
+    dioptres: Float[np.ndarray, " pixels"]
+
+    @classmethod
+    def of(cls, fact: Fact, depth_m: Float32[np.ndarray, "height width"], camera: Camera) -> "_Equation":
+        rays = [camera.unproject(np.array(each), np.array(1.0)) for each in fact.pixels]
+        return cls(fact, np.array(rays), np.array([1.0 / _depth_at(depth_m, *each) for each in fact.pixels]))
+
+    def metres(self, p: float, q: float) -> float:
+        depth_m = 1.0 / np.maximum(p + q * self.dioptres, _LEAST_DIOPTRES)
+        points_m = self.rays * depth_m[:, None]
+        return float(depth_m[0]) if len(points_m) == 1 else float(np.linalg.norm(points_m[0] - points_m[1]))
+
+    def error(self, p: float, q: float) -> float:
+        return self.metres(p, q) / self.fact.metres - 1.0
+
+
+class _Solution(NamedTuple):
+    """A solution D' = p + q D. deep: whether both rest on facts. directed: whether facts tell which end of the sweep is near."""
+
+    p: float
+    q: float
+    deep: bool
+    directed: bool
 
 
 def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False) -> Regauged:
@@ -110,6 +140,17 @@ def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
     return changed
 
 
+def lines_of(done: Regauged) -> list[str]:
+    """Return lines that tell people what was found."""
+    distances_m = [each for each in done.stack.focus_distances_m if each is not None]
+    facts = metres_facts(done.stack)
+    lines = [f"{done.stack.folder}: focused from {min(distances_m):.4g} m to {max(distances_m):.4g} m, {facts['why']}"]
+    guessed = guesses(done.stack)
+    lines += [f"{done.stack.folder}: still guessed: {guessed}"] if guessed else []
+    off = [f"{fact} by {100 * error:+.1f} %" for fact, error in done.errors if abs(error) > _CONTRADICTS]
+    return [*lines, f"warning: what was told disagrees: {', '.join(off)}: look at the pixels and measure again"] if off else lines
+
+
 def _turn(stack: FocalStack, stated: Float[np.ndarray, " slices"]) -> tuple[float, float]:
     """Return p and q below 0 that turn the stack; what is stated or told stays at its dioptres."""
     facts, dioptres = metres_facts(stack), [1.0 / each for each in stack.focus_distances_m if each]
@@ -124,52 +165,10 @@ def _turn(stack: FocalStack, stated: Float[np.ndarray, " slices"]) -> tuple[floa
     return ends * factor, -factor
 
 
-def lines_of(done: Regauged) -> list[str]:
-    """Say what was found, for people."""
-    distances_m = [each for each in done.stack.focus_distances_m if each is not None]
-    facts = metres_facts(done.stack)
-    lines = [f"{done.stack.folder}: focused from {min(distances_m):.4g} m to {max(distances_m):.4g} m, {facts['why']}"]
-    guessed = guesses(done.stack)
-    lines += [f"{done.stack.folder}: still guessed: {guessed}"] if guessed else []
-    off = [f"{fact} by {100 * error:+.1f} %" for fact, error in done.errors if abs(error) > _CONTRADICTS]
-    return [*lines, f"warning: what was told disagrees: {', '.join(off)}: look at the pixels and measure again"] if off else lines
-
-
 def _with_earlier(stack: FocalStack, told: Sequence[Fact], overwrite: bool) -> tuple[Fact, ...]:
-    """Facts of earlier calls, and the new ones in place of those at the same pixels."""
+    """Return facts of earlier calls, and the new ones in place of those at the same pixels."""
     earlier = [] if overwrite else told_facts(stack)
     return tuple({each.pixels: each for each in (*earlier, *told)}.values())
-
-
-@dataclass(frozen=True)
-class _Equation:
-    """A fact, with the directions (x / z, y / z, 1) and the dioptres, as they are now, of what is at its pixels."""
-
-    fact: Fact
-    rays: Float[np.ndarray, "pixels 3"]
-    dioptres: Float[np.ndarray, " pixels"]
-
-    @classmethod
-    def of(cls, fact: Fact, depth_m: Float32[np.ndarray, "height width"], camera: Camera) -> "_Equation":
-        rays = [camera.unproject(np.array(each), np.array(1.0)) for each in fact.pixels]
-        return cls(fact, np.array(rays), np.array([1.0 / _depth_at(depth_m, *each) for each in fact.pixels]))
-
-    def metres(self, p: float, q: float) -> float:
-        depth_m = 1.0 / np.maximum(p + q * self.dioptres, _LEAST_DIOPTRES)
-        points_m = self.rays * depth_m[:, None]
-        return float(depth_m[0]) if len(points_m) == 1 else float(np.linalg.norm(points_m[0] - points_m[1]))
-
-    def error(self, p: float, q: float) -> float:
-        return self.metres(p, q) / self.fact.metres - 1.0
-
-
-class _Solution(NamedTuple):
-    """D' = p + q D. deep: whether both rest on facts. directed: whether facts tell which end of the sweep is near."""
-
-    p: float
-    q: float
-    deep: bool
-    directed: bool
 
 
 def _solution(equations: Sequence[_Equation], stated: Float[np.ndarray, " slices"], gauge: Mapping[str, Any]) -> _Solution:
@@ -211,7 +210,7 @@ def _least_squares(
 
 
 def _told_depth_m(stack: FocalStack) -> Float32[np.ndarray, "height width"]:
-    """Depth where the slices tell it, by its confidence or the error of its position in blur; nan elsewhere."""
+    """Return depth where the slices tell it, by its confidence or the error of its position in blur; nan elsewhere."""
     depth_m, told = stack.depth_m(), stack.depth_valid(_LEAST_CONFIDENCE)
     channels, gauge = read_exr(stack.depth_path)[0].channels, metres_facts(stack).get("gauge")
     if gauge and POSITION_ERROR in channels:
@@ -250,7 +249,7 @@ def _known_facts(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fa
 
 
 def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
-    """The stack with dioptres p + q D; what its metres rest on is left to the caller."""
+    """Return the stack with dioptres p + q D; what its metres rest on is left to the caller."""
     slices = tuple(_regauged_slice(stack, each, p, q) for each in stack.slices)
     distances_m = [float(each.focus_distance_m or 0.0) for each in slices]
     gauge = dict(metres_facts(stack)["gauge"])
@@ -273,7 +272,7 @@ def _distance(dioptres: float) -> float:
 
 
 def _lens_at(stack: FocalStack, distances_m: list[float]) -> Lens | None:
-    """A stated lens keeps its length; a nominal one is scaled like the world, so that it can focus there and sees the same."""
+    """Return the lens: a stated one keeps its length; a nominal one is scaled like the world, so that it sees the same and can focus."""
     lens = stack.lens
     if lens is None or not is_lens_guessed(stack):
         return None if lens is None else lens.focused_at(distances_m[stack.reference])

@@ -1,0 +1,1 @@
+"""Registration of the slices of a focal stack: one plane transform per slice, from tracked corners."""

@@ -1,10 +1,8 @@
-"""What joins slices that no tracks join: ECC's guess, else the breathing model.
-
-Registration of a focal stack: undoes focus breathing and small movements by one transform per slice.
+"""Registration of a focal stack: undoes focus breathing and small movements by one transform per slice.
 
 Neighbours are matched coarsely by masked ECC and then by tracked corners; slices three apart by corners alone. All tracks
 together give the transforms: similarities, or homographies where a camera in the hand has turned so far that a similarity leaves corners
-clearly apart. The breathing of the lens is the prior: it says which matches to believe, stands in where none
+clearly apart. The breathing of the lens is the prior: it rejects matches, stands in where none
 holds, and is kept as it is where the camera did not move.
 """
 
@@ -38,49 +36,6 @@ from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
 _LAID_SCATTER_PX = 0.01
-
-
-def with_links(
-    count: int, held: Mapping[Pair, CornerTracks], matches: Mapping[Pair, PairMatch], breathing: Breathing, size_px: tuple[int, int]
-) -> dict[Pair, CornerTracks]:
-    """The tracks of pairs that hold and, between neighbours that they leave unconnected, tracks that lie as they should.
-
-    matches: of all neighbours; what ECC found counts where its scale is one that the model allows.
-    """
-    pairs = dict(held)
-    for pair in _missing_links(count, held):
-        match = matches[pair]
-        guessed = (
-            match.tracks is None and match.guess_holds and breathing.allows(pair, scale_of(match.target_from_source, middle_of(size_px)))
-        )
-        link = match.target_from_source if guessed else about_centre(breathing.scale(*pair), *size_px)
-        pairs[pair] = _laid_tracks(link, size_px)
-    return pairs
-
-
-def _missing_links(count: int, pairs: Iterable[Pair]) -> list[Pair]:
-    """The neighbours that must be joined so that all slices hang together, and no more."""
-    group = list(range(count))
-    links = [(i, i + 1) for i in range(count - 1)]
-    missing = []
-    for pair in (*pairs, *links):
-        one, other = (group[k] for k in pair)
-        if one != other:
-            group = [one if each == other else each for each in group]
-            missing.append(pair)
-    return [pair for pair in missing if pair not in set(pairs)]
-
-
-def _laid_tracks(target_from_source: Transform, size_px: tuple[int, int]) -> CornerTracks:
-    """The corners of the picture, as a transform moves them.
-
-    They alone hold two groups of slices together: trusted like tracks, they would give way, and a group shrink to a point, where its own
-    tracks disagree by nothing.
-    """
-    source_px = np.array([[x, y] for x in (0.0, size_px[0]) for y in (0.0, size_px[1])])
-    return CornerTracks(moved(target_from_source, source_px), source_px, _LAID_SCATTER_PX)
-
-
 # Blur that differs at depth edges moves tracks by up to about this much over a stack; less is no movement of the camera.
 LEAST_MOVEMENT_PX = 0.25
 # Slices are moved if that brings corners nearer by this factor, or if it moves them by more than this share of half the diagonal.
@@ -104,7 +59,7 @@ def register_stack(
 
     read_rgb: gives slice i; one picture is held at a time.
     prior_scales: expected magnification of each slice (image distances of the thin lens), where the lens is known.
-    read_valid: where slice i has data that is not saturated; None is everywhere. Raises InputError where sizes differ.
+    read_valid: where slice i has data that is not saturated; None is everywhere. Raises InputError if sizes differ.
     unknown_scales: slices whose prior is a guess (infinity by a sentinel), which pictures override.
     """
     matches, size_px = _matched(read_rgb, count, prior_scales, read_valid)
@@ -120,13 +75,21 @@ def register_stack(
     reference, transforms = _to_narrowest(settled, size_px)
     correlations = tuple(matches[i, i + 1].correlation for i in range(count - 1))
     residuals_px = _residuals_px(transforms, {pair: matches[pair] for pair in held}, size_px)
-    return Registration(reference, transforms, correlations, residuals_px, size_px, breathing, camera_moved)
+    return Registration(
+        reference=reference,
+        reference_from_slice=transforms,
+        correlations=correlations,
+        residuals_px=residuals_px,
+        size_px=size_px,
+        breathing=breathing,
+        camera_moved=camera_moved,
+    )
 
 
 def _matched(
     read_rgb: Callable[[int], Rgb], count: int, prior_scales: Sequence[float] | None, read_valid: Callable[[int], Valid] | None
 ) -> tuple[dict[Pair, PairMatch], tuple[int, int]]:
-    """Pairs (target, source) one and three slices apart, and the size of the slices."""
+    """Match pairs (target, source) one and three slices apart; return the matches and the size of the slices."""
     far = max(1, min(_LONG_STRIDE, count - 1))
     matches: dict[Pair, PairMatch] = {}
     recent: dict[int, SliceStructure] = {}
@@ -154,7 +117,7 @@ def _require_same_size(one: SliceStructure, other: SliceStructure, index: int) -
 def _settled(
     measured: Sequence[Transform], breathing: Breathing, held: Mapping[Pair, CornerTracks], size_px: tuple[int, int]
 ) -> tuple[Sequence[Transform], bool]:
-    """Return (first_from_slice, whether the camera moved): what pictures cannot tell from the lens's own breathing is the lens's.
+    """Return (first_from_slice, whether the camera moved), with the lens's own breathing wherever pictures cannot tell it apart.
 
     First for all of the transforms, then for their scales alone, which drift most: depth edges pull all tracks the same way. Where no lens
     is known, slices that lie on one another as they are stay so: resampling blurs.
@@ -198,7 +161,7 @@ def _apart_px(transforms: Sequence[Transform], held: Mapping[Pair, CornerTracks]
 
 
 def _to_narrowest(first_from_slice: Sequence[Transform], size_px: tuple[int, int]) -> tuple[int, tuple[Transform, ...]]:
-    """(reference, reference_from_slice): what needs the least enlargement sees the narrowest field."""
+    """Return (reference, reference_from_slice); the slice that needs the least enlargement sees the narrowest field."""
     reference = int(np.argmin([scale_of(transform, middle_of(size_px)) for transform in first_from_slice]))
     back = inverse(first_from_slice[reference])
     return reference, tuple(np.eye(2, 3) if i == reference else chained(back, each) for i, each in enumerate(first_from_slice))
@@ -209,10 +172,52 @@ def _departure_px(one: Sequence[Transform], other: Sequence[Transform], size_px:
 
 
 def _residuals_px(transforms: Sequence[Transform], held: Mapping[Pair, PairMatch], size_px: tuple[int, int]) -> tuple[float | None, ...]:
-    """How far each slice's pairs, taken alone, disagree with where all together put it."""
+    """Return by how much each slice's pairs, taken alone, disagree with the joint result."""
     worst: list[float | None] = [None] * len(transforms)
     for (i, j), match in held.items():
         off_px = farthest_corner_px(match.target_from_source, chained(inverse(transforms[i]), transforms[j]), *size_px)
         for k in (i, j):
             worst[k] = max(off_px, worst[k] or 0.0)
     return tuple(worst)
+
+
+def with_links(
+    count: int, held: Mapping[Pair, CornerTracks], matches: Mapping[Pair, PairMatch], breathing: Breathing, size_px: tuple[int, int]
+) -> dict[Pair, CornerTracks]:
+    """Return the tracks of pairs that hold, joined by virtual tracks between neighbours that they leave unconnected.
+
+    The virtual tracks are those of ECC's guess where its scale is one that the breathing model allows, else of that model. matches: of all
+    neighbours.
+    """
+    pairs = dict(held)
+    for pair in _missing_links(count, held):
+        match = matches[pair]
+        guessed = (
+            match.tracks is None and match.guess_holds and breathing.allows(pair, scale_of(match.target_from_source, middle_of(size_px)))
+        )
+        link = match.target_from_source if guessed else about_centre(breathing.scale(*pair), *size_px)
+        pairs[pair] = _laid_tracks(link, size_px)
+    return pairs
+
+
+def _missing_links(count: int, pairs: Iterable[Pair]) -> list[Pair]:
+    """Return the neighbours that must be joined so that all slices are connected, and no more."""
+    group = list(range(count))
+    links = [(i, i + 1) for i in range(count - 1)]
+    missing = []
+    for pair in (*pairs, *links):
+        one, other = (group[k] for k in pair)
+        if one != other:
+            group = [one if each == other else each for each in group]
+            missing.append(pair)
+    return [pair for pair in missing if pair not in set(pairs)]
+
+
+def _laid_tracks(target_from_source: Transform, size_px: tuple[int, int]) -> CornerTracks:
+    """Return the corners of the picture as tracks of a transform.
+
+    They alone hold two groups of slices together: trusted like tracks, they would give way, and a group shrink to a point, where its own
+    tracks disagree by nothing.
+    """
+    source_px = np.array([[x, y] for x in (0.0, size_px[0]) for y in (0.0, size_px[1])])
+    return CornerTracks(moved(target_from_source, source_px), source_px, _LAID_SCATTER_PX)

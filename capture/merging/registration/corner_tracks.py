@@ -1,8 +1,6 @@
-"""What registration compares: the detail of a slice, freed from exposure, vignetting and contrast, at several sizes.
+"""Corners found in one slice, tracked into another to a fraction of a pixel, and the similarity that most tracks agree on.
 
-Where the corners of one slice lie in another, to a fraction of a pixel.
-
-The similarity that most tracks agree on.
+Slices are compared by their detail, freed from exposure, vignetting and contrast, at several sizes.
 """
 
 from dataclasses import dataclass
@@ -28,18 +26,28 @@ _LEAST_CONTRAST = 0.1
 _GREY, _GREY_PER_DEVIATION = 128.0, 45.0
 # Saturated and missing pixels spoil the corners around them, whose outlines move with the focus.
 _SPOILT_PX = 9
+_WINDOW_PX = 19
+_FIRST_PYRAMID_LEVELS = 1
+_FARTHEST_PX = 6.0  # from where the first guess puts a corner
+_LARGEST_ROUND_TRIP_PX = 0.15
+_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+AGREEING_PX = 1.0
+_SMALLEST_SCATTER_PX = 0.05
+_ROUNDS = 12
 
 Plane = Float32[np.ndarray, "height width"]
 Grey = UInt8[np.ndarray, "height width"]
 Corners = Float32[np.ndarray, "corners 2"]
+Points = Float[np.ndarray, "tracks 2"]
+Distances = Float[np.ndarray, " tracks"]
 
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """A slice 2^level times smaller.
+    """Detail of a slice 2^level times smaller.
 
     detail: band-passed log luminance over its local deviation; 128 is none.
-    usable: 255 where the slice has data that is not saturated, nor near such, else 0.
+    usable: 255 where the slice has data that is neither saturated nor near saturated pixels, else 0.
     corners_px: (N, 2) where detail can be located in both directions, in pixels of this level, (0.5, 0.5) at the first centre.
     """
 
@@ -51,7 +59,7 @@ class DetailLevel:
 
 @dataclass(frozen=True)
 class SliceStructure:
-    """One slice as registration sees it.
+    """A slice as registration sees it.
 
     size_px: (width, height) of the slice.
     levels: from small to large.
@@ -64,8 +72,27 @@ class SliceStructure:
     coarse_usable: Grey
 
 
+@dataclass(frozen=True)
+class CornerTracks:
+    """Places seen in two slices, (0.5, 0.5) at the centre of the first pixel.
+
+    scatter_px: standard deviation of a single track.
+    """
+
+    target_px: Points
+    source_px: Points
+    scatter_px: float = 1.0
+
+    def __len__(self) -> int:
+        return len(self.target_px)
+
+    def enlarged(self, factor: float) -> "CornerTracks":
+        """Return the tracks in pixels that are smaller by a factor."""
+        return CornerTracks(self.target_px * factor, self.source_px * factor, self.scatter_px * factor)
+
+
 def structure_of(rgb: Float32[np.ndarray, "height width 3"], valid: Bool[np.ndarray, "height width"] | None = None) -> SliceStructure:
-    """valid: where the slice has data that is not saturated; None is everywhere."""
+    """Compute the detail and the corners of a slice. valid: where it has data that is not saturated; None is everywhere."""
     luminance = cv2.transform(rgb, np.array([[0.2126, 0.7152, 0.0722]], np.float32))
     finest = max(0, int(np.ceil(0.5 * np.log2(luminance.size / _MOST_PIXELS))))
     coarsest = max(finest, int(np.log2(max(1.0, min(luminance.shape) / _SMALLEST_SIDE_PX))))
@@ -78,13 +105,46 @@ def structure_of(rgb: Float32[np.ndarray, "height width 3"], valid: Bool[np.ndar
     return SliceStructure((rgb.shape[1], rgb.shape[0]), levels, pictures[0][1], pictures[0][2])
 
 
-def _logarithm(luminance: Plane) -> Plane:
-    """In which a change of exposure or of light is an offset and bright lights do not outshout the rest."""
-    return cv2.log(np.maximum(luminance, 0.0) + np.float32(0.02))
+def track_corners(target: DetailLevel, source: DetailLevel, target_from_source: Transform, is_first_guess: bool = True) -> CornerTracks:
+    """Follow corners of both slices into the other (Lucas and Kanade 1981, Bouguet 2000) and back; drop those that do not return.
+
+    All in pixels of the level. is_first_guess: the transform may be pixels off. Blur that is the same on all sides of a corner
+    does not move it, so a track is unbiased where depth is even. Depth edges shift single tracks, which a robust fit leaves
+    out and a correlation of whole pictures cannot.
+    """
+    levels = _FIRST_PYRAMID_LEVELS if is_first_guess else 0
+    there = _followed(target, source, inverse(target_from_source), levels)
+    back = _followed(source, target, target_from_source, levels)
+    return CornerTracks(np.vstack([there[0], back[1]]), np.vstack([there[1], back[0]]))
+
+
+def similarity_of_tracks(tracks: CornerTracks) -> Transform:
+    """Fit target_from_source by least squares, reweighted until outliers do not count. Needs at least 2 tracks."""
+    weights = np.ones(len(tracks))
+    for _ in range(_ROUNDS):
+        similarity = _weighted_similarity(tracks, weights)
+        off_px = distances_px(tracks, similarity)
+        weights = robust_weights(off_px, typical_px(off_px))
+    return similarity
+
+
+def distances_px(tracks: CornerTracks, target_from_source: Transform) -> Distances:
+    """Return the distance at which each track's source lands from its target."""
+    return np.hypot(*(tracks.target_px - moved(target_from_source, tracks.source_px)).T)
+
+
+def typical_px(distances: Distances) -> float:
+    """Return 1.5 times the median distance, which is never 0."""
+    return max(_SMALLEST_SCATTER_PX, 1.5 * float(np.median(distances))) if len(distances) else 1.0
+
+
+def robust_weights(distances: Distances, scatter_px: float) -> Distances:
+    """Return the weights of Geman and McClure 1985: 1 for what agrees, towards 0 for what is many times the scatter off."""
+    return 1.0 / (1.0 + (distances / scatter_px) ** 2) ** 2
 
 
 def shrunk(plane: Plane, level: int) -> Float32[np.ndarray, "small_height small_width"]:
-    """Area-averaged by exactly 2^level; rows and columns that do not fill a pixel are left out."""
+    """Average over areas of exactly 2^level pixels; rows and columns that do not fill a pixel are left out."""
     if level == 0:
         return plane
     height, width = (max(1, side >> level) for side in plane.shape)
@@ -92,10 +152,15 @@ def shrunk(plane: Plane, level: int) -> Float32[np.ndarray, "small_height small_
 
 
 def shrunk_mask(mask: Grey, level: int) -> UInt8[np.ndarray, "small_height small_width"]:
-    """255 where the whole of a larger pixel is."""
+    """Return 255 where the whole of a larger pixel is 255."""
     if level == 0:
         return mask
     return np.where(shrunk(mask.astype(np.float32), level) > 254.5, np.uint8(255), np.uint8(0))
+
+
+def _logarithm(luminance: Plane) -> Plane:
+    """Return log luminance, in which a change of exposure is an offset and bright lights do not dominate."""
+    return cv2.log(np.maximum(luminance, 0.0) + np.float32(0.02))
 
 
 def _detail_level(level: int, logarithm: Plane, usable: Grey) -> DetailLevel:
@@ -105,7 +170,7 @@ def _detail_level(level: int, logarithm: Plane, usable: Grey) -> DetailLevel:
 
 
 def _normalised_detail(logarithm: Plane) -> Grey:
-    """Local normalisation lets sharp and blurred versions of a texture look alike, and every part of the picture count."""
+    """Normalise the detail locally, so that sharp and blurred versions of a texture look alike and every part of the picture counts."""
     box = (_SURROUND_PX, _SURROUND_PX)
     band = cv2.GaussianBlur(logarithm, (0, 0), _NOISE_SIGMA_PX) - cv2.boxFilter(logarithm, -1, box)
     deviation = cv2.sqrt(cv2.boxFilter(band * band, -1, box) + np.float32(_LEAST_CONTRAST**2))
@@ -113,51 +178,10 @@ def _normalised_detail(logarithm: Plane) -> Grey:
 
 
 def _corners_px(detail: Grey, usable: Grey) -> Corners:
-    """Shi and Tomasi 1994, spread over the picture by a least distance."""
+    """Find corners (Shi and Tomasi 1994), spread over the picture by a least distance."""
     apart_px = max(6.0, 0.5 * float(np.sqrt(detail.size / MOST_CORNERS)))
     found = cv2.goodFeaturesToTrack(detail, MOST_CORNERS, _WEAKEST_CORNER, apart_px, mask=usable, blockSize=_CORNER_BLOCK_PX)
     return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2) + np.float32(0.5)
-
-
-_WINDOW_PX = 19
-_FIRST_PYRAMID_LEVELS = 1
-_FARTHEST_PX = 6.0  # from where the first guess puts a corner
-_LARGEST_ROUND_TRIP_PX = 0.15
-_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
-
-Points = Float[np.ndarray, "tracks 2"]
-
-
-@dataclass(frozen=True)
-class CornerTracks:
-    """The same places in two slices, (0.5, 0.5) at the centre of the first pixel.
-
-    scatter_px: how well a single one is to be trusted.
-    """
-
-    target_px: Points
-    source_px: Points
-    scatter_px: float = 1.0
-
-    def __len__(self) -> int:
-        return len(self.target_px)
-
-    def enlarged(self, factor: float) -> "CornerTracks":
-        """In pixels that are smaller by a factor."""
-        return CornerTracks(self.target_px * factor, self.source_px * factor, self.scatter_px * factor)
-
-
-def track_corners(target: DetailLevel, source: DetailLevel, target_from_source: Transform, is_first_guess: bool = True) -> CornerTracks:
-    """Corners of both slices followed into the other (Lucas and Kanade 1981, Bouguet 2000) and back; what does not return is dropped.
-
-    All in pixels of the level. is_first_guess: the transform may be pixels off. Blur that is the same on all sides of a corner
-    does not move it, so that a track is unbiased where depth is even; depth edges shift single tracks, which a robust fit leaves
-    out and a correlation of whole pictures cannot.
-    """
-    levels = _FIRST_PYRAMID_LEVELS if is_first_guess else 0
-    there = _followed(target, source, inverse(target_from_source), levels)
-    back = _followed(source, target, target_from_source, levels)
-    return CornerTracks(np.vstack([there[0], back[1]]), np.vstack([there[1], back[0]]))
 
 
 def _followed(origin: DetailLevel, goal: DetailLevel, goal_from_origin: Transform, pyramid_levels: int) -> tuple[Points, Points]:
@@ -194,40 +218,8 @@ def _is_usable(level: DetailLevel, points: Float32[np.ndarray, "tracks 2"]) -> B
     return inside & (level.usable[row.clip(0, height - 1), column.clip(0, width - 1)] > 0)
 
 
-AGREEING_PX = 1.0
-_SMALLEST_SCATTER_PX = 0.05
-_ROUNDS = 12
-
-Distances = Float[np.ndarray, " tracks"]
-
-
-def similarity_of_tracks(tracks: CornerTracks) -> Transform:
-    """target_from_source by least squares, reweighted until the odd ones do not count. Wants at least 2 tracks."""
-    weights = np.ones(len(tracks))
-    for _ in range(_ROUNDS):
-        similarity = _weighted_similarity(tracks, weights)
-        off_px = distances_px(tracks, similarity)
-        weights = robust_weights(off_px, typical_px(off_px))
-    return similarity
-
-
-def distances_px(tracks: CornerTracks, target_from_source: Transform) -> Distances:
-    """How far each track's source lands from its target."""
-    return np.hypot(*(tracks.target_px - moved(target_from_source, tracks.source_px)).T)
-
-
-def typical_px(distances: Distances) -> float:
-    """How far most lie off, and never nothing."""
-    return max(_SMALLEST_SCATTER_PX, 1.5 * float(np.median(distances))) if len(distances) else 1.0
-
-
-def robust_weights(distances: Distances, scatter_px: float) -> Distances:
-    """Of Geman and McClure 1985: 1 for what agrees, towards 0 for what is many times the scatter off."""
-    return 1.0 / (1.0 + (distances / scatter_px) ** 2) ** 2
-
-
 def _weighted_similarity(tracks: CornerTracks, weights: Distances) -> Transform:
-    """Umeyama 1991 in the plane, weighted."""
+    """Fit a weighted similarity in the plane (Umeyama 1991)."""
     share = (weights / weights.sum())[:, None]
     middle_target, middle_source = (share * tracks.target_px).sum(0), (share * tracks.source_px).sum(0)
     p, q = tracks.source_px - middle_source, tracks.target_px - middle_target

@@ -1,8 +1,6 @@
-"""Focus breathing: how much larger each slice shows the scene than the first one does.
+"""Registration of a stack: one transform per slice, the model of focus breathing behind it, and registration.json.
 
-How the slices of a focal stack fit together: one transform per slice.
-
-registration.json: how the slices of a stack lie, to be read by people and used again instead of computing it.
+registration.json can be read by people, and used again instead of computing the registration.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -22,13 +20,20 @@ LARGEST_DEPARTURE = 0.01
 _ROUNDS = 30
 _SMALLEST_SCATTER = 2e-4
 _FEWEST_FOR_A_BEND = 5
+FILE_NAME = "registration.json"
+FORMAT = "mrbokeh-registration"
+VERSION = 1
+_CONVENTION = (
+    "reference_from_slice takes (x, y, 1) of a slice to pixels of the reference slice; the first pixel's centre is (0.5, 0.5); "
+    "a third row, where the camera has turned, is what both are divided by"
+)
 
 Pair = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Breathing:
-    """The model of a stack.
+    """Focus breathing: how much larger each slice shows the scene than the first one does.
 
     scales: magnification of each slice; only ratios count.
     source: "lens" (image distances of the thin lens) or "pictures" (a smooth curve through what was measured).
@@ -40,80 +45,22 @@ class Breathing:
     largest_departure: float = LARGEST_DEPARTURE
 
     def scale(self, target: int, source: int) -> float:
-        """Of target_from_source."""
+        """Return the scale of target_from_source."""
         return self.scales[target] / self.scales[source]
 
     def allows(self, pair: Pair, measured_scale: float) -> bool:
         return bool(abs(measured_scale / self.scale(*pair) - 1.0) <= self.largest_departure)
 
 
-def breathing_of(
-    count: int, measured: Mapping[Pair, float], lens_scales: Sequence[float] | None, unknown: Collection[int] = ()
-) -> Breathing:
-    """The lens's own breathing where most pairs agree with it, else one smooth curve over the slices.
-
-    measured: scale of target_from_source of pairs (target, source).
-    lens_scales: image distances of the slices; None where the lens or its focus is unknown. Lenses with internal focusing
-      breathe otherwise than the thin lens.
-    unknown: slices whose scale is the lens's at infinity because nobody knows their focus; pictures tell it between there and the
-      farthest known focus.
-    """
-    if lens_scales is not None:
-        scales = _told_by_pictures(lens_scales, unknown, measured)
-        lens = Breathing(tuple(float(scale / scales[0]) for scale in scales), "lens")
-        known = {pair: scale for pair, scale in measured.items() if not set(pair) & set(unknown)}
-        if not known or np.median([abs(scale / lens.scale(*pair) - 1.0) for pair, scale in known.items()]) <= LARGEST_DEPARTURE:
-            return lens
-    return _fitted(_abscissae(count, lens_scales), measured)
-
-
-def _told_by_pictures(lens_scales: Sequence[float], unknown: Collection[int], measured: Mapping[Pair, float]) -> list[float]:
-    """One after the other, by the median of the pairs with slices that are known or told before; where there are none, as given."""
-    scales = {index: float(scale) for index, scale in enumerate(lens_scales) if index not in unknown}
-    least_known = min(scales.values(), default=np.inf)
-    for index in sorted(unknown):
-        pairs = ((target, source, ratio) for (target, source), ratio in measured.items() if index in (target, source))
-        found = [ratio * scales[s] if t == index else scales[t] / ratio for t, s, ratio in pairs if {t, s} - {index} <= scales.keys()]
-        if found:
-            scales[index] = float(np.clip(np.median(found), lens_scales[index], max(lens_scales[index], least_known)))
-    return [scales.get(index, float(scale)) for index, scale in enumerate(lens_scales)]
-
-
-def _abscissae(count: int, lens_scales: Sequence[float] | None) -> Float[np.ndarray, " slices"]:
-    """From 0 to 1: focus in dioptres as far as it is known (the log of the image distance is nearly linear in them), else the index."""
-    along = np.arange(count, dtype=np.float64) if lens_scales is None else np.log(np.asarray(lens_scales, np.float64))
-    if not np.ptp(along) > 0:
-        along = np.arange(count, dtype=np.float64)
-    return (along - along[0]) / (along[-1] - along[0] or 1.0)
-
-
-def _fitted(along: Float[np.ndarray, " slices"], measured: Mapping[Pair, float]) -> Breathing:
-    """log scale = c_1 u + c_2 u^2 by least absolute differences (reweighted least squares)."""
-    terms = np.column_stack([along**power for power in range(1, 2 + (len(along) >= _FEWEST_FOR_A_BEND))])
-    if not measured:
-        return Breathing((1.0,) * len(along), "pictures")
-    rows = np.array([terms[target] - terms[source] for target, source in measured])
-    wanted = np.log(list(measured.values()))
-    weights, coefficients = np.ones(len(wanted)), np.zeros(terms.shape[1])
-    for _ in range(_ROUNDS):
-        root = np.sqrt(weights)
-        coefficients = np.linalg.lstsq(rows * root[:, None], wanted * root, rcond=None)[0]
-        weights = 1.0 / np.maximum(np.abs(rows @ coefficients - wanted), _SMALLEST_SCATTER)
-    # Uneven steps of the focus ring scatter about the curve; they are no errors.
-    scatter = 1.4826 * float(np.median(np.abs(rows @ coefficients - wanted)))
-    scales = tuple(float(each) for each in np.exp(terms @ coefficients))
-    return Breathing(scales, "pictures", max(LARGEST_DEPARTURE, 4.0 * scatter))
-
-
 @dataclass(frozen=True)
 class Registration:
-    """How the slices of a stack fit together.
+    """Transforms that lay the slices of a stack on one of them.
 
     reference: index of the slice with the narrowest field of view; all others are enlarged to match it.
     reference_from_slice: (2, 3) per slice, or (3, 3) where the camera turned in the hand; pixel coordinates with (0.5, 0.5) at the centre
       of the first pixel.
     correlations: ECC correlation of each neighbour pair (1 is perfect, below 0.6 counts as none).
-    residuals_px: per slice, how far a corner of the picture lies off by the worst of its pairs; None where no pair of the
+    residuals_px: per slice, the distance by which the worst of its pairs displaces a corner of the picture; None where no pair of the
       slice held and the breathing model alone has placed it.
     size_px: (width, height) of the slices.
     breathing: the model that served as prior.
@@ -130,19 +77,22 @@ class Registration:
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """How much larger the middle of each slice becomes."""
+        """Return the enlargement of each slice in its middle."""
         middle_px = middle_of(self.size_px or (0, 0))
         return tuple(scale_of(transform, middle_px) for transform in self.reference_from_slice)
 
 
-FILE_NAME = "registration.json"
-FORMAT = "mrbokeh-registration"
-VERSION = 1
-
-_CONVENTION = (
-    "reference_from_slice takes (x, y, 1) of a slice to pixels of the reference slice; the first pixel's centre is (0.5, 0.5); "
-    "a third row, where the camera has turned, is what both are divided by"
-)
+def read_registration(path: Path | str, slices: int | None = None, size_px: tuple[int, int] | None = None) -> Registration:
+    """Read registration.json. Raises InputError if it is not a registration of so many slices of that (width, height)."""
+    document = read_json(path, "a registration")
+    if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
+        raise InputError(f"{path}: expected format {FORMAT!r} version {VERSION}: delete the file, and merging registers the slices anew")
+    try:
+        registration = _registration(document)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path} is incomplete ({error!r}): delete it, and merging registers the slices anew") from None
+    _require_fit(registration, path, slices, size_px)
+    return registration
 
 
 def write_registration(path: Path | str, registration: Registration) -> None:
@@ -162,17 +112,24 @@ def write_registration(path: Path | str, registration: Registration) -> None:
     write_json(path, document)
 
 
-def read_registration(path: Path | str, slices: int | None = None, size_px: tuple[int, int] | None = None) -> Registration:
-    """Raises InputError where the file is not a registration, or not one of so many slices of that (width, height)."""
-    document = read_json(path, "a registration")
-    if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
-        raise InputError(f"{path}: expected format {FORMAT!r} version {VERSION}: delete the file, and merging registers the slices anew")
-    try:
-        registration = _registration(document)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path} is incomplete ({error!r}): delete it, and merging registers the slices anew") from None
-    _require_fit(registration, path, slices, size_px)
-    return registration
+def breathing_of(
+    count: int, measured: Mapping[Pair, float], lens_scales: Sequence[float] | None, unknown: Collection[int] = ()
+) -> Breathing:
+    """Return the lens's own breathing where most pairs agree with it, else one smooth curve over the slices.
+
+    measured: scale of target_from_source of pairs (target, source).
+    lens_scales: image distances of the slices; None where the lens or its focus is unknown. Lenses with internal focusing
+      breathe otherwise than the thin lens.
+    unknown: slices whose scale is the lens's at infinity because nobody knows their focus; pictures tell it between there and the
+      farthest known focus.
+    """
+    if lens_scales is not None:
+        scales = _told_by_pictures(lens_scales, unknown, measured)
+        lens = Breathing(tuple(float(scale / scales[0]) for scale in scales), "lens")
+        known = {pair: scale for pair, scale in measured.items() if not set(pair) & set(unknown)}
+        if not known or np.median([abs(scale / lens.scale(*pair) - 1.0) for pair, scale in known.items()]) <= LARGEST_DEPARTURE:
+            return lens
+    return _fitted(_abscissae(count, lens_scales), measured)
 
 
 def _registration(document: dict[str, Any]) -> Registration:
@@ -207,3 +164,41 @@ def _require_fit(registration: Registration, path: Path | str, slices: int | Non
         raise InputError(
             f"{path} registers slices of {given} px, but the stack has {expected} px: give the registration of a stack like it"
         )
+
+
+def _told_by_pictures(lens_scales: Sequence[float], unknown: Collection[int], measured: Mapping[Pair, float]) -> list[float]:
+    """Fill in unknown scales one after the other, by the median of their pairs with known ones; without such pairs they stay as given."""
+    scales = {index: float(scale) for index, scale in enumerate(lens_scales) if index not in unknown}
+    least_known = min(scales.values(), default=np.inf)
+    for index in sorted(unknown):
+        pairs = ((target, source, ratio) for (target, source), ratio in measured.items() if index in (target, source))
+        found = [ratio * scales[s] if t == index else scales[t] / ratio for t, s, ratio in pairs if {t, s} - {index} <= scales.keys()]
+        if found:
+            scales[index] = float(np.clip(np.median(found), lens_scales[index], max(lens_scales[index], least_known)))
+    return [scales.get(index, float(scale)) for index, scale in enumerate(lens_scales)]
+
+
+def _abscissae(count: int, lens_scales: Sequence[float] | None) -> Float[np.ndarray, " slices"]:
+    """Return 0 to 1: focus in dioptres as far as it is known (the log of the image distance is nearly linear in them), else the index."""
+    along = np.arange(count, dtype=np.float64) if lens_scales is None else np.log(np.asarray(lens_scales, np.float64))
+    if not np.ptp(along) > 0:
+        along = np.arange(count, dtype=np.float64)
+    return (along - along[0]) / (along[-1] - along[0] or 1.0)
+
+
+def _fitted(along: Float[np.ndarray, " slices"], measured: Mapping[Pair, float]) -> Breathing:
+    """Fit log scale = c_1 u + c_2 u^2 by least absolute differences (reweighted least squares)."""
+    terms = np.column_stack([along**power for power in range(1, 2 + (len(along) >= _FEWEST_FOR_A_BEND))])
+    if not measured:
+        return Breathing((1.0,) * len(along), "pictures")
+    rows = np.array([terms[target] - terms[source] for target, source in measured])
+    wanted = np.log(list(measured.values()))
+    weights, coefficients = np.ones(len(wanted)), np.zeros(terms.shape[1])
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weights)
+        coefficients = np.linalg.lstsq(rows * root[:, None], wanted * root, rcond=None)[0]
+        weights = 1.0 / np.maximum(np.abs(rows @ coefficients - wanted), _SMALLEST_SCATTER)
+    # Uneven steps of the focus ring scatter about the curve; they are no errors.
+    scatter = 1.4826 * float(np.median(np.abs(rows @ coefficients - wanted)))
+    scales = tuple(float(each) for each in np.exp(terms @ coefficients))
+    return Breathing(scales, "pictures", max(LARGEST_DEPARTURE, 4.0 * scatter))
