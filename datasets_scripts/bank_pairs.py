@@ -6,20 +6,24 @@
 
 Random layered scenes are rendered with the exact kernels of the bank (`ScatterReference`), each focused at several distances. What is
 hard in photographs is exact here: all-in-focus picture and depth. Finished files are kept; an interrupted run goes on where it stopped.
+
+Layered scenes made from numbers, for training on a measured lens: discs and bars of texture before a wall, with lamps.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
+from jaxtyping import Bool, Float32
 
-from datasets_scripts.bank_pairs_scenes import FARTHEST_M, NEAREST_M, random_layers
-from datasets_scripts.bokeh_stacks_manifest import LICENCE, stack_record
-from datasets_scripts.bokeh_stacks_view import slice_name
+from datasets_scripts.made_sets.bokeh_view import LICENCE, slice_name, stack_record
+from datasets_scripts.scenes.textures import checks, mottled, wood
+from datasets_scripts.tracers.traced_scene import Texture
 from mrbokeh.images.camera_rgb import write_camera_rgb
-from mrbokeh.images.layer import flatten
+from mrbokeh.images.layer import Layer, flatten, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
@@ -34,6 +38,55 @@ from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_st
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
+
+NEAREST_M, FARTHEST_M = 0.9, 6.5
+_TEXTURES: tuple[Callable[..., Texture], ...] = (mottled, wood, checks)
+_LAMPS, _LAMP_RADIANCE = 12, (20.0, 60.0)
+_SHAPES = (3, 7)  # least and most, exclusive
+
+
+def random_layers(size_px: tuple[int, int], rng: np.random.Generator) -> list[Layer]:
+    """Front first, each of one depth, the last a slanted opaque wall; (height, width). Edges are hard: a pixel has one depth."""
+    dioptres = np.sort(rng.uniform(1.0 / FARTHEST_M, 1.0 / NEAREST_M, int(rng.integers(*_SHAPES)) + 1))[::-1]
+    shapes = [_card(size_px, float(1.0 / each), rng) for each in dioptres[:-1]]
+    return [*shapes, _wall(size_px, float(dioptres[-1]), rng)]
+
+
+def _card(size_px: tuple[int, int], depth_m: float, rng: np.random.Generator) -> Layer:
+    inside = _disc(size_px, rng) if rng.random() < 0.5 else _bar(size_px, rng)
+    rgb = np.where(inside[..., None], _texture(size_px, rng), np.float32(0.0))
+    return Layer(rgb, inside.astype(np.float32), np.where(inside, np.float32(depth_m), np.float32(np.inf)).astype(np.float32))
+
+
+def _wall(size_px: tuple[int, int], dioptres: float, rng: np.random.Generator) -> Layer:
+    """Slanted by up to a tenth of its distance, with lamps of one pixel."""
+    across = np.linspace(-0.1, 0.1, size_px[1]) * rng.uniform(-1.0, 1.0)
+    rgb = _texture(size_px, rng)
+    rows, columns = (rng.integers(0, length, _LAMPS) for length in size_px)
+    rgb[rows, columns] = rng.uniform(*_LAMP_RADIANCE, (_LAMPS, 1)) * rng.uniform(0.4, 1.0, (_LAMPS, 3))
+    depth_m = np.clip((1.0 + across) / dioptres, NEAREST_M, FARTHEST_M)
+    return opaque(rgb, np.broadcast_to(depth_m, size_px).astype(np.float32))
+
+
+def _disc(size_px: tuple[int, int], rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
+    rows, columns = np.indices(size_px) + 0.5
+    return np.asarray(
+        np.hypot(rows - rng.uniform(0, size_px[0]), columns - rng.uniform(0, size_px[1])) < size_px[0] * rng.uniform(0.1, 0.3)
+    )
+
+
+def _bar(size_px: tuple[int, int], rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
+    rows, columns = np.indices(size_px) + 0.5
+    angle_rad, row, column = rng.uniform(0.0, np.pi), rng.uniform(0, size_px[0]), rng.uniform(0, size_px[1])
+    away = (columns - column) * np.sin(angle_rad) - (rows - row) * np.cos(angle_rad)
+    return np.asarray(np.abs(away) < size_px[0] * rng.uniform(0.01, 0.08))
+
+
+def _texture(size_px: tuple[int, int], rng: np.random.Generator) -> Float32[np.ndarray, "height width 3"]:
+    colours = rng.uniform(0.05, 0.9, (2, 3))
+    whole = _TEXTURES[int(rng.integers(len(_TEXTURES)))](max(size_px), rng, tuple(colours[0]), tuple(colours[1]))
+    return np.ascontiguousarray(whole[: size_px[0], : size_px[1]]).astype(np.float32)
+
 
 PLAN_NAME = "plan.json"
 _TEST_SHARE = 0.2

@@ -6,17 +6,193 @@ The object hangs behind a fence or leaves and before everything else. OUT/SCENE_
 conventions), scene/all_in_focus.exr, scene/depth.exr, scene/OPENING_FOCUS.exr (the photographs), object.exr (sharp, RGBA and Z),
 both/OPENING_FOCUS.exr (the truth) and sheet.png. Finished files are kept, so an interrupted run goes on where it stopped. It needs
 Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and is fast where LLVM's library is installed (Debian: libllvm19).
+
+Virtual objects for the mixed-reality truth: a ball in a hoop, a box and leaves, between the near things of a scene and the rest.
+
+A contact sheet of one view of the mixed-reality truth: what is sharp, then every photograph beside the same with the object.
+
+The files of one view of the mixed-reality truth: the scene alone, the object alone, and both traced together.
 """
 
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 import typer
+from jaxtyping import Float
 
-from datasets_scripts.mixed_reality_objects import OBJECT_DISTANCES_M
-from datasets_scripts.mixed_reality_views import MixedView
-from datasets_scripts.truth_plan import TruthPlan
-from datasets_scripts.truth_set import make_missing, truth_command
+from datasets_scripts.made_sets.file_job import Job
+from datasets_scripts.made_sets.truth_plan import TruthPlan, truth_name, view_document
+from datasets_scripts.made_sets.truth_set import ViewFiles, make_missing, truth_command
+from datasets_scripts.scenes.textures import checks, spots
+from datasets_scripts.scenes.truth_scenes import colour, fine, make_scene
+from datasets_scripts.tracers.truth import TruthTracer, make_tracer, sharp_layer
+from datasets_scripts.tracers.truth_scene import Body, PackedScene, TruthScene, ball, box, leaf, pack, wire
+from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.image_io import SheetRow, read_image, read_layer, write_contact_sheet, write_image, write_layer
+from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
+
+_HOOP_POINTS = 96
+_SUN, _SKY = slice(6, 9), slice(9, 12)
+
+OBJECT_DISTANCES_M: dict[str, float] = {"fence": 1.25, "leaves": 1.9}
+"""Scenes with near things, and the distance of the object's middle: behind all of those, before all of the rest."""
+
+
+def virtual_object(name: str, seed: int) -> TruthScene:
+    """The object of a scene alone, as a thin foreground before nothing; the seed chooses textures and places."""
+    rng = np.random.default_rng([seed, *f"object of {name}".encode()])
+    distance_m = OBJECT_DISTANCES_M[name]
+    centre_m = distance_m * np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.02, 0.02), 1.0])
+    bodies = (
+        [make(rng, centre_m, distance_m) for make in (_ball, _hoop)] + _box(rng, centre_m, distance_m) + _leaves(rng, centre_m, distance_m)
+    )
+    return TruthScene("thin", tuple(replace(body, thin=True) for body in bodies))
+
+
+def scene_around(name: str, seed: int) -> TruthScene:
+    """The truth scene of that name without the lamps that would hang before or in the object."""
+    scene, virtual = make_scene(name, seed), virtual_object(name, seed)
+    behind_m = max(float(body.vertices_m[:, 2].max()) for body in virtual.bodies)
+    return replace(scene, lamps=tuple(lamp for lamp in scene.lamps if lamp.centre_m[2] > behind_m))
+
+
+def with_object(scene: TruthScene, virtual: TruthScene) -> TruthScene:
+    """Both in one world."""
+    return replace(scene, bodies=(*scene.bodies, *(replace(body, thin=False) for body in virtual.bodies)))
+
+
+def without_shadows(packed: PackedScene) -> PackedScene:
+    """The sun reaches whatever faces it: then neither of two things changes the light on the other."""
+    facets = packed.facets.copy()
+    facets[:, _SKY] += facets[:, _SUN]
+    facets[:, _SUN] = 0.0
+    return replace(packed, facets=facets)
+
+
+def _ball(rng: np.random.Generator, centre_m: np.ndarray, size_m: float) -> Body:
+    texture = spots(384, rng, colour(rng, 0.8), (colour(rng, 0.1), colour(rng, 0.3), colour(rng, 0.6)), 60, (6.0, 20.0))
+    return ball(centre_m, 0.055 * size_m, texture)
+
+
+def _hoop(rng: np.random.Generator, centre_m: np.ndarray, size_m: float) -> Body:
+    angle = np.linspace(0.0, 2.0 * np.pi, _HOOP_POINTS)
+    lean = rng.uniform(0.3, 0.6)
+    circle = np.stack([np.cos(angle), np.sin(angle), lean * np.cos(angle + rng.uniform(0, 6))], axis=1)
+    return wire(centre_m + 0.085 * size_m * circle, 0.004 * size_m, fine(rng, (0.5, 0.3, 0.05), (0.9, 0.7, 0.3)))
+
+
+def _box(rng: np.random.Generator, centre_m: np.ndarray, size_m: float) -> list[Body]:
+    texture = checks(384, rng, colour(rng, 0.08), colour(rng, 0.85), count=5)
+    base_m = centre_m + size_m * np.array([0.17, 0.07, 0.0])
+    return box(base_m, (0.1 * size_m, 0.14 * size_m, 0.08 * size_m), float(rng.uniform(-0.7, 0.7)), texture)
+
+
+def _leaves(rng: np.random.Generator, centre_m: np.ndarray, size_m: float) -> list[Body]:
+    texture = fine(rng, (0.3, 0.02, 0.05), (0.8, 0.2, 0.25))
+    places: list[tuple[float, float]] = [(-0.15, -0.07), (-0.19, 0.01), (-0.14, 0.08)]
+    return [leaf(centre_m + size_m * np.array([x, y, 0.0]), 0.09 * size_m, 0.035 * size_m, _turn(rng), texture) for x, y in places]
+
+
+def _turn(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """Facing the camera within about 30 degrees."""
+    roll, yaw = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.5, 0.5)
+    along = np.array([np.cos(roll) * np.cos(yaw), np.sin(roll), np.cos(roll) * np.sin(yaw)])
+    towards = np.array([np.sin(yaw), 0.0, -np.cos(yaw)])
+    return np.stack([along, np.cross(towards, along), towards])
+
+
+def write_sheet(folder: Path) -> None:
+    """folder/sheet.png: sharp scene and object, then per opening the photographs, and under them both traced together."""
+    meta = read_json(folder / "meta.json", "the description of a view (meta.json)")
+    virtual, scene_rgb = read_layer(folder / "object.exr"), read_image(folder / "scene" / "all_in_focus.exr")
+    coverage = np.repeat(virtual.alpha[..., None], 3, axis=2)
+    rows = [SheetRow("sharp", {"all in focus": scene_rgb, "the object": virtual.rgb, "its coverage": coverage})]
+    for shape, names in meta["truth"].items():
+        for what in ("scene", "both"):
+            captions = [f"focus {distance_m:.2f} m" for distance_m in meta["focus_distances_m"]]
+            pictures = {caption: read_image(folder / what / name) for caption, name in zip(captions, names, strict=True)}
+            rows.append(SheetRow(f"{shape}, {what}", pictures))
+    write_contact_sheet(folder / "sheet.png", rows)
+
+
+What = Literal["scene", "both"]
+
+OBJECT_CONVENTIONS = {
+    "scene": "scene/ holds the scene without the object and without lamps that would hang before it: all_in_focus.exr, depth.exr and "
+    "the photographs that the object goes into",
+    "object": "object.exr is the object alone in focus, premultiplied RGBA with Z in metres, nothing before it and nothing behind",
+    "both": "both/ holds scene and object traced together, of the same random numbers as scene/",
+    "light": "nothing throws a shadow and nothing is mirrored, so the light on the scene and on the object is what it is alone",
+}
+
+
+class MixedView(ViewFiles):
+    """One camera's look at one scene with and without its object."""
+
+    @cached_property
+    def scene(self) -> TruthScene:
+        return scene_around(self._name, self._plan.seed)
+
+    @cached_property
+    def virtual(self) -> TruthScene:
+        return virtual_object(self._name, self._plan.seed)
+
+    @cached_property
+    def _tracers(self) -> dict[What, TruthTracer]:
+        return {"scene": self._tracer(self.scene), "both": self._tracer(with_object(self.scene, self.virtual))}
+
+    def _tracer(self, scene: TruthScene, part: Literal["all", "thin"] = "all") -> TruthTracer:
+        camera = self._plan.camera(self._number)
+        return make_tracer(without_shadows(pack(scene, camera)), camera, part, self._plan.seed, self._variant)
+
+    def document(self) -> dict[str, object]:
+        """meta.json: that of the scene's own truth, and what is added."""
+        document = view_document(self._plan, self._name, self.scene, self._number)
+        conventions = {key: text for key, text in dict(document["conventions"]).items() if key != "layers"}  # type: ignore[call-overload]
+        truth = {shape: [truth_name(shape, k) for k in range(len(self.scene.focus_distances_m))] for shape in self._plan.shapes}
+        return document | {
+            "format": "mrbokeh-mixed-reality",
+            "truth": truth,
+            "layers": ["object.exr"],
+            "object_distance_m": OBJECT_DISTANCES_M[self._name],
+            "conventions": conventions | OBJECT_CONVENTIONS,
+        }
+
+    def jobs(self) -> Iterator[Job]:
+        folder = self.folder
+        yield Job((folder / "scene" / "all_in_focus.exr", folder / "scene" / "depth.exr"), self._make_sharp)
+        yield Job((folder / "object.exr",), self._make_object)
+        for shape in self._plan.shapes:
+            for index, distance_m in enumerate(self.scene.focus_distances_m):
+                both: tuple[What, What] = ("scene", "both")
+                for what in both:
+                    path = folder / what / truth_name(shape, index)
+                    yield Job((path,), partial(self._make_defocused, what, shape, distance_m, path))
+
+    def write_sheet(self) -> None:
+        write_sheet(self.folder)
+
+    def _make_sharp(self) -> None:
+        layer = self._sharp(self._tracers["scene"])
+        comment = "metres along the optical axis, not antialiased"
+        write_exr(self.folder / "scene" / "depth.exr", ExrPart({"Z": layer.depth_m}, attributes={"comments": comment}))
+        write_image(self.folder / "scene" / "all_in_focus.exr", layer.rgb)
+
+    def _make_object(self) -> None:
+        write_layer(self.folder / "object.exr", self._sharp(self._tracer(self.virtual, "thin")))
+
+    def _sharp(self, tracer: TruthTracer):  # type: ignore[no-untyped-def]
+        return sharp_layer(tracer, self._plan.samples, self._plan.lamp_rays)
+
+    def _make_defocused(self, what: What, shape: str, focus_distance_m: float, path: Path) -> None:
+        opening, tracer = self._plan.opening(shape, focus_distance_m), self._tracers[what]
+        write_image(path, tracer.traced(opening, self._plan.samples).rgb + tracer.lamp_light(opening, self._plan.lamp_rays))
+
 
 DEFAULT_SHAPES = ("disc", "blades7", "cat_eye")
 

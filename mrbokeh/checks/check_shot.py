@@ -1,7 +1,4 @@
-"""All checks over a shot, one picture at a time.
-
-Which picture of the plate belongs to which checked one: by number, by time in films, else by order.
-"""
+"""All checks over a shot, one picture at a time, each beside its picture of the plate: by number, by time in films, else by order."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,9 +19,9 @@ _SAME_TIME_S = 2e-3
 
 
 def pairs(report: CheckReport, shot: Shot, plate: Shot | None, frames: tuple[int, int | None] = (0, None)) -> Iterator[Pair]:
-    """Checked pictures with their plates, None where there is none. What the plate has and the shot lacks becomes a finding.
+    """Yield checked pictures with their plates, None if there is none. What the plate has and the shot lacks becomes a finding.
 
-    frames: of the plate, counted from 0, from which the shot was made (the second is left out). Raises InputError where a picture
+    frames: of the plate, counted from 0, from which the shot was made (the second is left out). Raises InputError if a picture
     of the plate cannot be read or is of another size.
     """
     _note_missing(report, shot.path.name, [str(number) for number in sorted(_missing_numbers(shot, plate, frames))])
@@ -52,7 +49,7 @@ def _missing_numbers(shot: Shot, plate: Shot | None, frames: tuple[int, int | No
 
 
 def _by_number(shot: Shot, plate: Shot) -> Iterator[Pair]:
-    """Both are sorted; what only the plate has is passed over."""
+    """Pair by number; both are sorted, and pictures that only the plate has are skipped."""
     plates = zip(plate.numbers or (), plate.pictures(), strict=True)
     number, other = next(plates)
     for wanted, picture in zip(shot.numbers or (), shot.pictures(), strict=True):
@@ -62,7 +59,7 @@ def _by_number(shot: Shot, plate: Shot) -> Iterator[Pair]:
 
 
 def _by_time(report: CheckReport, shot: Shot, plate: Shot, frames: tuple[int, int | None]) -> Iterator[Pair]:
-    """Times of the shot count from the first frame taken of the plate, unless that is the plate's first."""
+    """Pair by time: times of the shot count from the first frame taken of the plate, unless that is the plate's first."""
     plates = (_readable(each, plate) for each in islice(plate.pictures(), *frames))
     first = next(plates, None)
     if first is None or first.time_s is None:
@@ -115,10 +112,11 @@ def _require_same_size(picture: CheckedPicture | str, plate: CheckedPicture | No
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """layers: files of layers by name (virtual, sharp), one for all pictures, or a folder with one for each.
+    """Settings of all checks.
 
+    layers: files of layers by name (virtual, sharp), one for all pictures, or a folder with one for each.
     lens: as focused for the shot, to find the reach of a sharp layer. energy_tolerance: share of the light. flicker_limit: mean
-    absolute difference beyond the plate's own. tolerance: what a pixel may differ from the plate (sRGB code; in EXR share of the
+    absolute difference beyond the plate's own. tolerance: how far a pixel may differ from the plate (sRGB code; in EXR share of the
     light); None: what storing it explains. frames: of the plate, from which the shot was made.
     """
 
@@ -131,7 +129,7 @@ class CheckSettings:
 
 
 def check_shot(shot: Shot, plate: Shot | None, settings: CheckSettings) -> tuple[CheckReport, LeakMap]:
-    """Raises InputError where no picture can be read, or the plate is of another size."""
+    """Check a shot. Raises InputError if no picture can be read, or the plate is of another size."""
     report, leaks, flicker = CheckReport(), LeakMap(settings.tolerance), FlickerScore()
     passed = track(pairs(report, shot, plate, settings.frames), f"checking {shot.path.name}", len(shot.numbers or ()))
     still = {name: read_layer(path) for name, path in settings.layers.items() if not path.is_dir()}
@@ -167,7 +165,7 @@ def _check_one(report: CheckReport, picture: CheckedPicture, plate: CheckedPictu
 
 
 def _layers(files: Mapping[str, Path], index: int) -> dict[str, Layer]:
-    """Those of which there is one for each picture."""
+    """Read the layers that have one file for each picture."""
     return {name: read_layer(_of_picture(folder, index)) for name, folder in files.items() if folder.is_dir()}
 
 

@@ -1,6 +1,6 @@
-"""One picture to check: its light, its alpha and the layers that a layered EXR keeps, with how finely its file can store light.
+"""What `mrbokeh check` opens: one picture, numbered pictures in a folder, the slices of a focal stack, or a film.
 
-Shots: what `mrbokeh check` opens: one picture, numbered pictures in a folder, the slices of a focal stack, or a film.
+Each picture comes with its alpha, the layers that a layered EXR keeps, and how finely its file can store light.
 """
 
 import re
@@ -32,20 +32,23 @@ _STEEPEST = 12.92
 
 @dataclass(frozen=True)
 class Storage:
-    """is_linear: steps are shares of the value (EXR), else of the sRGB code (integer files, films). step: what rounding may change."""
+    """Precision of a file.
+
+    is_linear: steps are shares of the value (EXR), else of the sRGB code (integer files, films). step: what rounding may change.
+    """
 
     is_linear: bool
     step: float
 
     @property
     def dark_step(self) -> float:
-        """How far below 0 storing can bring light: an EXR holds what was written; colours of lossy films ring over the dark beside them."""
+        """Return how far below 0 storing can bring light: not in EXR; colours of lossy films ring over the dark beside them."""
         if self.is_linear:
             return 0.0
         return float("inf") if self.step >= _LOSSY_STEP else self.step / _STEEPEST
 
     def changed(self, rgb: Rgb, plate_rgb: Rgb) -> Bool[np.ndarray, "height width"]:
-        """Where two pictures differ by more than storing them explains. Not a number differs from everything."""
+        """Return where two pictures differ by more than storing them explains. NaN differs from everything."""
         if self.is_linear:
             known = np.nan_to_num(rgb, posinf=0.0, neginf=0.0)
             allowed = self.step * np.maximum(np.abs(known), np.abs(plate_rgb)) + (1e-7 if self.step else 0.0)
@@ -62,7 +65,10 @@ LOSSLESS_FILM, LOSSY_FILM = Storage(False, 4.0 * _CODE_STEP_16), Storage(False, 
 
 @dataclass(frozen=True)
 class CheckedPicture:
-    """rgb: linear Rec.709; alpha: None where the file has none; layers by name; time_s: of a frame of a film, else None."""
+    """Picture to check.
+
+    rgb: linear Rec.709; alpha: None if the file has none; layers by name; time_s: of a frame of a film, else None.
+    """
 
     name: str
     rgb: Rgb
@@ -73,7 +79,7 @@ class CheckedPicture:
 
 
 def read_picture(path: Path) -> CheckedPicture:
-    """EXR with its layers, or any other picture. Raises InputError where it cannot be read."""
+    """Read an EXR with its layers, or any other picture. Raises InputError if it cannot be read."""
     if path.suffix.lower() != ".exr":
         return CheckedPicture(path.name, read_image(path), _integer_storage(path))
     parts = read_exr(path)
@@ -86,7 +92,7 @@ def read_picture(path: Path) -> CheckedPicture:
 
 
 def with_layers(picture: CheckedPicture, layers: Mapping[str, Layer]) -> CheckedPicture:
-    """With layers from files of their own. Raises InputError where one is of another size."""
+    """Add layers from files of their own. Raises InputError if one is of another size."""
     for name, layer in layers.items():
         if layer.alpha.shape != picture.rgb.shape[:2]:
             height, width = picture.rgb.shape[:2]
@@ -107,7 +113,7 @@ def _integer_storage(path: Path) -> Storage:
 
 
 def _layers(parts: list[ExrPart]) -> dict[str, Layer]:
-    """NAME.R, NAME.G, NAME.B with NAME.A and NAME.Z in any part, and parts of that name with R, G, B."""
+    """Return layers NAME.R, NAME.G, NAME.B with NAME.A and NAME.Z of any part, and parts of that name with R, G, B."""
     named = {name: part.channels for part in parts for name in (VIRTUAL, SHARP, SHADOW) if part.name == name and "R" in part.channels}
     for part in parts:
         for name in (VIRTUAL, SHARP, SHADOW):
@@ -131,9 +137,10 @@ _NUMBER = re.compile(r"(\d+)(?=\D*$)")
 
 @dataclass(frozen=True)
 class Shot:
-    """numbers: of the pictures as their names state them, or None for a film, where nobody knows before it is read.
+    """Pictures to check.
 
-    missing: numbers that should be there. is_sequence: pictures follow one another in time. pictures: a fresh pass over them; one
+    numbers: of the pictures as their names state them, or None for a film, whose length is unknown before it is read.
+    missing: numbers that should exist. is_sequence: pictures follow one another in time. pictures: opens a fresh pass over them; one
     that cannot be read comes as the sentence that says why.
     """
 
@@ -145,7 +152,7 @@ class Shot:
 
 
 def open_shot(path: Path) -> Shot:
-    """Raises InputError where there is nothing to check."""
+    """Open a shot. Raises InputError if there is nothing to check."""
     if not path.exists():
         raise InputError(f"expected a picture, a folder of pictures, a focal stack or a film at {path}, but there is nothing")
     if path.is_dir():

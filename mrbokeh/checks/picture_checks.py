@@ -1,10 +1,7 @@
-"""Findings: what a check has against a picture, and the measures that it took on the way.
+"""Checks of pictures and films, and their findings: NaN, alpha, negative light, energy, leaks and flicker.
 
-Checks of single pictures: numbers that are none, alpha outside [0, 1], negative light, and the ledger of light.
-
-Leaks: pixels of the photograph that were changed although no virtual light reaches them.
-
-Flicker: how much a film changes from frame to frame where its plate stands still, beyond what the plate does itself.
+Leaks are pixels of the photograph that were changed although no virtual light reaches them. Flicker is how much a film changes from frame
+to frame where its plate stands still, beyond what the plate does itself.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,8 +24,9 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Finding:
-    """check: its name (nan, alpha, negative, energy, leak, flicker, pop, frozen, missing, damaged, size). where: a picture or its frame.
+    """Finding of one check.
 
+    check: its name (nan, alpha, negative, energy, leak, flicker, pop, frozen, missing, damaged, size). where: a picture or its frame.
     value: what was measured; limit: what is allowed, in the same unit.
     """
 
@@ -41,7 +39,10 @@ class Finding:
 
 @dataclass
 class CheckReport:
-    """measures: numbers by name. skipped: checks that could not be made, with what they would need."""
+    """Findings and measures of all checks.
+
+    measures: numbers by name. skipped: checks that could not be made, with what they would need.
+    """
 
     pictures: int = 0
     findings: list[Finding] = field(default_factory=list)
@@ -53,7 +54,7 @@ class CheckReport:
         return not self.findings
 
     def raise_measure(self, name: str, value: float) -> None:
-        """Keep the largest of all pictures."""
+        """Keep the largest value of all pictures."""
         self.measures[name] = max(self.measures.get(name, float("-inf")), float(value))
 
     def to_json(self) -> dict[str, Any]:
@@ -69,7 +70,7 @@ class CheckReport:
 
 
 def _json_value(value: Any) -> Any:
-    """JSON has neither infinity nor NaN; they are written as words."""
+    """Return infinity and NaN, which JSON lacks, as words."""
     return str(value) if isinstance(value, float) and not abs(value) < float("inf") else value
 
 
@@ -83,10 +84,10 @@ _BORDER_PX = 2
 
 
 def check_numbers(report: CheckReport, picture: CheckedPicture, plate_rgb: Rgb | None) -> None:
-    """The picture and its layers, which are rendered in Rec.709 and have nothing below 0.
+    """Check the picture and its layers for NaN, alpha outside [0, 1] and negative light.
 
-    Strong colours of a camera are negative in Rec.709: in the picture only what is below the plate counts, or, without one, what no
-    colour of BT.2020 has. What storing does is allowed; of lossy films nothing can be said.
+    Layers are rendered in Rec.709 and have nothing below 0. Strong colours of a camera are negative in Rec.709: in the picture only what is
+    below the plate counts or, without one, what no colour of BT.2020 has. What storing explains is allowed; lossy films cannot be judged.
     """
     light = _in_bt2020(picture.rgb) if plate_rgb is None else picture.rgb - np.minimum(plate_rgb, np.float32(0.0))
     _check(report, picture.name, picture.rgb, picture.alpha, light, DARK_SLACK + picture.storage.dark_step)
@@ -99,7 +100,7 @@ def _in_bt2020(rgb: Rgb) -> Rgb:
 
 
 def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, light: Rgb, slack: float) -> None:
-    """light: the picture as far as it must not be negative."""
+    """Check one picture or layer. light: the picture as far as it must not be negative."""
     lost = ~np.isfinite(rgb).all(axis=2)
     if alpha is not None:
         lost |= ~np.isfinite(alpha)
@@ -122,9 +123,10 @@ def _note(
 
 
 def check_energy(report: CheckReport, picture: CheckedPicture, tolerance: float) -> None:
-    """Light of the virtual layer before and after the blur. More is a finding; less only where no light can have left the frame.
+    """Compare the light of the virtual layer before and after the blur.
 
-    The sharp layer is that which was blurred: what the scene hides is gone from it already.
+    More is a finding; less only if no light can have left the frame. The sharp layer must be the one that was blurred, without what the
+    scene hides.
     """
     sharp, blurred = picture.layers.get(SHARP), picture.layers.get(VIRTUAL)
     if sharp is None or blurred is None:
@@ -159,7 +161,7 @@ _SPARE_PX = 1.5
 
 
 def reach(picture: CheckedPicture, lens: Lens | None) -> Mask | None:
-    """(H, W) where virtual light may arrive or take the photograph's away; None where nobody knows.
+    """Return (H, W) where virtual light may arrive or take the photograph's away; None if that is unknown.
 
     From the blurred layers where the picture has them, else from the sharp layer and the circle of confusion of its lens.
     """
@@ -171,7 +173,7 @@ def reach(picture: CheckedPicture, lens: Lens | None) -> Mask | None:
 
 
 def reach_of_sharp(layer: Layer, lens: Lens) -> Mask:
-    """Every lit pixel grown by the radius of its circle of confusion, in a few steps of radius that err on the large side."""
+    """Grow every lit pixel by the radius of its circle of confusion, in a few steps of radius that err on the large side."""
     import cv2
 
     lit = (layer.alpha > 0) | (layer.rgb != 0).any(axis=2)
@@ -189,7 +191,7 @@ def reach_of_sharp(layer: Layer, lens: Lens) -> Mask:
 
 @dataclass
 class LeakMap:
-    """Counts, over all pictures, how often each pixel was changed out of reach."""
+    """Count of how often each pixel was changed out of reach, over all pictures."""
 
     storage_step: float | None = None
     counts: Int32[np.ndarray, "height width"] | None = field(default=None)
@@ -206,7 +208,7 @@ class LeakMap:
             report.findings.append(Finding("leak", picture.name, text, share, 0.0))
 
     def write(self, path: Path) -> bool:
-        """A PNG with the leaked pixels in white, darker where in few pictures only. False where there are none."""
+        """Write a PNG with the leaked pixels in white, darker if in few pictures only. Returns False if there are none."""
         if self.counts is None or not self.counts.any():
             return False
         shade = np.where(self.counts > 0, np.maximum(64, 255 * self.counts // self.counts.max()), 0).astype(np.uint8)
@@ -222,13 +224,13 @@ _LEAST_FRAMES = 6
 
 
 def static_pixels(plate_rgb: Rgb, previous_rgb: Rgb) -> Bool[np.ndarray, "height width"]:
-    """(H, W) where the plate changes by no more than its own noise, which is measured as the median change."""
+    """Return (H, W) where the plate changes by no more than its own noise, which is measured as the median change."""
     change = np.abs(np.clip(plate_rgb, 0, 1) - np.clip(previous_rgb, 0, 1)).max(axis=2)
     return change <= max(_LEAST_STATIC, _NOISE_SIGMAS * float(np.median(change)) / 0.6745)
 
 
 def mean_change(rgb: Rgb, previous_rgb: Rgb, where: Bool[np.ndarray, "height width"]) -> float:
-    """Mean absolute difference of linear light clipped to [0, 1]; 0 where nothing is asked for."""
+    """Return the mean absolute difference of linear light clipped to [0, 1]; 0 if the mask is empty."""
     if not where.any():
         return 0.0
     return float(np.abs(np.clip(rgb[where], 0, 1) - np.clip(previous_rgb[where], 0, 1)).mean(dtype=np.float64))
@@ -236,7 +238,7 @@ def mean_change(rgb: Rgb, previous_rgb: Rgb, where: Bool[np.ndarray, "height wid
 
 @dataclass
 class FlickerScore:
-    """Frames go in one by one; two are held."""
+    """Flicker of a film whose frames go in one by one; two are held."""
 
     changes: list[float] = field(default_factory=list)
     own_changes: list[float] = field(default_factory=list)
@@ -244,7 +246,7 @@ class FlickerScore:
     _previous: tuple[Rgb, Rgb] | None = None
 
     def add(self, report: CheckReport, name: str, rgb: Rgb, plate_rgb: Rgb) -> None:
-        """plate_rgb: the same frame of the plate."""
+        """Add a frame. plate_rgb: the same frame of the plate."""
         rgb = np.nan_to_num(rgb, posinf=1.0, neginf=0.0)
         if self._previous is not None:
             before, plate_before = self._previous
@@ -257,11 +259,11 @@ class FlickerScore:
         self._previous = rgb, plate_rgb
 
     def skip(self) -> None:
-        """A frame is missing: the next has nothing to be compared with."""
+        """Note that a frame is missing: the next has nothing to be compared with."""
         self._previous = None
 
     def judge(self, report: CheckReport, limit: float) -> None:
-        """The mean over the film against the limit, and single frames that jump out of their neighbours."""
+        """Compare the mean over the film with the limit, and find single frames that differ from their neighbours."""
         if not self.changes:
             return
         score, own = float(np.mean(self.changes)), float(np.mean(self.own_changes))

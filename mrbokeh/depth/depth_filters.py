@@ -1,15 +1,12 @@
-"""Depth edges without pixels that float between near and far: each pixel beside an edge gets the depth of one of its two sides.
+"""Depth maps refined: hard edges along the photograph, and films steadied over time.
 
-Depth maps of phones and networks are small and soft. Blurred as they are, the soft rim becomes a ghost surface between the two that
-are there. Which side a pixel is on, the photograph tells (guided filter); how deep that side is, its settled pixels tell.
+Depth maps of phones and networks are small and soft. Blurred as they are, the soft rim becomes a ghost surface between near and far. So
+each pixel beside an edge gets the depth of one of its two sides. Which side it is on, the photograph tells by a guided filter with a
+colour guide (He, Sun and Tang 2013; coefficients at low resolution, Fast Guided Filter 2015); how deep that side is, its settled pixels
+tell.
 
-Guided filter with a colour guide (He, Sun and Tang, Guided Image Filtering, 2013), its coefficients at low resolution (Fast Guided
-Filter, 2015): values of a small map follow the edges of a large photograph.
-
-Depth of a film, steadied: the depth is filtered, never the picture, so that blur and occlusion hold still where the scene does.
-
-A recursive mean per pixel in dioptres. What changes by more than the noise, which is measured from the film itself, starts afresh, so
-that a moving edge does not lag.
+In a film the depth is filtered, never the picture, so that blur and occlusion hold still where the scene does: a recursive mean per pixel
+in dioptres. A change larger than the noise, which is measured from the film itself, starts afresh, so that a moving edge does not lag.
 """
 
 from dataclasses import dataclass, field
@@ -75,7 +72,10 @@ _SLANTED = 2.0
 
 @dataclass(frozen=True)
 class EdgeSides:
-    """at_edge: (H, W) pixels near a jump. near, far: (H, W) dioptres of its two sides, which mean something at edges only."""
+    """Pixels near a jump of depth, and its two sides.
+
+    at_edge: (H, W) pixels near a jump. near, far: (H, W) dioptres of its two sides, meaningful at edges only.
+    """
 
     at_edge: Mask
     near: Plane
@@ -85,7 +85,7 @@ class EdgeSides:
 def refined_dioptres(
     dioptres: Plane, photo_rgb: Float32[np.ndarray, "rows columns 3"], edge_px: int = 3, least_jump: float = LEAST_JUMP
 ) -> Float32[np.ndarray, "rows columns"]:
-    """A soft map (h, w) at the size of its photograph (H, W, 3; linear), with hard edges where the photograph has them.
+    """Enlarge a soft map (h, w) to the size of its photograph (H, W, 3; linear), with hard edges where the photograph has them.
 
     edge_px: how far, in pixels of the map, its edges may be soft or misplaced.
     """
@@ -113,7 +113,8 @@ def _at_most(dioptres: Plane, side_px: int) -> Plane:
 
 
 def edge_sides(dioptres: Plane, edge_px: int, least_jump: float) -> EdgeSides:
-    """An edge is where the map jumps within edge_px and hardly rises farther out; what goes on rising is a slanted surface.
+    """Find edges, where the map jumps within edge_px and hardly rises farther out, and their sides; what goes on rising is a slanted
+    surface.
 
     The sides come from the nearest settled pixels: those that are as near or as far as anything around them, so that a wire one
     pixel wide is one too, and a pixel of the soft rim is not.
@@ -132,7 +133,7 @@ def edge_sides(dioptres: Plane, edge_px: int, least_jump: float) -> EdgeSides:
 
 
 def _nearest(values: Plane, known: Mask, reach_px: int) -> tuple[Plane, Mask]:
-    """The value of the nearest known pixel, and where that is within reach."""
+    """Return the value of the nearest known pixel, and where that is within reach."""
     from scipy.ndimage import distance_transform_edt
 
     if not known.any():
@@ -162,7 +163,7 @@ _AREA_PX = 7
 
 @dataclass
 class TemporalDepthFilter:
-    """Frames go in in order; each comes out with the mean of what the same surface showed before.
+    """Filter that takes frames in order; each comes out with the mean of what the same surface showed before.
 
     gate: a change of more than this many sigmas of the measured noise, seen by a pixel and two of its neighbours, is motion.
     memory: frames over which a still pixel is averaged at most. noise: relative standard deviation, measured so far; None before the
@@ -181,7 +182,7 @@ class TemporalDepthFilter:
             raise InputError(f"expected a gate above 0 and a memory of at least 1 frame, got {self.gate} and {self.memory}")
 
     def filtered(self, depth_m: Plane) -> Plane:
-        """Depth of the next frame (H, W) in metres, inf allowed, steadied. Raises InputError where its size changes."""
+        """Steady the depth of the next frame (H, W) in metres, inf allowed. Raises InputError if its size changes."""
         dioptres = (1.0 / depth_m).astype(np.float32)
         if self._mean is None or self._count is None:
             self._mean, self._count = dioptres, np.ones_like(dioptres)
@@ -197,7 +198,7 @@ class TemporalDepthFilter:
         return _metres(self._mean)
 
     def _moved(self, dioptres: Plane) -> Bool[np.ndarray, "height width"]:
-        """Where the scene changed: a jump of a pixel, or a smaller step of its whole neighbourhood."""
+        """Return where the scene changed: a jump of a pixel, or a smaller step of its whole neighbourhood."""
         import cv2
 
         assert self._mean is not None
@@ -213,7 +214,7 @@ class TemporalDepthFilter:
 
 
 def _measured(change: Plane, before: float | None) -> float:
-    """Standard deviation from the median, which things that move do not reach while they fill less than half of the picture."""
+    """Return the standard deviation from the median, which moving things do not affect while they fill less than half of the picture."""
     found = max(float(np.median(np.abs(change))) / _MAD_PER_SIGMA, _LEAST_NOISE)
     return found if before is None else min(found, _NOISE_GROWTH * before)
 

@@ -1,7 +1,4 @@
-"""DepthMap: depth of a photograph, pixel by pixel, with what is known of it.
-
-DepthSettings: what the user states of a depth map that does not say it itself, and its parsing from the command line.
-"""
+"""DepthMap: depth of a photograph, pixel by pixel; DepthSettings: what the user states of a map that does not say it itself."""
 
 from dataclasses import dataclass, replace
 
@@ -16,7 +13,7 @@ GIVES = ("inverse", "metric")
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """Somebody measured it: what is seen at a pixel of the photograph is that far away."""
+    """Measured distance of what is seen at a pixel of the photograph."""
 
     x_px: float
     y_px: float
@@ -25,7 +22,9 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class StereoCalibration:
-    """depth = focal_px * baseline_m / (disparity + offset_px); the offset is the difference of the principal points (doffs)."""
+    """Stereo cameras: depth = focal_px * baseline_m / (disparity + offset_px); the offset is the difference of the principal points
+    (doffs).
+    """
 
     focal_px: float
     baseline_m: float
@@ -34,10 +33,11 @@ class StereoCalibration:
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """near_far_m: what the largest and the smallest number of a map linear in dioptres mean; inf is allowed for the far one.
+    """Statements of the user about a depth map.
 
+    near_far_m: what the largest and the smallest number of a map linear in dioptres mean; inf is allowed for the far one.
     metres_per_unit: an integer file holds depth, 0 is unknown. stereo: of a disparity file. model_gives, known: of a network.
-    refined: soft edges are sharpened along the photograph; None: where the source is known to be soft.
+    refined: soft edges are sharpened along the photograph; None: if the source is known to be soft.
     """
 
     near_far_m: tuple[float, float] | None = None
@@ -57,19 +57,19 @@ class DepthSettings:
 
 
 def parse_near_far(text: str) -> tuple[float, float]:
-    """NEAR:FAR in metres, such as 0.5:inf."""
+    """Parse NEAR:FAR in metres, such as 0.5:inf."""
     near, far = _numbers(text, ":", 2, "NEAR:FAR in metres, such as 0.5:8 or 0.5:inf")
     return near, far
 
 
 def parse_stereo(text: str) -> StereoCalibration:
-    """FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX."""
+    """Parse FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX."""
     count = 3 if text.count(",") == 2 else 2
     return StereoCalibration(*_numbers(text, ",", count, "FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX"))
 
 
 def parse_known(text: str) -> KnownDistance:
-    """X,Y,METRES."""
+    """Parse X,Y,METRES."""
     known = KnownDistance(*_numbers(text, ",", 3, "X,Y,METRES of a pixel whose distance is known"))
     if not known.depth_m > 0:
         raise InputError(f"expected a known distance above 0 m, got {text!r}")
@@ -92,7 +92,9 @@ Mask = Bool[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class DepthMap:
-    """depth_m: (H, W) along the optical axis, above 0, inf is background. valid: (H, W) where it was measured; elsewhere it is the
+    """Depth of a photograph, pixel by pixel.
+
+    depth_m: (H, W) along the optical axis, above 0, inf is background. valid: (H, W) where it was measured; elsewhere it is the
     depth of the nearest place where it was. note: where it comes from, for people.
     """
 
@@ -106,7 +108,7 @@ class DepthMap:
 
     @classmethod
     def of_dioptres(cls, dioptres: Float[np.ndarray, "height width"], valid: Mask, note: str) -> "DepthMap":
-        """What is not above 0 lies at infinity."""
+        """Return the depth of dioptres; values not above 0 lie at infinity."""
         near = dioptres > 0
         depth_m = np.full(dioptres.shape, np.inf, np.float32)
         np.divide(1.0, dioptres, out=depth_m, where=near, casting="same_kind")
@@ -121,7 +123,7 @@ class DepthMap:
 
 
 def with_holes_filled(depth: DepthMap) -> DepthMap:
-    """Where nothing was measured the depth of the nearest measured pixel."""
+    """Give pixels that were not measured the depth of the nearest measured one."""
     if depth.valid.all() or not depth.valid.any():
         return depth
     from scipy.ndimage import distance_transform_edt

@@ -1,6 +1,6 @@
 """Depth from one picture by a network that the user brings (.onnx), such as MiDaS (Ranftl et al. 2020) or Depth Anything.
 
-What the network wants is read from its input; what the file cannot say stands in a JSON of its name beside it (model.onnx: model.json).
+The network's input tells its layout and size; what the file cannot say stands in a JSON of its name beside it (model.onnx: model.json).
 """
 
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class NetworkInput:
-    """What a depth network wants to see: sRGB codes in [0, 1], less mean, over std, in its size.
+    """Input that a depth network expects: sRGB codes in [0, 1], less mean, over std, in its size.
 
     short_side_px, multiple_px: of networks that take any size. fit: "stretch" to a fixed size, or "pad" (whole picture, mirrored beyond
     its edges). channels: "RGB" or "BGR".
@@ -47,7 +47,7 @@ class NetworkInput:
 
 
 def read_network_input(model: Path) -> NetworkInput:
-    """From the JSON beside the network, where there is one."""
+    """Read the JSON beside the network, if there is one."""
     sidecar = model.with_suffix(".json")
     if not sidecar.is_file():
         return NetworkInput()
@@ -61,7 +61,7 @@ def read_network_input(model: Path) -> NetworkInput:
 
 
 def network_depth(model: Path, photo_rgb: Rgb, settings: DepthSettings) -> DepthMap:
-    """At the network's own size; pixels that were padded are cut away."""
+    """Return the network's depth at its own size, without padding."""
     given = predicted(model, photo_rgb, read_network_input(model))
     everywhere = np.ones(given.shape, bool)
     if settings.model_gives == "metric":
@@ -79,7 +79,7 @@ def network_depth(model: Path, photo_rgb: Rgb, settings: DepthSettings) -> Depth
 
 
 def _fitted(given: Given, photo_rgb: Rgb, settings: DepthSettings) -> Given:
-    """1 / depth = a given + b through the known distances (least squares where there are more than two)."""
+    """Fit 1 / depth = a given + b through the known distances (least squares if there are more than two)."""
     height, width = photo_rgb.shape[:2]
     for each in settings.known:
         if not (0 <= each.x_px < width and 0 <= each.y_px < height):
@@ -97,7 +97,7 @@ def _fitted(given: Given, photo_rgb: Rgb, settings: DepthSettings) -> Given:
 
 
 def predicted(model: Path, photo_rgb: Rgb, wants: NetworkInput) -> Given:
-    """What the network gives for a photograph (linear), at the size in which it saw the picture."""
+    """Return what the network gives for a photograph (linear), at the size in which it saw the picture."""
     from mrbokeh.renderers.onnx_sessions import open_session
 
     session = open_session(model)
@@ -128,7 +128,7 @@ def _layout(shape: Any, model: Path) -> str:
 
 
 def _size(shape: Any, layout: str, photo_rgb: Rgb, wants: NetworkInput) -> tuple[int, int]:
-    """(width, height) in which the network sees the picture; a fixed one, or the short side as wanted, in whole multiples."""
+    """Return (width, height) in which the network sees the picture: a fixed one, or the short side as wanted, in whole multiples."""
     fixed = shape[2:4] if layout == "NCHW" else shape[1:3]
     height, width = photo_rgb.shape[:2]
     shrink = wants.short_side_px / min(height, width)
@@ -137,7 +137,7 @@ def _size(shape: Any, layout: str, photo_rgb: Rgb, wants: NetworkInput) -> tuple
 
 
 def _fitted_in(codes: Rgb, size: tuple[int, int], wants: NetworkInput) -> tuple[Seen, tuple[int, int, int, int]]:
-    """The picture at the network's size, and the rows and columns (top, bottom, left, right) that are picture and not padding."""
+    """Return the picture at the network's size, and the rows and columns (top, bottom, left, right) that are picture and not padding."""
     import cv2
 
     (height, width), (columns, rows) = codes.shape[:2], size
@@ -160,7 +160,7 @@ def _resized(codes: Rgb, size: tuple[int, int]) -> Seen:
 
 
 def _cut(plane: Plane, cut: tuple[int, int, int, int], size: tuple[int, int]) -> Given:
-    """Without padding; networks that give a coarser map than they see are cut in proportion."""
+    """Cut padding off; networks that give a coarser map than they see are cut in proportion."""
     down, across = plane.shape[0] / size[1], plane.shape[1] / size[0]
     top, bottom, left, right = round(cut[0] * down), round(cut[1] * down), round(cut[2] * across), round(cut[3] * across)
     return plane[top:bottom, left:right]

@@ -1,7 +1,4 @@
-"""The depth of a photograph from any source, at the photograph's size.
-
-Depth maps in files of plain numbers, whose meaning the user states: PNG and TIFF, and arrays of stereo disparity.
-"""
+"""Depth of a photograph from any source, at the photograph's size."""
 
 from pathlib import Path
 
@@ -20,7 +17,7 @@ Plane = Float32[np.ndarray, "height width"]
 
 
 def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
-    """An integer or float picture. With metres_per_unit it holds depth (0: unknown), with near_far_m dioptres, largest number nearest.
+    """Read a picture of plain numbers: depth with metres_per_unit (0: unknown), dioptres with near_far_m, the largest number nearest.
 
     For near_far_m the whole range of an integer format counts (0 is FAR, 65535 is NEAR), of floats the range that occurs.
     """
@@ -47,7 +44,7 @@ def _levels(numbers: np.ndarray) -> Plane:
 
 
 def read_stereo(path: Path, settings: DepthSettings) -> DepthMap:
-    """Disparity in pixels (.npz, .npy: its first array), as in the Middlebury data sets; what is not finite is unknown."""
+    """Read disparity in pixels (.npz, .npy: its first array), as in the Middlebury data sets; what is not finite is unknown."""
     if settings.stereo is None:
         raise InputError(f"{path} holds disparity: state the cameras with --stereo FOCAL_PX,BASELINE_M,OFFSET_PX")
     try:
@@ -70,10 +67,11 @@ _SAME_ASPECT = 0.02
 
 
 def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = None) -> DepthMap:
-    """source: EXR with Z, PNG or TIFF (settings say what the numbers mean), disparity of stereo (.npz, .npy), a phone's JPEG with GDepth
-    inside, or a depth network (.onnx). photo_rgb: (H, W, 3) linear; a map of another size is brought to it along its edges.
+    """Read depth from any source and bring it to the photograph's size along its edges.
 
-    Raises InputError where the source cannot be read, does not say what it means, or is of another shape than the photograph.
+    source: EXR with Z, PNG or TIFF (settings say what the numbers mean), disparity of stereo (.npz, .npy), a phone's JPEG with GDepth
+    inside, or a depth network (.onnx). photo_rgb: (H, W, 3) linear.
+    Raises InputError if the source cannot be read, does not say what it means, or is of another shape than the photograph.
     """
     settings = settings or DepthSettings()
     if not source.is_file():
@@ -86,7 +84,7 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
 
 
 def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthMap, bool]:
-    """The map at its own size, and whether such maps have soft edges."""
+    """Return the map at its own size, and whether such maps have soft edges."""
     suffix = source.suffix.lower()
     if suffix == ".onnx":
         from mrbokeh.depth.depth_network import network_depth

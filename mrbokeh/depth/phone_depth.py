@@ -2,8 +2,7 @@
 
 Formats: developers.google.com/depthmap-metadata. RangeInverse: d = far near / (far - n (far - near)), linear in dioptres;
 RangeLinear: d = near + n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale.
-
-XMP of a JPEG: the packet of the first kilobytes and the extended one, which is cut into chunks (XMP Specification Part 3, 1.1.3).
+They lie in the JPEG's XMP: a packet in the first kilobytes and an extended one in chunks (XMP Specification Part 3, 1.1.3).
 """
 
 import base64
@@ -27,7 +26,7 @@ _GUID = 32
 
 
 def read_xmp(path: Path) -> dict[str, str]:
-    """Simple properties by their full name ({namespace}Name); {} where the file is no JPEG or has none.
+    """Read simple properties by their full name ({namespace}Name); {} if the file is no JPEG or has none.
 
     Raises InputError where a chunk of the extended packet is missing.
     """
@@ -43,7 +42,7 @@ def read_xmp(path: Path) -> dict[str, str]:
 
 
 def _app1_segments(data: bytes) -> list[bytes]:
-    """Contents of the APP1 segments before the picture starts."""
+    """Return the contents of the APP1 segments before the picture starts."""
     segments, place = [], 2
     while data[:2] == b"\xff\xd8" and data[place : place + 1] == b"\xff" and place + 4 <= len(data):
         marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
@@ -56,7 +55,10 @@ def _app1_segments(data: bytes) -> list[bytes]:
 
 
 def _reassembled(chunks: list[bytes], guid: str, path: Path) -> bytes:
-    """Each chunk: the digest that names the packet, its full length, its own offset (big-endian), its part of the packet."""
+    """Join the chunks of an extended packet.
+
+    Each has the digest that names the packet, its full length, its own offset (big-endian) and its part of the packet.
+    """
     own = [each for each in chunks if each[:_GUID].decode("ascii", "replace") == guid]
     parts = {int.from_bytes(each[_GUID + 4 : _GUID + 8], "big"): each[_GUID + 8 :] for each in own}
     length = int.from_bytes(own[0][_GUID : _GUID + 4], "big") if own else -1
@@ -90,8 +92,10 @@ _ORIENTATION = 0x0112
 
 @dataclass(frozen=True)
 class PhoneFocus:
-    """What GFocus tells. focus_distance_m: in the unit of the depth. blur_at_infinity: RADIUS of the blur of what is infinitely far
-    over the longer side of the picture. x, y: the place in focus, in [0, 1].
+    """Focus that GFocus states.
+
+    focus_distance_m: in the unit of the depth. blur_at_infinity: RADIUS of the blur at infinity over the longer side of the picture.
+    x, y: the place in focus, in [0, 1].
     """
 
     focus_distance_m: float
@@ -100,15 +104,15 @@ class PhoneFocus:
     y: float = 0.5
 
     def coc_px_per_dioptre(self, width_px: int, height_px: int) -> float:
-        """coc = c_inf (1 - d_f / d), so that it grows by c_inf d_f for each dioptre away from the focus."""
+        """Return c_inf d_f, by which coc = c_inf (1 - d_f / d) grows for each dioptre away from the focus."""
         return 2.0 * self.blur_at_infinity * max(width_px, height_px) * self.focus_distance_m
 
 
 @dataclass(frozen=True)
 class PhonePhoto:
-    """Upright as the file's Exif says. depth: at its own size. original_rgb: (H, W, 3) linear, before the phone's own blur, or None.
+    """Contents of a phone's JPEG, upright as its Exif says.
 
-    focus: None where not told.
+    depth: at its own size. original_rgb: (H, W, 3) linear, before the phone's own blur, or None. focus: None if not stated.
     """
 
     depth: DepthMap
@@ -117,9 +121,9 @@ class PhonePhoto:
 
 
 def read_phone_photo(path: Path, near_far_m: tuple[float, float] | None = None) -> PhonePhoto | None:
-    """None where the file holds no GDepth. near_far_m: takes the place of the file's Near and Far, whose unit is often none.
+    """Read a phone's depth; None if the file holds no GDepth.
 
-    Raises InputError where what it holds is damaged or of an unknown format.
+    near_far_m: replaces the file's Near and Far, which often have no unit. Raises InputError if it is damaged or of an unknown format.
     """
     xmp = read_xmp(path) if path.suffix.lower() in (".jpg", ".jpeg") else {}
     if _DEPTH + "Data" not in xmp:
@@ -163,7 +167,7 @@ def _orientation(path: Path) -> int:
 
 
 def _upright(plane: Float32[np.ndarray, "height width"], orientation: int) -> Float32[np.ndarray, "rows columns"]:
-    """Turned and mirrored as Exif's orientation, 1 to 8, asks for."""
+    """Turn and mirror a plane by Exif's orientation, 1 to 8."""
     from PIL import Image, ImageOps
 
     picture = Image.fromarray(plane)
@@ -179,7 +183,7 @@ def _focus(xmp: Mapping[str, str]) -> PhoneFocus | None:
 
 
 def _decoded(text: str, path: Path) -> Float32[np.ndarray, "height width channels"]:
-    """A picture in base64 as its codes in [0, 1], RGB."""
+    """Decode a picture in base64 to its codes in [0, 1], RGB."""
     import cv2
 
     try:

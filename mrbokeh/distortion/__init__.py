@@ -6,17 +6,8 @@
     wide = overscan_camera(plate_camera, distortion)
     layer = distorted(renderer.render(scene, wide), wide, plate_camera, distortion)
 
-What lies where:
-    distortion            LensDistortion: distorted_px, undistorted_px; models by name, or an ST map
-    models                the polynomials: opencv, fisheye, ptlens, poly3, poly5
-    radial_inverse        where a profile folds, and its inverse
-    st_map                StMap: read_st_map; u to the right, v upwards, as Nuke writes it
-    colmap                colmap_distortion: parameters of COLMAP's camera models
-    lensfun_database      lensfun_distortion: by the names of camera and lens (needs lensfunpy)
-    distortion_json       to and from the entries of camera files
-    overscan              overscan_camera; source_positions_px
-    warping               distorted: a layer into the plate's pixels
-    resampling            resampled: a layer read at any positions, by areas
+`distortion` holds LensDistortion with its JSON, COLMAP's models and ST maps, `models` the polynomials and their inverse, `warping` the
+overscan and the resampling of layers.
 """
 
 from mrbokeh.distortion.distortion import LensDistortion

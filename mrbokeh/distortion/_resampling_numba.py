@@ -52,7 +52,9 @@ def resample(
 def _add_box(
     source: np.ndarray, depth_m: np.ndarray, at_x: float, at_y: float, half_width: float, half_height: float, total: np.ndarray
 ) -> float:
-    """The mean over the box to total, and the depth of the covering pixel next to its middle: inf for none, -1 outside the source."""
+    """Write the mean over the box to total. Returns the depth of the covering pixel next to its middle: inf for none, -1 outside the
+    source.
+    """
     height, width, channels = source.shape
     left, right = max(int(math.floor(at_x - half_width)), 0), min(int(math.ceil(at_x + half_width)), width)
     top, bottom = max(int(math.floor(at_y - half_height)), 0), min(int(math.ceil(at_y + half_height)), height)

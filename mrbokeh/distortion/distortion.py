@@ -1,13 +1,11 @@
-"""LensDistortion: where the pixels of an undistorted pinhole lie in the picture of a real lens, and back.
+"""LensDistortion: where the pixels of an undistorted pinhole lie in the picture of a real lens, and back; from JSON, COLMAP or an ST map.
 
-ST maps: distortion as a picture that says for every pixel from where it is read, as Nuke's STMap takes them.
+ST maps are pictures that say for every pixel from where it is read, as Nuke's STMap takes them. Red is u, from 0 at the left edge of the
+frame to 1 at its right; green is v, from 0 at the *bottom* edge to 1 at the top: the centre of the lower left pixel has (0.5 / width,
+0.5 / height). Values below 0 and above 1 address overscan.
 
-Red is u, from 0 at the left edge of the frame to 1 at its right; green is v, from 0 at the *bottom* edge to 1 at the top: the
-centre of the lower left pixel has (0.5 / width, 0.5 / height). Values below 0 and above 1 address overscan.
-
-A LensDistortion as JSON: {"model": "opencv", "k1": -0.1, ...}, values that are 0 left out.
-
-Parameters of COLMAP's camera models as focal lengths, principal point and distortion (src/colmap/sensor/models.h).
+COLMAP's camera models (src/colmap/sensor/models.h) are read as focal lengths, principal point and distortion. As JSON a distortion is
+{"model": "opencv", "k1": -0.1, ...}, values that are 0 left out.
 """
 
 from collections.abc import Sequence
@@ -37,10 +35,11 @@ Positions = Float[np.ndarray, "*batch 2"]
 
 @dataclass(frozen=True, eq=False)
 class StMap:
-    """uv: (h, w, 2) as in the file, v upwards; of any resolution.
+    """ST map: (u, v) for every pixel, the place from which it is read.
 
-    kind: "distort" (Nuke: redistort) holds for the plate's pixels the place in the undistorted picture: it turns renders into
-    plates. "undistort" holds for undistorted pixels the place in the plate. Prefer the first: it knows every pixel of the plate,
+    uv: (h, w, 2) as in the file, v upwards; of any resolution.
+    kind: "distort" (Nuke: redistort) gives for the plate's pixels the place in the undistorted picture: it turns renders into
+    plates. "undistort" gives for undistorted pixels the place in the plate. Prefer the first: it knows every pixel of the plate,
     the second only what lies in the frame on both sides.
     """
 
@@ -61,7 +60,7 @@ class StMap:
         return self._looked_up(xy_px, camera)[0] if self.kind == "distort" else self._inverse(xy_px, camera)
 
     def _looked_up(self, xy_px: Positions, camera: Camera) -> tuple[Positions, Float[np.ndarray, "*batch 2 2"]]:
-        """The map's positions, from the four samples around, and their derivatives; NaN more than a pixel outside the map."""
+        """Return the map's positions, from the four samples around, and their derivatives; NaN more than a pixel outside the map."""
         rows, columns = self.uv.shape[:2]
         size, cells = np.array([camera.width_px, camera.height_px]), np.array([columns, rows])
         at = xy_px / size * cells - 0.5
@@ -80,7 +79,7 @@ class StMap:
         return np.stack([u, 1.0 - v], axis=-1) * size
 
     def _inverse(self, xy_px: Positions, camera: Camera) -> Positions:
-        """Newton's method on the map's bilinear surface; NaN where the map does not hold the position."""
+        """Invert the map's bilinear surface by Newton's method; NaN if the map does not hold the position."""
         edge = np.array([camera.width_px, camera.height_px], np.float64)
         found = np.clip(xy_px, 0.0, edge)
         for _ in range(_STEPS):
@@ -95,7 +94,7 @@ class StMap:
 
 
 def read_st_map(path: Path | str, kind: str = "distort") -> StMap:
-    """An EXR file with u in red and v in green (or channels u, v). InputError where it is too coarse, as half floats are."""
+    """Read an EXR file with u in red and v in green (or channels u, v). Raises InputError if it is too coarse, as half floats are."""
     for part in read_exr(path):
         for u, v in _NAMES:
             if u in part.channels and v in part.channels:
@@ -115,7 +114,7 @@ HUGIN_UNIT = 1.0 / np.hypot(1.0, 1.5)
 
 @dataclass(frozen=True)
 class LensDistortion:
-    """A model of `mrbokeh.distortion.models` with its values, or an ST map, about a camera's principal point.
+    """Model of `mrbokeh.distortion.models` with its values, or an ST map, about a camera's principal point.
 
     model: its name; "none" bends nothing. values: in the order of models.PARAMETERS.
     unit_half_diagonals: for ptlens, poly3 and poly5 the radius 1 of the polynomial, in half diagonals of the camera's frame.
@@ -142,7 +141,7 @@ class LensDistortion:
 
     @classmethod
     def of(cls, model: str, unit_half_diagonals: float = HUGIN_UNIT, **values: float) -> "LensDistortion":
-        """A model with values by name, 0 where not given: LensDistortion.of("opencv", k1=-0.1, p2=1e-4)."""
+        """Return a model with values by name, 0 if not given: LensDistortion.of("opencv", k1=-0.1, p2=1e-4)."""
         names = PARAMETERS.get(model, ())
         unknown = sorted(values.keys() - set(names))
         if unknown:
@@ -155,11 +154,11 @@ class LensDistortion:
 
     @property
     def is_none(self) -> bool:
-        """Whether nothing is bent."""
+        """Return whether nothing is bent."""
         return self.model == "none" or (self.model not in ("fisheye", "st_map") and not any(self.values))
 
     def distorted_px(self, xy_px: Positions, camera: Camera) -> Positions:
-        """Positions of the undistorted pinhole to positions in the plate; NaN where the lens does not see them."""
+        """Convert positions of the undistorted pinhole to positions in the plate; NaN if the lens does not see them."""
         xy_px = np.asarray(xy_px, np.float64)
         if self.is_none:
             return xy_px.copy()
@@ -171,7 +170,7 @@ class LensDistortion:
         return self._in_picture(np.where(seen, bent(self.model, self.values, points)[0], np.nan), camera)
 
     def undistorted_px(self, xy_px: Positions, camera: Camera) -> Positions:
-        """Positions in the plate to positions of the undistorted pinhole: the inverse of `distorted_px`, solved to 1e-10 of the unit.
+        """Convert positions in the plate to positions of the undistorted pinhole: the inverse of `distorted_px`, to 1e-10 of the unit.
 
         NaN beyond the radius at which the model folds the picture back, for no point is seen there.
         """
@@ -211,7 +210,7 @@ Pair = tuple[float, float]
 
 
 def colmap_distortion(model: str, parameters: Sequence[float]) -> tuple[Pair, Pair, LensDistortion]:
-    """(focal_px, principal_px, distortion) of a model by COLMAP's name with all its parameters, in COLMAP's order.
+    """Return (focal_px, principal_px, distortion) of a model by COLMAP's name with all its parameters, in COLMAP's order.
 
     Pixel centres lie at halves in COLMAP as here, so nothing is shifted.
     """
@@ -228,7 +227,7 @@ def colmap_distortion(model: str, parameters: Sequence[float]) -> tuple[Pair, Pa
 
 
 def distortion_to_json(distortion: LensDistortion) -> dict[str, Any]:
-    """InputError for an ST map that was not read from a file."""
+    """Return the JSON document of a distortion. Raises InputError for an ST map that was not read from a file."""
     if distortion.st_map is not None:
         if distortion.st_map.path is None:
             raise InputError(
@@ -241,7 +240,7 @@ def distortion_to_json(distortion: LensDistortion) -> dict[str, Any]:
 
 
 def distortion_from_json(document: dict[str, Any], where: str = "distortion", folder: Path | str = ".") -> LensDistortion:
-    """The inverse of `distortion_to_json`; an ST map's path is relative to `folder`.
+    """Read the document of `distortion_to_json`; an ST map's path is relative to `folder`.
 
     Values without a model are OpenCV's, as camera tracks have them: {"k1": -0.1}.
     COLMAP's names are understood too: {"model": "RADIAL", "values": [k1, k2]}, without focal length and principal point.
@@ -262,7 +261,7 @@ def distortion_from_json(document: dict[str, Any], where: str = "distortion", fo
 
 
 def read_distortion(path: Path | None) -> LensDistortion:
-    """From a JSON file; None bends nothing."""
+    """Read a distortion from a JSON file; None bends nothing."""
     if path is None:
         return LensDistortion()
     return distortion_from_json(read_json(path, "a lens distortion (JSON)"), str(path), path.parent)

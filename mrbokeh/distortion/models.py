@@ -1,4 +1,4 @@
-"""Distortion models: where a point of the undistorted picture lands, and how the picture is stretched there.
+"""Distortion models: where a point of the undistorted picture lands, how the picture is stretched there, and the inverse.
 
 All bend a point q = (x, y), counted from the principal point in the model's unit, to q' along the radius, r' = g(r):
 
@@ -9,8 +9,7 @@ All bend a point q = (x, y), counted from the principal point in the model's uni
     poly5    g = r (1 + k1 r^2 + k2 r^4)
 
 The unit of the first two is the focal length; that of the others, which are lensfun's and Hugin's, is a length in the picture.
-
-The inverse of distortion models: Newton's method, kept within what the lens sees.
+The inverse is Newton's method, kept within what the lens sees.
 """
 
 from functools import lru_cache
@@ -34,7 +33,7 @@ Points = Float[np.ndarray, "*batch 2"]
 
 
 def radial(model: str, values: Values, radius: Radii) -> tuple[Radii, Radii]:
-    """(g, dg/dr) at radii from 0 on; what is tangential is left out."""
+    """Return (g, dg/dr) at radii from 0 on, without the tangential part."""
     if model == "opencv":
         return _rational(values, radius)
     if model == "fisheye":
@@ -49,7 +48,7 @@ def radial(model: str, values: Values, radius: Radii) -> tuple[Radii, Radii]:
 
 
 def _odd(terms: Values, radius: Radii) -> tuple[Radii, Radii]:
-    """r (t0 + t1 r^2 + t2 r^4 ...) and its derivative."""
+    """Return r (t0 + t1 r^2 + t2 r^4 ...) and its derivative."""
     r2, value, slope = radius**2, np.zeros_like(radius), np.zeros_like(radius)
     for power, term in reversed(list(enumerate(terms))):
         value, slope = value * r2 + term, slope * r2 + (2 * power + 1) * term
@@ -70,7 +69,7 @@ def is_tangential(model: str, values: Values) -> bool:
 
 
 def bent(model: str, values: Values, points: Points) -> tuple[Points, Float[np.ndarray, "*batch 2 2"]]:
-    """Bent points and the derivatives of their (x, y) by that of the points."""
+    """Return bent points and the derivatives of their (x, y) by that of the points."""
     radius = np.linalg.norm(points, axis=-1)
     value, slope = radial(model, values, radius)
     at_centre = radius < 1e-12
@@ -102,7 +101,7 @@ _RESIDUAL = 1e-11
 
 @lru_cache(maxsize=256)
 def fold_radius(model: str, values: Values) -> float:
-    """The radius from which on the picture would run back into itself: nothing beyond it is seen. At most LARGEST_RADIUS."""
+    """Return the radius beyond which the picture would run back into itself, so that nothing is seen. At most LARGEST_RADIUS."""
     radii = np.linspace(0.0, LARGEST_RADIUS, 4001)
     value, slope = radial(model, values, radii)
     falls = np.flatnonzero(~((slope > 0.0) & np.isfinite(value) & (value >= 0.0)))
@@ -116,7 +115,7 @@ def fold_radius(model: str, values: Values) -> float:
 
 
 def unbent(model: str, values: Values, points: Points) -> Points:
-    """The points that `bent` brings to these; NaN where there are none."""
+    """Return the points that `bent` brings to these; NaN if there are none."""
     radius = np.linalg.norm(points, axis=-1)
     before = _radius_before(model, values, radius)
     guess = points * np.divide(before, radius, out=np.ones_like(radius), where=radius > 0.0)[..., None]
@@ -126,7 +125,7 @@ def unbent(model: str, values: Values, points: Points) -> Points:
 
 
 def _radius_before(model: str, values: Values, radius: Radii) -> Radii:
-    """Newton's method on r' = g(r) between 0 and the fold, by bisection where it would leave the bracket."""
+    """Solve r' = g(r) by Newton's method between 0 and the fold, by bisection if it would leave the bracket."""
     fold = fold_radius(model, values)
     low, high = np.zeros_like(radius), np.full_like(radius, fold)
     found = np.minimum(radius, 0.5 * fold)
@@ -143,7 +142,7 @@ def _radius_before(model: str, values: Values, radius: Radii) -> Radii:
 
 
 def _polished(model: str, values: Values, points: Points, guess: Points) -> Points:
-    """From the inverse of the radial part to that of all, in two dimensions."""
+    """Refine the inverse of the radial part to that of the whole model, in two dimensions."""
     # Tangential terms move the edge of what is seen a little: start inside.
     radius = np.linalg.norm(points, axis=-1, keepdims=True)
     inward = points * (0.9 * fold_radius(model, values) / np.maximum(radius, 1e-30))

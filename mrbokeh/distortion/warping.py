@@ -1,12 +1,9 @@
-"""A sharp layer of the overscanned pinhole warped into the plate's distorted pixels.
+"""A sharp layer of an overscanned pinhole warped into the plate's distorted pixels.
 
-A layer read at any positions: every new pixel is the mean over the area of the old picture that it covers.
-
-The area is an upright box, as wide and high as the new pixel's parallelogram is on average (of the same variance), and never
-smaller than an old pixel. All weights are positive and sum to 1: colour does not ring, alpha stays within [0, 1], and colour,
-alpha and extra channels keep their proportions. Side by side, boxes of one size leave no gaps, so that light is kept.
-
-The pinhole camera with overscan: its picture holds everything that the distorted plate sees.
+Every new pixel is the mean over the area of the old picture that it covers. The area is an upright box, as wide and high as the new
+pixel's parallelogram is on average (of the same variance), and never smaller than an old pixel. All weights are positive and sum to 1:
+colour does not ring, alpha stays within [0, 1], and colour, alpha and extra channels keep their proportions. Side by side, boxes of one
+size leave no gaps, so that light is kept.
 """
 
 from functools import lru_cache
@@ -26,12 +23,10 @@ NO_MOTION = -1
 
 
 def resampled(layer: Layer, positions_px: Float64[np.ndarray, "rows_and_2 columns_and_2 2"], box: Box) -> Layer:
-    """The layer (h, w) seen at positions_px (h + 2, w + 2, 2), which have one more on every side; NaN sees nothing.
+    """Return the layer (h, w) seen at positions_px (h + 2, w + 2, 2), which have one more on every side; NaN sees nothing.
 
-    box: outside it the layer is clear (`mrbokeh.layering.pixel_box.lit_box`).
-
-    Depth is that of the nearest covering pixel, never a mixture. Motion becomes that of the new picture, by the derivatives of
-    the positions.
+    box: outside it the layer is clear (`mrbokeh.layering.pixel_box.lit_box`). Depth is that of the nearest covering pixel, never a mixture.
+    Motion becomes that of the new picture, by the derivatives of the positions.
     """
     from mrbokeh.distortion._resampling_numba import resample
 
@@ -68,7 +63,7 @@ Pair = tuple[float, float]
 
 
 def overscan_camera(camera: Camera, distortion: LensDistortion) -> Camera:
-    """A pinhole in the plate camera's place whose frame contains all that the plate shows, grown (or cut) by whole pixels.
+    """Return a pinhole in the plate camera's place whose frame contains all that the plate shows, grown (or cut) by whole pixels.
 
     The focal length stays, so that pixels are the plate's own, unless somewhere a pixel of the pinhole would cover more than
     one of the plate's; then it is raised, at most to twice, until none does. Without distortion it is the camera itself.
@@ -81,7 +76,7 @@ def overscan_camera(camera: Camera, distortion: LensDistortion) -> Camera:
 
 @lru_cache(maxsize=64)
 def _frame(distortion: LensDistortion, width_px: int, height_px: int, focal_px: Pair, principal_px: Pair) -> tuple[int, int, Pair, Pair]:
-    """(width, height, focal length, principal point) of the overscan: poses, which change from frame to frame, do not matter."""
+    """Return (width, height, focal length, principal point) of the overscan; poses, which change with every frame, do not matter."""
     camera = Camera(width_px, height_px, focal_px, principal_px)
     xy_px = distortion.undistorted_px(_grid_px(camera, GRID_STEP_PX), camera)
     if not np.isfinite(xy_px).all():
@@ -102,7 +97,7 @@ def _frame(distortion: LensDistortion, width_px: int, height_px: int, focal_px: 
 def source_positions_px(
     distortion: LensDistortion, plate: Camera, overscan: Camera, xy_px: Float[np.ndarray, "*b 2"]
 ) -> Float[np.ndarray, "*b 2"]:
-    """Where in the overscanned picture the plate's positions are seen; NaN where the lens sees nothing."""
+    """Return where the plate's positions are seen in the overscanned picture; NaN if the lens sees nothing there."""
     enlarged = np.asarray(overscan.focal_px) / np.asarray(plate.focal_px)
     undistorted = distortion.undistorted_px(xy_px, plate)
     return (undistorted - np.asarray(plate.principal_px)) * enlarged + np.asarray(overscan.principal_px)
@@ -114,7 +109,7 @@ def _grid_px(camera: Camera, step_px: int) -> Float[np.ndarray, "rows columns 2"
 
 
 def _needed_enlargement(distortion: LensDistortion, camera: Camera) -> float:
-    """1 over the least length, in undistorted pixels, to which a pixel of the plate comes in any direction."""
+    """Return 1 over the least length, in undistorted pixels, of a pixel of the plate in any direction."""
     around = [np.array(way) for way in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))]
     right, left, down, up = (distortion.undistorted_px(_grid_px(camera, GRID_STEP_PX) + way, camera) for way in around)
     derivative = np.stack([right - left, down - up], axis=-1)
@@ -132,11 +127,11 @@ Positions = Float64[np.ndarray, "rows columns 2"]
 
 
 def distorted(layer: Layer, overscan: Camera, plate: Camera, distortion: LensDistortion) -> Layer:
-    """What the overscanned pinhole rendered, as the plate's camera sees it; all in focus, blur comes afterwards.
+    """Return what the overscanned pinhole rendered as the plate's camera sees it; all in focus, blur comes afterwards.
 
     overscan: `overscan_camera(plate, distortion)`, or any pinhole in the same place that is turned the same way. Colour, alpha
     and extra channels are read by areas, depth is that of the nearest covering pixel, motion is turned and stretched with the
-    picture. Work and time go with the box of what the layer touches. Without distortion, and with one camera, it is the very
+    picture. Work and time grow with the bounding box of the layer. Without distortion, and with one camera, it is the very
     same layer. Light outside the overscanned frame is missing.
     """
     if (layer.height_px, layer.width_px) != (overscan.height_px, overscan.width_px):
@@ -154,7 +149,7 @@ def distorted(layer: Layer, overscan: Camera, plate: Camera, distortion: LensDis
 
 
 def _reached_box(box: Box, overscan: Camera, plate: Camera, distortion: LensDistortion) -> Box:
-    """The plate's pixels to which anything of a box of the overscanned picture can come: those within its warped border."""
+    """Return the plate's pixels that anything in a box of the overscanned picture can reach: those within its warped border."""
     if box.is_empty:
         return NOWHERE
     enlarged = np.asarray(overscan.focal_px) / np.asarray(plate.focal_px)
@@ -178,7 +173,7 @@ def _border_px(box: Box) -> Float64[np.ndarray, "points 2"]:
 
 
 def sampled_positions_px(distortion: LensDistortion, plate: Camera, overscan: Camera, box: Box) -> Positions:
-    """(h + 2, w + 2, 2): where the pixel centres of a box of the plate, and one more on every side, are seen by the pinhole.
+    """Return (h + 2, w + 2, 2) where the pixel centres of a box of the plate, and one more on every side, are seen by the pinhole.
 
     Models are smooth: their inverse is solved every 16 pixels and interpolated by cubic splines, to 1e-3 px. ST maps are read,
     and frames that hold a fold solved, at every pixel.
@@ -205,5 +200,5 @@ def _nodes(positions: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " nodes"
 
 
 def _spline(nodes: Float64[np.ndarray, " nodes"], positions: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n nodes"]:
-    """The matrix that interpolates values at nodes by a cubic spline (not-a-knot)."""
+    """Return the matrix that interpolates values at nodes by a cubic spline (not-a-knot)."""
     return np.asarray(make_interp_spline(nodes, np.eye(len(nodes)), k=3)(positions))

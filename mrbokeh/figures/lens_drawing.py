@@ -1,4 +1,4 @@
-"""A picture of what a lens does to points: its kernels over blur and field, its outlines, and how its blur grows with depth."""
+"""Sheet of a lens: its kernels over blur and field, its outlines, and how its blur grows with depth."""
 
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ _MOST_NAMED = 4
 
 
 def draw_lens(lens: Lens, image_width_px: int) -> "Figure":
-    """The sheet of a lens: kernels over signed diameter and, where they vary, over the field; outlines, low-rank error, depth."""
+    """Draw the sheet of a lens: kernels over signed diameter and, if they vary, over the field; outlines, low-rank error, depth."""
     from matplotlib.figure import Figure
 
     varies = lens.aperture.varies_over_field
@@ -51,7 +51,7 @@ def draw_lens(lens: Lens, image_width_px: int) -> "Figure":
 
 
 def kernel_rgb(aperture: Aperture, coc_px: float, field_xy: tuple[float, float] = (0.0, 0.0)) -> Float64[np.ndarray, "size size 3"]:
-    """The PSF of red, green and blue light at a signed diameter and place in the frame; each sums to 1."""
+    """Return the PSF of red, green and blue light at a signed diameter and place in the frame; each sums to 1."""
     side = 1 if coc_px > 0 else -1
     scales = aperture.channel_scale(side)
     kernels = [aperture.seen(side, field_xy, channel).rasterize(coc_px * scales[channel]).kernel for channel in range(3)]
@@ -69,7 +69,7 @@ def _draw_diameters(figure: "Figure", place: "SubplotSpec", aperture: Aperture) 
 
 
 def draw_field(axes: "Axes", aperture: Aperture, coc_px: float) -> None:
-    """Kernels of one diameter at places from corner to corner of a 3:2 frame, each where it lies."""
+    """Draw kernels of one diameter at places from corner to corner of a 3:2 frame, each where it lies."""
     columns, rows = FIELD_GRID
     x_field, y_field = _FRAME_ASPECT / np.hypot(_FRAME_ASPECT, 1.0), 1.0 / np.hypot(_FRAME_ASPECT, 1.0)
     places = [(x, y) for y in np.linspace(-y_field, y_field, rows) for x in np.linspace(-x_field, x_field, columns)]
@@ -86,14 +86,14 @@ def draw_field(axes: "Axes", aperture: Aperture, coc_px: float) -> None:
 
 
 def _shown(light: Float64[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
-    """Light as a display shows it, its largest value white."""
+    """Return light as a display shows it, its largest value white."""
     from mrbokeh.images.color import linear_to_srgb
 
     return linear_to_srgb(np.clip(light / light.max(), 0.0, 1.0).astype(np.float32))
 
 
 def draw_outlines(axes: "Axes", aperture: Aperture) -> None:
-    """The opening as the middle of the frame sees it behind the focus, and the few-edged polygons that fast sums use."""
+    """Draw the opening as the middle of the frame sees it behind the focus, and the few-edged polygons that fast sums use."""
     opening = aperture.seen(1)
     for index, (outline, weight) in enumerate(zip(opening.outlines, opening.weights, strict=True)):
         label = f"{len(outline)} vertices, weight {weight:+.3g}" if index < _MOST_NAMED else None
@@ -119,7 +119,7 @@ def _closed(outline: Float64[np.ndarray, "vertices 2"]) -> Float64[np.ndarray, "
 
 
 def draw_low_rank_error(axes: "Axes", aperture: Aperture) -> None:
-    """Relative error of the kernel's approximation by a few separable passes (McGraw, Eq. 4), behind the focus."""
+    """Draw the relative error of the kernel's approximation by a few separable passes (McGraw, Eq. 4), behind the focus."""
     errors = aperture_errors(aperture, KERNEL_COC_PX[-1])[:LARGEST_RANK]
     axes.semilogy(np.arange(1, len(errors) + 1), np.maximum(errors, 1e-6), marker="o", ms=3)
     axes.set_xlabel("rank")
@@ -129,7 +129,7 @@ def draw_low_rank_error(axes: "Axes", aperture: Aperture) -> None:
 
 
 def draw_depth(axes: "Axes", lens: Lens, image_width_px: int) -> None:
-    """The signed circle of confusion on the axis against depth, by colour where the colours differ."""
+    """Draw the signed circle of confusion on the axis against depth, by colour if the colours differ."""
     dioptres = np.linspace(1.0 / 50.0, min(3.0 / lens.focus_distance_m if np.isfinite(lens.focus_distance_m) else 2.0, 20.0), 400)
     coc_px = lens.coc_px(1.0 / dioptres, image_width_px)
     if any(lens.aperture.axial_chromatic):
@@ -144,7 +144,7 @@ def draw_depth(axes: "Axes", lens: Lens, image_width_px: int) -> None:
 
 
 def draw_focus(axes: "Axes", lens: Lens, image_width_px: int) -> None:
-    """The depth that is in focus over a 3:2 frame, of a tilted lens or one with a curved field; in dioptres."""
+    """Draw the depth that is in focus over a 3:2 frame, of a tilted lens or one with a curved field; in dioptres."""
     dioptres = lens.focus_dioptres(image_width_px, round(image_width_px / _FRAME_ASPECT))
     picture = axes.imshow(dioptres, cmap="viridis")
     axes.set_anchor("S")

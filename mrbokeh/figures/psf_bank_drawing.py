@@ -1,7 +1,4 @@
-"""A picture of a bank of PSFs: kernels over its coordinates, the cells that they stand for, and how large they are.
-
-The kernels of a bank as pictures, for a convolution in Nuke, OpenDefocus or Blender.
-"""
+"""Sheet of a bank of PSFs (kernels over its coordinates, their cells and sizes), and its kernels as pictures for Nuke or Blender."""
 
 import csv
 from pathlib import Path
@@ -18,7 +15,7 @@ from mrbokeh.system.errors import InputError
 
 
 def export_bank(bank: PsfBank, folder: Path | str, suffix: Literal["exr", "png"], overwrite: bool = False) -> int:
-    """One picture per cell, 00000.exr and so on, and index.csv with their coordinates; how many pictures.
+    """Write one picture per cell, 00000.exr and so on, and index.csv with their coordinates. Returns how many pictures.
 
     EXR holds the values as they are (float). PNG has 16 bits, linear, its largest value white; `peak` in the index is what
     white stands for. The index names for each axis the middle of the cell and its two ends; it is written last.
@@ -61,7 +58,7 @@ _SHORT = {
 
 
 def draw_bank(bank: PsfBank) -> "Figure":
-    """The sheet of a bank."""
+    """Draw the sheet of a bank."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 8), layout="constrained")
@@ -80,8 +77,10 @@ def draw_bank(bank: PsfBank) -> "Figure":
 
 
 def sampled_cells(bank: PsfBank) -> list[int]:
-    """The cells whose kernels are drawn: at even steps of the unit coordinates (of their logarithms beyond the knee of a bank that
-    has one), the second axis downwards; others in their middle."""
+    """Return the cells whose kernels are drawn: at even steps of the unit coordinates, the second axis downwards, others in their middle.
+
+    In a bank with a knee the steps are those of the logarithm beyond it.
+    """
     steps = (np.arange(KERNELS_IN_ROW) + 0.5) / KERNELS_IN_ROW
     if bank.knee_px is not None:
         ends = [axis.high / bank.knee_px for axis in bank.axes]
@@ -106,7 +105,7 @@ def _draw_kernels(figure: "Figure", place: "SubplotSpec", bank: PsfBank) -> None
 
 
 def _shown(kernel: Float32[np.ndarray, "size size channels"]) -> Float[np.ndarray, "size size 3"]:
-    """A kernel as a display shows it, its largest value white."""
+    """Return a kernel as a display shows it, its largest value white."""
     from mrbokeh.images.color import linear_to_srgb
 
     rgb = np.broadcast_to(kernel, (*kernel.shape[:2], 3))
@@ -114,7 +113,7 @@ def _shown(kernel: Float32[np.ndarray, "size size channels"]) -> Float[np.ndarra
 
 
 def _draw_cells(axes: "Axes", bank: PsfBank) -> None:
-    """The cells over the first two unit coordinates, coloured by how far they reach along the first."""
+    """Draw the cells over the first two unit coordinates, coloured by how far they reach along the first."""
     from matplotlib.collections import PolyCollection
 
     low, high = bank.grid.boxes[:, :2, 0], bank.grid.boxes[:, :2, 1]
@@ -128,7 +127,7 @@ def _draw_cells(axes: "Axes", bank: PsfBank) -> None:
 
 
 def _draw_widths(axes: "Axes", bank: PsfBank) -> None:
-    """How wide a cell is against where it lies, for one coordinate."""
+    """Draw the width of cells against where they lie, for one coordinate."""
     boxes = bank.boxes[:, 0]
     finite = np.isfinite(boxes).all(axis=1)
     axes.plot(bank.centres[finite, 0], boxes[finite, 1] - boxes[finite, 0], ".", ms=3)
@@ -138,7 +137,7 @@ def _draw_widths(axes: "Axes", bank: PsfBank) -> None:
 
 
 def _draw_sizes(axes: "Axes", bank: PsfBank) -> None:
-    """How large kernels are over the first coordinate."""
+    """Draw the size of kernels over the first coordinate."""
     axes.plot(_unit_centres(bank), [kernel.shape[0] for kernel in bank.kernels], ".", ms=3)
     _label(axes, bank.axes[0], vertical=False)
     axes.set_title("width of the kernels in px", fontsize=9)
@@ -146,7 +145,7 @@ def _draw_sizes(axes: "Axes", bank: PsfBank) -> None:
 
 
 def _draw_throughput(axes: "Axes", bank: PsfBank) -> None:
-    """How much light arrives, by colour, over the first coordinate."""
+    """Draw how much light arrives, by colour, over the first coordinate."""
     for colour, light in zip(_COLOURS[bank.channels], bank.throughput.T, strict=True):
         axes.plot(_unit_centres(bank), light, ".", ms=3, color=colour)
     _label(axes, bank.axes[0], vertical=False)
@@ -160,7 +159,7 @@ def _unit_centres(bank: PsfBank) -> Float64[np.ndarray, " cells"]:
 
 
 def _label(axes: "Axes", axis: Axis, vertical: bool) -> None:
-    """A side over a unit coordinate, marked with the physical one."""
+    """Mark a side over a unit coordinate with the physical one."""
     names = [f"{value:.3g}" for value in axis.from_unit(_TICKS)]
     if vertical:
         axes.set_yticks(_TICKS, names)

@@ -51,7 +51,7 @@ def _small(picture: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, 
 
 
 def write_stack_pictures(stack: FocalStack, out: Path) -> list[tuple[Path, str]]:
-    """(file, caption) of some slices, the all-in-focus picture and the depth, at full size."""
+    """Write some slices, the all-in-focus picture and the depth at full size. Returns (file, caption) of each."""
     pictures = [(stack.slice_rgb(index), f"slice {index}{_focus_text(stack, index)}", f"slice_{index}") for index in shown_slices(stack)]
     pictures.append((stack.all_in_focus(), "all in focus", "all_in_focus"))
     pictures.append((depth_picture(stack), "depth: near is red, far is blue; grey where it is a guess", "depth"))
@@ -75,12 +75,12 @@ def orientation_of(stack: FocalStack) -> int:
 
 
 def shown_slices(stack: FocalStack) -> list[int]:
-    """The nearest, a middle and the farthest slice."""
+    """Return the nearest, a middle and the farthest slice."""
     return sorted({0, len(stack) // 2, len(stack) - 1})
 
 
 def depth_picture(stack: FocalStack) -> Rgb:
-    """`depth_codes` as scene-linear light, a little dimmed so that a tone curve for people leaves it as it is."""
+    """Return `depth_codes` as scene-linear light, dimmed a little so that tone mapping for people leaves it unchanged."""
     return _shown_alike(depth_codes(stack))
 
 
@@ -89,7 +89,7 @@ def _shown_alike(codes: Rgb8) -> Rgb:
 
 
 def depth_codes(stack: FocalStack) -> UInt8[np.ndarray, "height width 3"]:
-    """Depth (dioptres, or the focus index) in sRGB colours from near (red) to far (blue), grey where it is a guess.
+    """Return depth (dioptres, or the focus index) in sRGB colours from near (red) to far (blue), grey where it is a guess.
 
     The scale runs from the 1st to the 99th percentile of what is trusted, or of all where that is little.
     """

@@ -145,7 +145,7 @@ class ProportionalGrid:
 
     @classmethod
     def of_cells(cls, cells: int, highs_px: tuple[float, float], knee_px: float, step_ratio: float) -> "ProportionalGrid":
-        """Return the finest grid with at most `cells` cells whose steps along the second axis are `step_ratio` times those along the first."""
+        """Return the finest grid of at most `cells` cells whose steps along the second axis are `step_ratio` times those of the first."""
         if cells < 1:
             raise InputError(f"a grid needs at least one cell, got {cells}")
         grid, rows = cls((1, 1), highs_px, knee_px), 1

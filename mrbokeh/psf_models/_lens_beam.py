@@ -27,7 +27,7 @@ Window = Float64[np.ndarray, "3"]
 
 
 class LensBeam:
-    """A lens and its sensor at z = sensor_at_mm.
+    """Light that a lens passes from a point to its sensor, found and traced; the sensor lies at z = sensor_at_mm.
 
     A point is given by its chief ray (green, through the middle of the stop), which is found from where it meets the
     sensor, and by 1 / distance from the front principal plane along the axis, in 1/mm (0: infinitely far).
@@ -40,7 +40,7 @@ class LensBeam:
         self.area_mm2 = lru_cache(maxsize=4096)(self._area_mm2)
 
     def chief_ray(self, eccentricity: float) -> Float64[np.ndarray, "5"]:
-        """x on the sensor, then x and z on the first surface and direction x and z (mm; x right, z towards the sensor).
+        """Return x on the sensor, then x and z on the first surface and direction x and z (mm; x right, z towards the sensor).
 
         The source lies to the right (+x) in the scene, so its upside-down image lies at -x.
         """
@@ -50,11 +50,11 @@ class LensBeam:
         return np.array([target_mm, *found])
 
     def chief_rays(self, low: float, high: float) -> Float64[np.ndarray, "nodes 5"]:
-        """Chief rays evenly over a range of eccentricity, near enough to be interpolated between."""
+        """Return chief rays evenly over a range of eccentricity, near enough to be interpolated between."""
         return np.stack([self.chief_ray(each) for each in np.linspace(low, high, _NODES if high > low else 1).tolist()])
 
     def window(self, per_mm: Float64[np.ndarray, " depths"], eccentricities: Float64[np.ndarray, " fields"]) -> Window:
-        """Outside of which no light comes through from any of these points, in any colour."""
+        """Return the window outside of which no light comes through from any of these points, in any colour."""
         found = np.array([np.inf, -np.inf, 0.0])
         for chief in map(self.chief_ray, eccentricities.tolist()):
             for each in per_mm.tolist():
@@ -66,7 +66,7 @@ class LensBeam:
         return found
 
     def _look(self, chief: Float64[np.ndarray, "4"], per_mm: float, wavelength_um: float) -> Window:
-        """A coarse look over all of the front surface (a fine one if it finds nothing), then ever nearer ones around what it found."""
+        """Look coarsely over all of the front surface (finely if that finds nothing), then ever closer around what was found."""
 
         def lit(window: Window, steps: int) -> Window:
             around = np.array([np.inf, -np.inf, 0.0])
@@ -92,7 +92,7 @@ class LensBeam:
         field: Float64[np.ndarray, " rays"],
         bands_um: Float64[np.ndarray, "colours 2"] = BANDS_UM,
     ) -> tuple[Float64[np.ndarray, "rays colours 2"], Float64[np.ndarray, "rays colours"]]:
-        """Where rays land, in mm on the sensor from their chief ray's place, and their weights, 0 where they do not.
+        """Return where rays land, in mm on the sensor from their chief ray's place, and their weights, 0 if they do not land.
 
         The mean weight times the area of the whole window is the cross-section of the beam that gets through, measured
         across the axis. shares: of the window (a, |b|) and of the band. field: place in `chiefs`, 0 to nodes - 1.
@@ -103,11 +103,11 @@ class LensBeam:
         return landings, weights
 
     def open_share(self, per_mm: float, eccentricity: float) -> float:
-        """Cross-section of the beam across the axis relative to that on the axis."""
+        """Return the cross-section of the beam across the axis relative to that on the axis."""
         return self.area_mm2(per_mm, eccentricity) / self.area_mm2(per_mm, 0.0)
 
     def lit_up_to(self, per_mm: Float64[np.ndarray, " depths"]) -> float:
-        """1, or the eccentricity beyond which less than 1 % of the light on the axis comes through from one of these depths."""
+        """Return 1, or the eccentricity beyond which less than 1 % of the light on the axis comes through from one of these depths."""
 
         def is_lit(eccentricity: float) -> bool:
             try:
@@ -124,7 +124,7 @@ class LensBeam:
         return low
 
     def _area_mm2(self, per_mm: float, eccentricity: float) -> float:
-        """Cross-section across the axis of the beam that gets through from one point, mean of the colours."""
+        """Return the cross-section across the axis of the beam that gets through from one point, mean of the colours."""
         window = self.window(np.array([per_mm]), np.array([eccentricity]))
         (shares,) = sobol_blocks(3, _AREA_RAYS, 0)
         _, weights = self.trace(

@@ -1,8 +1,6 @@
-"""Rays through a thin lens, compiled: each lands half a circle of confusion times its lens point away.
+"""Rays of the simple, the combined and the stylized model, compiled: each lands half a circle of confusion times its lens point away.
 
-A disc swept along a line, compiled: its exact light per pixel, and rays that sample it.
-
-Rays through a picture, compiled: lens points are drawn in proportion to its light.
+Also the exact light per pixel of a disc swept along a line.
 """
 
 import numpy as np
@@ -12,7 +10,7 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True)
 def opening_at(x: float, y: float, edges: np.ndarray, starts: np.ndarray, extent: float) -> float:
-    """The weight of the opening at a lens point within `extent`: the signed weights of the edges that a ray to +x crosses.
+    """Return the weight of the opening at a lens point within `extent`: the signed weights of the edges that a ray to +x crosses.
 
     edges (E, 5): x0, y0, x1, y1 and the weight of what lies to the left of an edge that goes up (y1 > y0), with its sign
     turned for one that goes down; sorted into bands of equal height over -extent..extent, of which band b has those from
@@ -32,7 +30,9 @@ def opening_at(x: float, y: float, edges: np.ndarray, starts: np.ndarray, extent
 def trace_lens(
     kernel: np.ndarray, low_px: float, high_px: float, shares: np.ndarray, extent: float, edges: np.ndarray, starts: np.ndarray
 ) -> float:
-    """Add rays (rays, 3) to kernel (K, K): lens points over the square of half width `extent`, diameters from low to high; their light."""
+    """Add rays (rays, 3) to kernel (K, K): lens points over the square of half width `extent`, diameters from low to high. Returns their
+    light.
+    """
     size = kernel.shape[0]
     centre = 0.5 * size
     light = 0.0
@@ -51,20 +51,20 @@ def trace_lens(
 
 @njit(cache=True, nogil=True)
 def _half_disc(y: float, radius: float) -> float:
-    """The integral of c(y) = sqrt(radius^2 - y^2) from 0 to y, |y| <= radius."""
+    """Return the integral of c(y) = sqrt(radius^2 - y^2) from 0 to y, |y| <= radius."""
     return 0.5 * (y * np.sqrt(max(radius * radius - y * y, 0.0)) + radius * radius * np.arcsin(min(max(y / radius, -1.0), 1.0)))
 
 
 @njit(cache=True, nogil=True)
 def _moment(a: float, y: float, half: float, radius: float, sign: float) -> float:
-    """The integral of (a + sign c(y))^2 / 2 from 0 to y; half is `_half_disc` at y."""
+    """Return the integral of (a + sign c(y))^2 / 2 from 0 to y; half is `_half_disc` at y."""
     square = radius * radius
     return 0.5 * (a * a * y + 2.0 * sign * a * half + square * y - y * y * y / 3.0)
 
 
 @njit(cache=True, nogil=True)
 def _ramp(a: float, y: float, half: float, bound: float, half_bound: float, radius: float) -> float:
-    """The integral from 0 to y >= 0 of max(a + c, 0)^2 / 2 - max(a - c, 0)^2 / 2, for |a| >= radius or with its bound.
+    """Return the integral from 0 to y >= 0 of max(a + c, 0)^2 / 2 - max(a - c, 0)^2 / 2, for |a| >= radius or with its bound.
 
     bound: sqrt(radius^2 - a^2), where a + c (for a < 0) or a - c (for a > 0) changes its sign; 0 for |a| >= radius.
     """
@@ -124,7 +124,7 @@ def fill_capsule(kernel: np.ndarray, diameter_px: float, motion_px: float, weigh
 
 @njit(cache=True, nogil=True)
 def trace_capsule(kernel: np.ndarray, box: np.ndarray, shares: np.ndarray) -> int:
-    """Count rays (rays, 5) in kernel (K, K): a lens point of the disc, a time, and a diameter and motion of the box; how many landed."""
+    """Count rays (rays, 5) in kernel (K, K): a lens point of the disc, a time, a diameter and motion of the box. Returns how many landed."""
     size = kernel.shape[0]
     centre = 0.5 * size
     landed = 0
@@ -143,7 +143,7 @@ def trace_capsule(kernel: np.ndarray, box: np.ndarray, shares: np.ndarray) -> in
 
 @njit(cache=True, nogil=True)
 def _inverted(cumulative: np.ndarray, share: float) -> float:
-    """Where a rising polyline over 0, 1, 2, ... reaches `share`."""
+    """Return where a rising polyline over 0, 1, 2, ... reaches `share`."""
     low = int(np.searchsorted(cumulative, share, side="right")) - 1
     low = min(max(low, 0), len(cumulative) - 2)
     rise = cumulative[low + 1] - cumulative[low]
@@ -161,7 +161,7 @@ def trace_picture(
     rows: np.ndarray,
     columns: np.ndarray,
 ) -> int:
-    """Count rays (rays, 3) in kernel (K, K) for diameters from low to high; returns how many landed.
+    """Count rays (rays, 3) in kernel (K, K) for diameters from low to high; lens points are drawn in proportion to the picture's light.
 
     origin (x, y): the centre of the pupil in the picture; unit: pupil radii per pixel of the picture. rows (H + 1) and columns
     (H, W + 1): light above each row, and left of each column within a row, both from 0 to 1.

@@ -1,6 +1,4 @@
-"""Rays from a point through a lens to the sensor, compiled. Tables, units and axes as in `_ray_tracing_numba`.
-
-Rays through spherical surfaces, and the chief ray among them, compiled.
+"""Rays from a point through the spherical surfaces of a lens to the sensor, and the chief ray among them, compiled.
 
 A table has a row per surface: z, curvature, squared aperture radius, Cauchy A and B. Light travels towards +z; millimetres and
 micrometres (wavelengths). The meridional plane, which holds the axis and the source, is y = 0.
@@ -50,8 +48,10 @@ def trace_ray(table: np.ndarray, first: int, index: float, ray: np.ndarray, wave
 def _through_stop(
     table: np.ndarray, reverse: np.ndarray, stop: int, slope: float, wavelength_um: float, sensor_mm: float, chief: np.ndarray
 ) -> float:
-    """The ray through the middle of the stop whose slope is given just behind it: chief (4: x, z at the first surface, direction
-    x, z) and where it meets the sensor (x); nan where it is lost. Rims are not asked."""
+    """Trace the ray through the middle of the stop whose slope just behind it is given; rims do not block it.
+
+    Fills chief (4: x, z at the first surface, direction x, z) and returns where it meets the sensor (x); nan if it is lost.
+    """
     last = table.shape[0] - 1
     length, behind = np.sqrt(1.0 + slope * slope), table[stop, 3] + table[stop, 4] / (wavelength_um * wavelength_um)
     ray = np.array([0.0, 0.0, table[stop, 0], slope / length, 0.0, 1.0 / length])
@@ -68,7 +68,7 @@ def _through_stop(
 def find_chief(
     table: np.ndarray, reverse: np.ndarray, stop: int, wavelength_um: float, sensor_mm: float, target_mm: float, chief: np.ndarray
 ) -> bool:
-    """The chief ray to target_mm <= 0 on the sensor (x): `_through_stop` solved by stepping and halving; False beyond the field."""
+    """Find the chief ray to target_mm <= 0 on the sensor (x): `_through_stop` solved by stepping and halving; False beyond the field."""
     low, step = 0.0, 1.0 / 256.0
     while True:
         if low >= 1.5:
@@ -107,7 +107,7 @@ def trace_point(
     ray: np.ndarray,
     landing: np.ndarray,
 ) -> float:
-    """One ray from a point on the chief ray; landing (2: x, y on the sensor), returns its weight, 0 if it does not arrive.
+    """Trace one ray from a point on the chief ray; fills landing (2: x, y on the sensor), returns its weight, 0 if it does not arrive.
 
     per_mm: 1 / distance of the point from the plane z = front_mm along the axis, 0 is infinitely far. The ray
     crosses the plane at a right angle to the chief ray, where that meets the first surface, a_mm (meridional) and b_mm
@@ -165,7 +165,7 @@ def trace_rays(
     landings: np.ndarray,
     weights: np.ndarray,
 ) -> None:
-    """Rays for all colours: landings (rays, colours, 2) in mm from the chief ray's place, weights (rays, colours).
+    """Trace rays for all colours: landings (rays, colours, 2) in mm from the chief ray's place, weights (rays, colours).
 
     chiefs (nodes, 5): where the sensor is met (x) and the chief ray, evenly over the range of eccentricity; field (rays):
     place in that range, 0 to nodes - 1. shares (rays, 3): a, b and the wavelength in its band (bands_um (colours, 2): middle

@@ -15,7 +15,7 @@ _TO_UNIT = 1.0 / 9007199254740992.0
 
 @njit(cache=True, nogil=True)
 def uniform(state: np.ndarray) -> float:
-    """The next number in [0, 1) of state (1, uint64), which moves on."""
+    """Return the next number in [0, 1) of state (1, uint64), and advance it."""
     state[0] += _GOLDEN
     z = state[0]
     z = (z ^ (z >> np.uint64(30))) * _FIRST
@@ -25,7 +25,7 @@ def uniform(state: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True)
 def start_photon(state: np.ndarray, seed: int, photon: int) -> None:
-    """A state of its own for each photon: seed and number, mixed once."""
+    """Set the state of a photon from seed and number, mixed once."""
     state[0] = np.uint64(seed) * _FIRST + np.uint64(photon) * _SECOND
     z = state[0]
     z = (z ^ (z >> np.uint64(33))) * _SECOND
@@ -34,8 +34,10 @@ def start_photon(state: np.ndarray, seed: int, photon: int) -> None:
 
 @njit(cache=True, nogil=True)
 def free_path(state: np.ndarray, density_per_m: float, majorant_per_m: float) -> float:
-    """Metres to the next collision, by Woodcock tracking (1965): tentative flights through the denser majorant, of whose
-    collisions a share density / majorant is real. inf without a medium."""
+    """Return metres to the next collision, by Woodcock tracking (1965); inf without a medium.
+
+    Tentative flights go through the denser majorant; of their collisions a share density / majorant is real.
+    """
     if density_per_m <= 0.0:
         return np.inf
     path_m = 0.0
@@ -47,7 +49,7 @@ def free_path(state: np.ndarray, density_per_m: float, majorant_per_m: float) ->
 
 @njit(cache=True, nogil=True)
 def scattering_cosine(anisotropy: float, share: float) -> float:
-    """Cosine between old and new direction at a share of the cumulated Henyey-Greenstein phase function (1941)."""
+    """Return the cosine between old and new direction at a share of the cumulated Henyey-Greenstein phase function (1941)."""
     if abs(anisotropy) < 1e-4:
         return 2.0 * share - 1.0
     part = (1.0 - anisotropy * anisotropy) / (1.0 - anisotropy + 2.0 * anisotropy * share)
@@ -80,7 +82,7 @@ def walk(
     place: np.ndarray,
     heading: np.ndarray,
 ) -> int:
-    """A photon from the middle of a ball of medium to its surface; place and heading (3 each) at the end, returns its collisions."""
+    """Walk a photon from the middle of a ball of medium to its surface; fills place and heading (3 each), returns its collisions."""
     place[:] = 0.0
     heading[0], heading[1], heading[2] = 0.0, 0.0, 1.0
     collisions = 0
@@ -111,7 +113,7 @@ def trace_photons(
     cosines: np.ndarray,
     collisions: np.ndarray,
 ) -> None:
-    """For each radius a photon: cosine between its heading and the outward normal where it leaves the ball, and its collisions."""
+    """Trace a photon for each radius: cosine between its heading and the outward normal where it leaves the ball, and its collisions."""
     state, place, heading = np.zeros(1, np.uint64), np.empty(3), np.empty(3)
     for i in range(len(radii_m)):
         start_photon(state, seed, first + i)

@@ -1,7 +1,4 @@
-"""What every model of point spread functions offers (Leimkuehler et al. 2018, Section 5.1 and Table 1).
-
-Quasi-random shares: points that fill the unit cube evenly, for light tracing.
-"""
+"""PsfModel: what every model of point spread functions offers (Leimkuehler et al. 2018, Section 5.1 and Table 1), and what models share."""
 
 from collections.abc import Iterator
 from hashlib import sha256
@@ -18,7 +15,7 @@ _BLOCK, _GPU_BLOCK = 1 << 16, 1 << 18
 
 
 def sobol_blocks(dimensions: int, rays: int, seed: int, device: str = "") -> Iterator[Float64[np.ndarray, "rays dimensions"]]:
-    """The first `rays` points of a Sobol sequence, scrambled by the seed, in [0, 1), block by block; best for powers of two.
+    """Yield the first `rays` points of a Sobol sequence, scrambled by the seed, in [0, 1), block by block; best for powers of two.
 
     device: where they are traced; the points are the same, a GPU takes more of them at once.
     Not the plainer additive recurrence frac(offset + i sqrt(prime)): with the five dimensions of a physical lens two of its
@@ -38,7 +35,7 @@ Kernel = Float32[np.ndarray, "size size channels"]
 
 @runtime_checkable
 class PsfModel(Protocol):
-    """A function from a few physical coordinates to a point spread function.
+    """Function from a few physical coordinates to a point spread function.
 
     Positions are pixels, x right, y down; the source of the light is the centre of the middle pixel of a kernel. A model
     that `turns` with the motion gives kernels for motion to the right (+x), one that turns with the field gives them for
@@ -74,7 +71,7 @@ class PsfModel(Protocol):
     def settings(self) -> dict[str, Any]: ...
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
-        """The PSF averaged over a box of coordinates (rows: axes; columns: low and high end): pre-filtering, Section 5.4.
+        """Return the PSF averaged over a box of coordinates (rows: axes; columns: low and high end): pre-filtering, Section 5.4.
 
         The average is uniform over the box, along each axis in the measure of `Axis.between`: a ray takes the coordinates
         `axis.between(low, high, share)` for quasi-random shares in [0, 1). A box without extent gives one PSF.
@@ -86,18 +83,18 @@ class PsfModel(Protocol):
         ...
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel | None:
-        """The PSF at a point in closed form, each pixel the exact integral over its area; None where there is no such form."""
+        """Return the PSF at a point in closed form, each pixel the exact integral over its area; None if there is no such form."""
         ...
 
 
 def digest(*arrays: np.ndarray) -> str:
-    """A short name for the contents of arrays (rounded to 9 decimals), for `settings` that would be long."""
+    """Return a short name for the contents of arrays (rounded to 9 decimals), for `settings` that would be long."""
     rounded = b"".join(np.round(np.asarray(array, np.float64), 9).tobytes() for array in arrays)
     return sha256(rounded).hexdigest()[:16]
 
 
 def nodes(axis: Axis, low: float, high: float, largest_step: float) -> Float64[np.ndarray, " nodes"]:
-    """Middles of equal parts of an interval, none longer than `largest_step`: where a closed form is averaged over it."""
+    """Return the middles of equal parts of an interval, none longer than `largest_step`: where a closed form is averaged over it."""
     count = max(1, int(np.ceil((high - low) / largest_step)))
     return axis.between(low, high, (np.arange(count) + 0.5) / count)
 
@@ -109,6 +106,6 @@ def check_positive(name: str, value: float) -> float:
 
 
 def centred(kernel: np.ndarray, size: int) -> np.ndarray:
-    """A kernel (K, K, ...) with a border of zeros, so that it is `size` wide; both odd."""
+    """Return a kernel (K, K, ...) with a border of zeros, so that it is `size` wide; both odd."""
     border = (size - kernel.shape[0]) // 2
     return np.pad(kernel, ((border, border), (border, border), *((0, 0),) * (kernel.ndim - 2)))

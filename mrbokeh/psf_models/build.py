@@ -1,7 +1,4 @@
-"""A model becomes a bank in a folder, cell by cell; an interrupted build goes on where it stopped.
-
-Models by name, imported when asked for.
-"""
+"""Choose a model by name, and build its bank in a folder, cell by cell; an interrupted build continues where it stopped."""
 
 import json
 from collections.abc import Callable
@@ -32,7 +29,7 @@ from mrbokeh.system.resources import cores
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """What a user may say about a model; None is the model's own default. Names and units are those of the models' constructors.
+    """Options that a user may give a model; None is the model's own default. Names and units are those of the models' constructors.
 
     lens: file of the lens whose aperture is swept over diameters. image: the picture of a stylised PSF. diameter_px, motion_px:
     the largest of the bank. prescription: a .dat file of lens surfaces. counts: steps of the grid along each axis. cells: of the
@@ -118,7 +115,7 @@ def _given(options: ModelOptions, *names: str) -> dict:
 
 
 def choose_model(name: str, options: ModelOptions | None = None) -> PsfModel:
-    """The model of a name; an option that it has no use for is a mistake."""
+    """Return the model of a name; refuse options that it has no use for."""
     options = options or ModelOptions()
     if name not in _MODELS:
         raise InputError(f"expected a model out of {', '.join(MODEL_NAMES)}, got {name!r}")
@@ -130,7 +127,7 @@ def choose_model(name: str, options: ModelOptions | None = None) -> PsfModel:
 
 
 def bank_head(model: PsfModel, rays: int, seed: int) -> BankHead:
-    """The description of a model's bank. Several coordinates make a nested grid, unless the model has a knee for a proportional one.
+    """Return the description of a model's bank: a nested grid over several coordinates, or a proportional one if the model has a knee.
 
     One coordinate keeps the regular grid after its power remapping: nesting saves cells only where coordinates multiply, and
     100 cells up to 512 px (exponent 2) are then 10 px wide at the far end instead of 20. Signed diameters must not be nested.
@@ -190,5 +187,5 @@ def _build_cell(model: PsfModel, folder: Path | str, cell: int, box: Float64[np.
 
 
 def _is_part_of(folder: Path | str, head: BankHead) -> bool:
-    """Whether a folder holds some but not all cells of this very bank."""
+    """Return whether a folder holds some but not all cells of this very bank."""
     return (Path(folder) / HEAD).is_file() and read_head(folder) == head and bool(missing_cells(folder, head))

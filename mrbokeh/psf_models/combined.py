@@ -43,7 +43,7 @@ _STEPS_PX = (0.25, 1.0)
 
 
 class Combined:
-    """A thin lens with a round opening before a point that moves evenly in a straight line: a capsule with soft ends.
+    """Thin lens with a round opening before a point that moves evenly in a straight line: a capsule with soft ends.
 
     Coordinates: the diameter of the circle of confusion and the length of the path per shutter, without its direction (by
     which the kernel is turned where it is used). The source in the middle of the kernel is the point at half time.
@@ -96,7 +96,7 @@ class Combined:
         return np.maximum(total, 0.0)[..., None].astype(np.float32)
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel:
-        """The capsule with its true profile: over a pixel, the light of the disc during the time in which it covers it."""
+        """Return the capsule with its true profile: over a pixel, the light of the disc during the time in which it covers it."""
         return self.kernel(np.stack([coords, coords], axis=1), 0, 0)
 
 

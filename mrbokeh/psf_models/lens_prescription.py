@@ -1,20 +1,15 @@
-"""LensPrescription: the spherical surfaces of a real lens.
+"""LensPrescription: the spherical surfaces of a real lens, their glass, and its first-order optics.
 
-Glass: refractive index by wavelength, and an estimate of its dispersion where a prescription has one index only.
+Glass. Indices n_d and Abbe numbers of catalogue glasses: Schott's catalogue, checked against its indices at the C and F lines
+(tests/psf_models/test_lens_prescription.py). Cauchy's two terms through n_d and V meet those to 1e-4 for V above 40 and to 5e-4 for the
+densest flints. Indices of a lens come from its table, and so do its Abbe numbers if the table has them.
 
-Where the numbers come from. Indices n_d and Abbe numbers of catalogue glasses: Schott's catalogue, checked against its indices
-at the C and F lines (tests/psf_models/test_lens_prescription.py). Cauchy's two terms through n_d and V meet those to 1e-4 for V above 40
-and to 5e-4 for the densest flints. Indices of a lens: its table. Abbe numbers of a lens: its table, where it has them.
-
-Where it has none, which is so of the published double Gauss, wide-angle and fisheye: an estimate. Of the double Gauss
-(Tronnier, US 2,673,491) the Abbe numbers are known from Kolb et al. 1995: 47.1, 47.1, 30.1, 38.0, 57.3, 48.0. From the
-edges of the Abbe diagram alone they come out as 55.3, 55.3, 30.1, 38.3, 55.7, 54.6, and blue is focused 0.22 mm behind red,
-when it is 0.07 mm in front of it. With the edges mixed until blue and red meet
-(`mrbokeh.psf_models.lens_prescription_file`) they are 53.0, 53.0, 30.9, 39.2, 53.5, 51.8. Red and blue kernels at f/2, focused
-at 2 m, then differ from those of the known glass by 2 to 3 % of their light at 0.7 m (edges alone: 10 to 21 %) and by 17 to 25 %
-at 20 m (63 to 95 %). No published numbers were found for the other two lenses.
-
-Paraxial: first-order optics of a row of surfaces by ray transfer matrices (Born and Wolf, Principles of Optics, 4.4).
+If it has none, as those of the published double Gauss, wide-angle and fisheye, they are estimated. Of the double Gauss (Tronnier, US
+2,673,491) the Abbe numbers are known from Kolb et al. 1995: 47.1, 47.1, 30.1, 38.0, 57.3, 48.0. From the edges of the Abbe diagram alone
+they come out as 55.3, 55.3, 30.1, 38.3, 55.7, 54.6, and blue is focused 0.22 mm behind red, when it is 0.07 mm in front of it. With the
+edges mixed until blue and red meet (`mrbokeh.psf_models.lens_prescription_file`) they are 53.0, 53.0, 30.9, 39.2, 53.5, 51.8. Red and blue
+kernels at f/2, focused at 2 m, then differ from those of the known glass by 2 to 3 % of their light at 0.7 m (edges alone: 10 to 21 %) and
+by 17 to 25 % at 20 m (63 to 95 %). No published numbers were found for the other two lenses.
 """
 
 from dataclasses import dataclass, replace
@@ -42,7 +37,7 @@ _FLINTS = (
 
 
 def estimated_abbe_number(index: float, is_positive: bool, mix: float = 0.0) -> float:
-    """The Abbe number of a glass of which only n_d is known, from the sign of its element's power.
+    """Estimate the Abbe number of a glass of which only n_d is known, from the sign of its element's power.
 
     Lenses are freed from colour by collecting elements of low and diverging elements of high dispersion (Kingslake and
     Johnson, Lens Design Fundamentals, 2010, chapter 5), so the glass of a positive element is taken from the upper (crown)
@@ -56,7 +51,7 @@ def estimated_abbe_number(index: float, is_positive: bool, mix: float = 0.0) -> 
 
 
 def cauchy_coefficients(index: float, abbe_number: float) -> tuple[float, float]:
-    """(A, B in um^2) of n(wavelength) = A + B / wavelength^2 through n_d and V; B is 0 for an infinite V (air)."""
+    """Return (A, B in um^2) of n(wavelength) = A + B / wavelength^2 through n_d and V; B is 0 for an infinite V (air)."""
     if not (index >= 1.0 and abbe_number > 0.0):
         raise InputError(f"expected a refractive index of at least 1 and a positive Abbe number, got {index:g} and {abbe_number:g}")
     slope_um2 = (index - 1.0) / (abbe_number * (LINE_F_UM**-2 - LINE_C_UM**-2))
@@ -64,7 +59,7 @@ def cauchy_coefficients(index: float, abbe_number: float) -> tuple[float, float]
 
 
 def index_at(index: float, abbe_number: float, wavelength_um: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch"]:
-    """Refractive index at wavelengths in micrometres, by Cauchy's formula with two terms."""
+    """Return the refractive index at wavelengths in micrometres, by Cauchy's formula with two terms."""
     constant, slope_um2 = cauchy_coefficients(index, abbe_number)
     return np.asarray(constant + slope_um2 / np.square(wavelength_um))
 
@@ -74,8 +69,9 @@ Matrix = Float64[np.ndarray, "2 2"]
 
 @dataclass(frozen=True)
 class Paraxial:
-    """Matrices act on (height, index times slope). Positions z in mm from the first vertex towards the sensor.
+    """First-order optics of a row of surfaces by ray transfer matrices (Born and Wolf, Principles of Optics, 4.4).
 
+    Matrices act on (height, index times slope). Positions z in mm from the first vertex towards the sensor.
     vertices_mm (N,), curvatures_per_mm (N,), indices (N + 1,): the media in front of, between and behind the surfaces.
     """
 
@@ -84,7 +80,9 @@ class Paraxial:
     indices: Float64[np.ndarray, " media"]
 
     def between(self, first: int, last: int) -> Matrix:
-        """From just before surface `first` to the vertex of surface `last`, which is not refracted at; N is behind the last one."""
+        """Return the matrix from just before surface `first` to the vertex of surface `last`, which does not refract; N is behind the last
+        one.
+        """
         matrix, surfaces = np.eye(2), len(self.vertices_mm)
         for i in range(first, last):
             power = (self.indices[i + 1] - self.indices[i]) * self.curvatures_per_mm[i]
@@ -100,22 +98,22 @@ class Paraxial:
 
     @property
     def focal_length_mm(self) -> float:
-        """Effective focal length, inf without power, negative for a diverging lens."""
+        """Return the effective focal length: inf without power, negative for a diverging lens."""
         power = self._system[1, 0]
         return float(-1.0 / power) if power != 0.0 else np.inf
 
     @property
     def front_principal_mm(self) -> float:
-        """z of the front principal plane, from which distances to the scene count."""
+        """Return z of the front principal plane, from which distances to the scene count."""
         return float((self._system[1, 1] - 1.0) / self._system[1, 0])
 
     @property
     def rear_principal_mm(self) -> float:
-        """z of the rear principal plane, from which the image distance counts."""
+        """Return z of the rear principal plane, from which the image distance counts."""
         return float(self.vertices_mm[-1] + (1.0 - self._system[0, 0]) / self._system[1, 0])
 
     def sensor_mm(self, focus_distance_m: float) -> float:
-        """z of the sensor that is in focus at a distance (from the front principal plane, metres, inf allowed)."""
+        """Return z of the sensor that is in focus at a distance (from the front principal plane, metres, inf allowed)."""
         focal_mm, distance_mm = self.focal_length_mm, focus_distance_m * 1000.0
         if not distance_mm > focal_mm:
             raise InputError(
@@ -124,23 +122,23 @@ class Paraxial:
         return self.rear_principal_mm + 1.0 / (1.0 / focal_mm - 1.0 / distance_mm)
 
     def heights_of_axial_beam(self) -> Float64[np.ndarray, " surfaces"]:
-        """Heights at the surfaces of a ray that comes in parallel to the axis at height 1."""
+        """Return the heights at the surfaces of a ray that comes in parallel to the axis at height 1."""
         return np.array([self.between(0, i)[0, 0] for i in range(len(self.vertices_mm))])
 
     def entrance_pupil_mm(self, stop: int, stop_diameter_mm: float) -> tuple[float, float]:
-        """(z, diameter) of the stop's image through what lies in front of it."""
+        """Return (z, diameter) of the stop's image through what lies in front of it."""
         matrix = self.between(0, stop)
         return float(matrix[0, 1] / matrix[0, 0]), float(stop_diameter_mm / abs(matrix[0, 0]))
 
     def exit_pupil_mm(self, stop: int, stop_diameter_mm: float) -> tuple[float, float]:
-        """(z, diameter) of the stop's image through what lies behind it."""
+        """Return (z, diameter) of the stop's image through what lies behind it."""
         matrix = self.between(stop, len(self.vertices_mm))
         return float(self.vertices_mm[-1] - matrix[0, 1] / matrix[1, 1]), float(stop_diameter_mm / abs(matrix[1, 1]))
 
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface, met by light that travels from the scene to the sensor.
+    """Surface of a lens, met by light that travels from the scene to the sensor.
 
     radius_mm: positive where the centre of curvature lies on the sensor's side, inf is flat. distance_mm: along the axis to
     the next surface (0 for the last one). index: n_d of the medium behind the surface. diameter_mm: of the clear aperture.
@@ -190,12 +188,12 @@ class LensPrescription:
 
     @cached_property
     def vertices_mm(self) -> Float64[np.ndarray, " surfaces"]:
-        """z of each surface on the axis."""
+        """Return z of each surface on the axis."""
         return np.cumsum([0.0, *(each.distance_mm for each in self.surfaces[:-1])])
 
     @cached_property
     def stop(self) -> int:
-        """Which surface is the stop: the one marked so, else the rim that limits the axial beam from infinity."""
+        """Return the index of the stop: the surface marked so, else the rim that limits the axial beam from infinity."""
         marked = [i for i, each in enumerate(self.surfaces) if each.is_stop]
         if marked:
             return marked[0]
@@ -204,11 +202,11 @@ class LensPrescription:
 
     @cached_property
     def paraxial(self) -> Paraxial:
-        """First-order optics at the d line."""
+        """Return the first-order optics at the d line."""
         return self.paraxial_at(LINE_D_UM)
 
     def paraxial_at(self, wavelength_um: float) -> Paraxial:
-        """First-order optics at a wavelength in micrometres."""
+        """Return the first-order optics at a wavelength in micrometres."""
         curvatures = np.array([each.curvature_per_mm for each in self.surfaces])
         indices = [float(index_at(each.index, each.abbe_number, wavelength_um)) for each in self.surfaces]
         return Paraxial(self.vertices_mm, curvatures, np.array([1.0, *indices]))
@@ -219,18 +217,18 @@ class LensPrescription:
 
     @property
     def axial_colour_mm(self) -> float:
-        """How far behind the focus of blue (F line) that of red (C line) lies, for light from infinity; below 0 in front of it."""
+        """Return how far red (C line) is focused behind blue (F line), for light from infinity; below 0 in front of it."""
         red, blue = (self.paraxial_at(line_um).sensor_mm(inf) for line_um in (LINE_C_UM, LINE_F_UM))
         return red - blue
 
     @property
     def entrance_pupil_mm(self) -> tuple[float, float]:
-        """(z, diameter) of the stop's image as seen from the scene."""
+        """Return (z, diameter) of the stop's image as seen from the scene."""
         return self.paraxial.entrance_pupil_mm(self.stop, self.surfaces[self.stop].diameter_mm)
 
     @property
     def exit_pupil_mm(self) -> tuple[float, float]:
-        """(z, diameter) of the stop's image as seen from the sensor."""
+        """Return (z, diameter) of the stop's image as seen from the sensor."""
         return self.paraxial.exit_pupil_mm(self.stop, self.surfaces[self.stop].diameter_mm)
 
     @property
@@ -238,7 +236,7 @@ class LensPrescription:
         return self.focal_length_mm / self.entrance_pupil_mm[1]
 
     def stopped_down(self, f_number: float) -> "LensPrescription":
-        """With the iris closed to an f-number, at least that of the open lens."""
+        """Return the lens with its iris closed to an f-number, at least that of the open lens."""
         if not (isfinite(f_number) and f_number >= self.f_number * (1.0 - 1e-9)):
             raise InputError(f"{self.name} opens to f/{self.f_number:.3g} only: expected an f-number of at least that, got {f_number:g}")
         stop = self.surfaces[self.stop]
@@ -246,7 +244,7 @@ class LensPrescription:
         return replace(self, surfaces=(*self.surfaces[: self.stop], closed, *self.surfaces[self.stop + 1 :]))
 
     def optics_table(self) -> Float64[np.ndarray, "surfaces 5"]:
-        """For tracing: z of the vertex, curvature, squared radius of the aperture, Cauchy's A and B of the medium behind."""
+        """Return the table for tracing: z of the vertex, curvature, squared radius of the aperture, Cauchy's A and B of the medium behind."""
         rows = [
             (z, each.curvature_per_mm, (0.5 * each.diameter_mm) ** 2, *cauchy_coefficients(each.index, each.abbe_number))
             for z, each in zip(self.vertices_mm, self.surfaces, strict=True)
@@ -254,7 +252,7 @@ class LensPrescription:
         return np.array(rows, np.float64)
 
     def reversed_table(self) -> Float64[np.ndarray, "surfaces 5"]:
-        """`optics_table` of the lens turned round: z counts from its last vertex towards the scene, in the path of light sent back."""
+        """Return `optics_table` of the lens turned round: z counts from its last vertex towards the scene, in the path of light sent back."""
         table, last = self.optics_table(), self.vertices_mm[-1]
         media = np.concatenate([[[1.0, 0.0]], table[:-1, 3:]])
         return np.column_stack([last - table[:, 0], -table[:, 1], table[:, 2], media])[::-1].copy()

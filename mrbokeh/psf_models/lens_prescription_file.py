@@ -1,7 +1,4 @@
-"""Lens prescriptions read from the tables in which lens designs are published.
-
-The simplest lens: two equal surfaces of one glass.
-"""
+"""Lens prescriptions read from the tables in which lens designs are published, and the simplest one by formula."""
 
 from dataclasses import replace
 from math import inf, sqrt
@@ -16,7 +13,7 @@ from mrbokeh.system.errors import InputError
 def biconvex_lens(
     focal_length_mm: float = 50.0, f_number: float = 4.0, edge_mm: float = 1.0, index: float = 1.5168, abbe_number: float = 64.17
 ) -> LensPrescription:
-    """The simple bi-convex spherical lens of Leimkuehler et al. 2018: two equal radii, by default of BK7, no iris but its rims.
+    """Return the bi-convex spherical lens of Leimkuehler et al. 2018: two equal radii, by default of BK7, no iris but its rims.
 
     The paper states no numbers. Radius R and thickness t follow from the thick lensmaker's formula
     1/f = (n - 1)(2/R - (n - 1) t / (n R^2)) with t just leaving `edge_mm` at the rim.
@@ -38,7 +35,7 @@ _HALVINGS = 30
 
 
 def read_prescription(path: Path | str) -> LensPrescription:
-    """A table of surfaces from the scene to the sensor, one per line, `#` begins a comment.
+    """Read a table of surfaces from the scene to the sensor, one per line, `#` begins a comment.
 
     Columns, in mm: radius (0: the stop; inf: flat), distance to the next surface, index n_d behind it (0: as before),
     aperture diameter; with five columns the Abbe number stands before the aperture (the order of Kolb et al. 1995).
@@ -80,9 +77,9 @@ def _surface(words: list[str], index_before: float, abbe_before: float) -> Surfa
 def with_estimated_abbe_numbers(lens: LensPrescription) -> LensPrescription:
     """Give glass (index above 1.01) without an Abbe number one by its index and the power (n - 1)(1/R1 - 1/R2) of its element.
 
-    Designers bring blue and red to one focus. Where glass from the edges of the Abbe diagram would do more than that, all
+    Designers bring blue and red to one focus. If glass from the edges of the Abbe diagram would do more than that, all
     estimates are moved from their edge towards the other one until no axial colour is left (`estimated_abbe_number`'s mix).
-    Half way every index has one Abbe number, as if for a single lens, which has too little correction: the place lies before.
+    Half way every index has one Abbe number, as for a single lens, which has too little correction: the solution lies before.
     """
     unknown = {i: _is_positive(lens.surfaces, i) for i, each in enumerate(lens.surfaces) if each.index > 1.01 and each.abbe_number == inf}
 
@@ -102,7 +99,7 @@ def with_estimated_abbe_numbers(lens: LensPrescription) -> LensPrescription:
 
 
 def _is_positive(surfaces: tuple[Surface, ...], i: int) -> bool:
-    """Whether the element that begins at surface i collects light."""
+    """Return whether the element that begins at surface i collects light."""
     front = next((before for before in surfaces[i::-1] if not before.is_stop), surfaces[i])
     back = next((behind for behind in surfaces[i + 1 :] if not behind.is_stop), surfaces[i])
     return front.curvature_per_mm >= back.curvature_per_mm

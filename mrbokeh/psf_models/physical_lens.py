@@ -31,7 +31,7 @@ _Through = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class PhysicalLens:
-    """A lens by its prescription in front of a sensor; without one the paper's bi-convex lens (`biconvex_lens`).
+    """Lens by its prescription in front of a sensor; without one the paper's bi-convex lens (`biconvex_lens`).
 
     The source of a kernel's light is where its chief ray (green, through the middle of the stop) meets the sensor, so that
     distortion is no part of the blur, and red and blue are displaced as the lens's lateral colour has them. Eccentricity is
@@ -95,7 +95,7 @@ class PhysicalLens:
         }
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel | None:  # noqa: ARG002
-        """There is no closed form."""
+        """Return None: there is no closed form."""
         return None
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
@@ -107,8 +107,11 @@ class PhysicalLens:
     def landed(
         self, box: Float64[np.ndarray, "axes 2"], rays: int, blocks: Iterable[Float64[np.ndarray, "rays 5"]]
     ) -> Float64[np.ndarray, "size size 3"]:
-        """What so many rays bring to the sensor, relative to the light on the axis. Their shares in [0, 1) come in blocks: of the
-        window (meridional and across), of the band of wavelengths, of the range of depth and of that of eccentricity."""
+        """Return what this many rays bring to the sensor, relative to the light on the axis.
+
+        blocks: shares in [0, 1) of the window (meridional and across), of the band of wavelengths, of the range of depth and of
+        eccentricity.
+        """
         chiefs = self.beam.chief_rays(*box[1].tolist())
         ends = self._per_mm(np.unique(box[0]))[::-1]
         window = self.beam.window(ends, np.unique(np.append(box[1], box[1].mean())))
@@ -121,7 +124,7 @@ class PhysicalLens:
         return kernel
 
     def _added(self, kernel: np.ndarray, through: _Through, light: Float64[np.ndarray, " rays"]) -> np.ndarray:
-        """The kernel, wider where it has to be, with rays in it; through: what `LensBeam.trace` takes."""
+        """Return the kernel, widened if needed, with rays added; through: what `LensBeam.trace` takes."""
         landings, weights = self.beam.trace(*through)
         weights *= light[:, None]
         kernel = self._wide_enough(kernel, float(np.abs(landings[weights > 0.0]).max(initial=0.0)))
@@ -136,7 +139,7 @@ class PhysicalLens:
         return kernel + rays.picture(len(kernel), self.mm_per_px)
 
     def throughput(self, depth_m: float, eccentricity: float) -> float:
-        """The open share: cross-section of the beam across the axis that reaches the sensor, relative to the beam on the axis.
+        """Return the open share: cross-section of the beam across the axis that reaches the sensor, relative to the beam on the axis.
 
         It is what rims take away (mechanical vignetting), without the natural fall of light by cos^4. Above 1 where the
         pupil of a wide-angle lens turns towards the field and grows; kernels sum to at most 1.
@@ -144,7 +147,7 @@ class PhysicalLens:
         return self.beam.open_share(float(self._per_mm(np.array(depth_m))), float(eccentricity))
 
     def _of_known_light(self, kernel: Float64[np.ndarray, "size size 3"], rays: int) -> Kernel:
-        """All colours with the same sum: red, green and blue are the brightness of the light that arrives, not of the glass."""
+        """Scale all colours to one sum: red, green and blue are the brightness of the light that arrives, not of the glass."""
         light = kernel.sum(axis=(0, 1))
         if not light.min() > 0.0:
             raise InputError(f"none of {rays} rays came through {self.lens.name}: trace more of them")

@@ -23,7 +23,7 @@ _STEP_PX = 0.25
 
 
 class SimpleLens:
-    """The opening of a thin lens, as large as the circle of confusion: shift-invariant, one coordinate.
+    """Opening of a thin lens, as large as the circle of confusion: shift-invariant, one coordinate.
 
     aperture: its spherical aberration and axial colour make the sides of the focus differ, then diameters are signed; what
     varies over the field (cat's eyes, lateral colour) needs a model with an eccentricity.
@@ -50,7 +50,7 @@ class SimpleLens:
 
     @cached_property
     def near_side_turned(self) -> bool:
-        """Signed diameters hold the near side themselves; an opening that half a turn maps to itself looks the same on both."""
+        """Return whether the near side is the far side turned; not if diameters are signed, or half a turn maps the opening to itself."""
         behind = self.aperture.rasterize(64.0).kernel
         return not self._signed and not np.allclose(behind, behind[::-1, ::-1], atol=1e-9)
 
@@ -75,7 +75,7 @@ class SimpleLens:
         return np.maximum(total, 0.0).astype(np.float32)
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel:
-        """The opening's polygons clipped against pixels (`Aperture.rasterize`)."""
+        """Return the opening's polygons clipped against pixels (`Aperture.rasterize`)."""
         return self.kernel(np.stack([coords, coords], axis=1), 0, 0)
 
     def _size(self, largest_px: float) -> int:
@@ -114,9 +114,9 @@ def _tracer(device: str) -> Callable[..., float]:
 
 
 def banded_edges(plain: Aperture, extent: float) -> tuple[Float64[np.ndarray, "edges 5"], Int64[np.ndarray, " bands_and_end"]]:
-    """(edges, starts) as `_simple_lens_numba.opening_at` takes them: the edges of all outlines, sorted into bands of height.
+    """Return (edges, starts) as `_lens_points_numba.opening_at` takes them: the edges of all outlines, sorted into bands of height.
 
-    An outline that goes round the one way or the other counts alike: its weight takes the sign of its area.
+    The winding direction of an outline does not matter: its weight takes the sign of its area.
     """
     edges = []
     for outline, weight in zip(plain.outlines, plain.weights, strict=True):
@@ -132,5 +132,5 @@ def banded_edges(plain: Aperture, extent: float) -> tuple[Float64[np.ndarray, "e
 
 
 def _sides(low: float, high: float) -> list[tuple[float, float]]:
-    """An interval of diameters, cut at the focus."""
+    """Return an interval of diameters, cut at the focus."""
     return [(low, 0.0), (0.0, high)] if low < 0.0 < high else [(low, high)]

@@ -26,7 +26,7 @@ _LEAST_PX = 1e-6
 
 
 class Stylized:
-    """A picture, light where light falls, scaled with the circle of confusion; in front of the focus turned by half a turn.
+    """Picture, light where light falls, scaled with the circle of confusion; in front of the focus turned by half a turn.
 
     picture: (H, W, 3) scene-linear, >= 0, every colour with some light; averaged down to 512 pixels where it is larger. The
     centroid of its light (of all colours) is where an unblurred point lies, the farthest lit corner of a pixel lies at the
@@ -76,7 +76,7 @@ class Stylized:
         return total.astype(np.float32)
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel:
-        """The picture with its pixels as squares of even light, cut up by the pixels of the kernel."""
+        """Return the picture with its pixels as squares of even light, cut up by the pixels of the kernel."""
         diameter_px = abs(float(coords[0]))
         return self._closed_form(diameter_px, self._size(diameter_px)).astype(np.float32)
 
@@ -117,7 +117,7 @@ def _tracer(device: str) -> Callable[..., float]:
 
 
 def _shares(count: int, origin: float, px: float, size: int) -> "csr_array":
-    """How much of each of `count` source pixels, `px` wide, lies in each of `size` pixels (size, count); `origin` is in the middle."""
+    """Return the share of each of `count` source pixels, `px` wide, in each of `size` pixels (size, count); `origin` is in the middle."""
     from scipy.sparse import csr_array
 
     edges = (np.arange(count + 1) - origin) * px
@@ -127,7 +127,7 @@ def _shares(count: int, origin: float, px: float, size: int) -> "csr_array":
 
 
 def _light_of(picture: Float[np.ndarray, "height width 3"]) -> Float64[np.ndarray, "height width 3"]:
-    """The picture in float64, at most 512 pixels wide and high, each colour with a sum of 1."""
+    """Return the picture in float64, at most 512 pixels wide and high, each colour with a sum of 1."""
     import cv2
 
     if not (np.isfinite(picture).all() and picture.min() >= 0.0 and (picture.max(axis=(0, 1)) > 0.0).all()):
@@ -141,7 +141,7 @@ def _light_of(picture: Float[np.ndarray, "height width 3"]) -> Float64[np.ndarra
 
 
 def _settled(light: Float64[np.ndarray, "height width 3"]) -> tuple[Float64[np.ndarray, "2"], float]:
-    """(centroid of the light (x, y) in pixels, pupil radii per pixel so that the farthest corner of a lit pixel lies at 1)."""
+    """Return (centroid of the light (x, y) in pixels, pupil radii per pixel so that the farthest corner of a lit pixel lies at 1)."""
     total = light.sum(axis=2) / 3.0
     height, width = total.shape
     origin = np.array([total.sum(axis=0) @ (np.arange(width) + 0.5), total.sum(axis=1) @ (np.arange(height) + 0.5)])

@@ -25,7 +25,7 @@ _RING_PX = 0.125
 
 
 class Volume:
-    """A homogeneous medium. The paper's density has no unit; here it is collisions per metre.
+    """Homogeneous medium. The paper's density has no unit; here it is collisions per metre.
 
     anisotropy: Henyey-Greenstein's g, the mean cosine of a scattering angle, above -1 and below 1. albedo: share of light
     that a collision leaves, for red, green, blue. focal_px: pinhole focal length of the picture in pixels. farthest_m: range
@@ -85,13 +85,13 @@ class Volume:
         }
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel | None:
-        """Without a medium or a distance, the point itself; else there is no closed form."""
+        """Return the point itself if there is no medium or no distance; else there is no closed form."""
         if self.density_per_m * float(coords[0]) == 0.0:
             return np.ones((1, 1, 3), np.float32)
         return None
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
-        """See `PsfModel.kernel`. Distances are quasi-random; the walks, whose length has no bound, pseudo-random (seeded)."""
+        """Return the kernel; see `PsfModel.kernel`. Distances are quasi-random; the walks, of unbounded length, pseudo-random (seeded)."""
         if rays <= 0:
             raise InputError("scattering has no closed form: expected at least one ray")
         rings, albedo = self._rings(), np.array([*self.albedo, 1.0])
@@ -110,7 +110,7 @@ class Volume:
     def trace(
         self, distances_m: Float64[np.ndarray, " rays"], seed: int, first: int = 0
     ) -> tuple[Float64[np.ndarray, " rays"], Int64[np.ndarray, " rays"]]:
-        """For each distance one photon (number `first` and following): cosine of the angle from the source, and collisions."""
+        """Trace one photon (number `first` and following) for each distance: cosine of the angle from the source, and collisions."""
         cosines, collisions = np.empty(len(distances_m)), np.empty(len(distances_m), np.int64)
         medium = (self.density_per_m, self.majorant_per_m, self.anisotropy)
         compiled.trace_photons(first, seed, distances_m, *medium, cosines, collisions)
@@ -126,11 +126,11 @@ class Volume:
         return photons_in_rings(*photons, albedo, self.focal_px, _RING_PX, len(self._rings()))
 
     def _rings(self) -> Float64[np.ndarray, "rings 4"]:
-        """As many as reach the corners of the window; the last channel loses nothing."""
+        """Return empty rings, as many as reach the corners of the window; the last channel loses nothing."""
         return np.zeros((int(np.ceil(self.size_px * np.sqrt(0.5) / _RING_PX)), 4))
 
     def _of_known_light(self, kernel: Float64[np.ndarray, "size size 4"], rays: int) -> Kernel:
-        """Divided by what would be in the window without absorption."""
+        """Divide by what would be in the window without absorption."""
         whole, *colours = kernel.sum(axis=(0, 1))[[3, 0, 1, 2]]
         if not min(colours) > 0.0:
             raise InputError(f"none of {rays} photons reached the window: trace more of them, or choose a nearer distance")
@@ -138,7 +138,7 @@ class Volume:
 
 
 def _cut(kernel: np.ndarray) -> np.ndarray:
-    """The smallest odd window that holds all light."""
+    """Return the smallest odd window that holds all light."""
     lit = np.nonzero(kernel.any(axis=2))
     middle = len(kernel) // 2
     radius = max(int(np.abs(places - middle).max(initial=0)) for places in lit)

@@ -1,9 +1,7 @@
-"""Rays of the simple, the combined and the stylized model: a lens point each, times half a diameter. Twins of the compiled loops,
-with the same arguments after the device; each adds a block of rays to a kernel and returns its light.
+"""Rays of the simple, combined, stylized and physical models on a device: twins of the compiled loops, for all rays of a block at once.
 
-Arrays that go to a device of torch, and light that is added up in bins there.
-
-Rays through the surfaces of a lens: `_physical_lens_numba` and `_ray_tracing_numba` for all rays of a block at once.
+`trace_lens`, `trace_capsule` and `trace_picture` take the arguments of the compiled ones after the device; each adds a block of rays to a
+kernel and returns its light. Light is added up in bins of whole numbers, which come out the same in any order.
 """
 
 import math
@@ -24,13 +22,15 @@ def on(device: torch.device, array: Shaped[np.ndarray, "..."]) -> Shaped[Tensor,
 
 
 def number(value: float, like: Float64[Tensor, "..."]) -> Float64[Tensor, ""]:
-    """For divisions that are rounded once. With a plain number torch multiplies by a reciprocal: always where the number is the
-    dividend, on GPUs where it is the divisor too."""
+    """Return a number as a tensor, for divisions that are rounded once.
+
+    With a plain number torch multiplies by a reciprocal: always if the number is the dividend, on GPUs if it is the divisor too.
+    """
     return torch.full((), value, dtype=torch.float64, device=like.device)
 
 
 def summed(bins: Int64[Tensor, " rays"], weights: Float64[Tensor, " rays"], count: int) -> Float64[np.ndarray, " count"]:
-    """The sum of the weights that fall in each of `count` bins, to 2**-61 of rays x the largest weight: whole numbers of 64 bits."""
+    """Sum the weights in each of `count` bins, to 2**-61 of rays x the largest weight: whole numbers of 64 bits."""
     largest = float(weights.abs().max()) if len(weights) else 0.0
     exponent = _BITS - math.frexp(max(largest * len(weights), 1e-200))[1]
     sums = torch.zeros(count, dtype=torch.int64, device=bins.device)
@@ -39,7 +39,7 @@ def summed(bins: Int64[Tensor, " rays"], weights: Float64[Tensor, " rays"], coun
 
 
 def pixels(x: Float64[Tensor, "*rays"], y: Float64[Tensor, "*rays"], size: int) -> tuple[Int64[Tensor, "*rays"], Bool[Tensor, "*rays"]]:
-    """(number of the pixel of a picture `size` wide and high, row by row, and whether the place lies in it)."""
+    """Return (number of the pixel of a picture `size` wide and high, row by row, and whether the place lies in it)."""
     column, row = x.floor(), y.floor()
     inside = (row >= 0.0) & (row < size) & (column >= 0.0) & (column < size)
     return torch.where(inside, row * size + column, 0.0).to(torch.int64), inside
@@ -59,7 +59,7 @@ def trace_lens(
     edges: Float64[np.ndarray, "edges 5"],
     starts: Int64[np.ndarray, " bands_and_end"],
 ) -> float:
-    """See `_simple_lens_numba.trace_lens`."""
+    """Trace rays as `_lens_points_numba.trace_lens` does."""
     where = device_named(device)
     first, second, third = on(where, shares.T)
     u, v = (2.0 * first - 1.0) * extent, (2.0 * second - 1.0) * extent
@@ -71,7 +71,7 @@ def trace_lens(
 def _opening_at(
     x: Rays, y: Rays, edges: Float64[Tensor, "edges 5"], starts: Int64[Tensor, " bands_and_end"], extent: float, most: int
 ) -> Rays:
-    """The first edge of each ray's band, then the second, up to the most that a band has."""
+    """Return the weight of the opening at each ray: the first edge of its band, then the second, up to the most that a band has."""
     bands = len(starts) - 1
     band = ((y + extent) * bands / number(2.0 * extent, y)).to(torch.int64).clamp(0, bands - 1)
     start, end = starts[band], starts[band + 1]
@@ -85,7 +85,7 @@ def _opening_at(
 
 
 def trace_capsule(device: str, kernel: Kernel, box: Float64[np.ndarray, "2 2"], shares: Float64[np.ndarray, "rays 5"]) -> float:
-    """See `_combined_numba.trace_capsule`."""
+    """Trace rays as `_lens_points_numba.trace_capsule` does."""
     first, second, third, fourth, fifth = on(device_named(device), shares.T)
     radius, angle = torch.sqrt(first), 2.0 * math.pi * second
     (low_px, high_px), (shortest_px, longest_px) = box.tolist()
@@ -107,7 +107,7 @@ def trace_picture(
     rows: Float64[np.ndarray, " height_and_end"],
     columns: Float64[np.ndarray, "height width_and_end"],
 ) -> float:
-    """See `_stylized_numba.trace_picture`."""
+    """Trace rays as `_lens_points_numba.trace_picture` does."""
     where = device_named(device)
     first, second, third = on(where, shares.T)
     y = _inverted(on(where, rows[None]), torch.zeros_like(first, dtype=torch.int64), first)
@@ -117,7 +117,7 @@ def trace_picture(
 
 
 def _inverted(cumulative: Float64[Tensor, "lines points"], line: Int64[Tensor, " rays"], share: Rays) -> Rays:
-    """Where the rising polyline of a ray's line, over 0, 1, 2, ..., reaches its share; found by halving."""
+    """Return where the rising polyline of a ray's line, over 0, 1, 2, ..., reaches its share; found by halving."""
     width = cumulative.shape[1]
     values, start = cumulative.reshape(-1), line * width
     low, high = torch.zeros_like(line), torch.full_like(line, width)
@@ -132,7 +132,7 @@ def _inverted(cumulative: Float64[Tensor, "lines points"], line: Int64[Tensor, "
 
 
 def _added(kernel: Kernel, x: Rays, y: Rays, weights: Rays) -> float:
-    """Add rays that land at (x, y), counted from the corner of the kernel; their light."""
+    """Add rays that land at (x, y), counted from the corner of the kernel. Returns their light."""
     size = len(kernel)
     pixel, inside = pixels(x, y, size)
     light = summed(pixel, torch.where(inside, weights, 0.0), size * size)
@@ -146,7 +146,7 @@ ColouredVectors = tuple[Coloured, Coloured, Coloured]
 
 
 class LandedRays:
-    """A block of rays of all colours on the sensor. Arguments after the beam as those of `LensBeam.trace`.
+    """Block of rays of all colours on the sensor. Arguments after the beam are those of `LensBeam.trace`.
 
     light (rays): by which the weight of a ray is multiplied.
     landings: x and y in mm from the chief ray's place, each (colours, rays). weights (colours, rays): 0 where a ray is lost.
@@ -180,12 +180,12 @@ class LandedRays:
 
     @property
     def reach_mm(self) -> float:
-        """How far from the chief ray's place, along x or y, the farthest light lands."""
+        """Return how far from the chief ray's place, along x or y, the farthest light lands."""
         lit = self.weights > 0.0
         return max(float(torch.where(lit, each.abs(), 0.0).max()) for each in self.landings)
 
     def picture(self, size: int, mm_per_px: float) -> Float64[np.ndarray, "size size colours"]:
-        """See `_physical_lens_numba.add_landings`."""
+        """Sum the rays in pixels as `_physical_lens_numba.add_landings` does."""
         centre, (x, y) = 0.5 * size, self.landings
         column, aside = centre - x / number(mm_per_px, x), y / number(mm_per_px, y)
         above, is_above = pixels(column, centre - aside, size)
@@ -200,7 +200,7 @@ class LandedRays:
 def _chief_rays(
     chiefs: Float64[Tensor, "nodes 5"], field: Float64[Tensor, " rays"]
 ) -> tuple[Float64[Tensor, " rays"], Float64[Tensor, "4 rays"]]:
-    """(x on the sensor, (x and z on the first surface, direction x and z)), linear between the nodes."""
+    """Return (x on the sensor, (x and z on the first surface, direction x and z)), linear between the nodes."""
     last = len(chiefs) - 1
     node = field.to(torch.int64).clamp(max=max(last - 1, 0))
     part = (field - node)[:, None]
@@ -212,7 +212,7 @@ def _chief_rays(
 def _from_points(
     chief: Float64[Tensor, "4 rays"], front_mm: float, per_mm: Rays, a_mm: Rays, b_mm: Rays
 ) -> tuple[tuple[Vectors, Vectors], Rays, Rays]:
-    """((places, directions), square of the ray's length relative to the chief ray's, that length): see `trace_point`."""
+    """Return ((places, directions), square of the ray's length relative to the chief ray's, that length): see `trace_point`."""
     x, z, along_x, along_z = chief
     near = along_z * per_mm / (1.0 + (z - front_mm) * per_mm)
     aside = 1.0 + (a_mm * a_mm + b_mm * b_mm) * near * near
@@ -225,7 +225,7 @@ def _from_points(
 def through_surfaces(
     table: Float64[np.ndarray, "surfaces 5"], place: Vectors, heading: Vectors, wavelengths_um: Coloured
 ) -> tuple[ColouredVectors, ColouredVectors, Bool[Tensor, "colours rays"]]:
-    """(places on the last surface, directions behind it, whether the ray got through): see `trace_ray`, with rims, from air.
+    """Return (places on the last surface, directions behind it, whether the ray got through): see `trace_ray`, with rims, from air.
 
     A lost ray goes on as numbers without a meaning (finite or not).
     """

@@ -1,4 +1,4 @@
-"""Photons in a homogeneous medium: `_volume_numba` for all photons of a block in step, each with its own random numbers."""
+"""Photons in a homogeneous medium on a device: `_volume_numba` for all photons of a block in step, each with its own random numbers."""
 
 import math
 
@@ -12,7 +12,7 @@ from mrbokeh.system.torch_device import device_named
 
 
 def _signed(number: int) -> int:
-    """64 bits as torch holds them."""
+    """Return 64 bits as torch holds them."""
     return (number + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
@@ -25,12 +25,12 @@ Vectors = Float64[Tensor, "3 photons"]
 
 
 def _shifted(z: States, bits: int) -> States:
-    """To the right, with zeros from the left."""
+    """Shift to the right, with zeros from the left."""
     return (z >> bits) & ((1 << (64 - bits)) - 1)
 
 
 def first_states(first: int, count: int, seed: int, device: torch.device) -> States:
-    """See `start_photon`: of the photons `first` and following."""
+    """Return the states of photon `first` and following: see `start_photon`."""
     photons = torch.arange(first, first + count, dtype=torch.int64, device=device)
     z = photons * _SECOND + _signed(seed * _FIRST)
     z = (z ^ _shifted(z, 33)) * _SECOND
@@ -38,7 +38,7 @@ def first_states(first: int, count: int, seed: int, device: torch.device) -> Sta
 
 
 def uniform(states: States) -> tuple[States, Photons]:
-    """(the states after, the next number in [0, 1) of each): SplitMix64; whole numbers wrap round as unsigned ones do."""
+    """Return (the states after, the next number in [0, 1) of each): SplitMix64; whole numbers wrap round as unsigned ones do."""
     states = states + _GOLDEN
     z = (states ^ _shifted(states, 30)) * _FIRST
     z = (z ^ _shifted(z, 27)) * _SECOND
@@ -46,7 +46,7 @@ def uniform(states: States) -> tuple[States, Photons]:
 
 
 def _free_paths(states: States, density_per_m: float, majorant_per_m: float) -> tuple[States, Photons]:
-    """See `free_path`: tentative flights by all photons until each has had a real collision."""
+    """Fly all photons tentatively until each has had a real collision: see `free_path`."""
     paths_m = torch.zeros(len(states), dtype=torch.float64, device=states.device)
     flying = torch.ones(len(states), dtype=torch.bool, device=states.device)
     states = states.clone()
@@ -82,7 +82,7 @@ def _turned(direction: Vectors, cosine: Photons, azimuth: Photons) -> Vectors:
 
 
 def _rest_m(radii_m: Photons, place: Vectors, heading: Vectors) -> Photons:
-    """How far it is to the surface of the ball."""
+    """Return the distance to the surface of the ball."""
     along = place[0] * heading[0] + place[1] * heading[1] + place[2] * heading[2]
     inside = (radii_m * radii_m - (place[0] * place[0] + place[1] * place[1] + place[2] * place[2])).clamp(min=0.0)
     root = torch.sqrt(along * along + inside)
@@ -98,7 +98,7 @@ def trace_photons(
     majorant_per_m: float,
     anisotropy: float,
 ) -> tuple[Photons, Int64[Tensor, " photons"]]:
-    """(cosines between headings and normals, collisions): see `_volume_numba.trace_photons`. Photons that are out are laid aside."""
+    """Return (cosines between headings and normals, collisions): see `_volume_numba.trace_photons`. Finished photons leave the loop."""
     radii = on(device_named(device), radii_m)
     cosines, collisions = torch.ones_like(radii), torch.zeros_like(radii, dtype=torch.int64)
     if density_per_m <= 0.0:
@@ -136,7 +136,7 @@ def photons_in_rings(
     ring_px: float,
     rings: int,
 ) -> Float64[np.ndarray, "rings channels"]:
-    """See `_volume_numba.add_to_rings`."""
+    """Sort photons into rings as `_volume_numba.add_to_rings` does."""
     sine = torch.sqrt((1.0 - cosines * cosines).clamp(min=0.0))
     ring = torch.where(cosines > 0.0, focal_px * sine / (cosines * ring_px), math.inf)
     caught = ring < rings
