@@ -1,9 +1,4 @@
-"""The scale from a ChArUco board: its corners triangulated with the poses, then a similarity that fits the board to its pictures.
-
-The corners of a board in photographs, where there is time to search more than once.
-
-The board that lies in a scene, as the command line names it.
-"""
+"""The scale from a ChArUco board: its corners triangulated with the poses, then a similarity fitted to their pictures."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +18,23 @@ from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
 
 _ENLARGED_UP_TO_PX = 2000
+FEWEST_CORNERS = 6
+POSES_SIGMA, POSES_SIGMA_WITH_DISTORTION = 5e-4, 1e-3
+"""What errors of poses and lens leave, which the corners do not show: 0.00 to 0.04 % on traced scenes where the lens has no
+distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too. That is noise of the matches: 0.1 px on 500
+points of the lab's seven views leave 0.09 % root mean square beside a term of distortion that is there, and 0.06 % without one.
+"""
+_MEDIAN_OF_RAYLEIGH = 1.1774  # of the length of an error whose two parts are normal with a deviation of 1
+_WRONG_SIGMAS = 5.0
+_LEAST_WRONG_PX = 0.1
+Points = Float[np.ndarray, "points 3"]
 
 
 class BoardSearch:
-    """Takes the board as printed by OpenCV before and since 4.6: nobody knows which version made a print.
+    """A thorough search for a board's corners in photographs.
 
-    The whole print is not laid over the picture (mrbokeh.tracking.charuco.board_alignment). On a traced board with white paper around it
+    The board is tried as printed by OpenCV before and since 4.6, since nobody knows which version made a print.
+    The whole print is not fitted to the picture (mrbokeh.tracking.charuco.board_alignment). On a traced board with white paper around it
     that took the corners' error from 0.070 to 0.016 px and their share of the scale's from 0.02 to 0.004 %, where poses leave 0.05 %;
     but its homography knows no distortion, which photographs keep here, and a board cut off at its squares does not fit.
     """
@@ -37,29 +43,15 @@ class BoardSearch:
         self._detectors = [CharucoDetector(replace(board, legacy=legacy)) for legacy in (board.legacy, not board.legacy)]
 
     def corners(self, rgb8: UInt8[np.ndarray, "height width 3"]) -> Corners:
-        """The search that found most. Small pictures are also searched enlarged: small markers are read there that were not before."""
+        """Return the corners of the search that found most. Small pictures are also searched enlarged, which finds smaller markers."""
         grey = cv2.cvtColor(np.ascontiguousarray(rgb8), cv2.COLOR_RGB2GRAY)
         scales = (1, 2) if max(grey.shape) <= _ENLARGED_UP_TO_PX else (1,)
         return max((each.detect_enlarged(grey, enlarged) for enlarged in scales for each in self._detectors), key=len)
 
 
-FEWEST_CORNERS = 6
-POSES_SIGMA, POSES_SIGMA_WITH_DISTORTION = 5e-4, 1e-3
-"""What errors of poses and lens leave, which the corners do not show: 0.00 to 0.04 % on traced scenes where the lens has no
-distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too. That is noise of the matches: 0.1 px on 500
-points of the lab's seven views leave 0.09 % root mean square beside a term of distortion that is there, and 0.06 % without one.
-"""
-
-_MEDIAN_OF_RAYLEIGH = 1.1774  # of the length of an error whose two parts are normal with a deviation of 1
-_WRONG_SIGMAS = 5.0
-_LEAST_WRONG_PX = 0.1
-
-Points = Float[np.ndarray, "points 3"]
-
-
 @dataclass(frozen=True)
 class BoardDetections:
-    """Where the views see corners of the board: index of the view, id of the corner, position in the picture."""
+    """Corners of the board seen in the views: index of the view, id of the corner, position in the picture."""
 
     views: Int[np.ndarray, " seen"]
     corners: Int[np.ndarray, " seen"]
@@ -71,7 +63,7 @@ class BoardDetections:
 
 @dataclass(frozen=True)
 class Similarity:
-    """y = scale * rotation @ x + translation."""
+    """The similarity y = scale * rotation @ x + translation."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
@@ -82,7 +74,7 @@ class Similarity:
 
 
 def board_scale(model: SparseModel, board: CharucoBoard, pictures: Iterator[UInt8[np.ndarray, "_ _ 3"]]) -> ScaleAnswer:
-    """pictures: 8-bit RGB, one for each view of the model, in its order and with its intrinsics."""
+    """Return the scale by a board. pictures: 8-bit RGB, one for each view of the model, in its order and with its intrinsics."""
     return scale_of_detections(model, board, detect_board(board, pictures))
 
 
@@ -94,7 +86,7 @@ def detect_board(board: CharucoBoard, pictures: Iterator[UInt8[np.ndarray, "_ _ 
 
 
 def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> ScaleAnswer:
-    """Similarity of Umeyama (1991) from the triangulated corners, then refined on the pixels, where the errors are alike."""
+    """Fit a similarity to the triangulated corners (Umeyama 1991), then refine it on the pixels, where all errors have one size."""
     seen = seen.only(_seen_twice(seen))
     corners = np.unique(seen.corners)
     if len(corners) < FEWEST_CORNERS:
@@ -126,7 +118,7 @@ def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDete
 
 
 def board_outlines(model: SparseModel, board: CharucoBoard, seen: BoardDetections, fit: Similarity) -> dict[str, list[list[float]]]:
-    """The four corners of the board in the picture of every view that saw it; beyond the frame where the board is."""
+    """Return the four corners of the board in the picture of every view that saw it; they may lie beyond the frame."""
     width_m, height_m = (side / MM_PER_M for side in board.size_mm)
     corners_m = np.array([(0.0, 0.0, 0.0), (width_m, 0.0, 0.0), (width_m, height_m, 0.0), (0.0, height_m, 0.0)])
     views = [model.views[index] for index in np.unique(seen.views)]
@@ -134,13 +126,13 @@ def board_outlines(model: SparseModel, board: CharucoBoard, seen: BoardDetection
 
 
 def _wrong(residuals_px: Float[np.ndarray, "seen 2"]) -> np.ndarray:
-    """Beyond five standard deviations of what is usual here: corners that something half covers lie a pixel or so off."""
+    """Mark residuals beyond five standard deviations: a partly covered corner lies about a pixel off."""
     off_px = np.linalg.norm(residuals_px, axis=1)
     return off_px > max(_WRONG_SIGMAS * float(np.median(off_px)) / _MEDIAN_OF_RAYLEIGH, _LEAST_WRONG_PX)
 
 
 def _from_triangulated(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> tuple[Similarity, float]:
-    """From the board to the model by points in space, and how far these lie off, root mean square, in mm."""
+    """Return the similarity from the board to the triangulated corners, and their root mean square distance from it in mm."""
     corners = np.unique(seen.corners)
     points = np.array(
         [triangulate([model.views[v] for v in seen.views[seen.corners == c]], seen.xy_px[seen.corners == c]) for c in corners]
@@ -155,7 +147,7 @@ def _seen_twice(seen: BoardDetections) -> np.ndarray:
 
 
 def triangulate(views: Sequence[SparseView], xy_px: Float[np.ndarray, "seen 2"]) -> Float[np.ndarray, "3"]:
-    """The point nearest to the rays of all views, in least squares."""
+    """Return the point with the least squared distance from the rays of all views."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for view, place in zip(views, xy_px, strict=True):
         pinhole = undistorted_px(view.camera, view.distortion, place)
@@ -167,7 +159,7 @@ def triangulate(views: Sequence[SparseView], xy_px: Float[np.ndarray, "seen 2"])
 
 
 def umeyama(source: Points, target: Points) -> Similarity:
-    """The similarity with the least squared distance from source to target (Umeyama 1991, eqs. 40-42)."""
+    """Return the similarity with the least squared distance from source to target (Umeyama 1991, eqs. 40-42)."""
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     centred_s, centred_t = source - mean_s, target - mean_t
     u, singular, vt = np.linalg.svd(centred_t.T @ centred_s)
@@ -178,7 +170,7 @@ def umeyama(source: Points, target: Points) -> Similarity:
 
 
 def _fit_to_pixels(model: SparseModel, board: CharucoBoard, seen: BoardDetections, start: Similarity) -> tuple[Similarity, float]:
-    """(the similarity of least squared reprojection errors, robust; the relative standard deviation of its scale)."""
+    """Return (the similarity of least robust reprojection errors, the relative standard deviation of its scale)."""
 
     def similarity(parameters: np.ndarray) -> Similarity:
         turn = Rotation.from_rotvec(parameters[1:4]).as_matrix()
@@ -204,7 +196,7 @@ def _residuals_px(model: SparseModel, board: CharucoBoard, seen: BoardDetections
 
 
 def board_from_options(board: str, square_mm: float | None, marker_mm: float | None, dictionary: str) -> CharucoBoard:
-    """`board` is "COLUMNSxROWS" with the sizes beside it, or the path of a board.toml or board.json."""
+    """Return the board of the options: "COLUMNSxROWS" with its sizes, or the path of a board.toml or board.json."""
     if board.endswith((".toml", ".json")):
         return read_board(Path(board))
     try:

@@ -124,7 +124,7 @@ def fill_capsule(kernel: np.ndarray, diameter_px: float, motion_px: float, weigh
 
 @njit(cache=True, nogil=True)
 def trace_capsule(kernel: np.ndarray, box: np.ndarray, shares: np.ndarray) -> int:
-    """Count rays (rays, 5) in kernel (K, K): a lens point of the disc, a time, a diameter and motion of the box. Returns how many landed."""
+    """Count rays (rays, 5) in kernel (K, K): lens point of the disc, time, diameter and motion of the box. Returns how many landed."""
     size = kernel.shape[0]
     centre = 0.5 * size
     landed = 0

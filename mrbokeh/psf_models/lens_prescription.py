@@ -244,7 +244,7 @@ class LensPrescription:
         return replace(self, surfaces=(*self.surfaces[: self.stop], closed, *self.surfaces[self.stop + 1 :]))
 
     def optics_table(self) -> Float64[np.ndarray, "surfaces 5"]:
-        """Return the table for tracing: z of the vertex, curvature, squared radius of the aperture, Cauchy's A and B of the medium behind."""
+        """Return the table for tracing: z of the vertex, curvature, squared aperture radius, Cauchy's A and B of the medium behind."""
         rows = [
             (z, each.curvature_per_mm, (0.5 * each.diameter_mm) ** 2, *cauchy_coefficients(each.index, each.abbe_number))
             for z, each in zip(self.vertices_mm, self.surfaces, strict=True)
@@ -252,7 +252,7 @@ class LensPrescription:
         return np.array(rows, np.float64)
 
     def reversed_table(self) -> Float64[np.ndarray, "surfaces 5"]:
-        """Return `optics_table` of the lens turned round: z counts from its last vertex towards the scene, in the path of light sent back."""
+        """Return `optics_table` of the reversed lens: z counts from its last vertex towards the scene, in the path of light sent back."""
         table, last = self.optics_table(), self.vertices_mm[-1]
         media = np.concatenate([[[1.0, 0.0]], table[:-1, 3:]])
         return np.column_stack([last - table[:, 0], -table[:, 1], table[:, 2], media])[::-1].copy()

@@ -5,12 +5,9 @@
     metres = read_focus_pull("venice.csv").smoothed().at(12)
 
 What lies where:
-    track               CameraTrack, TrackedFrame: cameras by frame number or by time
-    between_frames      interpolated: rotations along the shortest arc, places along lines, focus in dioptres
-    world_axes          the axes of OpenGL's cameras and of worlds with another axis up
-    formats             read_track, write_track; the files are track_file (ours), chan_file, nerfstudio_file, colmap_file, opentrackio_file
-    opentrackio_sample  one sample of it, from a file or a live tracking system; stage_axes has the axes of such stages
-    focus_pull          FocusPull: the focus distance by frame; focus_metadata reads that of cine cameras, focus_steps smooths it
-    board_track         the track of a clip in which a printed board is seen: board_corners finds it, board_calibration the camera,
-                        board_smoothing and steady_poses keep the poses from trembling more than the camera did
+    track               CameraTrack, TrackedFrame: cameras by frame number or by time, and interpolated; TrackOptions of files
+    formats             read_track, write_track and our own JSON; chan_file, nerfstudio_file, colmap_file, opentrackio_file the others
+    focus_pull          FocusPull: the focus distance by frame, from keys or from what cine cameras wrote, smoothed
+    board_track         the track of a clip in which a printed board is seen; board_calibration finds the camera, board_smoothing
+                        keeps the poses from trembling more than the camera did
 """

@@ -36,7 +36,10 @@ _WORST_PX, _WORST_SHARE = 2.0, 0.002
 
 @dataclass(frozen=True)
 class Calibration:
-    """camera: without a pose. focal_sigma: of the focal length, as a share. residual_px: RMS over all corners of the views used."""
+    """Calibrated camera of a clip.
+
+    camera: without a pose. focal_sigma: of the focal length, as a share. residual_px: RMS over all corners of the views used.
+    """
 
     camera: Camera
     distortion: Distortion
@@ -46,7 +49,9 @@ class Calibration:
 
 
 def calibrated(board: CharucoBoard, seen: Sequence[Corners], width_px: int, height_px: int) -> Calibration:
-    """seen: corners as read in frames of that size, not aligned with the print, whose homography would hide distortion.
+    """Calibrate a camera from the corners of a board in the frames of a clip.
+
+    seen: corners as read in frames of that size, not aligned with the print, whose homography would hide distortion.
 
     Square pixels; then in turn k1, k2 and the principal point are freed where Schwarz's criterion (BIC 1978) says that the views know
     them. Raises InputError where they leave the focal length open.
@@ -73,7 +78,7 @@ def calibrated(board: CharucoBoard, seen: Sequence[Corners], width_px: int, heig
 
 
 def _solved(board: CharucoBoard, views: Sequence[Corners], size_px: tuple[int, int], freed: int) -> tuple[float, Calibration] | None:
-    """(Schwarz's criterion, calibration); None where a parameter is left open."""
+    """Return (Schwarz's criterion, calibration); None if a parameter is left open."""
     points = [board.corners_m[each.ids].astype(np.float32) for each in views]
     pixels = [(each.xy_px - 0.5).astype(np.float32).reshape(-1, 1, 2) for each in views]
     start = np.array([[max(size_px), 0.0, size_px[0] / 2 - 0.5], [0.0, max(size_px), size_px[1] / 2 - 0.5], [0.0, 0.0, 1.0]])
@@ -103,13 +108,13 @@ def _scaled(factor: float) -> Float64[np.ndarray, "3 3"]:
 def _rms_px(
     points: list[np.ndarray], pixels: list[np.ndarray], size_px: tuple[int, int], matrix: np.ndarray, coefficients: np.ndarray, flags: int
 ) -> float:
-    """What remains with that focal length, everything else fitted anew."""
+    """Return the RMS that remains with that focal length, everything else fitted anew."""
     fixed = flags | cv2.CALIB_FIX_FOCAL_LENGTH
     return float(cv2.calibrateCamera(points, pixels, size_px, matrix, coefficients.copy(), flags=fixed)[0])
 
 
 def _focal_sigma(rms_px: float, others_px: list[float], count: int) -> float:
-    """Relative, from how much worse focal lengths a tenth shorter and longer fit (a likelihood profile).
+    """Return the relative error of the focal length, from how much worse values a tenth shorter and longer fit (a likelihood profile).
 
     OpenCV's own uncertainty is a billionth where a board is only seen head on.
     """
@@ -118,7 +123,7 @@ def _focal_sigma(rms_px: float, others_px: list[float], count: int) -> float:
 
 
 def _spread(seen: Sequence[Corners], board: CharucoBoard) -> list[Corners]:
-    """Up to 40 views that differ most in where they see the board's outline, the farthest from those taken next."""
+    """Return up to 40 views that differ most in where they see the board's outline, each time the farthest from those taken."""
     if len(seen) <= _MOST_VIEWS:
         return list(seen)
     outlines = np.array([_outline_px(each, board) for each in seen])
@@ -131,7 +136,7 @@ def _spread(seen: Sequence[Corners], board: CharucoBoard) -> list[Corners]:
 
 
 def _outline_px(corners: Corners, board: CharucoBoard) -> Float64[np.ndarray, "8"]:
-    """Where the board's four outer corners lie; 0 where the view does not tell."""
+    """Return where the board's four outer corners lie; 0 if the view does not tell."""
     homography, _ = cv2.findHomography(1000.0 * board.corners_m[corners.ids, :2], corners.xy_px, cv2.USAC_MAGSAC, 2.0)
     if homography is None:
         return np.zeros(8)

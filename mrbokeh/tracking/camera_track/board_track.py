@@ -1,11 +1,8 @@
 """The camera track of a clip in which a printed board is seen.
 
-Intrinsics for the pictures of a clip: of its size, and turned as its metadata turn the pictures.
-
-Corners of a board in every frame of a clip, read or carried from frames before and after.
-
-Reading is tried in every frame. What cannot be read is carried by flow from the frame before, and where the board is read again
-afterwards, back from there; in either case the whole print is laid over the picture, which keeps what is carried from drifting.
+The board is looked for in every frame. Corners that cannot be read are carried by flow from the frame before, and if the board is read
+again afterwards, back from there; in either case the whole print is laid over the picture, which keeps carried corners from drifting.
+Intrinsics that were stated for the camera are brought to the size of the clip's pictures, and turned as its metadata turn them.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -33,20 +30,23 @@ from mrbokeh.video.clip import probe, read_display_frames
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """camera: its pose says nothing. distortion: None is a pinhole."""
+    """Camera with its distortion.
+
+    camera: its pose says nothing. distortion: None is a pinhole.
+    """
 
     camera: Camera
     distortion: Distortion | None = None
 
     def turned(self, quarter_turns: int) -> "Intrinsics":
-        """For pictures turned counter-clockwise, so often by 90 degrees."""
+        """Return the intrinsics for pictures turned counter-clockwise by quarter turns."""
         turned = self
         for _ in range(quarter_turns % 4):
             turned = turned._turned_once()
         return turned
 
     def _turned_once(self) -> "Intrinsics":
-        """A point (x, y) comes to (y, width - x)."""
+        """Return the intrinsics after one quarter turn: a point (x, y) comes to (y, width - x)."""
         (fx, fy), (cx, cy), width_px = self.camera.focal_px, self.camera.principal_px, self.camera.width_px
         camera = Camera(self.camera.height_px, width_px, (fy, fx), (cy, width_px - cx), np.eye(4))
         if self.distortion is None:
@@ -57,9 +57,10 @@ class Intrinsics:
 
 
 def intrinsics_of_clip(stated: Intrinsics, size_px: tuple[int, int], quarter_turns: int, clip: Path) -> Intrinsics:
-    """size_px: (width, height) of the clip's pictures as they are shown; quarter_turns: counter-clockwise, by which they were turned.
+    """Return the intrinsics for the pictures of a clip.
 
-    What was stated for the camera held level holds for upright pictures too, if the clip's metadata turn them. InputError where the
+    size_px: (width, height) of the clip's pictures as they are shown; quarter_turns: counter-clockwise, by which they were turned.
+    Intrinsics stated for the camera held level hold for upright pictures too, if the clip's metadata turn them. Raises InputError if the
     pictures have another shape.
     """
     for turns in dict.fromkeys((0, quarter_turns)):
@@ -79,13 +80,13 @@ _BACK_FRAMES = 60
 
 
 def read_greys(clip: Path, width_px: int, height_px: int) -> Iterator[tuple[Grey, float]]:
-    """(grey picture, its time in seconds) of each frame."""
+    """Yield (grey picture, its time in seconds) of each frame."""
     for frame in read_display_frames(clip, width_px, height_px):
         yield cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), frame.time_s
 
 
 class Undistorting:
-    """Pictures of a lens with distortion as its pinhole would have them; a homography then explains a board."""
+    """Undistortion of pictures to the pinhole of their lens; a homography then explains a board."""
 
     def __init__(self, camera: Camera, distortion: Distortion | None) -> None:
         told = opencv_coefficients(distortion)
@@ -104,13 +105,13 @@ def opencv_coefficients(distortion: Distortion | None) -> Float64[np.ndarray, "8
 
 
 class RollingCorners:
-    """Corners of frame after frame; `all` mends what went before where the board comes back into sight."""
+    """Corners of frame after frame; `all` also fills the frames before the board comes back into sight."""
 
     def __init__(self, board: CharucoBoard) -> None:
         self._board, self._detector = board, CharucoDetector(board)
 
     def all(self, greys: Iterable[Grey]) -> list[Corners]:
-        """One for each frame; empty where the board is neither seen nor carried."""
+        """Return the corners of each frame; none if the board is neither seen nor carried."""
         found: list[Corners] = []
         before: Grey | None = None
         waiting: list[Grey] = []
@@ -129,7 +130,7 @@ class RollingCorners:
         return found
 
     def _in_frame(self, grey: Grey, read: Corners, carried: Corners) -> tuple[Corners, bool]:
-        """(corners, whether reading or the print confirms them)."""
+        """Return (corners, whether reading or the print confirms them)."""
         start = read.with_more(carried)
         aligned = aligned_corners(self._board, grey, start)
         if aligned is not None:
@@ -137,7 +138,7 @@ class RollingCorners:
         return start, len(read) >= FEWEST_POINTS
 
     def _go_back(self, found: list[Corners], greys: list[Grey]) -> None:
-        """From the last frame, in which the board is seen, to those before, as far as it holds."""
+        """Carry corners from the last frame, in which the board is seen, to those before, as far as it holds."""
         for back in range(1, len(greys)):
             place = len(found) - 1 - back
             carried = self._carried(greys[-back], greys[-back - 1], found[place + 1])
@@ -157,7 +158,9 @@ _CALIBRATED_FROM = 240
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """longest_gap: so many frames without the board in sight are bridged.
+    """Settings of `track_board`.
+
+    longest_gap: so many frames without the board in sight are bridged.
 
     smooth: as far as the corners' own scatter leaves poses open, see `board_smoothing`. extra_px: further, so that the picture of the
       board may move by so much (RMS); it takes the trembling of a hand away, which is in the plate.
@@ -170,7 +173,9 @@ class TrackSettings:
 
 @dataclass(frozen=True)
 class BoardTrack:
-    """frame_count: of the clip. seen: frames in which the pose was measured; bridged: interpolated; lost: in neither, and not in the track.
+    """Track of a clip and how well it was measured.
+
+    frame_count: of the clip. seen: frames in which the pose was measured; bridged: interpolated; lost: in neither, and not in the track.
 
     unsure: frames in which the board was found, but so small or so much head on that two poses fit alike; each is bridged or lost, too.
     residual_px: RMS distance of all corners from where the track's poses put them; measured_residual_px: with the poses as measured.
@@ -187,7 +192,7 @@ class BoardTrack:
 
 
 def calibrate_clip(clip: Path, board: CharucoBoard) -> Calibration:
-    """Intrinsics and distortion from the frames of the clip itself."""
+    """Calibrate intrinsics and distortion from the frames of the clip itself."""
     info = probe(clip)
     step = max(1, (info.frame_count or _CALIBRATED_FROM) // _CALIBRATED_FROM)
     detector = CharucoDetector(board)
@@ -199,8 +204,10 @@ def calibrate_clip(clip: Path, board: CharucoBoard) -> Calibration:
 def track_board(
     clip: Path, board: CharucoBoard, camera: Camera, distortion: Distortion | None = None, settings: TrackSettings | None = None
 ) -> BoardTrack:
-    """camera: intrinsics, made those of the clip's pictures. Raises InputError where these have another shape and where the board is never
-    seen."""
+    """Track a clip by its board.
+
+    camera: intrinsics, brought to the clip's pictures. Raises InputError if these have another shape, or the board is never seen.
+    """
     settings, info = settings or TrackSettings(), probe(clip)
     intrinsics = intrinsics_of_clip(Intrinsics(camera, distortion), (info.width_px, info.height_px), info.quarter_turns, clip)
     camera, distortion = intrinsics.camera, intrinsics.distortion
@@ -228,7 +235,7 @@ def track_board(
 
 
 def poses_of(corners: Sequence[Corners], board: CharucoBoard, camera: Camera, times_s: Sequence[float]) -> dict[int, PoseFit]:
-    """By frame; of two poses that explain a frame alike the one that fits into the whole shot is taken."""
+    """Return the pose of each frame; of two poses that explain a frame alike the one that fits the whole shot is taken."""
     found = {number: poses_from_plane(board.corners_m[each.ids], each.xy_px, camera) for number, each in enumerate(corners)}
     return fits_of_shot({number: each for number, each in found.items() if each is not None}, times_s)
 
@@ -269,7 +276,7 @@ def _judged(corners: Sequence[Corners], found: dict[int, PoseFit], shot: _Shot, 
 
 
 def _gap(number: int, fits: dict[int, PoseFit]) -> int:
-    """How many frames around this one are missing."""
+    """Return how many frames around this one are missing."""
     before, after = number, number
     while before not in fits:
         before -= 1

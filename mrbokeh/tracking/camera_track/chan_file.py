@@ -23,7 +23,7 @@ _UP = "+y"
 
 
 def read(path: Path, options: TrackOptions) -> CameraTrack:
-    """options.size_px is needed; raises InputError with the line that is wrong."""
+    """Read a .chan; options.size_px is needed. Raises InputError with the line that is wrong."""
     if options.size_px is None:
         raise InputError(f"{path}: a .chan does not tell the size of the pictures: give --size WIDTHxHEIGHT")
     frames: dict[int, TrackedFrame] = {}
@@ -41,7 +41,7 @@ def read(path: Path, options: TrackOptions) -> CameraTrack:
 
 
 def write(path: Path, track: CameraTrack, options: TrackOptions) -> tuple[str, ...]:
-    """Numbers with all their digits."""
+    """Write a .chan with all digits. Returns what it cannot hold."""
     turned = track.with_up(options.up or _UP)
     lines = [_line(number, turned.frames[number].camera, options.rotation_order) for number in turned.numbers]
     with atomic_path(path) as temporary:
@@ -81,7 +81,7 @@ def _line(number: int, camera: Camera, order: str) -> str:
 
 
 def _euler_deg(rotation: np.ndarray, order: str) -> list[float]:
-    """Of x, y, z. Where the middle rotation is a right angle, many triples are one rotation: SciPy chooses, and would warn."""
+    """Return angles of x, y, z. If the middle rotation is a right angle, many triples are one rotation: SciPy chooses, and would warn."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         angles = Rotation.from_matrix(rotation).as_euler(order.lower(), degrees=True)

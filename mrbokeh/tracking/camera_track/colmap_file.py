@@ -1,14 +1,10 @@
 """A folder with a COLMAP model, text or binary, as a CameraTrack.
 
-Its world has no axis that points up by rule; most maps begin with a camera held upright, whose -y that is. Its unit is open.
+Its world has no axis that points up by rule; most maps begin with a camera held upright, whose -y that is. Its unit is open. Camera models
+are those of src/colmap/sensor/models.h; the centre of its first pixel lies at (0.5, 0.5), as ours does.
 
-COLMAP's camera models (src/colmap/sensor/models.h) and ours; the centre of its first pixel lies at (0.5, 0.5), as ours does.
-
-cameras.bin and images.bin of a COLMAP model; points3D.bin is not opened, for poses do not need it.
-
-Counts in these files are believed only as far as the file reaches: a file that was cut off ends in a sentence, not in all memory.
-
-cameras.txt and images.txt of a COLMAP model.
+points3D.bin is not opened, for poses do not need it. Counts in binary files are believed only as far as the file reaches: a file that was
+cut off ends in a sentence, not in all memory.
 """
 
 import struct
@@ -42,7 +38,7 @@ MODEL_OF_NAME = {name: number for number, (name, _) in MODELS.items()}
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """model: a number of MODELS."""
+    """Camera of a COLMAP model; model: a number of MODELS."""
 
     model: int
     width_px: int
@@ -52,7 +48,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """turn: quaternion (w, x, y, z); with shift it takes world points into camera axes. camera: key of its ColmapCamera."""
+    """Posed picture; turn (quaternion w, x, y, z) and shift take world points into camera axes. camera: key of its ColmapCamera."""
 
     name: str
     turn: tuple[float, ...]
@@ -61,7 +57,7 @@ class ColmapImage:
 
 
 def model_number(model: int | str, where: str) -> int:
-    """Raises InputError for a camera that is no pinhole with distortion."""
+    """Return the number of a camera model. Raises InputError for a camera that is no pinhole with distortion."""
     number = MODEL_OF_NAME.get(model, -1) if isinstance(model, str) else model
     if number not in MODELS:
         raise InputError(
@@ -84,7 +80,7 @@ def tracked_frame(image: ColmapImage, camera: ColmapCamera, options: TrackOption
 
 
 def colmap_camera(frame: TrackedFrame) -> ColmapCamera:
-    """PINHOLE, OPENCV or FULL_OPENCV, whichever is enough."""
+    """Return the camera as PINHOLE, OPENCV or FULL_OPENCV, whichever is enough."""
     told = {**dict.fromkeys(DISTORTION_NAMES, 0.0), **frame.coefficients}
     model = 1 if not frame.coefficients else 6 if any(told[name] for name in DISTORTION_NAMES[4:]) else 4
     values = dict(zip(("fx", "fy", "cx", "cy"), (*frame.camera.focal_px, *frame.camera.principal_px), strict=True)) | told
@@ -162,7 +158,7 @@ def _read_binary_images(path: Path) -> list[ColmapImage]:
 
 
 def _write_binary(folder: Path, cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> None:
-    """Also an empty points3D.bin, without which COLMAP opens no model."""
+    """Write the model as .bin, with an empty points3D.bin, without which COLMAP opens no model."""
     camera_bytes = b"".join(
         _CAMERA.pack(number, each.model, each.width_px, each.height_px) + struct.pack(f"<{len(each.parameters)}d", *each.parameters)
         for number, each in cameras.items()
@@ -181,7 +177,7 @@ def _write_binary(folder: Path, cameras: Mapping[int, ColmapCamera], images: Seq
 
 
 def _read_text_cameras(path: Path) -> dict[int, ColmapCamera]:
-    """CAMERA_ID MODEL WIDTH HEIGHT PARAMS."""
+    """Read lines of CAMERA_ID MODEL WIDTH HEIGHT PARAMS."""
     cameras = {}
     for line, where in _lines(path):
         if not line:
@@ -197,7 +193,7 @@ def _read_text_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def _read_text_images(path: Path) -> list[ColmapImage]:
-    """IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, each with a line of its points, which may be empty."""
+    """Read lines of IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, each with a line of its points, which may be empty."""
     images = []
     for index, (line, where) in enumerate(_lines(path)):
         if index % 2:
@@ -214,7 +210,7 @@ def _read_text_images(path: Path) -> list[ColmapImage]:
 
 
 def _write_text(folder: Path, cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> None:
-    """Also an empty points3D.txt, without which COLMAP opens no model."""
+    """Write the model as .txt, with an empty points3D.txt, without which COLMAP opens no model."""
     camera_lines = [
         " ".join([str(number), MODELS[each.model][0], str(each.width_px), str(each.height_px), *map(repr, each.parameters)])
         for number, each in cameras.items()
@@ -229,7 +225,7 @@ def _write_text(folder: Path, cameras: Mapping[int, ColmapCamera], images: Seque
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """(text, where it is) of all lines but comments, with the empty ones: those may be an image without points."""
+    """Yield (text, where it is) of all lines but comments, with the empty ones: those may be an image without points."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
@@ -248,7 +244,7 @@ _KINDS = {
 
 
 def read(folder: Path, options: TrackOptions) -> CameraTrack:
-    """Binary goes before text. Frames are numbered by the names of the pictures."""
+    """Read a model, binary before text. Frames are numbered by the names of the pictures."""
     found = [suffix for suffix in _KINDS if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images"))]
     if not found:
         raise InputError(f"expected a COLMAP model in {folder}: cameras.bin and images.bin, or both as .txt")
@@ -276,7 +272,7 @@ def write_binary(folder: Path, track: CameraTrack, options: TrackOptions) -> tup
 
 
 def _write(folder: Path, track: CameraTrack, options: TrackOptions, suffix: str) -> tuple[str, ...]:
-    """Frames with the same intrinsics share a camera."""
+    """Write a model in which frames with the same intrinsics share a camera."""
     turned = track.with_up(options.up or _UP)
     numbers_of: dict[ColmapCamera, int] = {}
     images = []

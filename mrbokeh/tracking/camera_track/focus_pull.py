@@ -1,23 +1,19 @@
-"""FocusPull: the focus distance by frame, from keyframes, metadata or a track.
+"""FocusPull: the focus distance by frame, from keyframes or from tables that cine cameras wrote (CSV).
 
-Between keys it goes in dioptres, which rings of lenses and the size of the blur are about linear in.
+Between keys it goes in dioptres, in which rings of lenses and the size of the blur are about linear.
 
-Takes the steps out of focus distances that a camera wrote rounded, without moving any by more than half a step.
-
-A smooth sequence is sought among those that round to what was written: averaging with neighbours on both sides, which knows no lag,
-alternates with clipping to half a step (projections onto convex sets, Bregman 1965). The average is a Gaussian and what that takes
-away averaged once more ("twicing", Tukey 1977), for a plain one pulls a curve into chords: on rounded sines it left more error than
-the rounding. Lens encoders and the tables behind them step neither in metres nor evenly in dioptres, so the step is measured around
-each value.
-
-Focus distances that cameras wrote for each frame, as tables (CSV).
-
-    Sony Venice    "Focus Distance (ft)", "Aperture" as "T 2 3/10": 2^((2 + 0.3) / 2), as SMPTE's camdkit reads it
-    RED            REDline --printMeta 5: "Focus Distance" in mm; "Aperture" is a T-number where the lens speaks Cooke /i, else an f-number
-    Canon          "FocusPosition": the bits of a float in metres; "ApertureNumber" as a fraction, a T-number where ApertureMode is 2
-    any            a column named focus or focus distance with its unit: focus_distance_m, Focus (mm), focus_ft, ...; f_number, t_number
+    Sony Venice    "Focus Distance (ft)"
+    RED            REDline --printMeta 5: "Focus Distance" in mm
+    Canon          "FocusPosition": the bits of a float in metres
+    any            a column named focus or focus distance with its unit: focus_distance_m, Focus (mm), focus_ft, ...
 
 Rows count as frames from 0 unless there is a column FrameNo or frame. Rows without a distance are bridged.
+
+Cameras round what they write. A smooth sequence is sought among those that round to what was written: averaging with neighbours on both
+sides, which has no lag, alternates with clipping to half a step (projections onto convex sets, Bregman 1965). The average is a Gaussian
+and what that takes away averaged once more ("twicing", Tukey 1977), for a plain one pulls a curve into chords: on rounded sines it left
+more error than the rounding. Lens encoders and the tables behind them step neither in metres nor evenly in dioptres, so the step is
+measured around each value.
 """
 
 import csv
@@ -42,7 +38,7 @@ _ROUNDS = 60
 
 
 def quantisation_steps(values: Samples) -> Samples:
-    """At each sample the least distance between two of the values that occur around its own; 0 where only one occurs."""
+    """Return at each sample the least distance between two of the values that occur around its own; 0 if only one occurs."""
     levels, of_sample = np.unique(values, return_inverse=True)
     if len(levels) == 1:
         return np.zeros_like(values)
@@ -52,7 +48,7 @@ def quantisation_steps(values: Samples) -> Samples:
 
 
 def smoothed_within_steps(values: Samples) -> Samples:
-    """Samples within half a step of those given, as smooth as that allows about."""
+    """Return samples within half a step of those given, about as smooth as that allows."""
     reach = 0.5 * quantisation_steps(values)
     low, high = values - reach, values + reach
     smooth = values
@@ -62,7 +58,7 @@ def smoothed_within_steps(values: Samples) -> Samples:
 
 
 def _averaged(values: Samples) -> Samples:
-    """Mirrored through the first and last sample, so that a steady pull stays as it is at its ends."""
+    """Average samples, mirrored through the first and last one so that a steady pull stays as it is at its ends."""
     pad = min(len(values) - 1, int(6 * _SIGMA_FRAMES))
     before, after = 2.0 * values[0] - values[pad:0:-1], 2.0 * values[-1] - values[-2 : -pad - 2 : -1]
     longer = np.concatenate([before, values, after])
@@ -78,7 +74,9 @@ Keys = Float64[np.ndarray, " keys"]
 
 @dataclass(frozen=True)
 class FocusPull:
-    """frames: growing. dioptres: 1/m at those frames, 0 is infinity.
+    """Focus distance by frame, from keys.
+
+    frames: growing. dioptres: 1/m at those frames, 0 is infinity.
 
     easing: linear, or smooth: no kinks, at rest in the first and last key, never beyond the keys (Fritsch and Carlson 1980).
     held: before the first and after the last key the focus stays; else asking for such frames is an InputError.
@@ -98,17 +96,17 @@ class FocusPull:
             raise InputError("the distances of a focus pull must be positive metres, or inf")
 
     def at(self, frame: float | int) -> float:
-        """Metres from the entrance pupil; inf is infinity."""
+        """Return metres from the entrance pupil; inf is infinity."""
         place = self._place(frame)
         dioptres = float(np.interp(place, self.frames, self.dioptres) if self.easing == "linear" else self._smooth(place))
         return 1.0 / dioptres if dioptres > 0.0 else float("inf")
 
     def shifted(self, offset: float | int) -> "FocusPull":
-        """Key n becomes n + offset."""
+        """Return the pull in which key n is n + offset."""
         return replace(self, frames=self.frames + offset)
 
     def smoothed(self) -> "FocusPull":
-        """Without the steps in which cameras write their metadata: see `focus_steps`. The keys must be one a frame, or about."""
+        """Return the pull without the steps in which cameras write their metadata. The keys must be about one a frame."""
         return replace(self, dioptres=smoothed_within_steps(self.dioptres))
 
     def _place(self, frame: float | int) -> float:
@@ -128,7 +126,7 @@ class FocusPull:
 
 
 def parse_focus_keys(text: str, easing: str = "linear") -> FocusPull:
-    """ "FRAME:METRES,FRAME:METRES,..." such as 0:1.2,48:3.5; inf is infinity."""
+    """Parse "FRAME:METRES,FRAME:METRES,..." such as 0:1.2,48:3.5; inf is infinity."""
     try:
         pairs = [each.split(":") for each in text.split(",")]
         frames, metres = np.array([float(frame) for frame, _ in pairs]), np.array([float(distance) for _, distance in pairs])
@@ -147,7 +145,7 @@ _FRAME_COLUMNS = ("frame", "frameno", "frame_number")
 
 
 def read_focus_pull(path: Path | str) -> FocusPull:
-    """Raises InputError where no column or no row tells a focus distance."""
+    """Read a table of focus distances. Raises InputError if no column or no row tells one."""
     path = Path(path)
     rows = _rows(path)
     distance_m = _distance_column(rows[0], path)
@@ -174,7 +172,7 @@ def _rows(path: Path) -> list[Row]:
 
 
 def _distance_column(row: Row, path: Path) -> Callable[[Row], float]:
-    """What takes the metres out of a row."""
+    """Return a function that takes the metres out of a row."""
     for name in row:
         if name and (match := _HEADER.fullmatch(name.strip())):
             unit = _METRES[match[1].lower()]
@@ -190,7 +188,7 @@ def _distance_column(row: Row, path: Path) -> Callable[[Row], float]:
 
 
 def _tried(distance_m: Callable[[Row], float], row: Row, where: str) -> float | None:
-    """None where the row tells nothing; raises InputError where it tells what is no number."""
+    """Return the distance of a row, None if it is empty. Raises InputError if it is no number."""
     try:
         return distance_m(row)
     except (ValueError, TypeError, struct.error) as error:

@@ -1,20 +1,16 @@
-"""Camera tracks in files of many kinds, chosen by name or by what the file is.
+"""Camera tracks in files of many kinds, chosen by name or by content.
 
 json            our own, or a single camera            opentrackio     JSON samples of SMPTE's OpenTrackIO 1.0.1
 chan            Nuke                                   colmap          a folder with cameras.txt and images.txt
 nerfstudio      transforms.json                        colmap-binary   the same as .bin
 
-Our own JSON: everything a CameraTrack holds.
+Our own JSON holds everything of a CameraTrack:
 
     {"format": "mrbokeh-camera-track", "version": 1, "up": "-z", "metric": true, "fixed": false,
      "frames": [{"frame": 0, "time_s": 0.0, "camera": {...}, "focus_distance_m": 1.2, "f_number": 2.8, "distortion": {"k1": -0.1}}]}
 
-camera is that of `mrbokeh.optics.camera`. What is not known is left out; focus_distance_m null is infinity. A file with one camera
-and nothing else is a camera on a tripod.
-
-What a file of cameras does not say of itself, and what it cannot hold.
-
-Frame numbers from the names of pictures.
+camera is that of `mrbokeh.optics.camera`. Unknown values are left out; focus_distance_m null is infinity. A file with one camera and
+nothing else is a camera on a tripod.
 """
 
 import math
@@ -34,7 +30,7 @@ VERSION = 1
 
 
 def read_own(path: Path, options: TrackOptions) -> CameraTrack:
-    """Raises InputError where it is of another version or incomplete."""
+    """Read our own JSON. Raises InputError if it is of another version or incomplete."""
     document = read_json(path, "a camera track")
     if isinstance(document, dict) and "camera_from_world" in document:
         return fixed_track(camera_from_json(document, str(path)), options.up or "-z")
@@ -99,7 +95,7 @@ FORMATS: MappingProxyType[str, tuple[Read, Write]] = MappingProxyType(
 
 
 def read_track(path: Path | str, options: TrackOptions | None = None, format_: str | None = None) -> CameraTrack:
-    """Raises InputError where the file is none of FORMATS, incomplete, or needs an option to be understood."""
+    """Read a camera track. Raises InputError if the file is none of FORMATS, incomplete, or needs an option to be understood."""
     path = Path(path)
     if not path.exists():
         raise InputError(f"expected a camera track at {path}, but there is none")
@@ -107,12 +103,12 @@ def read_track(path: Path | str, options: TrackOptions | None = None, format_: s
 
 
 def write_track(path: Path | str, track: CameraTrack, options: TrackOptions | None = None, format_: str | None = None) -> tuple[str, ...]:
-    """Returns what the format cannot hold and the file therefore lacks, in words."""
+    """Write a camera track. Returns what the format cannot hold and the file therefore lacks, in words."""
     return FORMATS[_checked(format_ or format_of_name(Path(path)))][1](Path(path), track, options or TrackOptions())
 
 
 def format_of_name(path: Path) -> str:
-    """transforms.json is nerfstudio's, any other .json ours, .jsonl OpenTrackIO; a name without suffix becomes a COLMAP folder."""
+    """Return the format by name: transforms.json is nerfstudio's, any other .json ours, .jsonl OpenTrackIO, no suffix a COLMAP folder."""
     if path.name == "transforms.json":
         return "nerfstudio"
     names = {".json": "json", ".chan": "chan", ".jsonl": "opentrackio", "": "colmap"}
@@ -122,7 +118,7 @@ def format_of_name(path: Path) -> str:
 
 
 def format_of_file(path: Path) -> str:
-    """By what is in it where the suffix leaves it open."""
+    """Return the format by suffix, or by content if the suffix leaves it open."""
     if path.is_dir():
         return "colmap"
     if path.suffix.lower() != ".json":

@@ -32,7 +32,7 @@ _INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
 def read(path: Path, options: TrackOptions) -> CameraTrack:
-    """Raises InputError for fisheye and other cameras that are no pinhole with distortion."""
+    """Read a transforms.json. Raises InputError for fisheye and other cameras that are no pinhole with distortion."""
     document = read_json(path, "a transforms.json")
     try:
         names = [str(each["file_path"]) for each in document["frames"]]
@@ -45,7 +45,7 @@ def read(path: Path, options: TrackOptions) -> CameraTrack:
 
 
 def write(path: Path, track: CameraTrack, options: TrackOptions) -> tuple[str, ...]:
-    """Intrinsics are shared where all frames have the same."""
+    """Write a transforms.json; intrinsics are shared if all frames have the same. Returns what it cannot hold."""
     turned = track.with_up(options.up or _UP)
     intrinsics = {number: _intrinsics_to_json(turned.frames[number]) for number in turned.numbers}
     first = intrinsics[turned.numbers[0]]
@@ -63,7 +63,7 @@ def write(path: Path, track: CameraTrack, options: TrackOptions) -> tuple[str, .
 
 
 def _frame(document: Mapping[str, Any], options: TrackOptions, where: str) -> TrackedFrame:
-    """document: of the frame, with the shared values below its own."""
+    """Return one frame. document: its own values over the shared ones."""
     if (model := document.get("camera_model", "OPENCV")) not in _PINHOLES or document.get("is_fisheye"):
         raise InputError(f"{where}: expected a pinhole camera with distortion, got {model}: undistort the pictures first")
     pose = np.asarray(document["transform_matrix"], np.float64)
@@ -74,7 +74,7 @@ def _frame(document: Mapping[str, Any], options: TrackOptions, where: str) -> Tr
 
 
 def _camera(document: Mapping[str, Any], pose: np.ndarray, where: str) -> Camera:
-    """What is missing follows as instant-ngp has it: an angle of view instead of a focal length, one for both axes, the middle."""
+    """Return the camera; missing values follow instant-ngp: an angle of view for a focal length, one for both axes, the middle."""
     if "w" not in document or "h" not in document:
         raise InputError(f"{where}: expected the size of the pictures as w and h")
     width_px, height_px = round(float(document["w"])), round(float(document["h"]))

@@ -1,18 +1,13 @@
 """OpenTrackIO 1.0.1 samples (SMPTE RIS, opentrackio.org) as JSON: one sample, a list of them, or one on each line (.jsonl).
 
-`opentrackio_sample` has the axes. Lens values are turned by "Conversion of OpenCV to OpenTrackIO
-lens calibration parameters" (SMPTE RIS, 2025-09-02): lengths on the sensor are millimetres from the middle of the picture, right and
-down, so that coefficients of r^2n are those of OpenCV over F^2n; in `radial` those above and below the bar alternate. Tangential
-ones, of second order in millimetres, are those of OpenCV over F.
-
-Sensor and lens of an OpenTrackIO sample: see `opentrackio_file` for the conventions.
-
-What a sample of OpenTrackIO 1.0.1 (SMPTE RIS, opentrackio.org) says of the pose and the lens, from a file or a network.
-
 Its stage is Z up, Y forward, X right, metres; a camera without rotation looks along Y. `transforms` are composed in order, each with a
 translation and the intrinsic right-handed rotations pan (about Z), tilt (X), roll (Y) in degrees.
 
-Samples are what JSON or CBOR gave, and may be anything: what is not as it should be raises KeyError, TypeError, ValueError or
+Lens values are converted by "Conversion of OpenCV to OpenTrackIO lens calibration parameters" (SMPTE RIS, 2025-09-02): lengths on the
+sensor are millimetres from the middle of the picture, right and down, so that coefficients of r^2n are those of OpenCV over F^2n; in
+`radial` those above and below the bar alternate. Tangential ones, of second order in millimetres, are those of OpenCV over F.
+
+Samples from a network are what JSON or CBOR gave, and may be anything: a malformed one raises KeyError, TypeError, ValueError or
 AttributeError.
 """
 
@@ -45,7 +40,7 @@ def is_sample(document: Any) -> bool:
 
 
 def camera_from_stage(sample: Document, before_m: float = 0.0) -> Pose:
-    """Our camera axes from the stage. before_m: how far the point that is meant lies before the one whose place is told."""
+    """Return our camera axes from the stage. before_m: how far the point that is meant lies before the one whose place is stated."""
     if not len(sample["transforms"]):
         raise ValueError("no transforms")
     stage_from_camera = np.eye(4)
@@ -55,12 +50,12 @@ def camera_from_stage(sample: Document, before_m: float = 0.0) -> Pose:
 
 
 def is_scaled(sample: Document) -> bool:
-    """Whether a transform has a scale, which `camera_from_stage` leaves out."""
+    """Return whether a transform has a scale, which `camera_from_stage` leaves out."""
     return any("scale" in transform for transform in sample["transforms"])
 
 
 def known(lens: Document, name: str) -> float | None:
-    """A number of the lens that must be above 0; 0 and below are what senders write that do not know."""
+    """Return a number of the lens that must be above 0; senders write 0 and below if they do not know it."""
     value = lens.get(name)
     return None if value is None or number(value) <= 0.0 else number(value)
 
@@ -72,13 +67,13 @@ def number(value: Any) -> float:
 
 
 def sampled_s(sample: Document) -> float | None:
-    """By the sender's clock; None where it is not told."""
+    """Return the time by the sender's clock; None if it is not stated."""
     told = sample.get("timing", {}).get("sampleTimestamp")
     return None if told is None else number(told["seconds"]) + number(told["nanoseconds"]) / _NANOSECONDS
 
 
 def pose_document(camera_from_stage: Pose, time_s: float | None) -> dict[str, Any]:
-    """A sample without static data and lens."""
+    """Return a sample without static data and lens."""
     stage_from_camera = inverted(camera_from_stage) @ CAMERA_FROM_STAGE_CAMERA
     pan, tilt, roll = pan_tilt_roll_deg(stage_from_camera[:3, :3])
     x, y, z = stage_from_camera[:3, 3].tolist()
@@ -91,7 +86,7 @@ def pose_document(camera_from_stage: Pose, time_s: float | None) -> dict[str, An
 
 
 def lens_numbers(**values: float | None) -> dict[str, float]:
-    """What is not known, and a focus at infinity, for which JSON has no number, are left out."""
+    """Return the known values; a focus at infinity, for which JSON has no number, is left out."""
     return {name: value for name, value in values.items() if value is not None and math.isfinite(value)}
 
 
@@ -109,7 +104,7 @@ _RADIAL = ("k1", "k4", "k2", "k5", "k3", "k6")
 def camera_on_stage(
     static: Mapping[str, Any], lens: Mapping[str, Any], camera_from_world: np.ndarray, options: TrackOptions, where: str
 ) -> tuple[Camera, float]:
-    """(the camera, its focal length in millimetres)."""
+    """Return (the camera, its focal length in millimetres)."""
     told = static.get("camera", {})
     (width_px, height_px), (width_mm, height_mm) = _size_px(told, options, where), _sensor_mm(told, options, where)
     height_mm = height_mm or width_mm * height_px / width_px
@@ -123,7 +118,7 @@ def camera_on_stage(
 
 
 def distortion_of(lens: Mapping[str, Any], focal_mm: float, where: str) -> Distortion | None:
-    """None where it tells none; raises InputError for any other model, and for a centre of its own."""
+    """Return the distortion, None if there is none. Raises InputError for any other model, and for a centre of its own."""
     listed = lens.get("distortion", [])
     if not listed:
         return None
@@ -163,7 +158,7 @@ def lens_document(frame: TrackedFrame, sensor_mm: float) -> dict[str, Any]:
 
 
 def static_document(camera: Camera, sensor_mm: float) -> dict[str, Any]:
-    """A sensor on which pixels that are not square are wider or higher."""
+    """Return the sensor's document; pixels that are not square make it wider or higher."""
     dimensions = {"width": sensor_mm, "height": _height_mm(camera, sensor_mm)}
     return {
         "camera": {
@@ -205,7 +200,7 @@ _UP = "+z"
 
 
 def read(path: Path, options: TrackOptions) -> CameraTrack:
-    """Frames are numbered in the order of samples, times count from the first one; other cameras' samples must be taken out before."""
+    """Read samples; frames are numbered in their order, times count from the first. Other cameras' samples must be removed before."""
     samples = _samples(path)
     static: dict[str, Any] = {}
     frames = {}
@@ -226,7 +221,7 @@ def read(path: Path, options: TrackOptions) -> CameraTrack:
 
 
 def write(path: Path, track: CameraTrack, options: TrackOptions) -> tuple[str, ...]:
-    """.jsonl gets a sample on each line, anything else one list."""
+    """Write samples, one on each line of a .jsonl, else one list. Returns what the format cannot hold."""
     turned = track.with_up(options.up or _UP)
     sensor_mm = options.sensor_width_mm or 36.0
     samples = [_sample(turned.frames[number], sensor_mm) for number in turned.numbers]

@@ -1,10 +1,6 @@
-"""CameraTrack: the camera of each frame of a shot.
+"""CameraTrack: the camera of each frame of a shot, what lies between two frames, and what files do not say of themselves.
 
-TrackedFrame: camera, lens state and distortion at one moment.
-
-What lies between two frames of a track.
-
-Rotations go along the shortest arc (Shoemake 1985), places of the entrance pupil along a line: the last column of
+Between frames rotations go along the shortest arc (Shoemake 1985), places of the entrance pupil along a line: the last column of
 camera_from_world turns with the camera, and a turning camera on a tripod would leave it. Focus goes linearly in dioptres, as rings
 of lenses and the blur do, the aperture in stops.
 """
@@ -32,7 +28,9 @@ DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """focus_distance_m: from the entrance pupil, inf is allowed. time_s: from the start of the shot. None is not known.
+    """Camera, lens state and distortion at one moment.
+
+    focus_distance_m: from the entrance pupil, inf is allowed. time_s: from the start of the shot. None is not known.
 
     distortion: from the pinhole's picture to the real one; None or empty is a pinhole.
     """
@@ -52,7 +50,7 @@ class TrackedFrame:
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Those that are not 0."""
+        """Return the distortion coefficients that are not 0."""
         return {name: float(value) for name, value in (self.distortion or {}).items() if value}
 
 
@@ -60,7 +58,7 @@ Pose = Float64[np.ndarray, "4 4"]
 
 
 def between(one: TrackedFrame, other: TrackedFrame, share: float) -> TrackedFrame:
-    """share 0 is one, 1 is the other; what only one of them knows is not known in between."""
+    """Interpolate two frames: share 0 is one, 1 is the other; what only one of them knows is not known in between."""
     return TrackedFrame(
         camera_between(one.camera, other.camera, share),
         focus_between_m(one.focus_distance_m, other.focus_distance_m, share),
@@ -80,7 +78,7 @@ def camera_between(one: Camera, other: Camera, share: float) -> Camera:
 
 
 def pose_between(one: Pose, other: Pose, share: float) -> Pose:
-    """Of two camera_from_world."""
+    """Interpolate two camera_from_world."""
     a, b = np.linalg.inv(one), np.linalg.inv(other)
     turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
     pose = np.eye(4)
@@ -107,7 +105,7 @@ def _linear(one: float | None, other: float | None, share: float) -> float | Non
 
 
 def _distortion(one: Distortion | None, other: Distortion | None, share: float) -> Distortion | None:
-    """A coefficient that is not told is 0."""
+    """Interpolate coefficients; a missing one is 0."""
     if one is None and other is None:
         return None
     a, b = one or {}, other or {}
@@ -116,9 +114,10 @@ def _distortion(one: Distortion | None, other: Distortion | None, share: float) 
 
 @dataclass(frozen=True)
 class CameraTrack:
-    """frames: by number, all of one size. up: which axis of its world points up, one of UPRIGHT_FROM_WORLD (staging/upright.py).
+    """Cameras of the frames of a shot.
 
-    metric: lengths are metres; False where nobody knows the unit (structure from motion).
+    frames: by number, all of one size. up: which axis of its world points up, one of UPRIGHT_FROM_WORLD (mrbokeh.tracking.world_axes).
+    metric: lengths are metres; False if nobody knows the unit (structure from motion).
     fixed: a camera on a tripod: its only frame stands for every number and time.
     """
 
@@ -140,17 +139,17 @@ class CameraTrack:
 
     @cached_property
     def numbers(self) -> list[int]:
-        """Of all frames, growing."""
+        """Return the numbers of all frames, ascending."""
         return sorted(self.frames)
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """(width, height)."""
+        """Return (width, height)."""
         camera = self.frames[self.numbers[0]].camera
         return camera.width_px, camera.height_px
 
     def at(self, frame: int) -> TrackedFrame:
-        """Raises InputError where the track does not hold that frame."""
+        """Return a frame. Raises InputError if the track does not hold it."""
         if self.fixed:
             return self.frames[self.numbers[0]]
         if frame not in self.frames:
@@ -163,7 +162,7 @@ class CameraTrack:
         return self.frames[frame]
 
     def at_time(self, time_s: float | int) -> TrackedFrame:
-        """Interpolated between the two frames around that time; outside, and where frames have no times, an InputError."""
+        """Interpolate the two frames around a time. Raises InputError outside of the track, and if frames have no times."""
         if self.fixed:
             return replace(self.frames[self.numbers[0]], time_s=float(time_s))
         times_s = self._times_s
@@ -177,17 +176,17 @@ class CameraTrack:
         return replace(between(one, other, float(share)), time_s=float(time_s))
 
     def timed(self, frame_rate: float | int) -> "CameraTrack":
-        """With times from frame numbers: frame 0 at 0 s."""
+        """Return the track with times from frame numbers: frame 0 at 0 s."""
         if not 0.0 < frame_rate < float("inf"):
             raise InputError(f"a frame rate must be a positive number of frames per second, got {frame_rate}")
         return replace(self, frames={number: replace(each, time_s=number / frame_rate) for number, each in self.frames.items()})
 
     def shifted(self, offset: int) -> "CameraTrack":
-        """Frame n becomes n + offset, for files that count from 1 or 1001; times stay."""
+        """Return the track in which frame n is n + offset, for files that count from 1 or 1001; times stay."""
         return replace(self, frames={number + offset: each for number, each in self.frames.items()})
 
     def resized(self, width_px: int, height_px: int) -> "CameraTrack":
-        """The same views in another number of pixels; distortion does not depend on it."""
+        """Return the same views in another number of pixels; distortion does not depend on it."""
         frames = {number: replace(each, camera=each.camera.resized(width_px, height_px)) for number, each in self.frames.items()}
         return replace(self, frames=frames)
 
@@ -214,12 +213,12 @@ class CameraTrack:
 
 
 def fixed_track(camera: Camera, up: str = "-z") -> CameraTrack:
-    """A camera on a tripod."""
+    """Return the track of a camera on a tripod."""
     return CameraTrack({0: TrackedFrame(camera)}, up, fixed=True)
 
 
 def is_rigid(pose: np.ndarray) -> bool:
-    """Whether a matrix is a rotation and a shift."""
+    """Return whether a matrix is a rotation and a shift."""
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         return False
     turn = pose[:3, :3]
@@ -233,11 +232,11 @@ ROTATION_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """None leaves it to the format.
+    """Facts that a file of cameras does not state; None leaves them to the format.
 
     up: axis of the file's world that points up. size_px: (width, height) of the pictures. rotation_order: of a .chan, first
-      rotation first. sensor_width_mm: of OpenTrackIO samples that do not tell it. metric: whether its lengths are metres.
-    keep_distortion: False drops a lens distortion, which would else be an error where it cannot be read.
+      rotation first. sensor_width_mm: of OpenTrackIO samples that lack it. metric: whether its lengths are metres.
+    keep_distortion: False drops a lens distortion, which would else be an error if it cannot be read.
     """
 
     up: str | None = None
@@ -267,7 +266,7 @@ _FACTS: dict[str, Callable[[TrackedFrame], bool]] = {
 
 
 def lost(track: CameraTrack, kept: Container[str] = ()) -> tuple[str, ...]:
-    """What the track tells and a file that holds only `kept` does not."""
+    """Return what the track knows and a file that holds only `kept` does not."""
     told = [name for name, knows in _FACTS.items() if any(knows(each) for each in track.frames.values())]
     return tuple(name for name in told if name not in kept)
 
@@ -278,7 +277,7 @@ def _centred(each: TrackedFrame) -> bool:
 
 
 def frame_numbers(names: Sequence[str]) -> list[int]:
-    """The last number in each name (frame_00012.png is 12); where one has none, or two have the same, places in the order of names."""
+    """Return the last number in each name (frame_00012.png is 12); if one has none, or two have the same, places in the order of names."""
     found = [re.findall(r"\d+", PurePosixPath(name.replace("\\", "/")).stem) for name in names]
     numbers = [int(each[-1]) for each in found if each]
     if len(numbers) == len(set(numbers)) == len(names):
@@ -288,5 +287,5 @@ def frame_numbers(names: Sequence[str]) -> list[int]:
 
 
 def picture_name(number: int) -> str:
-    """What `frame_numbers` reads back; no name tells a negative number."""
+    """Return a name from which `frame_numbers` reads the number; no name holds a negative number."""
     return f"frame_{number:06d}.png"

@@ -1,19 +1,17 @@
-"""A printed board to track and measure by: one or more ChArUco grids; of different scale, so that one of them outlives any defocus.
+"""Printed boards to track and measure by: ChArUco grids, of different scale so that one of them outlives any defocus; their files.
 
 A ChArUco grid is a chessboard with a marker in each white square (Garrido-Jurado et al. 2014; corners of squares are saddle
 points, which defocus does not move, as it does the corners of markers). Board axes are those of OpenCV: x right, y down, z into
 the paper; the origin is the outer corner of the top left square of a grid at offset (0, 0).
 
-Which rectangles of a board are black, in millimetres: what is printed, and what pictures of it are traced from.
-
-A board as JSON, or as TOML with the same keys.
+A board is kept as JSON, or as TOML with the same keys:
 
     {"dictionary": "DICT_4X4_50",
      "grids": [{"squares": [8, 6], "square_mm": 20.0, "marker_mm": 15.0, "offset_mm": [0, 0], "first_marker": 0}],
      "legacy": false,
      "black_mm": [[x, y, width, height], ...]}
 
-legacy: see CharucoBoard. black_mm is there for whoever draws the board; it is not read. A board.toml of one grid needs no table:
+black_mm is there for whoever draws the board; it is not read. A board.toml of one grid needs no table:
 
     squares = [8, 6]             # columns, rows
     square_mm = 30.0             # measured on the print, over many squares
@@ -43,7 +41,10 @@ DICTIONARY = "DICT_4X4_50"
 
 @dataclass(frozen=True)
 class CharucoGrid:
-    """squares: (columns, rows). offset_mm: (x, y) of its outer top left corner on the board. first_marker: the lowest id of its markers."""
+    """Chessboard with markers.
+
+    squares: (columns, rows). offset_mm: (x, y) of its outer top left corner on the board. first_marker: the lowest id of its markers.
+    """
 
     squares: tuple[int, int]
     square_mm: float
@@ -67,19 +68,21 @@ class CharucoGrid:
 
     @property
     def marker_ids(self) -> range:
-        """One for each white square, row by row."""
+        """Return the marker of each white square, row by row."""
         return range(self.first_marker, self.first_marker + self.squares[0] * self.squares[1] // 2)
 
     @property
     def box_mm(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom on the board."""
+        """Return left, top, right and bottom on the board."""
         (x, y), (width, height) = self.offset_mm, self.size_mm
         return x, y, x + width, y + height
 
 
 @dataclass(frozen=True)
 class CharucoBoard:
-    """dictionary: a name in cv2.aruco. Ids of corners count through the grids in their order.
+    """Board of one or more grids.
+
+    dictionary: a name in cv2.aruco. Ids of corners count through the grids in their order.
 
     legacy: printed by OpenCV before 4.6, which began with a white square where the number of rows is even.
     """
@@ -103,33 +106,33 @@ class CharucoBoard:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """From the origin to the right and lower end."""
+        """Return (width, height) from the origin to the right and lower end."""
         return max(grid.box_mm[2] for grid in self.grids), max(grid.box_mm[3] for grid in self.grids)
 
     @cached_property
     def corners_m(self) -> Float64[np.ndarray, "corners 3"]:
-        """Places of all inner corners, by id; z = 0."""
+        """Return the places of all inner corners, by id; z = 0."""
         return np.concatenate([_corners_mm(grid) for grid in self.grids]) / MM_PER_M
 
     @cached_property
     def grid_of_corner(self) -> Int64[np.ndarray, " corners"]:
-        """Which grid each corner belongs to."""
+        """Return the grid that each corner belongs to."""
         return np.repeat(np.arange(len(self.grids)), [len(_corners_mm(grid)) for grid in self.grids])
 
     @property
     def squares_text(self) -> str:
-        """For sentences: 8x6, or 4x3 and 9x5."""
+        """Return the squares for messages: 8x6, or 4x3 and 9x5."""
         return " and ".join(f"{columns}x{rows}" for columns, rows in (grid.squares for grid in self.grids))
 
     def begins_white(self, grid: int) -> bool:
-        """Whether the top left square of a grid is white."""
+        """Return whether the top left square of a grid is white."""
         return self.legacy and self.grids[grid].squares[1] % 2 == 0
 
     def opencv_dictionary(self) -> Any:
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
 
     def opencv_board(self, grid: int) -> Any:
-        """One grid for OpenCV, in millimetres from its own corner."""
+        """Return one grid for OpenCV, in millimetres from its own corner."""
         it = self.grids[grid]
         ids = np.array(it.marker_ids, np.int32)
         board = cv2.aruco.CharucoBoard(it.squares, it.square_mm, it.marker_mm, self.opencv_dictionary(), ids)
@@ -138,7 +141,7 @@ class CharucoBoard:
 
 
 def _corners_mm(grid: CharucoGrid) -> Float64[np.ndarray, "corners 3"]:
-    """Row by row, as OpenCV numbers them."""
+    """Return corners row by row, as OpenCV numbers them."""
     columns, rows = np.meshgrid(np.arange(1, grid.squares[0]), np.arange(1, grid.squares[1]))
     xy = np.stack([columns.ravel(), rows.ravel()], axis=1) * grid.square_mm + np.asarray(grid.offset_mm)
     return np.pad(xy, ((0, 0), (0, 1)))
@@ -160,7 +163,7 @@ Rectangle = tuple[float, float, float, float]
 
 
 def black_rectangles_mm(board: CharucoBoard) -> Float64[np.ndarray, "rectangles 4"]:
-    """x, y (of the top left corner, y down), width, height; they touch but do not overlap."""
+    """Return x, y (of the top left corner, y down), width and height of what is printed black; rectangles touch but do not overlap."""
     return np.array([rectangle for index in range(len(board.grids)) for rectangle in _of_grid(board, index)])
 
 
@@ -179,13 +182,13 @@ def _of_grid(board: CharucoBoard, index: int) -> Iterator[Rectangle]:
 
 
 def marker_is_black(board: CharucoBoard, marker: int) -> Bool[np.ndarray, "cells cells"]:
-    """The cells of a marker with its black border of one cell, row by row."""
+    """Return the cells of a marker with its black border of one cell, row by row."""
     dictionary = board.opencv_dictionary()
     return dictionary.generateImageMarker(marker, dictionary.markerSize + 2, None, 1) == 0
 
 
 def _of_marker(black: Bool[np.ndarray, "cells cells"], x: float, y: float, side: float) -> Iterator[Rectangle]:
-    """Neighbours in a row become one rectangle."""
+    """Yield the rectangles of a marker; neighbours in a row become one."""
     cell = side / len(black)
     for row, cells in enumerate(black):
         ends = np.flatnonzero(np.diff(np.pad(cells.astype(np.int8), 1)))
@@ -204,7 +207,7 @@ def write_board(path: Path | str, board: CharucoBoard) -> None:
 
 
 def read_board(path: Path | str) -> CharucoBoard:
-    """JSON, or TOML by the suffix."""
+    """Read a board from JSON, or TOML by the suffix."""
     document = _read_toml(Path(path)) if Path(path).suffix.lower() == ".toml" else read_json(path, _WHAT)
     return board_from_json(document, str(path))
 

@@ -1,8 +1,8 @@
-"""All corners of a board from all of its print: the drawing is laid over the picture until both agree best.
+"""Corners of a board from all of its print: the drawing is laid over the picture until both agree best.
 
 Read corners start it; then every edge counts, also of markers too blurred to be read. Out of focus this is ten times as exact as
 the corners alone: a blurred saddle point is lost in noise, thousands of blurred pixels are not. The measure is the correlation of
-Evangelidis and Psarakis (ECC, PAMI 2008), which no change of brightness or contrast moves. It is taken in linear light, about:
+Evangelidis and Psarakis (ECC, PAMI 2008), which no change of brightness or contrast moves. It is taken in about linear light:
 in display codes a blurred edge lies towards its dark side, which moved poses by 0.5 mm where light leaves 0.1 mm.
 """
 
@@ -34,7 +34,7 @@ Drawing = UInt8[np.ndarray, "drawn_height drawn_width"]
 
 
 class AlignedDetector:
-    """A CharucoDetector whose corners are aligned with the whole print where that is seen. Not to be shared between threads."""
+    """CharucoDetector whose corners are aligned with the whole print if that is seen. Not to be shared between threads."""
 
     def __init__(self, board: CharucoBoard) -> None:
         self._detector, self._board = CharucoDetector(board), board
@@ -46,7 +46,7 @@ class AlignedDetector:
 
 
 def aligned_corners(board: CharucoBoard, grey: Grey, read: Corners) -> Corners | None:
-    """All corners of the board that lie in the picture; None where too few were read to begin with or the print does not fit."""
+    """Return all corners of the board that lie in the picture; None if too few were read to begin with or the print does not fit."""
     picture_from_board = _from_corners(board, read)
     if picture_from_board is None:
         return None
@@ -59,7 +59,7 @@ def aligned_corners(board: CharucoBoard, grey: Grey, read: Corners) -> Corners |
 
 
 def _laid_over(drawing: Drawing, picture: Grey, start: Homography) -> Homography | None:
-    """Picture from drawing; None where they do not agree."""
+    """Return the homography to the picture from the drawing; None if they do not agree."""
     try:
         fit, found = cv2.findTransformECC(
             drawing,
@@ -81,7 +81,7 @@ def _margin_mm(board: CharucoBoard) -> float:
 
 
 def _from_corners(board: CharucoBoard, read: Corners) -> Homography | None:
-    """Picture (OpenCV's pixels) from millimetres on the board."""
+    """Return the homography to the picture (OpenCV's pixels) from millimetres on the board."""
     if len(read) < _FEWEST_CORNERS:
         return None
     found, _ = cv2.findHomography(1000.0 * board.corners_m[read.ids, :2], read.xy_px - 0.5, cv2.USAC_MAGSAC, 2.0)
@@ -89,7 +89,7 @@ def _from_corners(board: CharucoBoard, read: Corners) -> Homography | None:
 
 
 def _checked(board: CharucoBoard, grey: Grey, read: Corners, picture_from_board: Homography) -> Corners | None:
-    """None if what was read lies elsewhere: the print may have slid by a square."""
+    """Return the corners; None if what was read lies elsewhere, for the print may have slid by a square."""
     height, width = grey.shape
     xy_px = _through(picture_from_board, 1000.0 * board.corners_m[:, :2]) + 0.5
     if not np.median(np.linalg.norm(xy_px[read.ids] - read.xy_px, axis=1)) < _FURTHEST_PX:
@@ -104,7 +104,7 @@ def _through(homography: Homography, xy: Float64[np.ndarray, "points 2"]) -> Flo
 
 
 def _scale(board: CharucoBoard, picture_from_board: Homography) -> float:
-    """Pixels of the drawing per millimetre: about as many as in the picture, in steps of sqrt(2), and not more than time allows."""
+    """Return pixels of the drawing per millimetre: about as many as in the picture, in steps of sqrt(2), within the time allowed."""
     width, height = board.size_mm
     outline = _through(picture_from_board, np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]))
     seen = np.sqrt(cv2.contourArea(outline.astype(np.float32)) / (width * height))
@@ -114,7 +114,7 @@ def _scale(board: CharucoBoard, picture_from_board: Homography) -> float:
 
 @lru_cache(maxsize=8)
 def _drawing(board: CharucoBoard, px_per_mm: float) -> Drawing:
-    """The print with its margin, black 0 and white 255, each pixel the mean of 16."""
+    """Draw the print with its margin, black 0 and white 255, each pixel the mean of 16."""
     margin_mm = _margin_mm(board)
     size_px = [int(np.ceil((side + 2 * margin_mm) * px_per_mm)) for side in board.size_mm]
     fine = np.full((size_px[1] * _SUPERSAMPLED, size_px[0] * _SUPERSAMPLED), 255, np.uint8)

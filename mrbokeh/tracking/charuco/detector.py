@@ -1,6 +1,6 @@
-"""Finds the corners of a board in a grey picture, with settings for blur and dim light.
+"""CharucoDetector: finds the corners of a board in a grey picture, with settings for blur and dim light; flow carries them on.
 
-Corners carried from frame to frame by optical flow (Lucas and Kanade 1981, pyramids of Bouguet 2001), checked backwards.
+Optical flow is that of Lucas and Kanade 1981 with the pyramids of Bouguet 2001, checked backwards.
 """
 
 from collections import OrderedDict
@@ -25,7 +25,7 @@ Marker = tuple[int, np.ndarray]
 
 @dataclass(frozen=True)
 class Corners:
-    """ids: of the board's corners, each once. xy_px: where they are, the centre of the first pixel at (0.5, 0.5)."""
+    """Corners of a board, each id once; xy_px with the centre of the first pixel at (0.5, 0.5)."""
 
     ids: Int64[np.ndarray, " found"]
     xy_px: Float64[np.ndarray, "found 2"]
@@ -37,7 +37,7 @@ class Corners:
         return Corners(self.ids[keep], self.xy_px[keep])
 
     def with_more(self, others: "Corners") -> "Corners":
-        """These, and of the others those that are not among them."""
+        """Return these corners and those of others that are not among them."""
         new = others.only(~np.isin(others.ids, self.ids))
         return Corners(np.concatenate([self.ids, new.ids]), np.concatenate([self.xy_px, new.xy_px]))
 
@@ -46,7 +46,7 @@ NO_CORNERS = Corners(np.zeros(0, np.int64), np.zeros((0, 2)))
 
 
 class CharucoDetector:
-    """One search for markers serves all grids of the board. Not to be shared between threads."""
+    """Detector of a board's corners; one search for markers serves all its grids. Not to be shared between threads."""
 
     def __init__(self, board: CharucoBoard) -> None:
         self.board = board
@@ -56,11 +56,11 @@ class CharucoDetector:
         self._grids = [cv2.aruco.CharucoDetector(board.opencv_board(index), settings) for index in range(len(board.grids))]
 
     def detect(self, grey: Grey) -> Corners:
-        """Small pictures are searched enlarged: their markers have too few pixels for OpenCV's contours."""
+        """Find corners; small pictures are searched enlarged, because their markers have too few pixels for OpenCV's contours."""
         return self.detect_enlarged(grey, 2 if max(grey.shape) <= _ENLARGED_UP_TO_PX else 1)
 
     def detect_enlarged(self, grey: Grey, enlarged: int) -> Corners:
-        """The same with markers searched in a picture so many times as wide; places are always those in the picture given."""
+        """Find corners, with markers searched in a picture so many times as wide; places are those in the picture given."""
         picture = grey if enlarged == 1 else cv2.resize(grey, None, fx=enlarged, fy=enlarged, interpolation=cv2.INTER_CUBIC)
         corners, ids, _ = self._markers.detectMarkers(picture)
         read = [(int(number), each.reshape(1, 4, 2)) for number, each in zip(np.ravel(ids), corners, strict=True)] if len(corners) else []
@@ -75,7 +75,7 @@ class CharucoDetector:
         return found
 
     def _in_grid(self, picture: Grey, index: int, markers: list[Marker]) -> Corners:
-        """OpenCV 5 returns (N, 2) and (N,) where 4.x had (N, 1, 2) and (N, 1); its first pixel has its centre at (0, 0)."""
+        """Read one grid. OpenCV 5 returns (N, 2) and (N,) where 4.x had (N, 1, 2) and (N, 1); its first pixel has its centre at (0, 0)."""
         ids, corners = np.array([number for number, _ in markers], np.int32), [each for _, each in markers]
         found, found_ids, _, _ = self._grids[index].detectBoard(picture, markerCorners=corners, markerIds=ids)
         if found_ids is None or len(found_ids) == 0:
@@ -84,16 +84,16 @@ class CharucoDetector:
         return Corners(np.asarray(found_ids, np.int64).ravel() + first, np.asarray(found, np.float64).reshape(-1, 2) + 0.5)
 
     def _clear_px(self, index: int, markers: list[Marker]) -> float:
-        """From a corner to the nearest marker, as the smallest marker that was read shows it."""
+        """Return the distance from a corner to the nearest marker, as the smallest marker that was read shows it."""
         grid = self.board.grids[index]
         side_px = min(float(np.linalg.norm(np.diff(each[0], axis=0, append=each[0, :1]), axis=1).min()) for _, each in markers)
         return side_px / grid.marker_mm * (grid.square_mm - grid.marker_mm) / 2.0
 
 
 def _refined(grey: Grey, rough: Corners, clear_px: float) -> Corners:
-    """Saddle points anew in a window that ends before the markers: OpenCV's own takes them in and is pulled towards them.
+    """Refine saddle points in a window that ends before the markers: OpenCV's own includes them and is pulled towards them.
 
-    In the picture as it came: enlarged, they were found 10 to 70 % worse. Corners that were not read are not looked for where a
+    The picture is used as it came: enlarged, corners were found 10 to 70 % worse. Corners that were not read are not looked for where a
     pose expects them: beyond the limit of reading, saddle points are so poor that poses with them were three times as far off.
     """
     if not len(rough):
@@ -105,7 +105,7 @@ def _refined(grey: Grey, rough: Corners, clear_px: float) -> Corners:
 
 
 def _marker_parameters() -> Any:
-    """What differs from OpenCV's: thresholds that a dim and a blurred picture still pass, more pixels for each bit."""
+    """Return OpenCV's parameters with thresholds that a dim and a blurred picture still pass, and more pixels for each bit."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = 11
     parameters.adaptiveThreshWinSizeMax = 131
@@ -128,7 +128,7 @@ Points = Float64[np.ndarray, "points 2"]
 
 
 def flow(start: Grey, end: Grey, xy_px: Points) -> tuple[Points, Bool[np.ndarray, " points"]]:
-    """(places in `end`, which of them are to be trusted: those that flow back to within 0.7 px of where they came from)."""
+    """Return (places in `end`, which of them can be trusted: those that flow back to within 0.7 px of where they came from)."""
     if len(xy_px) == 0:
         return xy_px, np.zeros(0, bool)
     # OpenCV builds pyramids of whole pictures at every call: only the part around the points is given to it.
@@ -149,21 +149,21 @@ def flow(start: Grey, end: Grey, xy_px: Points) -> tuple[Points, Bool[np.ndarray
 
 
 def _around(xy_px: Points, shape: tuple[int, ...]) -> tuple[slice, slice, Float64[np.ndarray, "2"]]:
-    """(rows, columns, x and y of their first pixel) of the box of the points with a margin for their motion."""
+    """Return (rows, columns, x and y of their first pixel) of the box of the points with a margin for their motion."""
     low = np.maximum(np.floor(xy_px.min(axis=0)).astype(int) - _REACH_PX, 0)
     high = np.minimum(np.ceil(xy_px.max(axis=0)).astype(int) + _REACH_PX, shape[::-1])
     return slice(low[1], high[1]), slice(low[0], high[0]), low.astype(np.float64)
 
 
 class FrameHistory:
-    """The last few frames, by their number; all of one size."""
+    """Last few frames, by their number; all of one size."""
 
     def __init__(self, length: int = 8) -> None:
         self._length = length
         self._frames: OrderedDict[int, Grey] = OrderedDict()
 
     def add(self, sequence: int, grey: Grey) -> bool:
-        """Whether the frames before are still of use: not so when the size changed or the numbers went backwards."""
+        """Add a frame. Returns whether the frames before are still of use: not if the size changed or the numbers went backwards."""
         newest = next(reversed(self._frames), None)
         goes_on = newest is not None and newest <= sequence and self._frames[newest].shape == grey.shape
         if not goes_on:
@@ -174,7 +174,7 @@ class FrameHistory:
         return goes_on
 
     def carry(self, corners: Corners, sequence: int) -> Corners | None:
-        """Corners of the frame of that number, in the newest frame, hop by hop; None if that frame is not kept any more."""
+        """Carry corners of the frame of that number into the newest frame, hop by hop; None if that frame is not kept any more."""
         if sequence not in self._frames:
             return None
         numbers = [each for each in self._frames if each >= sequence]
@@ -184,7 +184,7 @@ class FrameHistory:
         return corners
 
     def from_before(self, corners: Corners) -> Corners:
-        """Corners of the frame before the newest one, in the newest one."""
+        """Carry corners of the frame before the newest one into the newest one."""
         numbers = list(self._frames)
         carried = self.carry(corners, numbers[-2]) if len(numbers) > 1 else None
         return NO_CORNERS if carried is None else carried

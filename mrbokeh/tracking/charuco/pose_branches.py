@@ -1,8 +1,8 @@
-"""Which of the two poses of a plane is the right one, and how sure that is: a hidden Markov chain over the frames.
+"""Choice between the two poses of a plane, and how sure it is: a hidden Markov chain over the frames.
 
-In one frame noise may make the wrong pose fit better; the right one, however, moves from frame to frame as a camera does, and what each
-frame says of the two adds up. States are the two poses of a frame. What a frame says is the likelihood of its corners; from frame to
-frame the pose turns as a hand turns it (Rabiner 1989, forward and backward). Where both poses come near one another, as when a board is
+In one frame noise may make the wrong pose fit better; the right one, however, moves from frame to frame as a camera does, and the
+evidence of the frames adds up. States are the two poses of a frame. A frame's evidence is the likelihood of its corners; from frame to
+frame the pose turns as a hand turns it (Rabiner 1989, forward and backward). If both poses come near one another, as when a board is
 passed head on, the chain loses track of which is which, and says so until a frame tells them apart again.
 """
 
@@ -30,7 +30,9 @@ Weights = Float64[np.ndarray, " poses"]
 
 @dataclass(frozen=True)
 class PoseFit:
-    """camera_from_world: (4, 4). residual_px: RMS distance over the inliers.
+    """Chosen pose of one frame.
+
+    camera_from_world: (4, 4). residual_px: RMS distance over the inliers.
 
     turn_sigma_deg: RMS error of the rotation that is to be expected, of noise and of having taken the wrong one of two poses.
     """
@@ -46,7 +48,7 @@ class PoseFit:
 
 
 class PoseBranches:
-    """Frame by frame as they come."""
+    """Choice of poses frame by frame as they come."""
 
     def __init__(self) -> None:
         self._before: PlanePoses | None = None
@@ -54,11 +56,11 @@ class PoseBranches:
         self._shown: Pose | None = None
 
     def reset(self) -> None:
-        """The next frame has nothing to do with those before."""
+        """Forget the frames before: the next one has nothing to do with them."""
         self._before = self._shown = None
 
     def take(self, found: PlanePoses, time_s: float) -> PoseFit:
-        """The likelier pose; while that is not certain, the one nearer to the pose given before, so that nothing jumps for nothing."""
+        """Return the likelier pose; while that is uncertain, the one nearer to the pose given before, so that nothing jumps for nothing."""
         weights = _evidence(found)
         if self._before is not None:
             weights = weights * (self._weights @ _transitions(self._before, found, time_s - self._time_s))
@@ -72,7 +74,7 @@ class PoseBranches:
 
 
 def fits_of_shot(found: Mapping[int, PlanePoses], times_s: Sequence[float]) -> dict[int, PoseFit]:
-    """All frames of a shot at once: what comes later tells of what came before, too. found: by frame; times_s: of all frames."""
+    """Choose the poses of a whole shot at once, using later frames for earlier ones. found: by frame; times_s: of all frames."""
     numbers = sorted(found)
     steps = [_transitions(found[one], found[other], times_s[other] - times_s[one]) for one, other in pairwise(numbers)]
     evidence = [_evidence(found[number]) for number in numbers]
@@ -87,13 +89,13 @@ def fits_of_shot(found: Mapping[int, PlanePoses], times_s: Sequence[float]) -> d
 
 
 def _evidence(found: PlanePoses) -> Weights:
-    """Likelihoods, tempered."""
+    """Return tempered likelihoods."""
     misfits = np.array([each.misfit for each in found.poses])
     return _normed(np.exp(-0.5 * _INDEPENDENT * (misfits - misfits.min())))
 
 
 def _transitions(one: PlanePoses, other: PlanePoses, elapsed_s: float) -> Float64[np.ndarray, "before after"]:
-    """Rows sum to 1."""
+    """Return transition probabilities; rows sum to 1."""
     likely = np.array([[_likely(a, b, elapsed_s) for b in other.poses] for a in one.poses]) + _SWITCHES
     return likely / likely.sum(axis=1, keepdims=True)
 
@@ -111,5 +113,5 @@ def _fit(found: PlanePoses, weights: Weights, chosen: int) -> PoseFit:
 
 
 def _normed(weights: Weights) -> Weights:
-    """Never quite 0, for what was ruled out once may turn out to be right."""
+    """Normalise weights, never quite to 0: what was ruled out once may turn out to be right."""
     return np.maximum(weights / weights.sum(), 1e-12)

@@ -1,12 +1,11 @@
-"""The poses of a camera from points of a plane and where it sees them.
+"""Poses of a camera from points of a plane and where it sees them, and how exact they are.
 
 A plane seen from far away or head on has two poses that fit almost alike (Collins and Bartoli 2014, IPPE gives both). Both are refined
 and given, with how well they fit and how exact each is; `pose_branches` tells them apart over time.
 
-How exact a pose from points of a plane is: the scatter of its corners, carried to its rotation (Gauss-Newton covariance).
-
-Foreshortening goes with the cosine of a tilt, so that near head on it tells a tilt less and less. A pose may by chance be tilted more
-than the board; its own derivatives then promise too much, and those of a pose nearer to head on are looked at, too.
+Exactness is the scatter of the corners, carried to the rotation (Gauss-Newton covariance). Foreshortening goes with the cosine of a tilt,
+so that near head on it tells a tilt less and less. A pose may by chance be tilted more than the board; its own derivatives then promise
+too much, and those of a pose nearer to head on are looked at, too.
 """
 
 from dataclasses import dataclass
@@ -32,13 +31,13 @@ Pose = Float64[np.ndarray, "4 4"]
 
 
 def corner_sigma_px(residual_px: float, points: int) -> float:
-    """Of one coordinate of a corner, from the RMS distance that the best pose leaves."""
+    """Return the error of one coordinate of a corner, from the RMS distance that the best pose leaves."""
     squares = points * residual_px**2 + _EXPECTED_WEIGHT * _EXPECTED_PX**2
     return float(np.sqrt(squares / (2 * points - _PARAMETERS + _EXPECTED_WEIGHT)))
 
 
 def turn_sigma_rad(points_m: Points, camera: Camera, pose: Pose, sigma_px: float) -> float:
-    """RMS angle by which corners that scatter by sigma_px turn a pose; inf where they leave it open."""
+    """Return the RMS angle by which corners that scatter by sigma_px turn a pose; inf if they leave it open."""
     seen = points_m @ pose[:3, :3].T + pose[:3, 3]
     sigma_rad = _sigma_rad(seen, camera, sigma_px)
     if not np.isfinite(sigma_rad):
@@ -47,7 +46,7 @@ def turn_sigma_rad(points_m: Points, camera: Camera, pose: Pose, sigma_px: float
 
 
 def _towards_head_on(seen: Points, normal: Float64[np.ndarray, "3"], at_most_rad: float) -> Points:
-    """Turned about their middle until the plane lies across the line of sight, or as far as allowed."""
+    """Turn points about their middle until the plane lies across the line of sight, or as far as allowed."""
     middle = seen.mean(axis=0)
     sight = middle / np.linalg.norm(middle) * np.sign(middle @ normal or 1.0)
     axis = np.cross(normal, sight)
@@ -72,14 +71,14 @@ def _sigma_rad(seen: Points, camera: Camera, sigma_px: float) -> float:
 
 
 def _by_place(seen: Points, camera: Camera) -> Float64[np.ndarray, "points 2 3"]:
-    """Derivatives of the pixel by the point in camera axes."""
+    """Return derivatives of the pixel by the point in camera axes."""
     x, y, z = seen.T
     nothing, (fx, fy) = np.zeros_like(z), camera.focal_px
     return np.stack([np.stack([fx / z, nothing, -fx * x / z**2], 1), np.stack([nothing, fy / z, -fy * y / z**2], 1)], axis=1)
 
 
 def _cross_matrices(arms: Points) -> Float64[np.ndarray, "points 3 3"]:
-    """Of each vector a the matrix A with A w = a x w."""
+    """Return for each vector a the matrix A with A w = a x w."""
     x, y, z = arms.T
     nothing = np.zeros_like(x)
     rows = ((nothing, -z, y), (z, nothing, -x), (-y, x, nothing))
@@ -98,7 +97,9 @@ PointsPx = Float64[np.ndarray, "points 2"]
 
 @dataclass(frozen=True)
 class PlanePose:
-    """camera_from_world: (4, 4). residual_px: RMS distance over the inliers. turn_sigma_rad: of its rotation, if it is the right one.
+    """Pose that may explain the points of a plane.
+
+    camera_from_world: (4, 4). residual_px: RMS distance over the inliers. turn_sigma_rad: of its rotation, if it is the right one.
 
     misfit: sum of squared distances over the variance of a corner, of which a wrong pose has more.
     """
@@ -111,19 +112,19 @@ class PlanePose:
 
 @dataclass(frozen=True)
 class PlanePoses:
-    """poses: one or two, the best fit first."""
+    """Poses of a plane: one or two, the best fit first."""
 
     poses: tuple[PlanePose, ...]
     inliers: Bool[np.ndarray, " points"]
 
 
 def largest_residual_px(camera: Camera) -> float:
-    """Beyond it a point is wrong, and so is a pose with an RMS of half as much: 3 px in a picture of 1280, never below 1.5."""
+    """Return the distance beyond which a point is wrong, as is a pose with an RMS of half as much: 3 px of 1280, never below 1.5."""
     return max(1.5, 3.0 * camera.width_px / 1280)
 
 
 def poses_from_plane(points_m: PointsM, xy_px: PointsPx, camera: Camera) -> PlanePoses | None:
-    """points_m: z = 0. camera: intrinsics. None if fewer than 6 points agree on a pose."""
+    """Return the poses that explain points_m (z = 0); None if fewer than 6 points agree on one. camera: intrinsics."""
     wrong_px = largest_residual_px(camera)
     inliers = _of_one_plane(points_m, xy_px, wrong_px)
     found = _fit(points_m, xy_px, inliers, camera)
@@ -152,7 +153,7 @@ def _fit(points_m: PointsM, xy_px: PointsPx, inliers: Bool[np.ndarray, " points"
 
 
 def _of_one_plane(points_m: PointsM, xy_px: PointsPx, wrong_px: float) -> Bool[np.ndarray, " points"]:
-    """Those that one homography explains (MAGSAC++, Barath et al. 2020)."""
+    """Return which points one homography explains (MAGSAC++, Barath et al. 2020)."""
     if len(points_m) < FEWEST_POINTS:
         return np.zeros(len(points_m), bool)
     _, mask = cv2.findHomography(points_m[:, :2], xy_px, cv2.USAC_MAGSAC, wrong_px)
@@ -175,13 +176,13 @@ def _refined_poses(points_m: PointsM, xy_px: PointsPx, camera: Camera) -> list[P
 
 
 def _apart(fits: list[tuple[float, Pose]]) -> list[tuple[float, Pose]]:
-    """The best, and the best of those that refinement did not lead to the same pose."""
+    """Return the best fit, and the best of those that refinement did not lead to the same pose."""
     others = [fit for fit in fits[1:] if turn_between_rad(fit[1], fits[0][1]) > _SAME_RAD]
     return [fits[0], *others[:1]]
 
 
 def opencv_matrix(camera: Camera) -> Float64[np.ndarray, "3 3"]:
-    """Intrinsics for positions whose first pixel has its centre at (0.5, 0.5): the convention cancels, as both sides keep it."""
+    """Return intrinsics for positions whose first pixel has its centre at (0.5, 0.5): the convention cancels, as both sides keep it."""
     return np.array([[camera.focal_px[0], 0, camera.principal_px[0]], [0, camera.focal_px[1], camera.principal_px[1]], [0, 0, 1]])
 
 
@@ -196,7 +197,7 @@ def _before_camera(points_m: PointsM, pose: Pose) -> bool:
 
 
 def turn_between_rad(one: Pose, other: Pose) -> float:
-    """The angle between two rotations."""
+    """Return the angle between two rotations."""
     return float(np.linalg.norm(cv2.Rodrigues(one[:3, :3] @ other[:3, :3].T)[0]))
 
 
