@@ -1,4 +1,4 @@
-"""A capture bundle: one moment of the viewfinder kept as files, to be composited again at full quality.
+"""CaptureBundle: one moment of the viewfinder kept as files, to be composited again at full quality.
 
 NAME/bundle.json     what follows, the camera with its pose, when, and what the stream looked like then
 NAME/plate.png       the camera's picture as it came
@@ -29,7 +29,9 @@ FORMAT, VERSION = "mrbokeh-capture-bundle", 1
 
 @dataclass(frozen=True)
 class CaptureBundle:
-    """plate_rgb: (H, W, 3) linear. layers: in focus, front first, (H, W). camera: of the plate, with its pose in the scene's world.
+    """Moment of the viewfinder, read back.
+
+    plate_rgb: (H, W, 3) linear. layers: in focus, front first, (H, W). camera: of the plate, with its pose in the scene's world.
 
     renderer: what blurred the stream, a name or an .onnx. facts: JSON values about the moment (time, tracking, stages).
     """
@@ -52,7 +54,7 @@ def write_bundle(
     renderer: str,
     facts: Mapping[str, Any],
 ) -> None:
-    """All files at once: the folder appears when it is whole. Raises InputError where it exists."""
+    """Write all files at once: the folder appears when it is whole. Raises InputError if it exists."""
     with atomic_folder(folder) as temporary:
         (temporary / "plate.png").write_bytes(plate_png)
         (temporary / "preview.jpg").write_bytes(preview_jpg)
@@ -69,7 +71,7 @@ def is_bundle(folder: Path) -> bool:
 
 
 def read_bundle(folder: Path) -> CaptureBundle:
-    """Raises InputError with one sentence where anything of it is missing or not of one size."""
+    """Read a bundle. Raises InputError if anything of it is missing or not of one size."""
     head = read_json(folder / FILE_NAME, "a capture bundle of the viewfinder")
     if not isinstance(head, dict) or head.get("format") != FORMAT or head.get("version") != VERSION:
         raise InputError(f"{folder / FILE_NAME}: expected format {FORMAT!r} version {VERSION}: capture again")

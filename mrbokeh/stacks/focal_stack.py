@@ -32,7 +32,7 @@ GROWTH, GROWTH_WIDTH = "px_per_dioptre", "px_per_dioptre_width_px"
 
 @dataclass(frozen=True)
 class Slice:
-    """One photograph of the stack.
+    """Photograph of a stack.
 
     path: relative to the folder of the stack; linear EXR in the stack's camera RGB.
     focus_distance_m: from the lens to the plane in focus, or None where nobody knows.
@@ -48,7 +48,7 @@ class Slice:
 
 @dataclass(frozen=True)
 class FocalStack:
-    """A folder with slices, and once merged an all-in-focus image and depth. Pictures are read when asked for.
+    """Folder with slices, and once merged an all-in-focus image and depth. Pictures are read when asked for.
 
     lens: the lens with the focus of the reference slice, or None where focal length, f-number or sensor are unknown.
     camera: intrinsics of the registered pictures, or None.
@@ -75,12 +75,12 @@ class FocalStack:
 
     @property
     def is_metric(self) -> bool:
-        """Every focus distance is known, so that depth is in metres; else it is the index of the sharpest slice."""
+        """Return whether every focus distance is known, so that depth is in metres; else it is the index of the sharpest slice."""
         return all(distance is not None for distance in self.focus_distances_m)
 
     @property
     def metres_known(self) -> bool:
-        """False where merging guessed metres because focus distances are unknown; its circles of confusion are measured all the same."""
+        """Return False if merging guessed metres because focus distances are unknown; circles of confusion are measured all the same."""
         return bool((self.metadata.get(METRES) or {}).get("known", True))
 
     def slice_camera_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
@@ -90,7 +90,7 @@ class FocalStack:
         return (self.slice_camera_rgb(index) for index in range(len(self)))
 
     def slice_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
-        """Linear Rec.709; for strong colours of the camera's own a channel may be negative."""
+        """Read linear Rec.709; for strong colours of the camera's own a channel may be negative."""
         return self.to_rec709(self.slice_camera_rgb(index))
 
     def iter_rgb(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
@@ -122,11 +122,11 @@ class FocalStack:
         return self.to_rec709(self.all_in_focus_camera_rgb())
 
     def exclusions(self) -> dict[str, Bool[np.ndarray, "height width"]]:
-        """(H, W) masks of what not to learn from, by reason: moving, saturated, border, low_confidence, board; {} if none are known."""
+        """Read (H, W) masks of what not to learn from, by reason: moving, saturated, border, low_confidence, board; {} if none are known."""
         return read_masks(self.exclusion_path)
 
     def depth_m(self) -> Float32[np.ndarray, "height width"]:
-        """(H, W) metres along the optical axis. Raises InputError where focus distances are unknown."""
+        """Read (H, W) metres along the optical axis. Raises InputError if focus distances are unknown."""
         if not self.is_metric:
             raise InputError(
                 f"{self.folder} has no depth in metres because its focus distances are unknown: add them to lens.toml and ingest again"
@@ -134,18 +134,18 @@ class FocalStack:
         return self._depth_channel("Z")
 
     def focus_index(self) -> Float32[np.ndarray, "height width"]:
-        """(H, W) the (fractional) index of the slice in which each pixel is sharp."""
+        """Read (H, W) the (fractional) index of the slice in which each pixel is sharp."""
         return self._depth_channel("focus_index")
 
     def depth_confidence(self) -> Float32[np.ndarray, "height width"]:
-        """(H, W) in [0, 1]: how far the depth of a pixel can be trusted; 0 is a guess from its neighbours."""
+        """Read (H, W) in [0, 1]: how far the depth of a pixel can be trusted; 0 is a guess from its neighbours."""
         return self._depth_channel("confidence")
 
     def depth_valid(self, least_confidence: float = 0.1) -> Bool[np.ndarray, "height width"]:
         return self.depth_confidence() >= least_confidence
 
     def stated_lens_of(self, index: int) -> Lens:
-        """The lens as it was focused for one slice, with the f-number that the camera states."""
+        """Return the lens as it was focused for one slice, with the f-number that the camera states."""
         distance = self.slices[index].focus_distance_m
         if self.lens is None or distance is None:
             raise InputError(
@@ -155,7 +155,7 @@ class FocalStack:
         return self.lens.focused_at(distance)
 
     def lens_of(self, index: int) -> Lens:
-        """The lens of one slice; where its blur was calibrated (`mrbokeh capture scale`), with the f-number that gives the blur found."""
+        """Return the lens of one slice; if its blur was calibrated (`mrbokeh capture scale`), with the f-number that gives the blur found."""
         lens, metadata = self.stated_lens_of(index), self.slices[index].metadata
         if GROWTH not in metadata:
             return lens
@@ -163,16 +163,16 @@ class FocalStack:
         return replace(lens, f_number=lens.f_number / found)
 
     def registered_lens_of(self, index: int) -> Lens:
-        """The lens that blurs as a registered slice is blurred: what registration enlarged is a larger picture of less of the sensor."""
+        """Return the lens that blurs as a registered slice is blurred: registration enlarged it to a larger picture of less of the sensor."""
         lens = self.lens_of(index)
         return replace(lens, sensor_width_mm=lens.sensor_width_mm / self.slices[index].scale)
 
     def coc_px_per_dioptre(self, index: int, width_px: int) -> float:
-        """How fast blur grows in a registered slice, width_px wide: what registration enlarged grew with it."""
+        """Return how fast blur grows in a registered slice, width_px wide: what registration enlarged grew with it."""
         return self.lens_of(index).coc_px_per_dioptre(width_px) * self.slices[index].scale
 
     def coc_px(self, index: int, depth_m: Float[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
-        """Signed circle of confusion (diameter) of a registered slice."""
+        """Return the signed circle of confusion (diameter) of a registered slice."""
         return (self.lens_of(index).coc_px(depth_m, depth_m.shape[1]) * self.slices[index].scale).astype(np.float32)
 
     def depth_planes(self, *names: str) -> list[Float32[np.ndarray, "height width"]]:
@@ -196,7 +196,7 @@ def write_merged(
     depth_m: Float32[np.ndarray, "height width"] | None,
     rec709_from_camera: Matrix3x3 | None = None,
 ) -> None:
-    """The pictures of a merged stack: all_in_focus.exr and depth.exr (focus_index, confidence and, if metric, Z).
+    """Write the pictures of a merged stack: all_in_focus.exr and depth.exr (focus_index, confidence and, if metric, Z).
 
     all_in_focus: in the RGB that rec709_from_camera leads from, which is the stack's.
     """
@@ -223,7 +223,7 @@ def write_focal_stack(stack: FocalStack) -> None:
 
 
 def read_focal_stack(folder: Path | str) -> FocalStack:
-    """The stack in a folder; pictures are not opened. Raises InputError where the folder is not one."""
+    """Read the stack in a folder; pictures are not opened. Raises InputError if the folder is not one."""
     folder = Path(folder)
     document = read_json(folder / FILE_NAME, "a focal stack")
     if document.get("format") != FORMAT or document.get("version") != VERSION:
@@ -248,7 +248,7 @@ def read_focal_stack(folder: Path | str) -> FocalStack:
 
 
 def _json_number(value: float | None) -> float | str | None:
-    """JSON has no infinity; a focus there is written as the word."""
+    """Return infinity, which JSON lacks, as the word."""
     return "inf" if value == float("inf") else value
 
 
@@ -257,7 +257,7 @@ def _number(value: float | str | None) -> float | None:
 
 
 def find_focal_stacks(scene: Path) -> list[FocalStack]:
-    """The stacks of a scene: the folder itself, or the folders under it, by name."""
+    """Find the stacks of a scene: the folder itself, or the folders under it, by name."""
     folders = sorted(path.parent for path in Path(scene).rglob(FILE_NAME))
     if not folders:
         raise InputError(f"expected a focal stack (a folder with {FILE_NAME}) in {scene}, found none: run `mrbokeh capture ingest` first")

@@ -25,7 +25,7 @@ PARTS: tuple[Part, ...] = ("train", "test")
 
 @dataclass(frozen=True)
 class FileRecord:
-    """sha256 (hexadecimal) and size of a file."""
+    """Record of a file: sha256 (hexadecimal) and size."""
 
     sha256: str
     bytes: int
@@ -44,7 +44,7 @@ class RadianceRange:
 
 @dataclass(frozen=True)
 class StackRecord:
-    """One stack of the data set. name: SCENE/VIEW, its folder in the data set.
+    """Stack of the data set. name: SCENE/VIEW, its folder in the data set.
 
     files: by path within the folder. excluded_shares: of the picture, by reason, and "any" for all together.
     largest_coc_px: the largest diameter over all slices, among pixels that are not excluded.
@@ -65,8 +65,9 @@ class StackRecord:
 
 @dataclass(frozen=True)
 class FocalStackDataset:
-    """radiance_scale: radiance x goes into the network's range as 2 x / radiance_scale - 1, so that 0 is -1 and the scale itself is 1.
+    """Data set of focal stacks.
 
+    radiance_scale: radiance x goes into the network's range as 2 x / radiance_scale - 1, so that 0 is -1 and the scale itself is 1.
     licence: the text under which the pictures may be used.
     """
 
@@ -88,22 +89,23 @@ class FocalStackDataset:
         return [each for each in self.stacks if each.part == part]
 
     def focal_stacks(self, part: Part) -> list[FocalStack]:
-        """Pictures are not opened."""
+        """Return the stacks of a part; pictures are not opened."""
         return [read_focal_stack(self.folder / each.name) for each in self.records(part)]
 
 
 def network_blocks(largest_coc_px: float) -> int:
-    """N of Neural Bokeh (Mandl et al. 2024, section 3.1): the last of its blocks has a kernel 2 N + 1 wide, which covers the largest
-    circle of confusion of the data.
+    """Return N of Neural Bokeh (Mandl et al. 2024, section 3.1).
+
+    The last of its blocks has a kernel 2 N + 1 wide, which covers the largest circle of confusion of the data.
     """
     return max(1, math.ceil((abs(largest_coc_px) - 1.0) / 2.0))
 
 
 def slices_to_hold_out(stack: FocalStack) -> tuple[int, ...]:
-    """Which slices of a stack are for testing where it is the only one: every fourth from the third on, in order of focus.
+    """Return which slices of the only stack are for testing: every fourth from the third on, in order of focus.
 
     Never an end of the focus range, which nothing else would show, and never the reference slice, whose place the next one takes, unless
-    there are only three. Four fifths or so are left to train on; of two slices none is held out.
+    there are only three. About four fifths are left to train on; of two slices none is held out.
     """
     focus = [0.0 if distance is None else 1.0 / distance for distance in stack.focus_distances_m]
     order = sorted(range(len(stack)), key=lambda index: (focus[index], index))
@@ -116,7 +118,7 @@ def slices_to_hold_out(stack: FocalStack) -> tuple[int, ...]:
 
 
 def file_troubles(dataset: FocalStackDataset, record: StackRecord, sha256_of: Callable[[Path], str] | None = None) -> Iterator[str]:
-    """What of a stack is missing or not as it was written, one sentence each; without sha256_of only sizes count, contents are not read."""
+    """Yield what of a stack is missing or changed, one sentence each; without sha256_of only sizes are compared."""
     for relative, expected in record.files.items():
         path = dataset.folder / record.name / relative
         if not path.is_file():
@@ -146,7 +148,7 @@ def write_focal_stack_dataset(dataset: FocalStackDataset) -> None:
 
 
 def read_focal_stack_dataset(folder: Path | str) -> FocalStackDataset:
-    """The data set in a folder; pictures are not opened. Raises InputError where the folder is not one."""
+    """Read the data set in a folder; pictures are not opened. Raises InputError if the folder is not one."""
     folder = Path(folder)
     document = read_json(folder / FILE_NAME, "a data set of focal stacks (made by `mrbokeh capture dataset`)")
     if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
@@ -173,7 +175,7 @@ def record_to_json(record: StackRecord) -> dict[str, Any]:
 
 
 def record_from_json(document: dict[str, Any]) -> StackRecord:
-    """Raises KeyError, TypeError or ValueError where something is missing."""
+    """Read the record of a stack. Raises KeyError, TypeError or ValueError if something is missing."""
     if document["part"] not in PARTS:
         raise ValueError(f"part {document['part']!r}")
     files = {path: FileRecord(**each) for path, each in document["files"].items()}

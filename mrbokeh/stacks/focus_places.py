@@ -1,4 +1,4 @@
-"""Focus as a user says it: in metres, by what is in focus at a pixel, or by where between the slices of a stack it lies."""
+"""Focus as a user states it: in metres, by what is in focus at a pixel, or by where between the slices of a stack it lies."""
 
 import re
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class Seen:
-    """What places are looked up in. depth_m: of the picture, or None. slices_m: focus distances of the slices, in their order."""
+    """Lookup of focus places. depth_m: of the picture, or None. slices_m: focus distances of the slices, in their order."""
 
     lens: Lens
     depth_m: Float32[np.ndarray, "height width"] | None = None
@@ -34,7 +34,7 @@ class Seen:
         return cls(stack.lens_of(stack.reference), stack.depth_m(), slices_m)
 
     def at_pixel(self, x_px: float, y_px: float) -> float:
-        """The focus distance at which what is seen there is sharp."""
+        """Return the focus distance at which what is seen at a pixel is sharp."""
         if self.depth_m is None:
             raise InputError(f"--focus @{x_px:g},{y_px:g} needs the depth of the picture: give metres, or a stack")
         return self.lens.focused_on(self.depth_m, x_px + 0.5, y_px + 0.5, _NEAR_PIXEL_PX).focus_distance_m

@@ -25,7 +25,10 @@ _OF_ITS_DEPTH = ("known", "why", "guessed")
 
 
 def metres_facts(stack: FocalStack) -> Mapping[str, Any]:
-    """known: whether metres are; why: in words; guessed: what else is a guess where they are known. Empty for stacks that state theirs."""
+    """Return what is known of a stack's metres; {} for stacks that state theirs.
+
+    known: whether metres are; why: in words; guessed: what else is a guess if they are known.
+    """
     facts = stack.metadata.get(METRES)
     return facts if isinstance(facts, Mapping) else {}
 
@@ -44,7 +47,7 @@ def inherited_facts(stack: FocalStack, with_lens: bool) -> dict[str, Any]:
 
 
 def is_lens_guessed(stack: FocalStack) -> bool:
-    """Whether its focal length and f-number only stand for the blur that was measured."""
+    """Return whether focal length and f-number only stand for the blur that was measured."""
     gauge = metres_facts(stack).get("gauge")
     if not gauge:
         return False
@@ -53,12 +56,12 @@ def is_lens_guessed(stack: FocalStack) -> bool:
 
 
 def is_view_guessed(stack: FocalStack) -> bool:
-    """Whether nobody knows the field of view."""
+    """Return whether nobody knows the field of view."""
     return is_lens_guessed(stack) and not (stack.metadata.get(STATED_BEFORE) or {}).get("camera")
 
 
 def unit_of(stack: FocalStack) -> str:
-    """What its distances are in, for messages."""
+    """Return the unit of its distances, for messages."""
     return "m" if stack.metres_known else GUESSED
 
 
@@ -82,7 +85,7 @@ def guesses(stack: FocalStack) -> str:
 
 
 def is_near_first(stack: FocalStack) -> bool:
-    """Whether its first slice is focused nearer than its last."""
+    """Return whether its first slice is focused nearer than its last."""
     first, last = (stack.focus_distances_m[index] for index in (0, -1))
     return float(first or 0.0) < float(last or 0.0)
 
@@ -96,7 +99,7 @@ def _guessed_end(stack: FocalStack) -> str | None:
 
 
 def metres_notes(stacks: Iterable[FocalStack]) -> str:
-    """One line for all stacks of a command; empty where all metres are known."""
+    """Return one line for all stacks of a command; empty if all metres are known."""
     notes = [note for note in map(metres_note, stacks) if note]
     if len(notes) < 2:
         return "".join(notes)
@@ -104,7 +107,7 @@ def metres_notes(stacks: Iterable[FocalStack]) -> str:
 
 
 def note_of_file(path: Path | None) -> str:
-    """The note of the stack that a picture or depth file belongs to."""
+    """Return the note of the stack that a picture or depth file belongs to."""
     if path is None or not (path.parent / FILE_NAME).is_file():
         return ""
     return metres_note(read_focal_stack(path.parent))

@@ -36,7 +36,7 @@ _SUFFIXES = (".npz", ".exr")
 
 
 def write_samples(path: Path | str, samples: LightFieldSamples) -> None:
-    """To .npz (any samples) or .exr (sorted by pixel); whole or not at all."""
+    """Write samples to .npz (any samples) or .exr (sorted by pixel); whole or not at all."""
     if _suffix(path) == ".npz":
         arrays: dict[str, Any] = {name: getattr(samples, name) for name in CHANNELS}
         with atomic_path(path) as temporary:
@@ -46,7 +46,7 @@ def write_samples(path: Path | str, samples: LightFieldSamples) -> None:
 
 
 def read_samples(path: Path | str) -> LightFieldSamples:
-    """From .npz or .exr. Raises InputError where the file is missing, damaged or holds something else."""
+    """Read samples from .npz or .exr. Raises InputError if the file is missing, damaged or holds something else."""
     if _suffix(path) == ".npz":
         return _read_npz(Path(path))
     parts = sorted((part for part in read_exr(path) if part.name.startswith("sample")), key=lambda part: part.name)
@@ -82,7 +82,7 @@ def _read_npz(path: Path) -> LightFieldSamples:
 
 
 def _parts(samples: LightFieldSamples) -> list[ExrPart]:
-    """The k-th sample of each pixel, in the order in which they come, goes to part k."""
+    """Return parts, of which part k holds the k-th sample of each pixel, in the order in which they come."""
     x, y = samples.pixels()
     place = y * samples.width_px + x
     order = np.argsort(place, kind="stable")
@@ -102,7 +102,7 @@ def _parts(samples: LightFieldSamples) -> list[ExrPart]:
 
 
 def _from_parts(parts: list[ExrPart], path: Path | str) -> LightFieldSamples:
-    """Pixel by pixel, the samples of one pixel one after the other."""
+    """Return samples pixel by pixel, those of one pixel one after the other."""
     sizes = {part.stacked(("Z",)).shape[:2] for part in parts}
     if len(sizes) > 1:
         raise InputError(f"the parts of {path} must be of one size, but are {sorted(sizes)} (height, width)")

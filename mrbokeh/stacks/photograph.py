@@ -1,16 +1,13 @@
-"""Photograph: one picture out of a camera, upright and in linear light, with what it tells of its lens and exposure.
+"""Photograph: one picture out of a camera, upright and in linear light, with its lens and exposure; and a lens turned with the sensor.
 
 RAW files are developed by the package `capture`, which is found by its name as the command line finds its sub-commands, and needs the
-extra of that name; so does the metadata of JPEG and TIFF. Without it a picture that is no RAW is read, and tells nothing.
+extra of that name; so does the metadata of JPEG and TIFF. Without it a picture that is no RAW is read, without metadata.
 
-The lens of a lens file as the camera was held: in an upright photograph the other side of the sensor lies along the rows.
-
-A lens file speaks of the camera held level, as data sheets do. Where EXIF turned a photograph upright, the lens is turned with it: the
-stated width lies along the columns, and the opening and the tilt turn too. The lens from metadata comes out alike. Where a lens file states
+A lens file describes the camera held level, as data sheets do. If EXIF turned a photograph upright, the lens is turned with it: the
+stated width lies along the columns, and the opening and the tilt turn too. The lens from metadata comes out alike. If a lens file states
 sensor_height_mm, the longer side lies along the longer side of any photograph, whether EXIF tells a turn or not; one of 24 by 36 mm is
-described for upright photographs, and is left as it is for them. A network's kernels cannot be turned; only its scale is.
-
-The same holds for clips, which videos turn by their metadata and numbered photographs by EXIF.
+described for upright photographs, and is left as it is for them. A network's kernels cannot be turned; only its scale is. The same holds
+for clips, which videos turn by their metadata and numbered photographs by EXIF.
 """
 
 import logging
@@ -31,10 +28,11 @@ _READER = "capture.photos.developing"
 
 @dataclass(frozen=True)
 class Photograph:
-    """rgb: (H, W, 3) linear Rec.709, upright. None is what the file does not tell.
+    """Picture out of a camera, with what its file states; None if it does not.
 
-    sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens. orientation: EXIF's, by which the picture came
-    upright. cut_from_px: width and height of the whole that this is a part of, or None where it is the whole.
+    rgb: (H, W, 3) linear Rec.709, upright. sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens.
+    orientation: EXIF's, by which the picture came upright. cut_from_px: width and height of the whole that this is a part of, or None if
+    it is the whole.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -49,11 +47,11 @@ class Photograph:
 
     @property
     def quarter_turns(self) -> int:
-        """Counter-clockwise, that brought the stored picture upright."""
+        """Return the counter-clockwise quarter turns that brought the stored picture upright."""
         return quarter_turns(self.orientation)
 
     def lens(self, path: Path, focus_m: float | None = None) -> Lens:
-        """The lens with a round opening. focus_m takes the place of the file's own focus. Raises InputError where parts are unknown."""
+        """Return the lens with a round opening. focus_m replaces the file's own focus. Raises InputError if parts are unknown."""
         focus = self.focus_distance_m if focus_m is None else focus_m
         told = {
             "focal length": self.focal_length_mm,
@@ -75,14 +73,14 @@ class Photograph:
         return Lens(self.focal_length_mm, self.f_number, focus, self.sensor_width_mm)
 
     def cut_told(self, path: Path) -> str:
-        """In words, of a picture that is not the whole; its middle is taken to be that of the whole."""
+        """Say that a picture is not the whole; its middle is taken to be that of the whole."""
         assert self.cut_from_px is not None
         height_px, width_px = self.rgb.shape[:2]
         return f"{path} of {width_px}x{height_px} px was cut out of {self.cut_from_px[0]}x{self.cut_from_px[1]} px, as its EXIF tells"
 
 
 def read_photograph(path: Path | str) -> Photograph:
-    """A RAW file, JPEG, TIFF, PNG, WebP, EXR or HDR.
+    """Read a RAW file, JPEG, TIFF, PNG, WebP, EXR or HDR.
 
     Raises InputError where it cannot be read, MissingExtraError for RAW without the extra.
     """
@@ -91,8 +89,11 @@ def read_photograph(path: Path | str) -> Photograph:
 
 @dataclass(frozen=True)
 class Holding:
-    """How the camera was held, as its picture tells. whole_px: (width, height) of all that it took, upright, of which the picture may be
-    a part. quarter_turns: counter-clockwise, that brought the stored picture upright.
+    """Orientation of the sensor when a picture was taken.
+
+    whole_px: (width, height) of all that it took, upright, of which the picture may be a part. quarter_turns: counter-clockwise, that
+    brought
+    the stored picture upright.
     """
 
     whole_px: tuple[int, int]
@@ -100,7 +101,7 @@ class Holding:
 
 
 def lens_as_held(lens: Lens, photograph: Photograph, path: Path) -> Lens:
-    """The lens for the upright picture of a photograph; says in one line what was taken where that is not plain."""
+    """Return the lens for the upright picture of a photograph; logs one line about what was assumed if that is not plain."""
     height_px, width_px = photograph.rgb.shape[:2]
     held = lens_held(lens, Holding(photograph.cut_from_px or (width_px, height_px), photograph.quarter_turns), path)
     if photograph.cut_from_px is not None:
@@ -113,7 +114,7 @@ def lens_as_held(lens: Lens, photograph: Photograph, path: Path) -> Lens:
 
 
 def lens_held(lens: Lens, holding: Holding, path: Path | None = None) -> Lens:
-    """The lens for upright pictures of a camera so held. path: of what it took, about which a line is said where that is not plain."""
+    """Return the lens for upright pictures of a sensor orientation. path: the file to name in a line about what was assumed."""
     held = _held(lens, holding)
     told = _way_told(lens, held, holding)
     if told and path is not None:
@@ -122,7 +123,7 @@ def lens_held(lens: Lens, holding: Holding, path: Path | None = None) -> Lens:
 
 
 def _way_told(lens: Lens, held: Lens, holding: Holding) -> str:
-    """Nothing where the lens stays as it is and may well be right."""
+    """Return what was assumed in words, '' if the lens needs no correction and may well be right."""
     width_px, height_px = holding.whole_px
     if held.sensor_width_mm != lens.sensor_width_mm:
         way = "upright" if height_px > width_px else "level"
@@ -137,7 +138,7 @@ def _way_told(lens: Lens, held: Lens, holding: Holding) -> str:
 
 
 def turned_by(lens: Lens, quarters: int) -> Lens:
-    """The opening and the tilt after quarter turns counter-clockwise in the picture; the sensor stays."""
+    """Turn the opening and the tilt by quarter turns counter-clockwise in the picture; the sensor stays."""
     right_rad, down_rad = lens.tilt_rad
     for _ in range(quarters):
         right_rad, down_rad = down_rad, -right_rad

@@ -1,4 +1,4 @@
-"""What each cell of the pupil sees of the sharp picture from a blurred pixel, compiled."""
+"""Rows of the equations of a slice, compiled: what each cell of the pupil sees of the sharp picture from a blurred pixel."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _STEPS = 3
 def gather_rows(
     rows: np.ndarray, sums: np.ndarray, coc_px: np.ndarray, where: np.ndarray, turns: np.ndarray, places: np.ndarray, cell: float
 ) -> None:
-    """rows (R, C, cells): mean of the picture over the patch that sends its light through a cell to each pixel.
+    """Fill rows (R, C, cells) with the mean of the picture over the patch that sends its light through a cell to each pixel.
 
     sums (H + 1, W + 1, C): the picture summed from its corner. coc_px (H, W): signed diameters. where (R, 2): row and column of the
     pixels. turns (R, 2): cosine and sine of the angle by which the pupil is turned. places (cells, 2): x, y of the cells; cell: their
@@ -43,7 +43,7 @@ def gather_rows(
 
 @njit(cache=True, nogil=True, inline="always")
 def _sum_at(sums: np.ndarray, y: float, x: float, channel: int) -> float:
-    """The integral from the corner to a point between pixels: bilinear, for the picture is constant within each."""
+    """Return the integral from the corner to a point between pixels: bilinear, because the picture is constant within each."""
     row, column = min(int(y), sums.shape[0] - 2), min(int(x), sums.shape[1] - 2)
     b, a = y - row, x - column
     upper = sums[row, column, channel] * (1.0 - a) + sums[row, column + 1, channel] * a

@@ -1,12 +1,9 @@
-"""Evidence: the normal equations of many pixels, for every knot and colour.
+"""Evidence of a fit: the normal equations of many pixels, for every knot and colour, and which of them may share one picture.
 
-Knots: the places over side of the focus, diameter and field at which a lens is measured.
-
-Sharing: colours, ranges of diameters or sides of the focus that have one picture of the pupil in common.
-
-What is shared is measured from the evidence of all that share it, with less noise, and costs renderers less. Whether a lens may be
-described so is asked of slices that the fit has not seen: the simplest description is taken that is no worse than the best one, within the
-standard error of their difference (Breiman et al. 1984, Section 3.4.3: the one-standard-error rule).
+Knots are the places over side of the focus, diameter and field at which a lens is measured. Colours, ranges of diameters or sides of the
+focus may share a picture of the pupil: it is then measured with less noise, and costs renderers less. Whether a lens may be described so
+is asked of slices that the fit has not seen: the simplest description is taken that is no worse than the best one, within the standard
+error of their difference (Breiman et al. 1984, Section 3.4.3: the one-standard-error rule).
 """
 
 from collections.abc import Sequence
@@ -22,7 +19,9 @@ _FARTHEST = 1.0  # half diagonals: a corner
 
 @dataclass(frozen=True)
 class Knots:
-    """Where kernels are solved for. Each stands for what is nearest to it; in front of the focus come first, then diameters, then places.
+    """Places at which kernels are solved for; each stands for what is nearest to it. The front of the focus comes first, then diameters,
+    then
+    places.
 
     diameters_px: ascending, above 0, the middles of the ranges of diameters (in proportion) whose kernels share a shape.
     regions: columns and rows into which the frame is cut. rings: more than 0 makes the lens symmetric instead: so many ranges of
@@ -44,7 +43,7 @@ class Knots:
 
     @property
     def fields(self) -> int:
-        """How many parts of the field are told apart."""
+        """Return how many parts of the field are told apart."""
         return self.rings or self.regions[0] * self.regions[1]
 
     def __len__(self) -> int:
@@ -52,11 +51,11 @@ class Knots:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Sides, diameters, parts of the field."""
+        """Return sides, diameters, parts of the field."""
         return 2, len(self.diameters_px), self.fields
 
     def fields_at(self, field_xy: Float[np.ndarray, "*batch 2"]) -> Int64[np.ndarray, "*batch"]:
-        """The part of the field of each position; regions row by row."""
+        """Return the part of the field of each position; regions row by row."""
         if self.rings:
             shares = np.hypot(field_xy[..., 0], field_xy[..., 1]) / _FARTHEST
             return np.asarray(np.clip((shares * self.rings).astype(np.int64), 0, self.rings - 1))
@@ -64,18 +63,18 @@ class Knots:
         return np.asarray(steps[1].astype(np.int64) * self.regions[0] + steps[0].astype(np.int64))
 
     def at(self, coc_px: Float[np.ndarray, "*batch"], field_xy: Float[np.ndarray, "*batch 2"]) -> Int64[np.ndarray, "*batch"]:
-        """The knot of a signed diameter at a position."""
+        """Return the knot of a signed diameter at a position."""
         middles = np.sqrt(np.array(self.diameters_px[:-1]) * np.array(self.diameters_px[1:]))
         step = np.searchsorted(middles, np.abs(coc_px))
         return np.asarray(((np.asarray(coc_px) > 0) * len(self.diameters_px) + step) * self.fields + self.fields_at(field_xy))
 
     def turns(self, field_xy: Float[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points 2"]:
-        """Cosine and sine of the angle by which kernels are turned at each position: none unless the lens is symmetric."""
+        """Return cosine and sine of the angle by which kernels are turned at each position: none unless the lens is symmetric."""
         angles = np.arctan2(field_xy[:, 1], field_xy[:, 0]) * bool(self.rings)
         return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
     def neighbours(self) -> dict[str, Int64[np.ndarray, "pairs 2"]]:
-        """Pairs of knots that differ by one step of "diameter" or "field", or by "side" alone."""
+        """Return pairs of knots that differ by one step of "diameter" or "field", or by "side" alone."""
         numbers = np.arange(len(self)).reshape(self.shape)
         across = numbers.reshape(*self.shape[:2], 1, -1) if self.rings else numbers.reshape(*self.shape[:2], *self.regions[::-1])
         field = [_pairs(across, axis) for axis in (2, 3)]
@@ -98,9 +97,9 @@ Pictures = Float[np.ndarray, "knots channels cells"]
 
 @dataclass(frozen=True)
 class Equations:
-    """Pixels of one slice or light: target = rows @ picture of the pupil, for each colour.
+    """Equations of the pixels of one slice or light: target = rows @ picture of the pupil, for each colour.
 
-    Both without the pixel's mean over the pupil: pictures sum to 1, so that nothing is lost, and the brightness of a place, which says
+    Both without the pixel's mean over the pupil: pictures sum to 1, so nothing is lost, and the brightness of a place, which says
     nothing about the shape of the blur, does not drown what does. weights: inverse variance, but for a factor that the slice has in
     common. knots: to which each pixel belongs.
     """
@@ -111,7 +110,7 @@ class Equations:
     knots: Int64[np.ndarray, " rows"]
 
     def residuals(self, pictures: Pictures) -> Float64[np.ndarray, "rows channels"]:
-        """Target minus prediction."""
+        """Return target minus prediction."""
         out = self.targets.copy()
         for knot in np.unique(self.knots):
             mine = self.knots == knot
@@ -119,11 +118,11 @@ class Equations:
         return out
 
     def error(self, pictures: Pictures) -> float:
-        """Root mean square of what is left, over the square root of radiance (as noise is)."""
+        """Return the root mean square of the residuals over the square root of radiance (as noise is)."""
         return float(np.sqrt((self.residuals(pictures) ** 2 * self.weights).mean()))
 
     def robust(self, pictures: Pictures) -> Float64[np.ndarray, "rows channels"]:
-        """Weights that are 1 over the variance found, less (Huber 1964) for pixels that disagree."""
+        """Return weights that are 1 over the variance found, less (Huber 1964) for pixels that disagree."""
         size = np.abs(self.residuals(pictures)) * np.sqrt(self.weights)
         deviation = max(1.4826 * float(np.median(size)), _LEAST_DEVIATION)
         share = np.minimum(1.0, _HUBER * deviation / np.maximum(size, 1e-12))
@@ -132,7 +131,10 @@ class Equations:
 
 @dataclass
 class Evidence:
-    """matrices (K, C, cells, cells) A'WA, sides (K, C, cells) A'Wy, energies (K,) y'Wy, counts (K,): pixels of each knot."""
+    """Normal equations of all knots.
+
+    matrices (K, C, cells, cells) A'WA, sides (K, C, cells) A'Wy, energies (K,) y'Wy, counts (K,): pixels of each knot.
+    """
 
     matrices: Float32[np.ndarray, "knots channels cells cells"]
     sides: Float64[np.ndarray, "knots channels cells"]
@@ -160,7 +162,7 @@ class Evidence:
                 self.sides[knot, channel] += rows.T @ (weights[mine, channel] * equations.targets[mine, channel])
 
     def errors(self, pictures: Pictures) -> Float64[np.ndarray, " knots"]:
-        """What is left of each knot's pixels (root mean square), in typical deviations of their slice; nan where there are none."""
+        """Return the RMS residual of each knot's pixels in typical deviations of their slice; nan if there are none."""
         explained = np.matmul(self.matrices, pictures[..., None].astype(np.float32))[..., 0] - 2.0 * self.sides
         left = self.energies + (explained * pictures).sum(axis=(1, 2))
         of = np.where(self.counts > 0, self.counts * self.sides.shape[1], np.nan)
@@ -169,14 +171,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Sharing:
-    """Which pictures are one and the same."""
+    """Choice of which pictures are one and the same."""
 
     colours: bool = False
     diameters: bool = False
     sides: bool = False
 
     def merged(self, evidence: Evidence, knots: Knots) -> tuple[Evidence, Knots]:
-        """The evidence of those that share, and the knots that are left; sides stay two, each with the evidence of both."""
+        """Return the evidence of those that share, and the knots that are left; sides stay two, each with the evidence of both."""
         fewer = replace(knots, diameters_px=knots.diameters_px[:1]) if self.diameters else knots
 
         def summed(of_knots: np.ndarray, with_channels: bool) -> np.ndarray:
@@ -192,7 +194,7 @@ class Sharing:
     def spread(
         self, pictures: Float64[np.ndarray, "fewer shared cells"], knots: Knots, channels: int
     ) -> Float64[np.ndarray, "knots channels cells"]:
-        """Those of all knots and colours, from those of `merged`."""
+        """Return the pictures of all knots and colours, from those of `merged`."""
         shape = (2, -1, knots.fields, *pictures.shape[1:])
         whole = np.broadcast_to(pictures.reshape(shape), (*knots.shape, channels, pictures.shape[-1]))
         return np.ascontiguousarray(whole.reshape(len(knots), channels, -1))
@@ -209,7 +211,7 @@ SIMPLEST_FIRST = (
 
 
 def simplest_of(errors: Sequence[Sequence[float]]) -> int:
-    """The first description, of those given from the simplest on, that is no worse than the best. errors: of each, slice by slice."""
+    """Return the first description, of those given from the simplest on, that is no worse than the best. errors: of each, slice by slice."""
     squares = np.square(np.asarray(errors, np.float64))
     if squares.size == 0:
         return len(squares) - 1

@@ -1,7 +1,4 @@
-"""The kernels of a fit as a bank of PSFs.
-
-A picture of how well a measured lens explains the slices it was measured on, and of what it was measured from.
-"""
+"""Results of a fit: its kernels as a bank of PSFs, and a picture of how well they explain the slices and of what they were measured from."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +18,7 @@ _NODES = 3
 
 
 def bank_of(fit: LensFit) -> PsfBank:
-    """A bank over signed diameters and, where the lens varies over the field, positions (or eccentricity, for a symmetric lens).
+    """Return a bank over signed diameters and, if the lens varies over the field, positions (or eccentricity, for a symmetric lens).
 
     Kernels have one channel where colours share theirs, else three.
     Each kernel is averaged over its cell's diameters. settings hold for each cell of the bank how many pixels and lights tell of it, and
@@ -56,7 +53,7 @@ def _field(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> int:
 
 
 def _kernel(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> Float32[np.ndarray, "size size channels"]:
-    """The mean over diameters of a cell; the one around the focus holds the focus."""
+    """Return the mean over diameters of a cell; the cell around the focus holds the focus."""
     low, high = box[0]
     diameters = [0.0] if low < 0.0 < high else low + (np.arange(_NODES) + 0.5) / _NODES * (high - low)
     channels = slice(0, 1 if fit.sharing.colours else 3)
@@ -67,7 +64,7 @@ def _kernel(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> Float32[np.ndar
 
 
 def picture_at(fit: LensFit, diameter_px: float, field: int) -> Float64[np.ndarray, "cells 3"]:
-    """The pupil at a signed diameter, for each colour: between the knots' diameters in proportion to the logarithm."""
+    """Return the pupil at a signed diameter, for each colour: between the knots' diameters in proportion to the logarithm."""
     pictures = fit.pictures.reshape(*fit.knots.shape, *fit.pictures.shape[1:])[int(diameter_px > 0), :, field]
     known = np.log(fit.knots.diameters_px)
     place = float(np.interp(np.log(max(abs(diameter_px), 1e-6)), known, np.arange(len(known))))
@@ -90,7 +87,7 @@ def _settings(fit: LensFit, boxes: Float64[np.ndarray, "cells axes 2"]) -> dict[
 
 
 def _knot(fit: LensFit, box: Float64[np.ndarray, "axes 2"]) -> int:
-    """That from which most of a cell of the bank comes."""
+    """Return the knot from which most of a cell of the bank comes."""
     in_the_middle = int(fit.knots.at(np.array([box[0].mean()]), np.zeros((1, 2)))[0])
     return in_the_middle // fit.knots.fields * fit.knots.fields + _field(fit, box)
 
@@ -103,7 +100,7 @@ _SIDES = ("in front", "behind")
 
 
 def draw_evidence(fit: LensFit) -> "Figure":
-    """What is left of each slice by a disc, the stated aperture and the kernels; pixels and lights of each knot."""
+    """Draw the residual of each slice under a disc, the stated aperture and the kernels; and the pixels and lights of each knot."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 5), layout="constrained")

@@ -1,4 +1,4 @@
-"""LensFit: the kernels of a lens, measured."""
+"""LensFit: the kernels of a lens, measured from focal stacks and from points of light."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +34,9 @@ _TIES = (1.0, 10.0, 100.0)  # how far neighbouring knots are held together: what
 
 @dataclass(frozen=True)
 class FitSettings:
-    """diameters_px: middles of the ranges of diameters whose shape is solved for by itself; () chooses two. regions, rings: as in
+    """Settings of a fit.
+
+    diameters_px: middles of the ranges of diameters whose shape is solved for by itself; () chooses two. regions, rings: as in
     `Knots`. smoothness: 1; more trusts pictures less. pixels: of all slices that are used. cell_px: size of a cell in the largest kernel.
     """
 
@@ -49,8 +51,10 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class SliceScore:
-    """What is left of one slice (root mean square over the square root of radiance): by a plain disc, by the aperture that the
-    stack's lens states, and by the kernels found. held_out: the fit has not seen it.
+    """Residuals of one slice (root mean square over the square root of radiance).
+
+    They are those of a plain disc, of the aperture that the stack's lens states, and of the kernels found. held_out: the fit has not seen
+    it.
     """
 
     stack: str
@@ -63,7 +67,9 @@ class SliceScore:
 
 @dataclass(frozen=True)
 class LensFit:
-    """pictures (knots, 3, cells): light through each cell of the pupil, sums to 1. largest_px: of all circles of confusion seen.
+    """Measured kernels of a lens.
+
+    pictures (knots, 3, cells): light through each cell of the pupil, sums to 1. largest_px: of all circles of confusion seen.
     pixels, lights (knots,): how many tell of each knot (pixels of lights count as pixels). errors (knots,): what is left of them, see
     `Evidence.errors`. sharing: which pictures are one and the same.
     """
@@ -82,9 +88,9 @@ class LensFit:
 def fit_lens(
     stacks: Sequence[FocalStack], lights: Sequence[PointLight], settings: FitSettings, frame: tuple[int, int] | None = None
 ) -> LensFit:
-    """The kernels that explain slices and lights. frame: width and height where there are lights only.
+    """Find the kernels that explain slices and lights. frame: width and height if there are lights only.
 
-    Raises InputError where stacks are not merged, not metric, or not blurred enough to tell.
+    Raises InputError if stacks are not merged, not metric, or not blurred enough.
     """
     slices = StackSlices.of(stacks)
     size = slices.size if stacks else frame
@@ -116,7 +122,7 @@ def _knots(settings: FitSettings, largest_px: float, size: tuple[int, int]) -> K
 
 
 def _most_side(knots: int) -> int:
-    """So that the normal equations fit into memory."""
+    """Return the largest side of the grid whose normal equations fit into memory."""
     return int(np.sqrt(np.sqrt(_MOST_BYTES / (12.0 * knots)) / (0.25 * np.pi)))
 
 
@@ -129,16 +135,16 @@ class _Fitting:
     settings: FitSettings
 
     def even(self, aperture: Aperture) -> Pictures:
-        """All knots seen through one aperture."""
+        """Return the pictures of all knots seen through one aperture."""
         return np.broadcast_to(self.grid.of_aperture(aperture).T, (len(self.knots), 3, len(self.grid.places)))
 
     def held_out(self, number: int) -> bool:
-        """One slice in six, another one of each stack; none where there are fewer."""
+        """Return whether a slice is held out: one in six, another one of each stack; none if there are fewer."""
         first = min(_HELD_OUT, self.slices.longest) - 1
         return len(self.slices) >= _HELD_OUT and sum(divmod(number, self.slices.longest)) % _HELD_OUT == first
 
     def shared(self, evidence: Evidence) -> list[tuple[Sharing, Pictures]]:
-        """The pictures of every sharing, the simplest first; none without slices to judge them by."""
+        """Return the pictures of every sharing, the simplest first; none without slices to judge them by."""
         if not self.holds_out:
             return []
         found, channels = [], evidence.sides.shape[1]
@@ -149,7 +155,7 @@ class _Fitting:
         return found
 
     def tied(self, evidence: Evidence, pictures: Pictures) -> list[tuple[Sharing, Pictures]]:
-        """Nothing shared, but neighbours held together, firmly first; at last the pictures given, which are those of the weakest ties."""
+        """Return pictures that share nothing but are tied to their neighbours, firmly first; last those given, which have the weakest ties."""
         firmly = sorted((factor for factor in _TIES if factor > 1.0 and self.holds_out), reverse=True)
         made = [solve(evidence, self.grid, self.knots, self._smoothness.tied(factor)) for factor in firmly]
         return [(NOTHING, each) for each in [*made, pictures]]
@@ -159,7 +165,7 @@ class _Fitting:
         return Smoothness().times(self.settings.smoothness)
 
     def evidence(self, pictures: Pictures, with_lights: bool) -> Evidence:
-        """That of all slices but those held out, and of lights; weighted by how well the pictures explain it."""
+        """Sum the evidence of all slices but those held out, and of lights; weighted by how well the pictures explain it."""
         evidence = Evidence.none(len(self.knots), 3, len(self.grid.places))
         for number in track(range(len(self.slices)), "slices"):
             if not self.held_out(number) and (equations := self._equations(number)) is not None:
@@ -175,7 +181,7 @@ class _Fitting:
         return evidence
 
     def rescale_lights(self, pictures: Pictures) -> None:
-        """Give lights the diameters that agree with what slices tell, which know theirs."""
+        """Give lights the diameters that agree with slices, whose diameters are known."""
         scales = [best_scale(light, self.grid, self.knots, pictures) for light in self.lights]
         self.lights = [replace(light, diameter_px=light.diameter_px * scale) for light, scale in zip(self.lights, scales, strict=True)]
 
@@ -184,7 +190,7 @@ class _Fitting:
         return any(self.held_out(number) for number in range(len(self.slices)))
 
     def scores(self, candidates: Sequence[Pictures]) -> list[tuple[SliceScore, ...]]:
-        """For each candidate those of slices that are held out, or of all where none is."""
+        """Return for each candidate the scores of slices that are held out, or of all if none is."""
         disc, found = self.even(Aperture.disc()), []
         for number in track(range(len(self.slices)), "proof"):
             if self.held_out(number) != self.holds_out or (equations := self._equations(number)) is None:
@@ -196,7 +202,7 @@ class _Fitting:
         return [tuple(each) for each in zip(*found, strict=True)] or [() for _ in candidates]
 
     def _equations(self, number: int) -> Equations | None:
-        """Of a slice; None where no pixel can be used."""
+        """Return the equations of a slice; None if no pixel can be used."""
         view: SliceView = self.slices.view(number)
         count = min(_MOST_PER_SLICE, self.settings.pixels // len(self.slices))
         where = drawn_pixels(view, self.knots, count, np.random.default_rng((self.settings.seed, number)))

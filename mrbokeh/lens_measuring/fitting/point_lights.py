@@ -21,7 +21,9 @@ _SCALES = np.linspace(0.8, 1.25, 46)
 
 @dataclass(frozen=True)
 class PointLight:
-    """light: (S, S, 3) around a point of light, background taken off, flux 1 per colour. centre_px: x, y within it (of its light, the
+    """Picture of a point of light out of focus.
+
+    light: (S, S, 3) around it, background taken off, flux 1 per colour. centre_px: x, y within it (of its light, the
     origin of the pupil). diameter_px: signed circle of confusion. field_xy: its place in half diagonals.
     """
 
@@ -32,7 +34,7 @@ class PointLight:
 
 
 def find_lights(frame: Rgb, in_front: bool) -> list[PointLight]:
-    """The lights of a linear frame that stand apart from each other and from its border and are not full, i.e. below 1.
+    """Find the lights of a linear frame that stand apart from each other and from its border and are below 1 (not clipped).
 
     in_front: whether they lie in front of the focus. Diameters reach to where a light's outline is farthest from its middle.
     """
@@ -50,7 +52,7 @@ def _lit(frame: Rgb) -> Bool[np.ndarray, "height width"]:
 
 
 def _light_in(frame: Rgb, mine: Bool[np.ndarray, "height width"], box: tuple[slice, slice], in_front: bool) -> PointLight | None:
-    """The light of one part of the frame; None where it touches the border, is full or too small."""
+    """Return the light of one part of the frame; None if it touches the border, is clipped or too small."""
     height, width = frame.shape[:2]
     side = max(box[0].stop - box[0].start, box[1].stop - box[1].start)
     top = (box[0].start + box[0].stop - side) // 2
@@ -77,7 +79,7 @@ def _light_in(frame: Rgb, mine: Bool[np.ndarray, "height width"], box: tuple[sli
 
 
 def equations_of_light(light: PointLight, grid: PupilGrid, knots: Knots, scale: float = 1.0) -> Equations:
-    """The equations of a light's pixels within the reach of its kernel; scale: by how much it is larger than was measured.
+    """Return the equations of a light's pixels within the reach of its kernel; scale: by how much it is larger than was measured.
 
     Their weights are final: a light that stands apart has no pixels to distrust, and those of its rim fit least before they are solved for.
     """
@@ -97,14 +99,14 @@ def equations_of_light(light: PointLight, grid: PupilGrid, knots: Knots, scale: 
 
 
 def _overlaps(pixels: int, middles: Float64[np.ndarray, " cells"], cell: float) -> Float64[np.ndarray, "pixels cells"]:
-    """The share of each cell's width that falls into each pixel."""
+    """Return the share of each cell's width that falls into each pixel."""
     left = np.arange(pixels)[:, None]
     overlap = np.minimum(middles + 0.5 * cell, left + 1.0) - np.maximum(middles - 0.5 * cell, left)
     return np.asarray(np.maximum(overlap, 0.0) / cell)
 
 
 def best_scale(light: PointLight, grid: PupilGrid, knots: Knots, pictures: Pictures) -> float:
-    """How much larger than measured a light is if its kernel is the one that stacks tell, whose diameters are known."""
+    """Return how much larger than measured a light is if its kernel is the one that stacks tell, whose diameters are known."""
     errors = []
     for scale in _SCALES:
         area = (scale * light.diameter_px) ** 2
@@ -114,6 +116,6 @@ def best_scale(light: PointLight, grid: PupilGrid, knots: Knots, pictures: Pictu
 
 
 def light_count(lights: list[PointLight], knots: Knots) -> Int64[np.ndarray, " knots"]:
-    """How many lights each knot has."""
+    """Return how many lights each knot has."""
     at = [int(knots.at(np.array([light.diameter_px]), np.array([light.field_xy]))[0]) for light in lights]
     return np.bincount(at, minlength=len(knots)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""A picture of the pupil as a grid of cells, and the kernels that it casts."""
+"""PupilGrid: a picture of the pupil as a grid of cells, and the kernels that it casts."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,9 +21,10 @@ _DRAWN_PX = 64  # an aperture is drawn this many times finer than its cells are,
 
 @dataclass(frozen=True)
 class PupilGrid:
-    """`side` x `side` square cells over -EXTENT..EXTENT of the pupil, x right, y down; those within the circle of that radius are used.
+    """Grid of `side` x `side` square cells over -EXTENT..EXTENT of the pupil, x right, y down.
 
-    Pictures of a pupil are (cells, ...) arrays over `used`, light per cell: they sum to 1.
+    Cells within the circle of radius EXTENT are used. Pictures of a pupil are (cells, ...) arrays over `used`, light per cell: they sum to
+    1.
     """
 
     side: int
@@ -34,12 +35,12 @@ class PupilGrid:
 
     @classmethod
     def for_diameter(cls, largest_px: float, cell_px: float, most: int) -> "PupilGrid":
-        """With cells about so large (in pixels) in the largest kernel, and at most `most` a side."""
+        """Return a grid with cells about so large (in pixels) in the largest kernel, and at most `most` a side."""
         return cls(int(np.clip(np.ceil(EXTENT * largest_px / cell_px), _LEAST_SIDE, min(most, _MOST_SIDE) - 1)) // 2 * 2 + 1)
 
     @property
     def cell(self) -> float:
-        """Width of a cell in pupil radii."""
+        """Return the width of a cell in pupil radii."""
         return 2.0 * EXTENT / self.side
 
     @cached_property
@@ -48,7 +49,7 @@ class PupilGrid:
 
     @cached_property
     def places(self) -> Float64[np.ndarray, "cells 2"]:
-        """Middles of the used cells, x and y."""
+        """Return the middles of the used cells, x and y."""
         x, y = np.meshgrid(self._middles, self._middles)
         return np.stack([x[self.used], y[self.used]], axis=1)
 
@@ -57,13 +58,13 @@ class PupilGrid:
         return (np.arange(self.side) + 0.5) * self.cell - EXTENT
 
     def square(self, picture: Float[np.ndarray, "cells channels"]) -> Float64[np.ndarray, "side side channels"]:
-        """The picture with zeros where cells are not used."""
+        """Return the picture with zeros in unused cells."""
         whole = np.zeros((self.side, self.side, picture.shape[1]))
         whole[self.used] = picture
         return whole
 
     def of_aperture(self, aperture: Aperture) -> Float64[np.ndarray, "cells 1"]:
-        """An aperture without modifiers as a picture: the share of its light that goes through each cell."""
+        """Return an aperture without modifiers as a picture: the share of its light that goes through each cell."""
         fine = max(1, _DRAWN_PX // self.side) * 2 + 1
         psf = aperture.rasterize(self.side * fine / EXTENT).kernel
         size, whole = psf.shape[0], np.zeros((self.side * fine, self.side * fine))
@@ -78,7 +79,7 @@ class PupilGrid:
 def kernel_of(
     grid: PupilGrid, picture: Float[np.ndarray, "cells channels"], diameter_px: float
 ) -> Float32[np.ndarray, "size size channels"]:
-    """The kernel at a signed diameter: exactly what each pixel sees of the picture; it sums to 1 and has no border of zeros."""
+    """Return the kernel at a signed diameter: exactly what each pixel sees of the picture; it sums to 1 and has no border of zeros."""
     channels = picture.shape[1]
     if abs(diameter_px) <= _SHARP_PX:
         return np.ones((1, 1, channels), np.float32)
@@ -92,7 +93,7 @@ def kernel_of(
 
 
 def _shares(grid: PupilGrid, diameter_px: float, radius: int) -> Float64[np.ndarray, "taps side"]:
-    """How much of each column of cells falls into each column of pixels."""
+    """Return the share of each column of cells in each column of pixels."""
     half = 0.5 * diameter_px
     borders = (np.arange(grid.side + 1) * grid.cell - EXTENT) * half
     low, high = np.minimum(borders[:-1], borders[1:]), np.maximum(borders[:-1], borders[1:])

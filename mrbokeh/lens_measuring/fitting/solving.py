@@ -24,7 +24,7 @@ _POWER_STEPS = 12
 
 @dataclass(frozen=True)
 class Smoothness:
-    """How far pictures are trusted to be smooth, in units of evidence of noise 1.
+    """Trust in smooth pictures, in units of evidence of noise 1.
 
     total_variation: within a picture. diameter, field, colour, side: one over the variance expected between cells of neighbouring knots.
     evidence: how much of a pixel's evidence counts, because neighbours err together.
@@ -38,19 +38,19 @@ class Smoothness:
     evidence: float = 0.1
 
     def times(self, factor: float) -> "Smoothness":
-        """All of it so much stronger."""
+        """Return all strengths times a factor."""
         names = ("total_variation", "diameter", "field", "colour", "side")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 
     def tied(self, factor: float) -> "Smoothness":
-        """Neighbouring knots nearer to one another by so much."""
+        """Return the ties between neighbouring knots times a factor."""
         return replace(self, diameter=factor * self.diameter, field=factor * self.field, colour=factor * self.colour)
 
 
 def solve(
     evidence: Evidence, grid: PupilGrid, knots: Knots, smoothness: Smoothness, steps: int = 150
 ) -> Float64[np.ndarray, "knots channels cells"]:
-    """The pictures of all knots and colours; knots without evidence are the mean of their neighbours."""
+    """Solve for the pictures of all knots and colours; knots without evidence are the mean of their neighbours."""
     told = np.flatnonzero(evidence.counts)
     problem = _Problem.of(evidence, told, grid, knots, smoothness)
     picture = np.broadcast_to(problem.start, problem.sides.shape).astype(np.float64)
@@ -68,7 +68,7 @@ def solve(
 def _filled(
     pictures: Float64[np.ndarray, "told channels cells"], told: Int64[np.ndarray, " told"], knots: Knots
 ) -> Float64[np.ndarray, "knots channels cells"]:
-    """Those of all knots from those that evidence tells of: from the next diameter, else place, else the other side, step by step."""
+    """Fill knots without evidence from the next diameter, else place, else the other side, step by step."""
     whole, known = np.zeros((len(knots), *pictures.shape[1:])), np.zeros(len(knots), bool)
     whole[told], known[told] = pictures, True
     neighbours = knots.neighbours()
@@ -98,7 +98,7 @@ class _Problem:
 
     @classmethod
     def of(cls, evidence: Evidence, told: Int64[np.ndarray, " told"], grid: PupilGrid, knots: Knots, smoothness: Smoothness) -> "_Problem":
-        """Of the knots that evidence tells of."""
+        """Return the problem of the knots that have evidence."""
         matrices = evidence.matrices if len(told) == len(knots) else evidence.matrices[told]
         disc = np.hypot(*grid.places.T) <= 1.0
         total = float(disc.sum())
@@ -140,7 +140,7 @@ class _Problem:
 
 
 def _largest_eigenvalues(matrices: Float32[np.ndarray, "knots channels cells cells"]) -> Float64[np.ndarray, "knots channels"]:
-    """By repeated multiplication, 20 % added for what it has not reached."""
+    """Return eigenvalues by repeated multiplication, 20 % added for what it has not reached."""
     vector = np.random.default_rng(0).standard_normal((*matrices.shape[:3], 1)).astype(np.float32)
     size = np.zeros(matrices.shape[:2])
     for _ in range(_POWER_STEPS):
@@ -151,7 +151,7 @@ def _largest_eigenvalues(matrices: Float32[np.ndarray, "knots channels cells cel
 
 
 def on_simplex(values: Float[np.ndarray, "*batch cells"], total: float) -> Float64[np.ndarray, "*batch cells"]:
-    """The nearest values that are nowhere negative and sum to `total`."""
+    """Return the nearest values that are nowhere negative and sum to `total`."""
     ordered = -np.sort(-values, axis=-1)
     over = (np.cumsum(ordered, axis=-1) - total) / np.arange(1, values.shape[-1] + 1)
     last = (ordered > over).sum(axis=-1, keepdims=True) - 1

@@ -1,10 +1,8 @@
-"""Equations of a focal stack: pixels of its slices whose blur is known well enough to tell the shape of the kernel.
+"""Equations of focal stacks: pixels of their slices whose blur is known well enough to tell the shape of the kernel.
 
-Counted are pixels with a trusted depth, not full, and far from every edge of depth by more than light travels there: around edges, what
+Counted are pixels with a trusted depth, not clipped, and far from every edge of depth by more than light travels there: around edges, what
 is hidden and what hides mix, which a kernel cannot explain. Among them those are drawn (weighted sampling without replacement, Efraimidis
 and Spirakis 2006) that see contrast, evenly over the field.
-
-The slices of several focal stacks, one after the other, as the fit sees them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +35,7 @@ Mask = Bool[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class SliceView:
-    """A registered slice, the all-in-focus picture and the signed diameters of both; known: where depth and slice can be trusted."""
+    """Registered slice, the all-in-focus picture and the signed diameters of both; known: where depth and slice can be trusted."""
 
     sharp: Rgb
     blurred: Rgb
@@ -45,14 +43,14 @@ class SliceView:
     known: Mask
 
     def field_xy(self, where: Int64[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points 2"]:
-        """Positions of pixels (row, column) in half diagonals."""
+        """Return positions of pixels (row, column) in half diagonals."""
         height, width = self.coc_px.shape
         middle = np.array([0.5 * width - 0.5, 0.5 * height - 0.5])
         return np.asarray((where[:, ::-1] - middle) / (0.5 * np.hypot(width, height)))
 
 
 def known_pixels(confidence: Plane, masks: SliceMasks, exclusions: Mapping[str, Mask]) -> Mask:
-    """Pixels with a trusted depth whose light was measured."""
+    """Return the pixels with a trusted depth whose light was measured."""
     known = (confidence >= _LEAST_CONFIDENCE) & masks.valid & ~masks.saturated
     for reason in (*_NO_TRUTH, "low_confidence"):
         known &= ~exclusions.get(reason, np.zeros_like(known))
@@ -60,10 +58,10 @@ def known_pixels(confidence: Plane, masks: SliceMasks, exclusions: Mapping[str, 
 
 
 def smoothed_coc(coc_px: Plane, confidence: Plane) -> Plane:
-    """Without the noise of single pixels, edges where they were.
+    """Remove the noise of single pixels from a map of diameters, keeping its edges.
 
-    What is thin (a lamp in front of a wall, a wire) keeps its own diameter where its depth is trusted: lost to its surroundings its light
-    would be taken for theirs, and one lamp outshines all that tells of the kernel there.
+    What is thin (a light in front of a wall, a wire) keeps its own diameter if its depth is trusted: lost to its surroundings its light
+    would be taken for theirs, and one light outshines all that tells of the kernel there.
     """
     smooth = cv2.medianBlur(np.ascontiguousarray(coc_px), 5)
     thin = (np.abs(coc_px - smooth) > _jump_px(coc_px)) & (confidence >= _LEAST_CONFIDENCE)
@@ -71,12 +69,12 @@ def smoothed_coc(coc_px: Plane, confidence: Plane) -> Plane:
 
 
 def _jump_px(coc_px: Plane) -> Plane:
-    """What two neighbours of one surface differ by at most."""
+    """Return what two neighbours of one surface differ by at most."""
     return np.maximum(np.float32(_JUMP_PX), np.float32(_JUMP_SHARE) * np.abs(coc_px))
 
 
 def usable_pixels(view: SliceView) -> Mask:
-    """Known, blurred enough, and farther from edges of depth and frame than light travels."""
+    """Return pixels that are known, blurred enough, and farther from edges of depth and frame than light travels."""
     size = np.abs(view.coc_px)
     square = np.ones((3, 3), np.uint8)
     jump = cv2.dilate(view.coc_px, square) - cv2.erode(view.coc_px, square)
@@ -94,7 +92,7 @@ def usable_pixels(view: SliceView) -> Mask:
 
 
 def drawn_pixels(view: SliceView, knots: Knots, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "points 2"]:
-    """At most `count` usable pixels (row, column), as many from each part of the field as there are."""
+    """Draw at most `count` usable pixels (row, column), as many from each part of the field as there are."""
     where = np.argwhere(usable_pixels(view))
     if not len(where):
         return where
@@ -107,7 +105,7 @@ def drawn_pixels(view: SliceView, knots: Knots, count: int, rng: np.random.Gener
 
 
 def _contrast(sharp: Rgb) -> Plane:
-    """How much the picture varies around each pixel, over its noise; noise of single pixels is averaged first."""
+    """Return how much the picture varies around each pixel, over its noise; noise of single pixels is averaged first."""
     grey = cv2.blur(np.ascontiguousarray(sharp.mean(axis=2)), (3, 3))
     mean = cv2.blur(grey, (_CONTRAST_PX, _CONTRAST_PX))
     variance = np.maximum(cv2.blur(grey * grey, (_CONTRAST_PX, _CONTRAST_PX)) - mean**2, 0.0)
@@ -115,7 +113,7 @@ def _contrast(sharp: Rgb) -> Plane:
 
 
 def equations_of(view: SliceView, where: Int64[np.ndarray, "points 2"], grid: PupilGrid, knots: Knots) -> Equations:
-    """The equations of pixels (row, column) of a slice."""
+    """Return the equations of pixels (row, column) of a slice."""
     from mrbokeh.lens_measuring.fitting._pupil_rows_numba import gather_rows
 
     field_xy = view.field_xy(where)
@@ -131,7 +129,7 @@ def equations_of(view: SliceView, where: Int64[np.ndarray, "points 2"], grid: Pu
 
 @dataclass
 class StackSlices:
-    """All slices of all stacks; pictures that a stack's slices share are kept while it is read."""
+    """Slices of all stacks, one after the other; pictures that a stack's slices share are kept while it is read."""
 
     stacks: tuple[FocalStack, ...]
     longest: int
@@ -139,7 +137,7 @@ class StackSlices:
 
     @classmethod
     def of(cls, stacks: Sequence[FocalStack]) -> "StackSlices":
-        """Raises InputError where pictures of a stack are not registered, merged and metric."""
+        """Open stacks. Raises InputError if one is not registered, merged and metric."""
         for stack in stacks:
             if not stack.registered:
                 raise InputError(
@@ -154,12 +152,12 @@ class StackSlices:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the first stack."""
+        """Return width and height of the first stack."""
         height, width = self.stacks[0].depth_m().shape
         return width, height
 
     def place(self, number: int) -> tuple[FocalStack, int]:
-        """The stack and slice of a number."""
+        """Return the stack and slice of a number."""
         for stack in self.stacks:
             if number < len(stack):
                 return stack, number
@@ -176,6 +174,6 @@ class StackSlices:
 
 
 def largest_diameter_px(stacks: Sequence[FocalStack]) -> float:
-    """The largest circle of confusion of any slice; 0 without stacks."""
+    """Return the largest circle of confusion of any slice; 0 without stacks."""
     maps = (np.abs(stack.coc_px(index, depth_m)) for stack in stacks for depth_m in [stack.depth_m()] for index in range(len(stack)))
     return max((float(each.max()) for each in maps), default=0.0)

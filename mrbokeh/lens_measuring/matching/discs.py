@@ -1,8 +1,7 @@
 """Out-of-focus lights of a photograph: bright even plateaus with a sharp closed contour on darker surroundings.
 
-Closed contours of a picture by linear interpolation between the centres of pixels, and measures of them.
-
-Where a photograph may have out-of-focus lights: compact parts above levels of light that step down.
+They are looked for in compact parts above levels of light that step down. Contours are traced by linear interpolation between the centres
+of pixels.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +15,7 @@ Contour = Float64[np.ndarray, "_ 2"]
 
 
 def level_contour(picture: Float64[np.ndarray, "height width"], level: float, around_px: Float64[np.ndarray, "2"]) -> Contour | None:
-    """The closed contour at `level` that encloses a place and the most area; None where there is none."""
+    """Return the closed contour at `level` that encloses a place and the most area; None if there is none."""
     from contourpy import contour_generator
 
     tracer: Any = contour_generator(z=picture)
@@ -32,7 +31,7 @@ def level_contour(picture: Float64[np.ndarray, "height width"], level: float, ar
 
 
 def _encloses(contour: Contour, place: Float64[np.ndarray, "2"]) -> bool:
-    """The even-odd rule along a ray to the right."""
+    """Return whether a contour encloses a place, by the even-odd rule along a ray to the right."""
     start, stop = contour - place, np.roll(contour, -1, axis=0) - place
     crosses = (start[:, 1] > 0.0) != (stop[:, 1] > 0.0)
     start, stop = start[crosses], stop[crosses]
@@ -41,7 +40,7 @@ def _encloses(contour: Contour, place: Float64[np.ndarray, "2"]) -> bool:
 
 
 def area_and_centroid(contour: Contour) -> tuple[float, Float64[np.ndarray, "2"]]:
-    """By the shoelace formula."""
+    """Return area and centroid by the shoelace formula."""
     following = np.roll(contour, -1, axis=0)
     cross = contour[:, 0] * following[:, 1] - following[:, 0] * contour[:, 1]
     total = float(cross.sum())
@@ -51,7 +50,7 @@ def area_and_centroid(contour: Contour) -> tuple[float, Float64[np.ndarray, "2"]
 
 
 def even_points(contour: Contour, count: int) -> Contour:
-    """`count` points at equal steps along a closed contour."""
+    """Return `count` points at equal steps along a closed contour."""
     closed = np.concatenate([contour, contour[:1]])
     along = np.concatenate([[0.0], np.hypot(*np.diff(closed, axis=0).T).cumsum()])
     places = along[-1] * np.arange(count) / count
@@ -59,7 +58,7 @@ def even_points(contour: Contour, count: int) -> Contour:
 
 
 def inside(shape: tuple[int, ...], contour: Contour, inset_px: float) -> Bool[np.ndarray, "height width"]:
-    """Pixels whose centres lie at least `inset_px` within a contour; negative: at most so far outside."""
+    """Return the pixels whose centres lie at least `inset_px` within a contour; negative: at most so far outside."""
     from shapely import Polygon, contains_xy, prepare
 
     area = Polygon(contour).buffer(-inset_px)
@@ -77,7 +76,7 @@ Box = tuple[int, int, int, int]
 
 
 def bright_parts(grey: Float32[np.ndarray, "height width"], least_px: float) -> Iterator[Box]:
-    """Boxes (left, top, width, height), clear of the border, from levels between the brightest light and near the median."""
+    """Yield boxes (left, top, width, height), clear of the border, from levels between the brightest light and near the median."""
     import cv2
 
     smooth = cv2.GaussianBlur(grey, (0, 0), 0.8)
@@ -120,7 +119,9 @@ Crop = Float64[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Disc:
-    """contour_px: points at equal steps along the contour. centroid_px, radius_px: of the disc of the same area. level, around:
+    """Out-of-focus light.
+
+    contour_px: points at equal steps along the contour. centroid_px, radius_px: of the disc of the same area. level, around:
     light inside (median) and outside. field_xy: place in half diagonals. full: whether its light is beyond what the file can hold.
     """
 
@@ -134,7 +135,7 @@ class Disc:
 
 
 def find_discs(grey: Float32[np.ndarray, "height width"], largest_value: float = np.inf) -> list[Disc]:
-    """Discs apart from one another and from the border, the sharpest of those that lie at one place; brightest first.
+    """Find discs apart from one another and from the border, the sharpest of those that lie at one place; brightest first.
 
     grey: linear light. largest_value: what the file can hold at most (1 for integers).
     """
@@ -150,14 +151,14 @@ def find_discs(grey: Float32[np.ndarray, "height width"], largest_value: float =
 
 
 def _is_of(box: Box, disc: Disc) -> bool:
-    """Whether a part is that of a lower level around the same disc."""
+    """Return whether a part is that of a lower level around the same disc."""
     left, top, wide, high = box
     apart = float(np.hypot(left + 0.5 * wide - disc.centroid_px[0], top + 0.5 * high - disc.centroid_px[1]))
     return apart < 0.4 * disc.radius_px and max(wide, high) < 3.0 * disc.radius_px
 
 
 def _disc_in(grey: Float32[np.ndarray, "height width"], box: Box, largest_value: float) -> tuple[float, Disc] | None:
-    """(softness of its edge, the disc) of a box; None where there is none."""
+    """Return (softness of its edge, the disc) of a box; None if there is none."""
     left, top, wide, high = box
     margin = 3 + max(wide, high) // 5
     corner = np.array([max(left - margin, 0), max(top - margin, 0)])
@@ -182,7 +183,7 @@ def _disc_in(grey: Float32[np.ndarray, "height width"], box: Box, largest_value:
 
 
 def _edge(crop: Crop, middle_px: Float64[np.ndarray, "2"], size_px: tuple[int, int]) -> tuple[Sequence[Contour], float] | None:
-    """(the contours at `_STEPS` of the step from the surroundings to the light just inside the edge, the surroundings)."""
+    """Return (the contours at `_STEPS` of the step from the surroundings to the light just inside the edge, the surroundings)."""
     rows, columns = np.indices(crop.shape) + 0.5
     quarter = (np.abs(rows - middle_px[1]) < 0.25 * size_px[1]) & (np.abs(columns - middle_px[0]) < 0.25 * size_px[0])
     first = level_contour(crop, 0.6 * float(np.median(crop[quarter])), middle_px) if quarter.any() else None

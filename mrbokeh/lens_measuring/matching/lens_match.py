@@ -1,8 +1,7 @@
 """A Lens from one photograph: its out-of-focus lights give the opening, its metadata the rest.
 
-Where a lens is focused, or how wide it is open, from the size of blurred points: `optics.lens.Lens.coc_px` solved the other way.
-
-What the size of the discs tells: the focus distance, the effective f-number, where the lights are, or a bound of these.
+The size of the discs gives the focus distance, the effective f-number, where the lights are, or a bound of these:
+`optics.lens.Lens.coc_px` solved the other way.
 """
 
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from mrbokeh.system.errors import InputError
 
 
 def focus_from_size(lens: Lens, coc_px: float, depth_m: float, image_width_px: int) -> float:
-    """The focus distance at which a point at `depth_m` (inf is allowed) blurs to the signed diameter `coc_px`.
+    """Return the focus distance at which a point at `depth_m` (inf is allowed) blurs to the signed diameter `coc_px`.
 
     With A the opening's diameter and c the blur's, both in the same unit, c = A f (1/s - 1/d) / (1 - f/s), so that
     1/s = (c + A f / d) / (f (A + c)). lens: its own focus distance does not matter.
@@ -38,7 +37,7 @@ def focus_from_size(lens: Lens, coc_px: float, depth_m: float, image_width_px: i
 
 
 def effective_f_number(lens: Lens, coc_px: float, depth_m: float, image_width_px: int) -> float:
-    """The f-number that gives blur of this size at a depth; blur is as large as the opening, which is the focal length over it."""
+    """Return the f-number that gives blur of this size at a depth; blur is as large as the opening, the focal length over the f-number."""
     expected_px = float(lens.coc_px(depth_m, image_width_px))
     if expected_px * coc_px <= 0.0:
         raise InputError(
@@ -49,7 +48,7 @@ def effective_f_number(lens: Lens, coc_px: float, depth_m: float, image_width_px
 
 
 def depth_from_size(lens: Lens, coc_px: float, image_width_px: int) -> float:
-    """The depth at which points blur to a signed diameter, infinite or negative beyond infinity."""
+    """Return the depth at which points blur to a signed diameter, infinite or negative beyond infinity."""
     dioptres = 1.0 / lens.focus_distance_m - coc_px / lens.coc_px_per_dioptre(image_width_px)
     return 1.0 / dioptres if dioptres != 0.0 else float(np.inf)
 
@@ -61,9 +60,10 @@ EDGE_PX, FULL_EDGE_PX = 0.15, 0.6
 
 @dataclass(frozen=True)
 class Sizes:
-    """f_number and focus_distance_m: for the lens file. Errors: standard, None where the value is as stated or unknown.
+    """Facts that the size of the discs gives.
 
-    focus_known: False where focus_distance_m only stands for the lights being far off. note: what was made of the sizes, for people.
+    f_number and focus_distance_m: for the lens file. Errors: standard, None if the value is as stated or unknown.
+    focus_known: False if focus_distance_m only stands for the lights being far off. note: what was made of the sizes, for people.
     """
 
     f_number: float
@@ -85,8 +85,9 @@ def size_facts(
     image_width_px: int,
     full: bool = False,
 ) -> Sizes:
-    """diameters_px: of the unit pupil. depth_m: of the lights. facts: all but the focus distance must be there.
+    """Derive focus and f-number from the size of the discs.
 
+    diameters_px: of the unit pupil. depth_m: of the lights. facts: all but the focus distance must be known.
     full: whether the light of most discs is beyond what the file can hold.
     """
     if depth_m is not None and not depth_m > 0.0:
@@ -118,13 +119,13 @@ def size_facts(
 
 
 def _with_error(value: Callable[[float], float], at: float, error: float) -> tuple[float, float]:
-    """By the slope over a thousandth, times the standard error."""
+    """Return a value and its error: the slope over a thousandth, times the standard error."""
     here, step = value(at), 1e-3 * at
     return here, abs(value(at - step) - here) / step * error if np.isfinite(here) else 0.0
 
 
 def _lights_at(lens: Lens, coc_px: float, image_width_px: int) -> str:
-    """Where the lights are by the stated f-number, or how far it is off where they would have to be beyond infinity."""
+    """Say where the lights are by the stated f-number, or how far it is off if they would have to be beyond infinity."""
     depth_m = depth_from_size(lens, coc_px, image_width_px)
     if depth_m > 0.0:
         return f"the stated f-number has the lights at {depth_m:.3g} m; give --depth-m for the effective one"
@@ -146,9 +147,11 @@ _HELP = (
 
 @dataclass(frozen=True)
 class LensMatch:
-    """side: +1 where the discs were taken to lie behind the focus, -1 in front. found: all discs; discs: those that agree.
-    choice: the fit of openings with blades; mean: in place of it where it is poor. own: centre and radius of the unit pupil of each of
-    `discs`, px. rim: (spherical_aberration, standard error), None where no disc tells. unknown: "cat_eye" and "squeeze" where the
+    """Lens that was found, and its evidence.
+
+    side: +1 if the discs were taken to lie behind the focus, -1 in front. found: all discs; discs: those that agree.
+    choice: the fit of openings with blades; mean: in place of it if it is poor. own: centre and radius of the unit pupil of each of
+    `discs`, px. rim: (spherical_aberration, standard error), None if no disc tells. unknown: "cat_eye" and "squeeze" if the
     discs do not tell them (they have their neutral values in the lens).
     """
 
@@ -172,9 +175,10 @@ def match_lens(
     depth_m: float | None = None,
     largest_value: float = np.inf,
 ) -> LensMatch:
-    """rgb: scene-linear. depth_m: where the lights are; inf is allowed. largest_value: what the file can hold at most.
+    """Find the lens of a photograph.
 
-    Raises InputError where fewer than 3 discs are found, or those found look alike in no way.
+    rgb: scene-linear. depth_m: where the lights are; inf is allowed. largest_value: what the file can hold at most.
+    Raises InputError if fewer than 3 discs are found, or those found do not look alike.
     """
     grey = rgb.max(axis=2)
     found = _enough(find_discs(grey, largest_value))
@@ -213,7 +217,7 @@ def _enough(found: list[Disc]) -> tuple[Disc, ...]:
 
 
 def _aperture(choice: BladeChoice, mean: MeanOutline | None, unknown: frozenset[str], rim: tuple[float, float] | None) -> Aperture:
-    """An aberration within twice its error of none is left out, as is what no disc tells."""
+    """Return the aperture; an aberration within twice its error of none is left out, as is what no disc tells."""
     aberration = rim[0] if rim is not None and abs(rim[0]) > 2.0 * rim[1] else 0.0
     if mean is not None:
         return Aperture(mean.aperture.outlines, mean.aperture.weights, 0.0, aberration)

@@ -1,6 +1,6 @@
-"""What was found about a lens, with uncertainty, as rows for people.
+"""Report of a matched lens: a table with uncertainties, and a picture of its evidence.
 
-The evidence of a matched lens: the discs found, the fitted outlines over them, their mean by region, and the table.
+The picture shows the discs found, the fitted outlines over them, their mean by region, and the table.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from mrbokeh.lens_measuring.matching.lens_match import LensMatch
 
 @dataclass(frozen=True)
 class Row:
-    """error: one standard error."""
+    """Row of the table; error: one standard error."""
 
     name: str
     value: str
@@ -23,7 +23,7 @@ class Row:
 
 
 def table_of(match: LensMatch) -> list[Row]:
-    """Discs, opening, rim, f-number and focus."""
+    """Return rows of discs, opening, rim, f-number and focus."""
     where = "behind" if match.side > 0 else "in front of"
     full = sum(disc.full for disc in match.discs)
     rows = [
@@ -114,7 +114,7 @@ def _sizes(match: LensMatch) -> list[Row]:
 
 
 def as_text(rows: list[Row]) -> str:
-    """Columns of equal width."""
+    """Return the table with columns of equal width."""
     widths = [max(len(getattr(row, name)) for row in rows) for name in ("name", "value", "error")]
     return "\n".join(
         f"{row.name:<{widths[0]}}  {row.value:>{widths[1]}} {'+-' if row.error else '  '} {row.error:<{widths[2]}}  {row.note}".rstrip()
@@ -134,7 +134,7 @@ Rgb = Float32[np.ndarray, "height width 3"]
 
 
 def draw_match(rgb: Rgb, match: LensMatch) -> "Figure":
-    """rgb: the photograph, scene-linear."""
+    """Draw the evidence of a match. rgb: the photograph, scene-linear."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14, 8.5), layout="constrained")
@@ -169,7 +169,7 @@ def _closed(outline: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, "cl
 
 
 def _draw_regions(axes: "Axes", rgb: Rgb, match: LensMatch) -> None:
-    """The mean disc of each region of the frame, scaled to one pupil radius and one brightness."""
+    """Draw the mean disc of each region of the frame, scaled to one pupil radius and one brightness."""
     columns, rows = REGIONS
     height, width = rgb.shape[:2]
     sheet = np.zeros((rows * _CROP_PX, columns * _CROP_PX), np.float32)
@@ -189,7 +189,7 @@ def _draw_regions(axes: "Axes", rgb: Rgb, match: LensMatch) -> None:
 
 
 def _normalised(rgb: Rgb, own: Float64[np.ndarray, "3"], level: float) -> Float32[np.ndarray, "crop crop"]:
-    """A disc resampled about its place; OpenCV's first pixel has its centre at (0, 0)."""
+    """Resample a disc about its place; OpenCV's first pixel has its centre at (0, 0)."""
     import cv2
 
     steps = (np.arange(_CROP_PX) + 0.5) / _CROP_PX * 2.0 - 1.0

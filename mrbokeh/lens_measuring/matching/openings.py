@@ -1,8 +1,7 @@
-"""How many blades: openings of 5 to 11 against a round one by the evidence of the contours, without the spots that are no discs.
+"""Openings from discs: how many blades there are, the mean outline of discs that have none, and soft or bright rims.
 
-The mean outline of discs that look like none of the openings with blades: a drawn, cut-out or dirty one.
-
-Soft or bright rims: how light within the discs changes from the middle to the rim.
+Openings of 5 to 11 blades compete with a round one by the evidence of the contours, without the spots that are no discs. Discs that look
+like none of them (a drawn, cut-out or dirty opening) are described by their mean outline.
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,9 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class BladeChoice:
-    """found: how many discs there were; discs: those that agree. log_evidence: of each number of blades over a round opening, natural
+    """Opening that explains the discs best.
+
+    found: how many discs there were; discs: those that agree. log_evidence: of each number of blades over a round opening, natural
     logarithm (half the difference of Schwarz's BIC).
     """
 
@@ -39,13 +40,13 @@ class BladeChoice:
 
     @property
     def is_poor(self) -> bool:
-        """Whether the discs look like none of the openings that were tried, or few of those found do."""
+        """Return whether the discs look like none of the openings that were tried, or few of those found do."""
         few = len(self.discs) < min(_LEAST_SHARE * self.found, ENOUGH_DISCS)
         return few or float(np.median(self.fit.relative_rms)) > max(_POOR, _POOR_PX / float(np.median(self.fit.own[:, 2])))
 
 
 def choose_opening(discs: Sequence[Disc], side: int) -> BladeChoice:
-    """The best opening; discs that it fits much worse than the others are left out and the rest is fitted again."""
+    """Return the best opening; discs that it fits much worse than the others are left out and the rest is fitted again."""
     kept = list(discs)
     for _ in range(_ROUNDS):
         choice = _choose(kept, side)
@@ -68,7 +69,7 @@ def _choose(discs: list[Disc], side: int) -> BladeChoice:
 
 
 def _bladed(discs: list[Disc], around: OutlineFit, count: int, side: int) -> OutlineFit:
-    """Started from the round fit, with corners where its residuals have those of that many corners."""
+    """Fit from the round opening, with corners where its residuals have those of that many corners."""
     contours = np.stack([disc.contour_px for disc in discs])
     away = (contours - around.own[:, None, :2]) * side
     angles = np.arctan2(away[..., 1], around.opening.squeeze * away[..., 0])
@@ -83,7 +84,7 @@ def _log_evidence(fit: OutlineFit) -> float:
 
 
 def _departure_px(fit: OutlineFit) -> float:
-    """How far the middle of a blade lies within the circle through the corners."""
+    """Return how far the middle of a blade lies within the circle through the corners."""
     half, curvature = np.pi / fit.opening.blades, fit.opening.curvature
     bow = 0.5 * curvature * np.sin(half) ** 2  # of a shallow arc
     return float(np.median(fit.own[:, 2]) * max(1.0 - np.cos(half) - bow, 0.0))
@@ -96,7 +97,10 @@ _LEAST_ALIKE = 0.4
 
 @dataclass(frozen=True)
 class MeanOutline:
-    """aperture: in the unit pupil. radius_px: of that unit in each disc. disagreement: of the discs with the mean, share of the radius."""
+    """Mean outline of discs that look alike.
+
+    aperture: in the unit pupil. radius_px: of that unit in each disc. disagreement: of the discs with the mean, share of the radius.
+    """
 
     discs: tuple[Disc, ...]
     aperture: Aperture
@@ -105,7 +109,7 @@ class MeanOutline:
 
 
 def mean_outline(discs: Sequence[Disc], side: int) -> MeanOutline | None:
-    """The mean of the largest group of discs that look alike; None where too few or too small a share of them do."""
+    """Return the mean of the largest group of discs that look alike; None if too few or too small a share of them do."""
     shapes = np.stack([_radius_over_angle(disc, side) for disc in discs])
     sizes = np.array([disc.radius_px for disc in discs])
     limit = np.maximum(_ALIKE, _ALIKE_PX / sizes)
@@ -124,7 +128,7 @@ def mean_outline(discs: Sequence[Disc], side: int) -> MeanOutline | None:
 
 
 def _radius_over_angle(disc: Disc, side: int) -> Float64[np.ndarray, " angles"]:
-    """About the centroid, in radii of the disc of the same area; the farthest crossing where a direction has several."""
+    """Return the radius about the centroid, in radii of the disc of the same area; the farthest crossing if a direction has several."""
     away = side * (disc.contour_px - disc.centroid_px) / disc.radius_px
     angles, radius = np.arctan2(away[:, 1], away[:, 0]), np.hypot(away[:, 0], away[:, 1])
     order = np.argsort(angles)
@@ -138,7 +142,7 @@ _FEWEST_PIXELS = 30
 def rim_light(
     grey: Float32[np.ndarray, "height width"], discs: Sequence[Disc], own: Float64[np.ndarray, "discs 3"], side: int
 ) -> tuple[float, float] | None:
-    """(spherical_aberration, its standard error) from discs that are not full; None where fewer than 2 are fit for it.
+    """Return (spherical_aberration, its standard error) from discs that are not full; None if fewer than 2 are fit for it.
 
     Light within a disc, less that around it, is a (1 + s (2 rho^2 - 1)), rho in pupil radii and s the aberration times
     `side`; a and a s by least squares.

@@ -1,9 +1,6 @@
 """One opening fitted to the contours of all discs by Levenberg and Marquardt's method, with standard errors.
 
-Outlines of `mrbokeh.optics.aperture.Aperture.blades` as radius over angle: turned, squeezed and cut by the rim of the lens.
-
-Distances of contours from an opening's outline, and the equations of what would lessen them.
-
+Outlines are those of `mrbokeh.optics.aperture.Aperture.blades` as radius over angle: turned, squeezed and cut by the rim of the lens.
 The opening's values are shared by all discs; each disc has a centre and a radius of its own, which are solved for within the equations of
 the shared ones (Schur complement).
 """
@@ -28,7 +25,10 @@ Angles = Float64[np.ndarray, "discs points"]
 
 @dataclass(frozen=True)
 class Opening:
-    """blades: 0 is round, which has neither rotation nor curvature. The others as in `mrbokeh.optics.aperture.Aperture`."""
+    """Parameters of an opening with blades.
+
+    blades: 0 is round, which has neither rotation nor curvature. The others as in `mrbokeh.optics.aperture.Aperture`.
+    """
 
     blades: int
     rotation_rad: float = 0.0
@@ -43,7 +43,7 @@ class Opening:
 
 
 def outline_radius(opening: Opening, angles_rad: Angles, field_xy: Float64[np.ndarray, "discs 2"], side: int) -> Angles:
-    """Distance of the outline from the origin of the pupil in directions of the picture, from x towards y.
+    """Return the distance of the outline from the origin of the pupil in directions of the picture, from x towards y.
 
     side: +1 shows the opening as it is, -1 (in front of the focus) mirrored through the origin, with what cuts it.
     """
@@ -59,7 +59,7 @@ def outline_radius(opening: Opening, angles_rad: Angles, field_xy: Float64[np.nd
 
 
 def _blades_radius(opening: Opening, angles_rad: Angles) -> Angles:
-    """Arcs of radius 1 / |curvature| between corners on the unit circle, by the law of cosines about the arc's centre."""
+    """Return the radius of arcs of radius 1 / |curvature| between corners on the unit circle, by the law of cosines about the arc's centre."""
     if opening.blades == 0:
         return np.ones_like(angles_rad)
     half = np.pi / opening.blades
@@ -80,12 +80,12 @@ Residuals = Float64[np.ndarray, "discs points"]
 
 
 def names_of(opening: Opening) -> tuple[str, ...]:
-    """What of an opening is fitted."""
+    """Return the parameters of an opening that are fitted."""
     return ("rotation_rad", "curvature", "squeeze", "cat_eye") if opening.blades else ("squeeze", "cat_eye")
 
 
 def scale_of(residuals_px: Residuals) -> float:
-    """Their typical size: the median absolute one as that of a normal distribution, and a floor."""
+    """Return the typical size of residuals: the median absolute one as that of a normal distribution, and a floor."""
     return 1.4826 * float(np.median(np.abs(residuals_px))) + NOISE_FLOOR_PX
 
 
@@ -96,7 +96,7 @@ def huber(residuals_px: Residuals, scale_px: float) -> float:
 
 @dataclass(frozen=True)
 class OutlineEquations:
-    """Per disc: `matrices` times a step of the shared values = -`pulls`; the disc's own values then move by `own_step`."""
+    """Equations per disc: `matrices` times a step of the shared values = -`pulls`; the disc's own values then move by `own_step`."""
 
     matrices: Float64[np.ndarray, "discs shared shared"]
     pulls: Float64[np.ndarray, "discs shared"]
@@ -120,13 +120,13 @@ class Contours:
         return cls(np.stack([disc.contour_px for disc in discs]), np.array([disc.field_xy for disc in discs]), side)
 
     def residuals(self, opening: Opening, own: Own) -> Residuals:
-        """Along the radius, px; positive outside. own: centre x, y and radius of the unit pupil of each disc."""
+        """Return residuals along the radius, px; positive outside. own: centre x, y and radius of the unit pupil of each disc."""
         away = self.points_px - own[:, None, :2]
         radius = outline_radius(opening, np.arctan2(away[..., 1], away[..., 0]), self.field_xy, self.side)
         return np.asarray(np.hypot(away[..., 0], away[..., 1]) - own[:, 2:] * radius)
 
     def equations(self, opening: Opening, own: Own, scale_px: float) -> OutlineEquations:
-        """Of weighted least squares, with Huber's weights at this scale."""
+        """Return the equations of weighted least squares, with Huber's weights at this scale."""
         errors = self.residuals(opening, own)
         root = np.sqrt(np.minimum(1.0, _HUBER_TIMES * scale_px / np.maximum(np.abs(errors), 1e-12)))[..., None]
         shared = root * np.stack([self._slope(opening, own, name, errors) for name in names_of(opening)], axis=2)
@@ -141,7 +141,9 @@ class Contours:
         )
 
     def _slope(self, opening: Opening, own: Own, name: str, errors: Residuals) -> Residuals:
-        """Across zero the ends that two rims cut are opposite, and their difference a mere shift: steps of cat_eye lead away from zero."""
+        """Return the derivative by a parameter. Steps of cat_eye lead away from zero, across which two rims cut opposite ends: a mere
+        shift.
+        """
         value, step = float(getattr(opening, name)), _STEP
         if name == "cat_eye":
             step = _RIM_STEP if value >= 0.0 else -_RIM_STEP
@@ -167,7 +169,10 @@ _PX_PER_SAMPLE = 3.0
 
 @dataclass(frozen=True)
 class OutlineFit:
-    """own: centre x, y and radius of the unit pupil of every disc, px. residuals_px: along the radius."""
+    """Fitted opening.
+
+    own: centre x, y and radius of the unit pupil of every disc, px. residuals_px: along the radius.
+    """
 
     contours: Contours
     opening: Opening
@@ -176,28 +181,28 @@ class OutlineFit:
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """Standard error by name."""
+        """Return the standard error by name."""
         return _standard_errors(self.contours, self.opening, self.own)
 
     @property
     def relative_rms(self) -> Float64[np.ndarray, " discs"]:
-        """Of each disc, as a share of its radius."""
+        """Return the RMS residual of each disc, as a share of its radius."""
         return np.asarray(np.sqrt((self.residuals_px**2).mean(axis=1)) / self.own[:, 2])
 
     @property
     def samples(self) -> float:
-        """How many independent measurements the contours are taken for: one every 3 px."""
+        """Return how many independent measurements the contours are taken for: one every 3 px."""
         return float(np.minimum(self.residuals_px.shape[1], 2.0 * np.pi * self.own[:, 2] / _PX_PER_SAMPLE).sum())
 
     @property
     def log_likelihood(self) -> float:
-        """Of normal errors of one unknown size, none of them larger than 4 times it."""
+        """Return the log likelihood of normal errors of one unknown size, none of them larger than 4 times it."""
         size = np.minimum(np.abs(self.residuals_px), _OUTLIER_TIMES * scale_of(self.residuals_px))
         return -0.5 * self.samples * float(np.log((size**2).mean() + NOISE_FLOOR_PX**2))
 
 
 def fit_outlines(discs: Sequence[Disc], start: Opening, side: int, own: Own | None = None) -> OutlineFit:
-    """The opening with as many blades as `start` that is nearest to the contours, from these values on."""
+    """Fit the opening with as many blades as `start` that is nearest to the contours, from these values on."""
     contours, opening, damping = Contours.of(discs, side), start, 1e-3
     if own is None:
         own = np.array([[*disc.centroid_px, disc.radius_px] for disc in discs])
@@ -221,7 +226,7 @@ def fit_outlines(discs: Sequence[Disc], start: Opening, side: int, own: Own | No
 
 
 def _prior(opening: Opening, scale_px: float) -> Float64[np.ndarray, " shared"]:
-    """Keeps what no disc tells where it started."""
+    """Return the prior that keeps what no disc tells where it started."""
     return np.array([(max(scale_px, _PRIOR_PX) / _PRIOR_SPREAD[name]) ** 2 for name in names_of(opening)])
 
 
@@ -235,7 +240,7 @@ def _moved(opening: Opening, step: Float64[np.ndarray, " shared"]) -> Opening:
 
 
 def _standard_errors(contours: Contours, opening: Opening, own: Own) -> dict[str, float]:
-    """By name: the bootstrap's over discs (one step from the fit for each draw) and that of a bias that all share, added as squares."""
+    """Return errors by name: the bootstrap's over discs (one step from the fit for each draw) and a bias that all share, added as squares."""
     scale = scale_of(contours.residuals(opening, own))
     equations = contours.equations(opening, own, scale)
     prior, count = np.diag(_prior(opening, scale)), len(own)

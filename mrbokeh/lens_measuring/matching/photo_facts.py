@@ -1,4 +1,4 @@
-"""What a photograph's metadata state about its lens: Exif of JPEG, TIFF and PNG."""
+"""Facts that a photograph's metadata state about its lens: Exif of JPEG, TIFF and PNG."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,7 +21,7 @@ _INFINITELY_FAR = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class PhotoFacts:
-    """None where unknown. focus_distance_m: from the lens; inf is allowed."""
+    """Facts about the lens of a photograph; None if unknown. focus_distance_m: from the lens; inf is allowed."""
 
     focal_length_mm: float | None = None
     f_number: float | None = None
@@ -29,7 +29,7 @@ class PhotoFacts:
     focus_distance_m: float | None = None
 
     def given(self, **values: float | None) -> "PhotoFacts":
-        """With what the user states in place of what the file does."""
+        """Return the facts with what the user states in place of what the file does."""
         for name, value in values.items():
             if value is not None and not value > 0.0:
                 raise InputError(f"expected {flag(name)} above 0, got {value:g}")
@@ -38,7 +38,7 @@ class PhotoFacts:
         )
 
     def require(self, where: Path | str) -> None:
-        """Everything but the focus distance."""
+        """Require everything but the focus distance."""
         names = ("focal_length_mm", "f_number", "sensor_width_mm")
         missing = [flag(name) for name in names if getattr(self, name) is None]
         if missing:
@@ -46,7 +46,7 @@ class PhotoFacts:
 
 
 def read_facts(path: Path | str, size_px: tuple[int, int]) -> PhotoFacts:
-    """size_px: (width, height). A file without Exif gives PhotoFacts without values.
+    """Read the facts of a photograph; a file without Exif gives PhotoFacts without values. size_px: (width, height).
 
     The sensor's width comes from the pixels per length on it, else from the focal length for 35 mm film, which counts diagonals (CIPA
     DCG-001). Exif counts the subject's distance from the film plane; with T that distance, the thin lens stands s from the subject with
@@ -71,7 +71,7 @@ def exif_tags(path: Path) -> dict[int, Any]:
 
 
 def positive_rational(value: Any) -> float | None:
-    """A rational number of Exif; 0 and 0/0 mean unknown, a numerator of all ones infinitely far."""
+    """Return a rational number of Exif; 0 and 0/0 mean unknown, a numerator of all ones infinitely far."""
     if getattr(value, "numerator", None) == _INFINITELY_FAR:
         return float("inf")
     try:

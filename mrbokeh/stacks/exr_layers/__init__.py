@@ -6,19 +6,11 @@
     write_composite_exr("out.exr", CompositeLayers(rgb, virtual=virtual, matte=matte))
 
 What lies where:
-    reader              LayerReader: what every way of reading one file is
-    channel_names       the table of names that programs give to colour, depth and motion
-    render_channels     RenderChannels: all channels of a file by name, of one stereo view
-    flat_render         FlatRender: RGBA, Z and motion to one layer
-    nearest_depth       depth of edge pixels whose own is that of the background
-    murmur_hash         the hash of Cryptomatte's names
-    cryptomatte         Cryptomatte: mattes of objects by name
-    object_split        ObjectSplit: one layer per object, or all but some
-    deep_samples        DeepSamples: a deep picture as flat lists of samples
-    deep_tidy           samples sorted, volumes split and merged; the plain twin of the compiled flattening
-    deep_layers         DeepSurfaces, DeepSlices: a deep picture as layers
+    render_channels     RenderChannels: all channels of a file by name, of one stereo view; the names that programs give them
+    flat_render         FlatRender: RGBA, Z and motion to one layer; LayerReader, the protocol of all ways of reading
+    cryptomatte         Cryptomatte: mattes of objects by name; ObjectSplit: one layer per object, or all but some
+    deep_layers         DeepSamples: a deep picture as flat lists; DeepSurfaces, DeepSlices: as layers
     deep_interleaved    deep pictures among flat layers, by depth
-    deep_out            sharp layers as a deep EXR
     sequence            ExrSequence: numbered files, their gaps, layers of a frame
-    composite_exr       CompositeLayers: our own layered EXR
+    composite_exr       CompositeLayers: our own layered EXR; sharp layers as a deep EXR
 """

@@ -24,7 +24,7 @@ def flatten_layers(
     out: np.ndarray,
     dioptres: np.ndarray,
 ) -> None:
-    """Per layer and pixel RGBA laid over one another, front first, into out (N, P, 4), and the mean of 1 / depth into dioptres (N, P).
+    """Lay RGBA over one another per layer and pixel, front first, into out (N, P, 4), and the mean of 1 / depth into dioptres (N, P).
 
     rgba: (S, 4) float64. With apart = 0 layers lie between edges_m (N - 1,), ascending; else there are no edges and a pixel's next layer
     begins where the depth is farther by more than that part. marks: room for two numbers per sample of a pixel and the edges.
@@ -66,7 +66,7 @@ def _is_there(piece: tuple) -> bool:
 
 @njit(cache=True, nogil=True)
 def _marks(first: int, end: int, front_m: np.ndarray, back_m: np.ndarray, edges_m: np.ndarray, marks: np.ndarray) -> int:
-    """Where anything begins or ends, sorted; edges only where they may cut something. How many there are."""
+    """Fill marks with where anything begins or ends, sorted; edges only where they may cut something. Returns how many there are."""
     count, is_thick = 0, False
     for s in range(first, end):
         marks[count] = front_m[s]
@@ -85,7 +85,7 @@ def _marks(first: int, end: int, front_m: np.ndarray, back_m: np.ndarray, edges_
 
 @njit(cache=True, nogil=True)
 def _points(first: int, end: int, here_m: float, rgba: np.ndarray, front_m: np.ndarray, back_m: np.ndarray) -> tuple:
-    """Samples without thickness at one depth, merged."""
+    """Merge samples without thickness at one depth."""
     total = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
     for s in range(first, end):
         if front_m[s] == here_m and back_m[s] <= here_m:
@@ -95,7 +95,7 @@ def _points(first: int, end: int, here_m: float, rgba: np.ndarray, front_m: np.n
 
 @njit(cache=True, nogil=True)
 def _volumes(first: int, end: int, here_m: float, next_m: float, rgba: np.ndarray, front_m: np.ndarray, back_m: np.ndarray) -> tuple:
-    """The pieces between two depths of all samples that reach through there, merged."""
+    """Merge the pieces between two depths of all samples that reach through there."""
     total = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
     for s in range(first, end):
         if front_m[s] <= here_m and back_m[s] >= next_m:
@@ -105,7 +105,7 @@ def _volumes(first: int, end: int, here_m: float, next_m: float, rgba: np.ndarra
 
 @njit(cache=True, nogil=True)
 def _with(total: tuple, sample: np.ndarray, part: float) -> tuple:
-    """Optical depth and colour per optical depth add up; of opaque samples the colours, to be averaged."""
+    """Add a sample: optical depth and colour per optical depth add up; of opaque samples the colours, to be averaged."""
     r, g, b, depth, opaque_r, opaque_g, opaque_b, opaque = total
     alpha = min(max(sample[3], 0.0), 1.0)
     if alpha >= 1.0:
@@ -118,7 +118,7 @@ def _with(total: tuple, sample: np.ndarray, part: float) -> tuple:
 
 @njit(cache=True, nogil=True)
 def _merged(total: tuple) -> tuple:
-    """RGBA of what was added up."""
+    """Return RGBA of what was added up."""
     r, g, b, depth, opaque_r, opaque_g, opaque_b, opaque = total
     if opaque > 0:
         return opaque_r / opaque, opaque_g / opaque, opaque_b / opaque, 1.0
@@ -129,7 +129,7 @@ def _merged(total: tuple) -> tuple:
 
 @njit(cache=True, nogil=True)
 def _put(piece: tuple, depth_m: float, pixel: int, index: int, out: np.ndarray, dioptres: np.ndarray, weights: np.ndarray) -> None:
-    """A piece behind what its slice has already."""
+    """Put a piece behind what its slice has already."""
     if not _is_there(piece):
         return
     r, g, b, alpha = piece

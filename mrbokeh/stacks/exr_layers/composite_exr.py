@@ -1,9 +1,9 @@
-"""Our own layered EXR: the finished picture, depth, and what it was put together from, to go on with in another program.
+"""Our own layered EXR: the finished picture, depth, and what it was put together from, to go on with in another program; and deep EXR.
 
 One part, for not all programs read several. The picture is the unnamed R, G, B, A and depth is Z, as EXR says; every layer is
 NAME.R, NAME.G, NAME.B, NAME.A, premultiplied; mattes and maps are layers of their own with one channel.
 
-Sharp layers as a deep EXR, for compositors that hold out and merge by depth: one sample per layer and pixel that holds anything.
+Deep EXR is for sharp layers and for compositors that hold out and merge by depth: one sample per layer and pixel that holds anything.
 """
 
 import re
@@ -23,9 +23,9 @@ _DEEP_COMMENTS = "Scene-linear; premultiplied alpha; Z in metres along the optic
 
 
 def write_deep_exr(path: Path | str, layers: Sequence[Layer], *, half: bool = True) -> None:
-    """R, G, B, A in half or float and Z in float; nearest first. Deep pictures are for sharp layers: blurred light has no one depth.
+    """Write R, G, B, A in half or float and Z in float, nearest sample first. Blurred light has no one depth, so layers must be sharp.
 
-    Who reads it goes by depth alone: where layers are not in the order of their depth, that is what changes.
+    Readers go by depth alone: if layers are not in the order of their depth, that changes.
     """
     import OpenEXR
 
@@ -62,7 +62,7 @@ _RESERVED = ("matte", "coc")
 
 @dataclass(frozen=True)
 class CompositeLayers:
-    """A finished picture with what it consists of; what is None is not written.
+    """Finished picture with what it consists of; what is None is not written.
 
     rgb: (H, W, 3) linear. alpha: of the picture; None is opaque. depth_m: of the picture. layers: by name, such as "virtual" and
     "shadow", front first, each with its own depth; letters, digits and _ (Nuke changes all else). matte: in [0, 1]. coc_px: signed.
@@ -103,7 +103,7 @@ def write_composite_exr(path: Path | str, composite: CompositeLayers, *, half: b
 
 
 def _rgba(prefix: str, rgb: np.ndarray, alpha: np.ndarray, dtype: type) -> dict[str, np.ndarray]:
-    """Half holds up to 65504; brighter light is kept at that, for inf would spoil every blur that follows."""
+    """Return RGBA channels, clipped to 65504 in half floats: inf would spoil every blur that follows."""
     planes = {name: rgb[..., i] for i, name in enumerate("RGB")} | {"A": alpha}
     limit = np.finfo(dtype).max
     return {f"{prefix}{name}": np.clip(plane, -limit, limit).astype(dtype) for name, plane in planes.items()}

@@ -1,12 +1,8 @@
-"""Cryptomatte 1.2 (Friedman and Jones 2015): which object covers how much of every pixel, by name, from a render's channels.
+"""Cryptomatte 1.2 (Friedman and Jones 2015): how much of every pixel an object covers, by name; and renders cut into layers by it.
 
 Every matte has a header entry "cryptomatte/KEY/name", the prefix of its channels NAME00, NAME01, ... (ranks two by two: R the ID of one
-object, G its coverage, B and A of the next), and mostly a manifest of names. An ID is the hash of the name, kept as a float of the
-same bits; only its bits are compared, for as a float it means nothing.
-
-MurmurHash3_x86_32 with seed 0 (Appleby, public domain), and the float that Cryptomatte 1.2 stores in its place.
-
-One render cut into layers by its objects: those of a Cryptomatte that were chosen, or all but some.
+object, G its coverage, B and A of the next), and mostly a manifest of names. An ID is the hash of the name (MurmurHash3_x86_32 with seed 0,
+Appleby, public domain), kept as a float of the same bits; only its bits are compared, for as a float it means nothing.
 
 A pixel that objects share has one colour, so each gets the share of it that it covers. Laid over one another again the layers give the
 render: what is behind is divided by what the layers before it leave free, for it is hidden there rather than thin. The depth of a shared
@@ -34,7 +30,7 @@ _MASK = 0xFFFFFFFF
 
 
 def murmur3_32(data: bytes) -> int:
-    """The hash of bytes, in 0 to 2^32 - 1."""
+    """Return the hash of bytes, in 0 to 2^32 - 1."""
     hashed, whole = 0, len(data) // 4 * 4
     for (word,) in struct.iter_unpack("<I", data[:whole]):
         hashed = (_rotated(hashed ^ _mixed(word), 13) * 5 + 0xE6546B64) & _MASK
@@ -45,7 +41,7 @@ def murmur3_32(data: bytes) -> int:
 
 
 def id_bits(name: str) -> int:
-    """The bits of a name's ID. An exponent of zeros or ones would be denormal, infinite or NaN: its lowest bit is turned over."""
+    """Return the bits of a name's ID. An exponent of zeros or ones would be denormal, infinite or NaN: its lowest bit is turned over."""
     hashed = murmur3_32(name.encode("utf-8"))
     return hashed ^ 1 << 23 if hashed >> 23 & 255 in (0, 255) else hashed
 
@@ -65,7 +61,7 @@ _BACKGROUND = 0
 
 @dataclass(frozen=True)
 class Cryptomatte:
-    """One matte of a file, such as CryptoObject or CryptoMaterial.
+    """Matte of a file, such as CryptoObject or CryptoMaterial.
 
     manifest: name to the bits of its ID; empty where the file has none, names then have to be known.
     ids, coverages: per rank (H, W), the largest coverage first; coverage in [0, 1].
@@ -78,11 +74,11 @@ class Cryptomatte:
 
     @property
     def names(self) -> list[str]:
-        """Of the manifest; not all of them need to be in the picture."""
+        """Return the names of the manifest; not all of them need to be in the picture."""
         return sorted(self.manifest)
 
     def matte(self, name: str) -> Float32[np.ndarray, "height width"]:
-        """How much of every pixel an object covers. Raises InputError where the name is neither listed nor in the picture."""
+        """Return how much of every pixel an object covers. Raises InputError if the name is neither listed nor in the picture."""
         bits = np.uint32(self._bits_of(name))
         total = np.zeros(self.coverages[0].shape, np.float32)
         for ids, coverage in zip(self.ids, self.coverages, strict=True):
@@ -91,7 +87,7 @@ class Cryptomatte:
 
     @cached_property
     def covered(self) -> Float32[np.ndarray, "height width"]:
-        """How much of every pixel all objects cover together."""
+        """Return how much of every pixel all objects cover together."""
         total = np.zeros(self.coverages[0].shape, np.float32)
         for ids, coverage in zip(self.ids, self.coverages, strict=True):
             total += np.where(ids != _BACKGROUND, coverage, np.float32(0.0))
@@ -109,7 +105,7 @@ class Cryptomatte:
 
 
 def cryptomattes(render: RenderChannels) -> dict[str, Cryptomatte]:
-    """All mattes of a file by name. Raises InputError where there are none, or one whose IDs are not what the specification says."""
+    """Read all mattes of a file by name. Raises InputError if there are none, or IDs are not what the specification says."""
     keys = {name.split("/")[1] for name in render.metadata if name.startswith("cryptomatte/") and name.count("/") == 2}
     found = [_cryptomatte(render, {what: render.metadata.get(f"cryptomatte/{key}/{what}") for what in _ENTRIES}) for key in sorted(keys)]
     if not found:
@@ -131,7 +127,7 @@ def _cryptomatte(render: RenderChannels, entries: Mapping[str, Any]) -> Cryptoma
 
 
 def _ranked_planes(render: RenderChannels, name: str) -> list[np.ndarray]:
-    """ID, coverage, ID, coverage, ... of all ranks."""
+    """Return ID, coverage, ID, coverage, ... of all ranks."""
     planes: list[np.ndarray] = []
     while True:
         layer = f"{name}{len(planes) // 4:02d}"
@@ -151,7 +147,7 @@ def _bits(render: RenderChannels, name: str, plane: np.ndarray) -> UInt32[np.nda
 
 
 def _manifest(path: Path, entries: Mapping[str, Any]) -> dict[str, int]:
-    """Name to bits, from the header or from a file beside the picture."""
+    """Return name to bits, from the header or from a file beside the picture."""
     text = entries["manifest"]
     try:
         if text is None and entries["manif_file"] is not None:
@@ -167,7 +163,9 @@ _WHOLLY = 0.999
 
 @dataclass(frozen=True)
 class ObjectSplit:
-    """objects: names, one layer each; empty takes none apart. without: names left out. with_rest: what belongs to neither, as a layer.
+    """Reader of a render as layers of its objects.
+
+    objects: names, one layer each; empty takes none apart. without: names left out. with_rest: what belongs to neither, as a layer.
 
     matte: name of the Cryptomatte, such as "CryptoObject", where a file has several; its end is enough.
     """
@@ -186,7 +184,7 @@ class ObjectSplit:
             raise InputError("nothing of the render would be left: name objects, or keep the rest")
 
     def layers(self, path: Path | str) -> list[Layer]:
-        """Front first, by their mean depth in dioptres."""
+        """Return the layers, front first by their mean depth in dioptres."""
         channels = RenderChannels.read(path, self.render.view)
         picture, matte = self.render.layer_of(channels), self._matte(channels)
         total = np.maximum(picture.alpha, matte.covered)
@@ -205,7 +203,7 @@ class ObjectSplit:
 
 
 def part_of(picture: Layer, share: Float32[np.ndarray, "height width"]) -> Layer:
-    """What a share of every pixel, in [0, 1], has of a picture, with its own depth; parts add up, and are not yet behind one another."""
+    """Return a share of every pixel, in [0, 1], of a picture, with its own depth; parts add up, and are not yet behind one another."""
     extra = {name: values * share[..., None] for name, values in picture.extra.items()}
     is_part = share > 0
     depth_m = np.where(is_part, _own_depth(picture.depth_m, share), np.float32(np.inf))
@@ -213,7 +211,7 @@ def part_of(picture: Layer, share: Float32[np.ndarray, "height width"]) -> Layer
 
 
 def in_order(parts: Sequence[Layer]) -> list[Layer]:
-    """Layers that "over" puts together as the parts add up: front first, each divided by what those before it leave free."""
+    """Return layers that "over" puts together as the parts add up: front first, each divided by what those before it leave free."""
     free, layers = np.ones_like(parts[0].alpha), []
     for part in sorted(parts, key=_mean_dioptres, reverse=True):
         scale = (1.0 / np.maximum(free, _NOTHING)).astype(np.float32)
@@ -232,7 +230,7 @@ def _share(
 def _own_depth(
     depth_m: Float32[np.ndarray, "height width"], share: Float32[np.ndarray, "height width"]
 ) -> Float32[np.ndarray, "height width"]:
-    """Depth of pixels that are wholly a thing's own; those it shares take it from the nearest such pixel, if there is one."""
+    """Return depth of pixels that are wholly a thing's own; shared pixels take it from the nearest such pixel, if there is one."""
     is_own = (share > _WHOLLY) & np.isfinite(depth_m)
     return nearest_depth(depth_m, is_own)[0] if is_own.any() else depth_m
 

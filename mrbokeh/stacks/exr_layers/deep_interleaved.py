@@ -21,7 +21,7 @@ _THIN = 1e-30
 
 
 def interleaved(deep: Sequence[DeepSamples], flat: Sequence[Layer], reading: DeepSurfaces = _USUAL) -> list[Layer]:
-    """Sharp layers, front first. flat: front first where they are in one place; reading: how samples become surfaces.
+    """Return sharp layers, front first. flat: front first where they are in one place; reading: how samples become surfaces.
 
     Raises InputError where sizes differ, or there is no deep picture.
     """
@@ -47,7 +47,7 @@ def interleaved(deep: Sequence[DeepSamples], flat: Sequence[Layer], reading: Dee
 
 
 def cut_at(samples: DeepSamples, plane_m: Float64[np.ndarray, " pixels"]) -> DeepSamples:
-    """Volumes that reach through a depth, which each pixel has its own of, cut in two there; see deep_tidy."""
+    """Cut volumes that reach through a depth, which each pixel has its own of, in two there."""
     at_m = np.repeat(plane_m, samples.counts)
     through = (samples.front_m < at_m) & (at_m < samples.back_m)
     if not through.any():
@@ -60,7 +60,7 @@ def cut_at(samples: DeepSamples, plane_m: Float64[np.ndarray, " pixels"]) -> Dee
 
 
 def _plane_m(layer: Layer) -> Float64[np.ndarray, " pixels"]:
-    """The layer's depth, continued; behind everything where it has none at all."""
+    """Return the layer's depth, continued beyond its outline; infinite if it has none at all."""
     there = ((layer.alpha > 0) | (layer.rgb != 0).any(axis=2)) & np.isfinite(layer.depth_m)
     if not there.any():
         return np.full(there.size, np.inf)
@@ -68,7 +68,7 @@ def _plane_m(layer: Layer) -> Float64[np.ndarray, " pixels"]:
 
 
 def _behind(samples: DeepSamples, planes_m: Sequence[Float64[np.ndarray, " pixels"]]) -> Int64[np.ndarray, " samples"]:
-    """Per sample how many of the layers lie before it: up to the last one that does."""
+    """Return per sample how many of the layers lie before it: up to the last one that does."""
     behind, middle_m = np.zeros(len(samples.alpha), np.int64), 0.5 * (samples.front_m + samples.back_m)
     for number, plane_m in enumerate(planes_m):
         behind[middle_m > np.repeat(plane_m, samples.counts)] = number + 1
@@ -76,7 +76,7 @@ def _behind(samples: DeepSamples, planes_m: Sequence[Float64[np.ndarray, " pixel
 
 
 def _part(samples: DeepSamples, share: Float64[np.ndarray, " samples"]) -> DeepSamples:
-    """A share of each sample's length: 1 - (1 - alpha)^share, and colour in that proportion; what is opaque stays so."""
+    """Return a share of each sample's length: 1 - (1 - alpha)^share, and colour in that proportion; opaque samples stay opaque."""
     alpha = samples.alpha.astype(np.float64)
     thin = -np.expm1(share * np.log1p(-np.minimum(alpha, 1.0 - 1e-12)))
     cut = np.where(alpha >= 1.0, alpha, np.where(alpha <= _THIN, alpha * share, thin))

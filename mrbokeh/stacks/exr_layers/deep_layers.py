@@ -1,4 +1,4 @@
-"""A deep picture as a few layers for lens blur, by what lies behind what at each pixel or by slices of depth.
+"""Deep EXR: any number of samples per pixel, each with colour, alpha and a place or range of depth; and as a few layers for lens blur.
 
 All layers laid over one another are the flat picture. Each keeps one depth per pixel, the mean in dioptres of what is seen of it, because
 blur grows evenly with dioptres.
@@ -7,7 +7,9 @@ blur grows evenly with dioptres.
 - DeepSlices: layers lie between depths. A surface that goes through such a depth is cut in two, and blurred it lets light through along
   the cut (0.21 of it in tests): edges belong into gaps. For fog and for things that stand apart.
 
-A deep EXR picture as flat lists of samples: any number per pixel, each with colour, alpha and a place or range of depth.
+A sample with thickness is fog of even density ("Interpreting OpenEXR Deep Pixels", openexr.com): a part r of its length has alpha
+1 - (1 - a)^r and colour in that proportion. Two samples in one place mix, each by how much of the light it stops. An opaque one stays
+opaque however it is cut.
 """
 
 import itertools
@@ -29,10 +31,11 @@ _COLOURS = ("R", "G", "B")
 
 @dataclass(frozen=True)
 class DeepSamples:
-    """Samples of pixel (y, x), one row after the other, are those from starts[y * width + x] up to starts[y * width + x + 1].
+    """Deep picture as flat lists of samples.
 
+    Samples of pixel (y, x), one row after the other, are those from starts[y * width + x] up to starts[y * width + x + 1].
     rgb: premultiplied, linear Rec.709. front_m, back_m: along the axis in metres, the same for a sample without thickness.
-    Pixels may have their samples in any order, and samples with thickness may overlap (see deep_tidy).
+    Pixels may have their samples in any order, and samples with thickness may overlap.
     """
 
     height_px: int
@@ -45,12 +48,12 @@ class DeepSamples:
 
     @cached_property
     def counts(self) -> Int64[np.ndarray, " pixels"]:
-        """Samples per pixel."""
+        """Return samples per pixel."""
         return np.diff(self.starts)
 
     @classmethod
     def read(cls, path: Path | str, part: str = "", metres_per_unit: float = 1.0) -> "DeepSamples":
-        """part: the name of the deep part, where there are several. Raises InputError without R, G, B, A and Z in a deep part."""
+        """Read the deep part of that name, or the only one. Raises InputError without R, G, B, A and Z in a deep part."""
         import OpenEXR
 
         if not Path(path).is_file():
@@ -63,7 +66,7 @@ class DeepSamples:
 
 
 def is_deep(path: Path | str) -> bool:
-    """Whether a file has a deep part and no flat one. Raises InputError where it is no EXR file."""
+    """Return whether a file has a deep part and no flat one. Raises InputError if it is no EXR file."""
     import OpenEXR
 
     try:
@@ -74,7 +77,7 @@ def is_deep(path: Path | str) -> bool:
 
 
 def merged(pictures: Sequence[DeepSamples]) -> DeepSamples:
-    """The samples of several deep pictures of one size in one: things that were rendered apart hide one another."""
+    """Merge the samples of several deep pictures of one size: things that were rendered apart hide one another."""
     sizes = {(each.width_px, each.height_px) for each in pictures}
     if len(sizes) != 1:
         raise InputError(f"deep pictures to be merged must be of one size, got {sorted(sizes)}")
@@ -120,7 +123,7 @@ def _from_part(path: Path, part: Any, metres_per_unit: float) -> DeepSamples:
 
 
 def _windows(header: Any) -> tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]:
-    """Size of the display window; for rows and columns, where the data window lies in it and which part of the data lies in it."""
+    """Return the display window's size; for rows and columns, where the data window lies in it and which part of the data lies in it."""
     (left, top), (right, bottom) = (each.tolist() for each in header["dataWindow"])
     (x, y), (x_end, y_end) = (each.tolist() for each in header["displayWindow"])
     first = (max(top, y), max(left, x))
@@ -131,7 +134,7 @@ def _windows(header: Any) -> tuple[tuple[int, int], tuple[slice, slice], tuple[s
 
 
 def _listed(pixels: np.ndarray) -> np.ndarray:
-    """Samples of all pixels in a row; a pixel without any is None."""
+    """Return the samples of all pixels in a row; a pixel without any is None."""
     return np.concatenate([each for each in pixels.ravel() if each is not None] or [np.zeros(0, np.float32)])
 
 
@@ -146,7 +149,7 @@ def _check(path: Path, is_good: Bool[np.ndarray, " samples"]) -> None:
 
 @dataclass(frozen=True)
 class DeepSurfaces:
-    """Reads a deep EXR as layers of what is first, second and so on at each pixel.
+    """Reader of a deep EXR as layers of what is first, second and so on at each pixel.
 
     surfaces: layers at most; the last one takes all that is left. apart: samples belong to one surface as long as their depth exceeds
     that of its first by no more than this part of it. part: name of the deep part, where there are several.
@@ -164,17 +167,17 @@ class DeepSurfaces:
             )
 
     def layers(self, path: Path | str) -> list[Layer]:
-        """Front first; layers in which nothing is are left out."""
+        """Return layers, front first, without empty ones."""
         return _full(peeled(self.samples(path), self.surfaces, self.apart))
 
     def samples(self, path: Path | str) -> DeepSamples:
-        """As they are in the file, in metres."""
+        """Read the samples, in metres."""
         return DeepSamples.read(path, self.part, self.metres_per_unit)
 
 
 @dataclass(frozen=True)
 class DeepSlices:
-    """Reads a deep EXR as layers.
+    """Reader of a deep EXR as slices of depth.
 
     edges_m: depths between which slices lie, ascending; one more slice than edges. Without them `slices` of about equal coverage
     are made, cut in gaps where there are any. part: name of the deep part, where there are several.
@@ -192,19 +195,19 @@ class DeepSlices:
             raise InputError(f"edges of depth slices must be above 0 and ascend, got {', '.join(f'{each:g}' for each in self.edges_m)}")
 
     def layers(self, path: Path | str) -> list[Layer]:
-        """Front first; slices in which nothing is are left out."""
+        """Return slices, front first, without empty ones."""
         samples = DeepSamples.read(path, self.part, self.metres_per_unit)
         edges_m = even_edges_m(samples, self.slices) if self.edges_m is None else np.array(self.edges_m, np.float64)
         return _full(sliced(samples, edges_m))
 
 
 def sliced(samples: DeepSamples, edges_m: Float64[np.ndarray, " edges"]) -> list[Layer]:
-    """One layer for each slice of depth, front first, also where it is empty. What lies at an edge belongs behind it."""
+    """Return one layer for each slice of depth, front first, also if it is empty. What lies at an edge belongs behind it."""
     return _flattened(samples, np.asarray(edges_m, np.float64), len(edges_m) + 1, 0.0)
 
 
 def peeled(samples: DeepSamples, surfaces: int, apart: float) -> list[Layer]:
-    """One layer for the first, second, ... surface of every pixel, front first, also where it is empty; see DeepSurfaces."""
+    """Return one layer for the first, second, ... surface of every pixel, front first, also if it is empty; see DeepSurfaces."""
     return _flattened(samples, np.zeros(0), surfaces, apart)
 
 
@@ -220,12 +223,12 @@ def _flattened(samples: DeepSamples, edges_m: Float64[np.ndarray, " edges"], cou
 
 
 def _full(layers: list[Layer]) -> list[Layer]:
-    """Those in which anything is; an empty one where there are none."""
+    """Return the layers that hold anything, or an empty one if none does."""
     return [layer for layer in layers if (layer.alpha != 0).any() or (layer.rgb != 0).any()] or [clear(*layers[0].alpha.shape)]
 
 
 def even_edges_m(samples: DeepSamples, slices: int) -> Float64[np.ndarray, " edges"]:
-    """Edges of slices that hold about equal coverage, each moved to the widest gap in dioptres near it; fewer if all lies in one place."""
+    """Return edges of slices of about equal coverage, each moved to the widest gap in dioptres near it; fewer if all lies in one place."""
     middle_dioptres = 2.0 / (samples.front_m + samples.back_m)
     is_seen = samples.alpha > 0
     order = np.argsort(-middle_dioptres[is_seen])
@@ -238,7 +241,7 @@ def even_edges_m(samples: DeepSamples, slices: int) -> Float64[np.ndarray, " edg
 
 
 def _widest_gap(dioptres: Float64[np.ndarray, " samples"], first: int, last: int) -> float | None:
-    """The middle of the widest gap among falling dioptres from one sample to another; None where there is no gap at all."""
+    """Return the middle of the widest gap among falling dioptres from one sample to another; None if there is no gap at all."""
     gaps = -np.diff(dioptres[first : last + 1])
     if not len(gaps) or gaps.max() <= 0:
         return None

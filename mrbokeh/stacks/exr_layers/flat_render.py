@@ -1,8 +1,6 @@
-"""A render of another program, RGBA with Z and perhaps motion, as one layer.
+"""A render of another program, RGBA with Z and perhaps motion, as one layer; and the protocol of all ways of reading a file.
 
-Depth of pixels whose own is not theirs: Z is that of one ray, which may have passed by what covers part of the pixel.
-
-What every way of turning one EXR file into layers is.
+Z is that of one ray, which may have passed by what covers part of the pixel: depth at edges is mended from the nearest known pixel.
 """
 
 from dataclasses import dataclass
@@ -25,7 +23,7 @@ _BESIDE_PX = 1.5
 
 
 def edges_mended(layer: Layer) -> Layer:
-    """Partly covered pixels without depth take that of a pixel beside them. Opaque ones without depth are sky and stay."""
+    """Give partly covered pixels without depth that of a pixel beside them. Opaque ones without depth are sky and stay."""
     is_known = np.isfinite(layer.depth_m)
     is_lost = ~is_known & (layer.alpha > 0) & (layer.alpha < 1)
     if not is_lost.any() or not is_known.any():
@@ -38,7 +36,7 @@ def edges_mended(layer: Layer) -> Layer:
 def nearest_depth(
     depth_m: Float32[np.ndarray, "height width"], is_known: Bool[np.ndarray, "height width"]
 ) -> tuple[Float32[np.ndarray, "height width"], np.ndarray]:
-    """Of the nearest pixel that is known, and how far away that is, in pixels; at least one has to be."""
+    """Return the depth of the nearest known pixel, and how far away that is, in pixels; at least one must be known."""
     from scipy.ndimage import distance_transform_edt
 
     distance_px, (rows, columns) = distance_transform_edt(~is_known, return_indices=True)
@@ -47,10 +45,10 @@ def nearest_depth(
 
 @runtime_checkable
 class LayerReader(Protocol):
-    """How one file of a render is to be understood; its settings are its constructor's."""
+    """Way of reading one file of a render; its settings are its constructor's."""
 
     def layers(self, path: Path | str) -> list[Layer]:
-        """Sharp layers, front first, linear Rec.709, depth in metres. Raises InputError where the file lacks what is asked for."""
+        """Return sharp layers, front first, linear Rec.709, depth in metres. Raises InputError if the file lacks what is asked for."""
         ...
 
 
@@ -59,11 +57,11 @@ DepthMeaning = Literal["axis", "inverse", "distance"]
 
 @dataclass(frozen=True)
 class FlatRender:
-    """How the channels of a file are to be understood. Nothing of it is guessed from the numbers.
+    """Reader of a flat render. Nothing about its channels is guessed from the numbers.
 
-    One thing is mended: pixels at edges whose depth is that of the background behind (nearest_depth).
+    One thing is mended: pixels at edges whose depth is that of the background behind.
 
-    layer, depth: names of the colour layer and the depth channel where the known ones (channel_names) do not fit.
+    layer, depth: names of the colour layer and the depth channel if the known ones (render_channels) do not fit.
     view: of stereo files.
     depth_is: "axis" along the optical axis; "inverse" one over that (Nuke); "distance" along the ray, which needs the camera.
     metres_per_unit: of the depth; 0.01 for a scene in centimetres.
@@ -92,7 +90,7 @@ class FlatRender:
         return [edges_mended(self.layer_of(RenderChannels.read(path, self.view)))]
 
     def layer_of(self, render: RenderChannels) -> Layer:
-        """The picture of channels that were read already, depth at edges as it is."""
+        """Return the picture of channels that were read already, without mending depth at edges."""
         name = render.colour_layer(self.layer)
         rgb = np.stack([render.plane(joined(name, each)) for each in "RGB"], axis=2).astype(np.float32)
         alpha_name = joined(name, "A")
@@ -107,7 +105,7 @@ class FlatRender:
         return self._moving(layer, render, name) if self.shutter > 0 else layer
 
     def _depth_m(self, render: RenderChannels, name: str) -> Float32[np.ndarray, "height width"]:
-        """Metres along the axis; what is not above 0 or farther than any scene is background."""
+        """Return metres along the axis; values not above 0 or farther than any scene are background."""
         stored = render.plane(name).astype(np.float32)
         require_numbers(render.path, {name: stored})
         if self.depth_is == "inverse":
@@ -125,7 +123,7 @@ class FlatRender:
 
 
 def _axis_share(camera: Camera, size: tuple[int, ...]) -> Float32[np.ndarray, "height width"]:
-    """Depth along the axis of a point at distance 1 along each pixel's ray."""
+    """Return the depth along the axis of a point at distance 1 along each pixel's ray."""
     if size != (camera.height_px, camera.width_px):
         raise InputError(
             f"the camera is {camera.width_px}x{camera.height_px} px but the render is {size[1]}x{size[0]} px: give its own camera"

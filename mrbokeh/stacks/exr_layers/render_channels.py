@@ -1,6 +1,6 @@
-"""All channels of an EXR file by their full name, whatever parts and views they are spread over.
+"""All channels of an EXR file by their full name, whatever parts and views they are spread over, and the names that programs give them.
 
-The names that programs give to colour, depth and motion in EXR files. One table; a name that is not in it has to be stated.
+One table; a name that is not in it has to be stated.
 
 | program | colour | depth along the axis | motion |
 |---|---|---|---|
@@ -14,8 +14,6 @@ from here to the frame before and Z, W from the frame after to here, so that bot
 (Cycles, geom/primitive.h; checked on renders of Blender 4.2 and 5.0); y goes up. Some of these programs write a depth that is not
 along the axis (Nuke 1/z, Arnold and Karma if asked the distance along the ray): nobody can tell from the numbers, so
 `FlatRender.depth_is` says it.
-
-Motion vectors of other programs' renders: EXR channels forward.u (right) and forward.v (up), in pixels of one frame.
 """
 
 from collections.abc import Sequence
@@ -53,7 +51,7 @@ BACKGROUND_FROM = 1e9
 
 
 def joined(layer: str, channel: str) -> str:
-    """The full name of a channel of a layer; the unnamed layer is ""."""
+    """Return the full name of a channel of a layer; the unnamed layer is ""."""
     return f"{layer}.{channel}" if layer else channel
 
 
@@ -61,7 +59,7 @@ _NAMES = (("forward.u", "forward.v"), ("motion.u", "motion.v"), ("u", "v"))
 
 
 def read_motion(path: Path | str) -> Float32[np.ndarray, "height width 2"]:
-    """Motion in pixels, right and down, as mrbokeh counts; files count upwards, as Nuke and Blender do.
+    """Read motion in pixels, right and down, as mrbokeh counts; files count upwards, as Nuke and Blender do.
 
     Raises InputError where there are no such channels.
     """
@@ -73,7 +71,7 @@ def read_motion(path: Path | str) -> Float32[np.ndarray, "height width 2"]:
 
 
 def taken_from_channels(layer: Layer, shutter: float) -> Layer:
-    """The layer with its extra channels forward.u and forward.v, times alpha as all extra channels, as its motion; else unchanged."""
+    """Return the layer with its extra channels forward.u and forward.v (times alpha, as all extra channels) as its motion; else unchanged."""
     if not {"forward.u", "forward.v"} <= layer.extra.keys():
         return layer
     alpha = np.maximum(layer.alpha, np.float32(1e-6))[..., None]
@@ -87,7 +85,7 @@ MULTI_VIEW = "multiView"
 
 @dataclass(frozen=True)
 class RenderChannels:
-    """What a file holds for one view (eye).
+    """Channels of a file for one view (eye).
 
     channels: full name to (H, W), as stored; a channel of a named part can also be had as PART.CHANNEL. stored: the names as the
     file has them, for errors. primaries: what R, G and B are, if stated. metadata: all strings and numbers of the headers.
@@ -101,7 +99,7 @@ class RenderChannels:
 
     @classmethod
     def read(cls, path: Path | str, view: str = "") -> "RenderChannels":
-        """view: "left", "right" or what else the file names; "" the first that it has."""
+        """Read a file. view: "left", "right" or another that the file names; "" is its first."""
         path = Path(path)
         parts = read_exr(path)
         of_parts = _views_of_parts(parts)
@@ -116,7 +114,7 @@ class RenderChannels:
         return cls(path, _named(by_part), stored, stated_primaries(mine[0], parts), metadata)
 
     def colour_layer(self, wanted: str | None = None) -> str:
-        """The layer whose R, G and B are the picture. Raises InputError where none is stated and several or none could be meant."""
+        """Return the layer whose R, G and B are the picture. Raises InputError if none is stated and several or none could be meant."""
         layers = [layer for layer in self._layers() if all(joined(layer, name) in self.channels for name in "RGB")]
         if wanted is not None:
             found = [layer for layer in layers if layer == wanted] or [layer for layer in layers if layer.endswith(f".{wanted}")]
@@ -131,7 +129,7 @@ class RenderChannels:
         raise InputError(f"{self.path}: expected {said}, but it has {', '.join(self.stored)}: state the layer that holds the picture")
 
     def depth_name(self, colour_layer: str, wanted: str | None = None) -> str:
-        """The channel that holds depth. Raises InputError where there is none."""
+        """Return the channel that holds depth. Raises InputError if there is none."""
         names = (wanted,) if wanted else DEPTH_NAMES
         found = self._first([(name,) for name in names], colour_layer)
         if found is None:
@@ -142,7 +140,7 @@ class RenderChannels:
         return found[0]
 
     def motion_names(self, colour_layer: str) -> MotionNames:
-        """The channels that hold motion. Raises InputError where there are none."""
+        """Return the channels that hold motion. Raises InputError if there are none."""
         for names in MOTION_NAMES:
             found = self._first([(names.right, names.up)], colour_layer)
             if found is not None:
@@ -157,14 +155,14 @@ class RenderChannels:
         return sorted({name.rpartition(".")[0] for name in self.channels})
 
     def _distinct(self, layers: Sequence[str]) -> list[str]:
-        """Layers without those that are another's pixels under a longer name."""
+        """Return layers without those that are another's pixels under a longer name."""
         kept: dict[int, str] = {}
         for layer in sorted(layers, key=len):
             kept.setdefault(id(self.channels[joined(layer, "R")]), layer)
         return list(kept.values())
 
     def _first(self, choices: Sequence[tuple[str, ...]], colour_layer: str) -> tuple[str, ...] | None:
-        """The first choice that is there: beside the colour layer, else anywhere at the top."""
+        """Return the first choice that exists: beside the colour layer, else anywhere at the top."""
         parents = [colour_layer, colour_layer.rpartition(".")[0], ""]
         for parent in dict.fromkeys(parents):
             for choice in choices:
@@ -175,12 +173,12 @@ class RenderChannels:
 
 
 def _views_of_parts(parts: Sequence[ExrPart]) -> list[str]:
-    """Names of the eyes where each has parts of its own, the default first."""
+    """Return names of the eyes if each has parts of its own, the default first."""
     return list(dict.fromkeys(str(part.attributes["view"]) for part in parts if "view" in part.attributes))
 
 
 def _views_of_names(path: Path) -> list[str]:
-    """Names of the eyes where they stand in the names of channels, the default first."""
+    """Return names of the eyes if they stand in the names of channels, the default first."""
     import OpenEXR
 
     with OpenEXR.File(str(path), header_only=True) as file:
@@ -188,7 +186,7 @@ def _views_of_names(path: Path) -> list[str]:
 
 
 def _named(by_part: Sequence[tuple[str, Channels]]) -> Channels:
-    """Channels of all parts. A name that several parts have needs the part's before it, unless one of them is the picture itself."""
+    """Return the channels of all parts. A name that several parts have needs the part's before it, unless one of them is the picture."""
     owners: dict[str, list[str]] = {}
     for part, of_part in by_part:
         for name in of_part:
@@ -204,7 +202,7 @@ def _named(by_part: Sequence[tuple[str, Channels]]) -> Channels:
 
 
 def _of_view(channels: Channels, view: str, views: Sequence[str]) -> Channels:
-    """Channels under the names that they would have if there were one view (Multi-View OpenEXR: LAYER.VIEW.CHANNEL)."""
+    """Return channels under the names that they would have if there were one view (Multi-View OpenEXR: LAYER.VIEW.CHANNEL)."""
     if len(views) < 2:
         return channels
     others = {each for each in views if each != view}

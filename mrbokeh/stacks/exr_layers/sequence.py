@@ -42,10 +42,11 @@ class ExrSequence:
         last: int | None = None,
         gaps: Gaps = "error",
     ) -> "ExrSequence":
-        """where: beauty.%04d.exr, beauty.####.exr, beauty.$F4.exr, a folder with one sequence, or a single file.
+        """Find the files of a sequence.
 
-        reader: how files are understood; None takes FlatRender, or DeepSurfaces where they are deep.
-        first, last: the frames wanted, both included. Raises InputError where nothing is found, frames are missing (gaps="error"), or
+        where: beauty.%04d.exr, beauty.####.exr, beauty.$F4.exr, a folder with one sequence, or a single file.
+        reader: how files are understood; None takes FlatRender, or DeepSurfaces if they are deep.
+        first, last: the frames wanted, both included. Raises InputError if nothing is found, frames are missing (gaps="error"), or
         the range reaches beyond the files.
         """
         if gaps not in get_args(Gaps):
@@ -61,7 +62,7 @@ class ExrSequence:
         return cls(found, frames, reader or _reader_for(next(iter(found.values()))), is_still)
 
     def path_of(self, frame: int) -> Path:
-        """The file that shows a frame: its own, or the one before it that is held."""
+        """Return the file that shows a frame: its own, or the one before it that is held."""
         if self.is_still:
             return next(iter(self.paths.values()))
         if frame not in self.frames:
@@ -71,16 +72,16 @@ class ExrSequence:
         return self.paths[max(number for number in self.paths if number <= frame)]
 
     def layers(self, frame: int) -> list[Layer]:
-        """Sharp layers of a frame, front first."""
+        """Return sharp layers of a frame, front first."""
         return self.reader.layers(self.path_of(frame))
 
     @property
     def is_deep(self) -> bool:
-        """Whether its samples can be put among other layers by depth."""
+        """Return whether its samples can be put among other layers by depth."""
         return isinstance(self.reader, DeepSurfaces)
 
     def samples(self, frame: int) -> DeepSamples:
-        """Of a deep frame. Raises InputError where the files are flat."""
+        """Return the samples of a deep frame. Raises InputError if the files are flat."""
         if not isinstance(self.reader, DeepSurfaces):
             raise InputError(f"expected deep pictures, but {self.path_of(frame)} is read as flat: take its layers")
         return self.reader.samples(self.path_of(frame))
@@ -91,7 +92,7 @@ def _reader_for(path: Path) -> LayerReader:
 
 
 def _found(where: Path) -> tuple[dict[int, Path], bool]:
-    """Files by number, and whether it is one file without a sequence."""
+    """Return files by number, and whether it is one file without a sequence."""
     if where.is_dir():
         return _in_folder(where), False
     if _PLACE.search(where.name):
@@ -103,7 +104,7 @@ def _found(where: Path) -> tuple[dict[int, Path], bool]:
 
 
 def _matching(pattern: Path) -> dict[int, Path]:
-    """Files of a pattern. Digits may be more than asked for, as in counting beyond 9999, but not fewer."""
+    """Return the files of a pattern. Digits may be more than asked for, as in counting beyond 9999, but not fewer."""
     place = _PLACE.search(pattern.name)
     assert place is not None
     digits = len(place[2]) if place[2] else int(place[1] or place[3] or 1)
@@ -116,7 +117,7 @@ def _matching(pattern: Path) -> dict[int, Path]:
 
 
 def _in_folder(folder: Path) -> dict[int, Path]:
-    """The one sequence of a folder."""
+    """Return the one sequence of a folder."""
     sequences: dict[tuple[str, str], dict[int, Path]] = {}
     for path in _files(folder):
         if match := _NUMBER.match(path.name):
