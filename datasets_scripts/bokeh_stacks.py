@@ -6,7 +6,7 @@
 OUT is a data set with a manifest (`mrbokeh.stacks.focal_stack_dataset`): OUT/SCENE/view_NN/ are focal stacks with all-in-focus picture and
 depth, OUT/lens.json is the lens. Finished files are kept, so an interrupted run goes on where it stopped; `--scenes` gives machines a
 share of the work each. With --pull OUT.pull/ becomes one test view at many focus distances, to see whether blur changes smoothly.
-It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and is fast where LLVM's library is installed (Debian: libllvm19).
+It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and LLVM's library (Debian: libllvm19).
 """
 
 from dataclasses import asdict, replace
@@ -16,13 +16,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from datasets_scripts.bokeh_stacks_manifest import LICENCE, dataset_of
-from datasets_scripts.bokeh_stacks_plan import SIZES, StacksPlan
-from datasets_scripts.bokeh_stacks_shapes import SHAPES
-from datasets_scripts.bokeh_stacks_view import StackView
-from datasets_scripts.file_job import claim_folder
-from datasets_scripts.truth_mitsuba import SCALAR, best_variant, load
+from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StacksPlan
+from datasets_scripts.made_sets.bokeh_view import LICENCE, StackView, dataset_of
+from datasets_scripts.made_sets.file_job import claim_folder
 from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.scene.mitsuba.mitsuba_tracer import load
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, write_focal_stack_dataset
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
@@ -30,16 +28,14 @@ from mrbokeh.system.errors import InputError
 PLAN_NAME = "plan.json"
 
 
-def make_bokeh_stacks(
-    out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *, overwrite: bool = False, variant: str | None = None
-) -> FocalStackDataset | None:
+def make_bokeh_stacks(out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *, overwrite: bool = False) -> FocalStackDataset | None:
     """Write what is missing of a set, the manifest last; returns it, or None where only some scenes were asked for.
 
     Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
     """
     _require_scenes(plan, only)
-    load(variant or best_variant())
-    views = [StackView(out / name, plan, *_place(name), variant=variant) for name in plan.names]
+    load()
+    views = [StackView(out / name, plan, *_place(name)) for name in plan.names]
     claim(out, plan, views, overwrite)
     write_lens(out / "lens.json", plan.lens(plan.focus_distances_m[0]))
     _make_missing([view for view, name in zip(views, plan.names, strict=True) if not only or _place(name)[0] in only], "tracing stacks")
@@ -51,14 +47,14 @@ def make_bokeh_stacks(
     return dataset
 
 
-def make_pull(out: Path, plan: StacksPlan, frames: int, *, overwrite: bool = False, variant: str | None = None) -> Path:
+def make_pull(out: Path, plan: StacksPlan, frames: int, *, overwrite: bool = False) -> Path:
     """A test view focused from the second to the last but one distance, evenly in dioptres, in so many frames; returns its folder."""
     if frames < 2:
         raise InputError(f"a focus pull needs at least 2 frames, got {frames}")
     name = next(name for name, part in plan.parts().items() if part == "test")
     inner = plan.focus_distances_m[1:-1] or plan.focus_distances_m
     distances_m = tuple(float(each) for each in 1.0 / np.linspace(1.0 / inner[0], 1.0 / inner[-1], frames))
-    view = StackView(out / name, plan, *_place(name), distances_m, variant)
+    view = StackView(out / name, plan, *_place(name), distances_m)
     claim(out, plan, [view], overwrite, {"pull_frames": frames})
     _make_missing([view], "tracing a focus pull")
     return out / name
@@ -112,8 +108,6 @@ def main(
             raise InputError(f"expected a size out of {', '.join(SIZES)}, got {size!r}")
         chosen = replace(SIZES[size], samples=samples) if samples else SIZES[size]
         plan = StacksPlan(shape, chosen, seed)
-        if best_variant() == SCALAR:
-            typer.echo("without LLVM's library (Debian: libllvm19) rays are traced one by one, some hundred times slower", err=True)
         dataset = make_bokeh_stacks(out, plan, tuple(scenes.split(",")) if scenes else (), overwrite=overwrite)
         if pull:
             typer.echo(f"{make_pull(out.with_name(out.name + '.pull'), plan, pull, overwrite=overwrite)}: focus pull complete")

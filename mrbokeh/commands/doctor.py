@@ -17,7 +17,7 @@ from mrbokeh import __version__
 app = typer.Typer(add_completion=False)
 
 
-class Finding(NamedTuple):
+class Component(NamedTuple):
     name: str
     found: str | None
     enables: str
@@ -60,15 +60,17 @@ def doctor() -> None:
     table = Table(title=f"mrbokeh {__version__} on Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores")
     for column in ("what", "found", "enables", "if you want it"):
         table.add_column(column)
-    for finding in findings():
-        table.add_row(finding.name, finding.found or "[yellow]missing[/]", finding.enables, "" if finding.found else escape(finding.remedy))
+    for component in findings():
+        table.add_row(
+            component.name, component.found or "[yellow]missing[/]", component.enables, "" if component.found else escape(component.remedy)
+        )
     Console().print(table)
 
 
-def findings() -> list[Finding]:
+def findings() -> list[Component]:
     """Every optional thing with its version or path, None where it is missing."""
-    packages = [Finding(name, _version(name), enables, remedy) for name, enables, remedy in PACKAGES]
-    programs = [Finding(name, shutil.which(name), enables, remedy) for name, enables, remedy in PROGRAMS]
+    packages = [Component(name, _version(name), enables, remedy) for name, enables, remedy in PACKAGES]
+    programs = [Component(name, shutil.which(name), enables, remedy) for name, enables, remedy in PROGRAMS]
     return [*packages, _opencv(), _cuda(), _graphics_device(), _llvm(), *programs]
 
 
@@ -79,28 +81,28 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _opencv() -> Finding:
+def _opencv() -> Component:
     """Find other packages of OpenCV beside ours: all write into one folder `cv2`, the last one installed wins."""
     others = [name for name in OTHER_OPENCV if _version(name)]
     remedy = f"pip uninstall -y {' '.join(others)} {OPENCV} && pip install {OPENCV}" if others else "pip install mrbokeh"
-    return Finding(OPENCV, None if others else _version(OPENCV), "picture files, registration, filters", remedy)
+    return Component(OPENCV, None if others else _version(OPENCV), "picture files, registration, filters", remedy)
 
 
-def _cuda() -> Finding:
+def _cuda() -> Component:
     remedy = "needs an NVIDIA driver and a CUDA build of torch; training works without, slower"
-    return Finding("CUDA in torch", _quietly(_cuda_device), "training on the GPU", remedy)
+    return Component("CUDA in torch", _quietly(_cuda_device), "training on the GPU", remedy)
 
 
-def _graphics_device() -> Finding:
+def _graphics_device() -> Component:
     remedy = "pip install 'mrbokeh[viewfinder]' and a Vulkan, Metal or Direct3D 12 driver; the ray caster draws without one"
-    return Finding("graphics device", _quietly(_described_device), "rendering 3D objects on a graphics card", remedy)
+    return Component("graphics device", _quietly(_described_device), "rendering 3D objects on a graphics card", remedy)
 
 
-def _llvm() -> Finding:
+def _llvm() -> Component:
     from mrbokeh.scene.mitsuba.mitsuba_tracer import find_llvm
 
     found = find_llvm()
-    return Finding("LLVM library", None if found is None else str(found), "Mitsuba's compiler", "Debian: apt install libllvm19")
+    return Component("LLVM library", None if found is None else str(found), "Mitsuba's compiler", "Debian: apt install libllvm19")
 
 
 def _described_device() -> str | None:

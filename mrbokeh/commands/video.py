@@ -16,10 +16,10 @@ from mrbokeh.compositing.plate_look.finishing import LookOptions
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.choose import BY_NAME
 from mrbokeh.shots.composite_recipe import CompositeRecipe
-from mrbokeh.shots.executors import Crew, DaskCrew, OneProcess, ProcessCrew
+from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
 from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
-from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.stacks.photograph import Holding, lens_held
@@ -187,7 +187,7 @@ def video(
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
         typer.echo(f"warning: {clip} {lost}", err=True)
-    note = _made(shot, _crew(work, len(shot.segments)), result.overwrite)
+    note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
     frames = shot.stop - shot.start
     typer.echo(f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})")
 
@@ -201,11 +201,11 @@ def _alpha_lost(clip: Path, source: PictureSource, target: Target) -> str | None
     return None
 
 
-def _crew(work: options.WorkOptions, segments: int) -> Crew:
+def _executor(work: options.WorkOptions, segments: int) -> Executor:
     if work.cluster is not None:
-        return DaskCrew(work.cluster)
+        return DaskExecutor(work.cluster)
     count = min(work.workers or cores(), segments)
-    return OneProcess() if count == 1 else ProcessCrew(count)
+    return SerialExecutor() if count == 1 else ProcessExecutor(count)
 
 
 def _try_first_frame(shot: Shot) -> None:
@@ -214,7 +214,7 @@ def _try_first_frame(shot: Shot) -> None:
     shot.recipe.build(1).make(shot.start, frame.rgb, frame.time_s, frame.alpha)
 
 
-def _made(shot: Shot, crew: Crew, overwrite: bool) -> str:
+def _made(shot: Shot, executor: Executor, overwrite: bool) -> str:
     with kept_when_interrupted(f"finished segments are kept in {shot.parts_path}"), progress_bars() as bars:
         task = bars.add_task("compositing", total=shot.stop - shot.start)
-        return make_shot(shot, crew, overwrite=overwrite, progress=lambda count: bars.advance(task, count))
+        return render_shot(shot, executor, overwrite=overwrite, progress=lambda count: bars.advance(task, count))

@@ -1,24 +1,19 @@
-"""Virtual layers into a photograph that its own lens has blurred already.
+"""Virtual layers in a photograph that its own lens has blurred already.
 
-    from mrbokeh.compositing.choose import insertion_of
+from mrbokeh.compositing.choose import insertion_of
 
-    inserted = insertion_of("between").insert(plate, layers, renderer)
-    picture = inserted.rgb
+inserted = insertion_of("between").insert(plate, layers, renderer)
+picture = inserted.rgb
 
-What lies where:
-    base             Insertion: the protocol of every way to put layers in; Inserted: the picture in two parts, photograph and virtual light
-    choose           insertion_of: by the name of the mode
-    touched_box      InTouchedBox: any insertion, computed only where virtual light can arrive
-    occlusion        occlusion_matte, covered_by: what the photographed scene hides, decided on sharp layers
-    over             OverPhotograph: blurred layers over the photograph, with that matte where depth is known
-    matte            SmoothedMatte: the same with the paper's eroded and smoothed matte
-    rerender         Rerendered: all-in-focus picture and layers blurred together
-    between          Between: behind what is near and blurred in the photograph, before the rest. Its steps:
-      virtual_surface  the layers' depth, continued beyond their outline
-      near_and_far     the sharp scene cut in two there
-      clean_colours    colours under a user's matte, where there is no sharp scene
-      pupil_points     points of the lens's opening
-      pupil_shares     rays through them: who hides whom, and where; _between_numba
-      light_points     lights, followed ray by ray
-      three_parts      near, virtual and far light put together
+plate            Plate: the photograph; Insertion: the protocol of every mode; Inserted: its picture in two parts
+choose           insertion_of: by the name of the mode; InDirtyRectangle: any mode, computed only in reach of virtual light
+over             blurred layers over the photograph, hidden by its depth first, as they are or with the paper's smoothed matte
+between          behind what is near and blurred in the photograph, before the rest; Rerendered: everything blurred together
+  near_and_far     the sharp scene cut in two at the virtual surface
+  edge_refinement  depth edges moved to where the photograph shows them
+  pupil_shares     rays through points of the pupil: which part of it near, virtual and far surfaces take
+  three_parts      near, virtual and far light put together; highlights are followed ray by ray
+plate_look/      exposure, white balance, falloff and grain of the photograph on virtual light
+overlay          a blurred layer over many frames
+stack_compositing  a virtual scene in every slice of a focal stack
 """

@@ -51,8 +51,10 @@ def gather(
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _past_near(free: np.ndarray, near_alpha: np.ndarray, coc_px: np.ndarray, row: int, column: int, rays: np.ndarray) -> None:
-    """How much of each ray (x, y, weight: 3 K) gets past the near things. This loop and the next two hold nothing but numbers, so that
-    many rays are followed at once."""
+    """Multiply each ray (x, y, weight: 3 K) by its share that gets past the near things.
+
+    This loop and the next two hold nothing but numbers, so that many rays are followed at once.
+    """
     here_px, x_px, y_px = coc_px[row, column], np.float32(column + 0.5), np.float32(row + 0.5)
     for k in range(len(free)):
         x, y = _meet_from(coc_px, here_px, x_px, y_px, rays[0, k], rays[1, k])
@@ -102,7 +104,7 @@ def _far_means(
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _still_far(mean: np.ndarray, far_rgb: np.ndarray, row: int, column: int) -> None:
-    """What is far is in focus: all rays of the pixel see one point of it."""
+    """Set the sums of far light that is in focus: all rays of the pixel see one point of it."""
     for c in range(3):
         mean[9 + c], mean[12 + c] = mean[0] * far_rgb[row, column, c], mean[15] * far_rgb[row, column, c]
 
@@ -143,7 +145,7 @@ def follow(
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _meet(coc_px: np.ndarray, x_px: np.float32, y_px: np.float32, ux: np.float32, uy: np.float32) -> tuple[np.float32, np.float32]:
-    """Where a ray meets a surface, by steps that settle where it is smooth."""
+    """Return the place at which a ray meets a surface, by steps that settle where it is smooth."""
     return _meet_from(coc_px, _nearest(coc_px, x_px, y_px), x_px, y_px, ux, uy)
 
 
@@ -151,7 +153,7 @@ def _meet(coc_px: np.ndarray, x_px: np.float32, y_px: np.float32, ux: np.float32
 def _meet_from(
     coc_px: np.ndarray, here_px: np.float32, x_px: np.float32, y_px: np.float32, ux: np.float32, uy: np.float32
 ) -> tuple[np.float32, np.float32]:
-    """here_px: the circle of confusion of the pixel that the ray ends in."""
+    """Return the place at which a ray meets a surface. here_px: the circle of confusion of the pixel that the ray ends in."""
     half_px = _HALF * here_px
     for _ in range(_STEPS - 1):
         half_px = _HALF * _nearest(coc_px, x_px - ux * half_px, y_px - uy * half_px)

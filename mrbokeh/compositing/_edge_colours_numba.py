@@ -1,4 +1,4 @@
-"""The loop over pixels of mrbokeh.compositing.edge_refinement."""
+"""Loop over pixels of mrbokeh.compositing.edge_refinement, compiled."""
 
 import numpy as np
 
@@ -95,7 +95,7 @@ def _spread(
 
 @njit(cache=True, nogil=True)
 def _solved(matrix: np.ndarray, a: float, b: float, c: float) -> tuple[float, float, float]:
-    """Of three equations, by cofactors."""
+    """Solve three equations by cofactors."""
     m = matrix
     p, q, r = m[1, 1] * m[2, 2] - m[1, 2] ** 2, m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2], m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
     s, t, u = m[0, 0] * m[2, 2] - m[0, 2] ** 2, m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1] - m[0, 1] ** 2

@@ -1,7 +1,4 @@
-"""The loop over the pixels of an Overlay on 8-bit codes, compiled; it runs without the GIL.
-
-The loops over the pixels of mrbokeh.compositing.plate_look, compiled; they run without the GIL.
-"""
+"""Loops over pixels that add virtual light to pictures, compiled; they run without the GIL: overlays on 8-bit codes, grain."""
 
 import numpy as np
 
@@ -45,7 +42,7 @@ def add_grain(
     shot: np.ndarray,
     read: np.ndarray,
 ) -> None:
-    """As grain_light.added_variance says, in place on light (h, w, 3); start: the texture's row and column at (0, 0)."""
+    """Add grain in place to light (h, w, 3), with the variance of `plate_look.grain`. start: the texture's row and column at (0, 0)."""
     height, width = alpha.shape
     side = texture.shape[0]
     for y in range(height):

@@ -1,7 +1,4 @@
-"""Ways of putting layers into a photograph, by name.
-
-Where virtual light can arrive: any insertion computed in that box alone, so that a small object in a large photograph is quick.
-"""
+"""Ways of inserting layers into a photograph, by name; each works only in the dirty rectangle that virtual light can reach."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +24,7 @@ _SPARE_PX = 4
 
 
 @dataclass(frozen=True)
-class InTouchedBox:
+class InDirtyRectangle:
     """An Insertion that lets another one work where light of the layers can arrive, and leaves the rest of the plate as it is.
 
     The result is that of the whole frame, but that near things which the frame cuts off go on beyond it. Where the blur depends on
@@ -44,20 +41,20 @@ class InTouchedBox:
             plate.depth_m is None and plate.near_alpha is not None
         ):
             return self.insertion.insert(plate, layers, renderer)
-        box = _touched_box(plate, lit)
+        box = _dirty_rectangle(plate, lit)
         found = self.insertion.insert(_cut_plate(plate, box), [box.cut_layer(layer) for layer in layers], renderer)
         photo_rgb = plate.rgb.copy()
         box.paste(found.photo_rgb, photo_rgb)
         return Inserted(photo_rgb, box.placed(found.virtual, plate.rgb.shape))
 
 
-def touched_box(plate: Plate, layers: Sequence[Layer]) -> Box:
+def dirty_rectangle(plate: Plate, layers: Sequence[Layer]) -> Box:
     """The box of all pixels that virtual light can reach, grown to all whose light mixes with it there; NOWHERE where there is none.
 
     For lenses whose blur is the same everywhere (`mrbokeh.layering.pixel_box.is_same_everywhere`).
     """
     lit = _lit_boxes(layers)
-    return _touched_box(plate, lit) if lit else NOWHERE
+    return _dirty_rectangle(plate, lit) if lit else NOWHERE
 
 
 def _lit_boxes(layers: Sequence[Layer]) -> list[tuple[Layer, Box]]:
@@ -66,7 +63,7 @@ def _lit_boxes(layers: Sequence[Layer]) -> list[tuple[Layer, Box]]:
     return [(layer, box) for layer, box in boxes if shows(layer.rgb[box.where], layer.alpha[box.where]).any()]
 
 
-def _touched_box(plate: Plate, lit: Sequence[tuple[Layer, Box]]) -> Box:
+def _dirty_rectangle(plate: Plate, lit: Sequence[tuple[Layer, Box]]) -> Box:
     reached = [_reached(layer, box, plate.lens) for layer, box in lit]
     arrival = Box(min(b.top for b in reached), max(b.bottom for b in reached), min(b.left for b in reached), max(b.right for b in reached))
     return arrival.within(plate.rgb.shape) if plate.depth_m is None else _with_sources(arrival, plate.depth_m, plate.lens)
@@ -107,7 +104,7 @@ def _with_sources(arrival: Box, depth_m: Plane, lens: Lens) -> Box:
 
 
 def _blurs_by_aperture(renderer: Renderer) -> bool:
-    """Whether its kernels are those of the lens's opening: banks and networks may know the place in the frame."""
+    """Return whether the renderer's kernels are those of the lens's opening: banks and networks may know the place in the frame."""
     return hasattr(renderer, "layering") and getattr(renderer, "bank", None) is None
 
 
@@ -119,11 +116,11 @@ def _cut_plate(plate: Plate, box: Box) -> Plate:
 
 
 MODES: dict[str, Insertion] = {
-    "front": InTouchedBox(OverPhotograph(by_depth=False)),
-    "over": InTouchedBox(OverPhotograph()),
-    "matte": InTouchedBox(SmoothedMatte()),
-    "between": InTouchedBox(Between()),
-    "rerender": InTouchedBox(Rerendered()),
+    "front": InDirtyRectangle(OverPhotograph(by_depth=False)),
+    "over": InDirtyRectangle(OverPhotograph()),
+    "matte": InDirtyRectangle(SmoothedMatte()),
+    "between": InDirtyRectangle(Between()),
+    "rerender": InDirtyRectangle(Rerendered()),
 }
 """front: over everything. over: the sharp layers lose what the depth of the photograph hides, then they are blurred. matte: the same
 with the paper's smoothed matte. between: behind the blurred near things of the photograph, before the rest. rerender: all-in-focus
@@ -133,14 +130,14 @@ DEFAULT_MODE = "over"
 
 
 def insertion_of(mode: str, near_m: float | None = None, *, exact_depth: bool = False) -> Insertion:
-    """near_m: how far what a user's matte shows is, for the mode between. exact_depth: rims stay where the depth has them.
+    """Return the insertion of a mode. Raises InputError if there is no mode of that name.
 
-    Raises InputError where there is no mode of that name.
+    near_m: distance of what a user's matte shows, for the mode between. exact_depth: edges stay where the depth has them.
     """
     if mode not in MODES:
         raise InputError(f"expected a mode out of {', '.join(MODES)}, got {mode!r}")
     if near_m is not None and mode != "between":
         raise InputError(f"the distance of what the matte shows is for the mode between, got the mode {mode}: leave it out")
     if mode == "between":
-        return InTouchedBox(Between(near_depth_m=near_m, true_rims=not exact_depth))
-    return InTouchedBox(Rerendered(true_rims=not exact_depth)) if mode == "rerender" else MODES[mode]
+        return InDirtyRectangle(Between(near_depth_m=near_m, refine_edges=not exact_depth))
+    return InDirtyRectangle(Rerendered(refine_edges=not exact_depth)) if mode == "rerender" else MODES[mode]

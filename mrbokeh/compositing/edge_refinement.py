@@ -1,16 +1,13 @@
-"""What the colours of a sharp picture say about the rims of near things, where depth may be off by a pixel or two.
+"""Edges of near things moved to where the photograph shows them, for depth maps that are off by a pixel or two.
 
-A pixel is certainly near if no far pixel lies within reach, or if it lies in the middle of a thin thing; certainly far likewise. The
-colours of the rest are put on the line that parts those of the certain pixels around them best (Fisher, The Use of Multiple
-Measurements in Taxonomic Problems, 1936). Colours are taken as v / (v + mean around), so that lights do not outweigh all else and
-twice the light gives the same answer.
+A wrong edge takes far colour for near all along. The photograph tells where the blurred edge lies, so proposals are tested: the scene
+is cut in two with each, blurred anew, and compared with the photograph; around every place the one that explains it better wins. Near
+things that depth misses altogether stay missed.
 
-Rims of near things put where the photograph shows that they lie, for depth maps that are off by a pixel or two.
-
-Such a rim takes far colour for near all along an edge. The photograph tells where the blurred edge lies, so proposals are put to the
-test: the scene is cut in two with each, blurred anew, and compared with the photograph; around every place the one that explains it
-better wins. What is proposed comes from the colours of the sharp picture (mrbokeh.compositing.edge_refinement). Near things that depth
-misses altogether stay missed.
+Proposals come from the colours of the sharp picture. A pixel is certainly near if no far pixel lies within reach, or if it lies in the
+middle of a thin thing; certainly far likewise. The colours of the rest are projected on the line that separates those of the certain
+pixels around them best (Fisher, The Use of Multiple Measurements in Taxonomic Problems, 1936). Colours are taken as v / (v + mean
+around), so that highlights do not outweigh all else and twice the light gives the same answer.
 """
 
 from collections.abc import Callable
@@ -39,9 +36,10 @@ Mask = Bool[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class EdgeColours:
-    """near: by depth. unsure: where it may be wrong. nearness: 0 as the far side, 1 as the near one; NaN where colours do not tell.
+    """Evidence of the colours around depth edges.
 
-    lit: lights and what is beside them; their colour says nothing.
+    near: by depth. unsure: pixels at which depth may be wrong. nearness: 0 as the far side, 1 as the near one; NaN if colours do not
+    tell. lit: highlights and their neighbours, whose colour tells nothing.
     """
 
     near: Mask
@@ -51,7 +49,7 @@ class EdgeColours:
 
     @classmethod
     def of(cls, rgb: Picture, near: Mask, at_edge: Mask) -> "EdgeColours":
-        """rgb: all in focus. at_edge: where depth has an edge; elsewhere it is right."""
+        """Classify pixels. rgb: all in focus. at_edge: pixels at which depth has an edge; elsewhere it is right."""
         from cv2 import dilate
 
         lit = np.asarray(dilate(find_highlights(rgb).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
@@ -65,7 +63,7 @@ class EdgeColours:
         return cls(near, unsure, nearness, lit)
 
     def by_colour(self) -> Mask:
-        """What is near where colours decide; lights at rims are taken for far ones."""
+        """Return what is near where colours decide; highlights at edges count as far."""
         told = self.near.copy()
         told[self.nearness < _FAR_BELOW] = False
         told[self.nearness > _NEAR_ABOVE] = True
@@ -73,7 +71,7 @@ class EdgeColours:
         return told
 
     def without_rim(self) -> Mask:
-        """What is near less a pixel at its edges, but for what colours say is near, and the middle of thin things."""
+        """Return what is near less a pixel at its edges, except where colours say near, and the middle of thin things."""
         from cv2 import erode
 
         inner = np.asarray(erode(self.near.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
@@ -81,7 +79,7 @@ class EdgeColours:
 
 
 def _certain(mask: Mask) -> tuple[Mask, Mask]:
-    """(in the mask for certain, in it but perhaps not)."""
+    """Return (certainly in the mask, in it but perhaps not)."""
     from cv2 import DIST_L2, dilate, distanceTransform
 
     depth_px = distanceTransform(mask.astype(np.uint8), DIST_L2, 5)
@@ -110,7 +108,7 @@ _FLOOR, _ROUND = np.float32(0.1), np.float32(1e-6)
 
 @dataclass(frozen=True)
 class EdgeRefinement:
-    """cut: a plate's sharp scene in two. tolerance: see `Between`."""
+    """Refinement of depth edges. cut: cuts a plate's sharp scene in two. tolerance: see `Between`."""
 
     cut: Callable[[Plate, Mask], NearAndFar]
     renderer: Renderer
@@ -136,7 +134,9 @@ class EdgeRefinement:
         return (plate, near) if best is near else (replace(plate, depth_m=moved(plate.depth_m, near, best)), best)
 
     def _error(self, plate: Plate, near: Mask, proposed: Mask) -> Plane:
-        """How ill the scene, cut so and blurred anew, explains the photograph around each pixel; relative to its light, squared."""
+        """Return how badly the scene, cut so and blurred anew, explains the photograph around each pixel; relative to its light,
+        squared.
+        """
         from cv2 import GaussianBlur, resize
 
         assert plate.depth_m is not None

@@ -1,10 +1,8 @@
-"""The sharp photographed scene cut in two by a virtual surface: what is nearer, with soft rims, and the rest, continued behind it.
+"""Sharp photographed scene cut in two by a virtual surface: what is nearer, with soft edges, and the rest, continued behind it.
 
-A pixel on the rim of a near thing holds both colours; they are taken apart as mrbokeh.layering.hidden_background does, but at depth edges
-alone: where the virtual surface cuts through a smooth surface (a table that an object stands on), the cut is hard. Highlights are kept
-apart from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
-
-The virtual layers as one surface: where it shows anything, and its depth continued beyond its outline.
+A pixel on the edge of a near thing holds both colours; they are separated as mrbokeh.layering.hidden_background does, but at depth
+edges alone: where the virtual surface cuts through a smooth surface (a table that an object stands on), the cut is hard. Highlights are
+separated from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
 """
 
 from dataclasses import dataclass
@@ -30,7 +28,7 @@ Mask = Bool[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Highlights:
-    """Single pixels far brighter than what is around them: places (row times width plus column), colour and depth."""
+    """Single pixels far brighter than their surroundings: places (row times width plus column), colour and depth."""
 
     places: Int64[np.ndarray, " highlights"]
     rgb: Float32[np.ndarray, "highlights 3"]
@@ -42,9 +40,10 @@ NO_HIGHLIGHTS = Highlights(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), 
 
 @dataclass(frozen=True)
 class NearAndFar:
-    """near: premultiplied, sharp, alpha 0 where nothing is near, its depth continued to all places.
+    """Sharp scene in two parts.
 
-    far_rgb, far_depth_m: opaque, without its lights; depth None: blurred already. lights: those of what is far.
+    near: premultiplied, sharp, alpha 0 where nothing is near, its depth continued to all places. far_rgb, far_depth_m: opaque, without
+    its highlights; depth None: blurred already. highlights: those of what is far.
     """
 
     near: Layer
@@ -54,7 +53,7 @@ class NearAndFar:
 
     @property
     def far(self) -> Layer:
-        """What is far as one opaque layer, its lights in it; for photographs with depth."""
+        """Far part as one opaque layer with its highlights; for photographs with depth."""
         assert self.far_depth_m is not None
         layer = Layer(self.far_rgb.copy(), np.ones_like(self.far_depth_m), self.far_depth_m)
         layer.rgb.reshape(-1, 3)[self.highlights.places] += self.highlights.rgb
@@ -62,7 +61,7 @@ class NearAndFar:
 
 
 def nearer_than(depth_m: Plane, virtual_depth_m: Plane, tolerance: float) -> Mask:
-    """Where the photographed surface lies before the virtual one by more than a share `tolerance` of its depth."""
+    """Return the pixels whose photographed surface lies before the virtual one by more than a share `tolerance` of its depth."""
     return np.isfinite(virtual_depth_m) & (depth_m * np.float32(1.0 + tolerance) < virtual_depth_m)
 
 
@@ -85,7 +84,7 @@ def nearest_places(known: Mask) -> Int64[np.ndarray, "height width"]:
 
 
 def cut_in_two(sharp_rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance: float) -> NearAndFar:
-    """reach_px: how far the lens looks past an edge; nothing is made up farther behind the near things."""
+    """Cut a scene in two. reach_px: how far the lens looks past an edge; nothing is inpainted farther behind the near things."""
     rgb = np.ascontiguousarray(sharp_rgb)
     without, places = without_highlights(rgb), np.flatnonzero(find_highlights(rgb))
     places = places[~_brightest_is_near(rgb, near, places)]
@@ -106,7 +105,7 @@ def _without_specks(depth_m: Plane) -> Plane:
 
 
 def _parted(rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance: float) -> tuple[np.ndarray, Picture]:
-    """(near (H, W, 4) premultiplied, far (H, W, 3) with what lies behind the near as far as the lens sees it)."""
+    """Return (near (H, W, 4) premultiplied, far (H, W, 3), continued behind the near as far as the lens sees it)."""
     height, width = near.shape
     values = np.ones((height, width, 4), np.float32)
     values[..., :3] = rgb
@@ -125,7 +124,7 @@ def _parted(rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance
 
 
 def without_edge(depth_m: Plane, tolerance: float) -> Mask:
-    """Where depth changes by no more than twice the tolerance (a share of it) among the pixels around."""
+    """Return the pixels around which depth changes by no more than twice the tolerance (a share of it)."""
     from cv2 import dilate, erode
 
     kernel = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
@@ -134,7 +133,7 @@ def without_edge(depth_m: Plane, tolerance: float) -> Mask:
 
 
 def _brightest_is_near(rgb: Picture, near: Mask, places: Int64[np.ndarray, " highlights"]) -> Bool[np.ndarray, " highlights"]:
-    """Whether the brightest of the 5x5 pixels around each place, the lamp whose light it holds, is near."""
+    """Return whether the brightest of the 5x5 pixels around each place, the source of its highlight, is near."""
     height, width = near.shape
     rows, columns = places // width, places % width
     brightest, is_near = np.full(len(places), -1.0, np.float32), np.zeros(len(places), bool)
@@ -156,6 +155,6 @@ def shows_anything(sharp: Layer) -> bool:
 
 
 def shows(rgb: Float32[np.ndarray, "height width 3"], alpha: Plane) -> Bool[np.ndarray, "height width"]:
-    """Where a layer covers anything or gives light."""
+    """Return the pixels at which a layer covers anything or gives light."""
     red, green, blue = (rgb[..., channel] > 0 for channel in range(3))
     return (alpha > 0) | red | green | blue

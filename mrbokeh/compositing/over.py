@@ -1,8 +1,7 @@
-"""Blurred layers over a photograph; where its depth is known, what stands in front hides parts of the sharp layers first.
+"""Blurred layers over a photograph; where its depth is known, nearer things hide parts of the sharp layers first.
 
-What of a virtual layer the photographed scene hides, decided on sharp layers, before the blur (Mandl et al. 2024, Section 3.4).
-
-The matte of Neural Bokeh: a white object on black, hidden by depth, eroded and smoothed while still sharp (Mandl et al. 2024, 3.4).
+The hidden part is decided on sharp layers, before the blur (Mandl et al. 2024, Section 3.4). SmoothedMatte is the matte of that paper
+(Neural Bokeh): a white object on black, hidden by depth, eroded and smoothed while still sharp.
 """
 
 from collections.abc import Sequence
@@ -20,11 +19,11 @@ Plane = Float32[np.ndarray, "height width"]
 
 
 def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, tolerance: float = 0.03, softness: float = 0.02) -> Plane:
-    """How much of the virtual surface the photographed scene leaves visible: 1 in front of it, 0 behind it.
+    """Return the share of the virtual surface that the photographed scene leaves visible: 1 in front of it, 0 behind it.
 
-    Depths are compared by their ratio. The photographed surface must be nearer by more than `tolerance` (a share of the
-    depth, the size of the error of depth from focus) to hide the virtual one, so that what stands on it does not sink in;
-    over `softness` the matte goes from 1 to 0, so that depth noise does not fray it.
+    Depths are compared by their ratio. The photographed surface must be nearer by more than `tolerance` (a share of the depth, the size
+    of the error of depth from focus) to hide the virtual one, so that what stands on it does not sink in; over `softness` the matte
+    goes from 1 to 0, so that depth noise does not fray it.
     """
     there = np.isfinite(virtual_depth_m)
     behind_by = np.zeros_like(virtual_depth_m)
@@ -53,7 +52,7 @@ class OverPhotograph:
 
 
 def behind(photo_rgb: Float32[np.ndarray, "height width 3"], layer: Layer) -> Float32[np.ndarray, "height width 3"]:
-    """What is left of an opaque picture behind a layer."""
+    """Return the part of an opaque picture that a layer leaves."""
     return (1.0 - layer.alpha[..., None]) * photo_rgb
 
 

@@ -30,7 +30,7 @@ def code_tables(transfer: str) -> CodeTables:
 
 @dataclass(frozen=True)
 class Overlay:
-    """What a layer puts over each frame, from pixel (left_px, top_px) on.
+    """Layer to lay over each frame, from pixel (left_px, top_px) on.
 
     rgb: (h, w, 3) linear premultiplied; shines_through: (h, w) one minus alpha, the part of the frame that stays.
     """
@@ -51,7 +51,7 @@ class Overlay:
         return cls(top, left, np.ascontiguousarray(layer.rgb[box]), np.float32(1.0) - layer.alpha[box])
 
     def over(self, frame_rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
-        """Laid over a linear frame; pixels outside the box stay bit for bit as they are."""
+        """Lay the layer over a linear frame; pixels outside the box stay bit for bit as they are."""
         result = frame_rgb.copy()
         height, width = self.shines_through.shape
         box = result[self.top_px : self.top_px + height, self.left_px : self.left_px + width]
@@ -60,7 +60,7 @@ class Overlay:
         return result
 
     def over_codes(self, frame_bgr: UInt8[np.ndarray, "height width 3"], tables: CodeTables) -> UInt8[np.ndarray, "height width 3"]:
-        """The same on 8-bit codes, blue first, in linear light through the tables; light above 1 is clipped."""
+        """Lay the layer over 8-bit codes, blue first, in linear light through the tables; light above 1 is clipped."""
         from mrbokeh.compositing._pixel_light_numba import over_codes
 
         result = frame_bgr.copy()

@@ -1,6 +1,5 @@
-"""Plate: the photograph that virtual objects go into, with what is known of its depth, lens and camera.
-
-What every way of putting virtual layers into a photograph is: a plate, layers and a renderer in, a picture in two parts out.
+"""Plate: the photograph that virtual objects go into, with its depth, lens and camera; Insertion: the protocol of every way to insert
+them.
 
 Every insertion owes these (tests/compositing/test_compositing.py asks all of them):
 - identity: where no light of a layer arrives and none of the photograph is hidden, the picture is the plate bit for bit;
@@ -35,13 +34,14 @@ from mrbokeh.system.errors import InputError
 
 @dataclass(frozen=True)
 class Plate:
-    """rgb: (H, W, 3) linear, blurred by the real lens; depth_m: (H, W) of the sharp scene or None; lens: as focused for this photograph.
+    """Photograph with its depth, lens and camera.
 
+    rgb: (H, W, 3) linear, blurred by the real lens. depth_m: (H, W) of the sharp scene or None. lens: as focused for this photograph.
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. lens_guessed: the lens has its blur,
-    but its focal length and f-number are made up.
+        but its focal length and f-number are made up.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -82,9 +82,9 @@ class Plate:
 
 
 def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
-    """A photograph with a lens, or a merged focal stack with the number of a slice, which brings its own lens and depth.
+    """Open a photograph with a lens, or a slice of a merged focal stack, which brings its own lens and depth.
 
-    lens: overrides what the photograph's metadata or the stack tell, but keeps the focus of a slice. focus_m overrides all.
+    lens: replaces that of the photograph's metadata or of the stack, but keeps the focus of a slice. focus_m replaces all.
     """
     if photo.is_dir() and not (photo / FILE_NAME).is_file():
         raise InputError(
@@ -114,7 +114,7 @@ def with_own_alpha(plate: Plate, path: Path, alpha: Float32[np.ndarray, "height 
 
 
 def bundle_plate(bundle: CaptureBundle, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
-    """What the viewfinder captured; lens: overrides the optics but keeps the focus. Objects are placed in camera axes."""
+    """Return the plate of a viewfinder's capture. lens: replaces the optics but keeps the focus. Objects are placed in camera axes."""
     focused = bundle.lens if lens is None else lens.focused_at(bundle.lens.focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)
     camera = replace(bundle.camera, camera_from_world=np.eye(4))

@@ -1,10 +1,8 @@
-"""How near things, a virtual surface and the rest share the pupil, place by place of the blurred picture.
+"""Shares of the pupil that near things, a virtual surface and the rest take, place by place of the blurred picture.
 
-Blurred coverages alone do not say it: a wire and the rim of an object behind it may hide the same part of the pupil or two parts
-of it. So rays are followed through some points of the pupil. Only what two coverages have in common (their covariance) and ratios
-are taken from so few rays; coverages and light by themselves come from the renderer.
-
-Points of the pupil, evenly spread, with what the opening lets through there.
+Blurred coverages alone do not say it: a wire and the edge of an object behind it may hide the same part of the pupil or two parts of
+it. So rays are followed through some evenly spread points of the pupil. Only the common part of two coverages (their covariance) and
+ratios are taken from so few rays; coverages and light by themselves come from the renderer.
 """
 
 from collections.abc import Iterator
@@ -28,9 +26,9 @@ _PLASTIC_NUMBER = 1.32471795724474602596
 
 @lru_cache(maxsize=512)
 def pupil_points(aperture: Aperture, count: int) -> Float64[np.ndarray, "points 3"]:
-    """x, y in the unit pupil and weight; a plain aperture. The first n of them are evenly spread too.
+    """Return x, y in the unit pupil and weight; a plain aperture. The first n of them are evenly spread too.
 
-    count: how many open points at least.
+    count: number of open points at least.
     """
     tried = count
     while True:
@@ -98,7 +96,7 @@ class Rays:
         return cls(scene, virtual, lens, np.stack(coc_px).astype(np.float32), points)
 
     def means(self, places: Places) -> PupilMeans:
-        """At places (row times width plus column) of the picture."""
+        """Return means over the pupil at places (row times width plus column) of the picture."""
         from mrbokeh.compositing._between_numba import gather
 
         sums, near, far = np.zeros((len(places), 16), np.float32), self.scene.near.alpha, self.scene.far_rgb
@@ -121,12 +119,12 @@ class Rays:
 
     @property
     def one_far_colour(self) -> Bool[np.ndarray, "height width"]:
-        """Where all rays get past the near things and end in one point of the rest: there the pupil is shared as in "over"."""
+        """Pixels whose rays all get past the near things and end in one point of the rest: the pupil is shared as in "over"."""
         return ~self.near_in_reach & (self.coc_px[2] == 0.0)
 
     @cached_property
     def near_in_reach(self) -> Bool[np.ndarray, "height width"]:
-        """Where rays may meet something near: within its blur and a pixel."""
+        """Pixels whose rays may meet something near: within its blur and a pixel."""
         from cv2 import MORPH_RECT, dilate, getStructuringElement
 
         there = self.scene.near.alpha > 0

@@ -70,7 +70,7 @@ def _layers(layers: Sequence[Layer] | Callable[[Plate], Sequence[Layer]], plate:
 
 
 def _plate(stack: FocalStack, index: int, depth_m: Float32[np.ndarray, "height width"], sharp_rgb: Rgb, other: Lens | None) -> Plate:
-    """All slices are seen by one camera; another lens takes the slice's focus and nothing else."""
+    """Return the plate of a slice. All slices are seen by one camera; another lens takes the slice's focus and nothing else."""
     lens = stack.registered_lens_of(index) if other is None else other.focused_at(stack.lens_of(index).focus_distance_m)
     rgb = stack.slice_rgb(index)
     camera = stack.camera or plate_of(rgb, stack.lens_of(stack.reference)).camera

@@ -1,9 +1,8 @@
-"""A photograph, near light, virtual light and rays through all of them put together: what each pixel shows of the three parts.
+"""Photograph, near light, virtual light and rays through all of them put together: the three parts of each pixel.
 
-Highlights followed ray by ray: at every place of its blur a light is seen through one point of the pupil, which is hidden or not.
-
-Few rays per pixel would miss it, and a blurred coverage would dim its whole disc where the truth cuts it. Only lights whose discs come
-to a pixel that is asked for are followed.
+Highlights are followed ray by ray: at every place of its blur a highlight is seen through one point of the pupil, which is hidden or
+not. Few rays per pixel would miss it, and a blurred coverage would dim its whole disc where the truth cuts it. Only highlights whose
+discs reach a pixel that is asked for are followed.
 """
 
 from dataclasses import dataclass, replace
@@ -27,16 +26,16 @@ Mask = Bool[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class HighlightsThrough:
-    """Light of single bright pixels (H, W, 3) as it arrives past one layer, and past that and another."""
+    """Light of highlights (H, W, 3) as it arrives past one layer, and past that and another."""
 
     one: Float32[np.ndarray, "height width 3"]
     both: Float32[np.ndarray, "height width 3"]
 
 
 def far_highlights(rays: Rays, left_over: Plane) -> HighlightsThrough:
-    """Past the near things, and past near and virtual ones, where `left_over` is a number.
+    """Follow far highlights past the near things, and past near and virtual ones, to pixels with a number in `left_over`.
 
-    left_over: light of the photograph (r + g + b) that surfaces do not explain, NaN where unknown. A light that the sharp picture
+    left_over: light of the photograph (r + g + b) that surfaces do not explain, NaN where unknown. A highlight that the sharp picture
     shows half hidden or clipped gets the brightness of its disc there.
     """
     first, second = (rays.scene.near.alpha, rays.coc_px[0]), (rays.virtual.alpha, rays.coc_px[1])
@@ -49,7 +48,7 @@ def far_highlights(rays: Rays, left_over: Plane) -> HighlightsThrough:
 
 
 def _arriving(rays: Rays, bright: Highlights, coc_px: Plane, wanted: Mask) -> Highlights:
-    """Those lights whose discs come to a wanted pixel, or to one beside it."""
+    """Return the highlights whose discs reach a wanted pixel, or one beside it."""
     from cv2 import integral
 
     (height, width), (rows, columns) = wanted.shape, np.unravel_index(bright.places, wanted.shape)
@@ -63,7 +62,7 @@ def _arriving(rays: Rays, bright: Highlights, coc_px: Plane, wanted: Mask) -> Hi
 
 
 def _gains(rays: Rays, bright: Highlights, ratio: Plane) -> Float32[np.ndarray, " highlights"]:
-    """Per light the median, over its disc, of how much more light there is than it gives."""
+    """Return the median, over each highlight's disc, of the ratio of the light there to the light that it gives."""
     height, width = ratio.shape
     gains = np.ones(len(bright.places), np.float32)
     for which, aperture in rays.cells(bright.places):
@@ -80,7 +79,7 @@ def _gains(rays: Rays, bright: Highlights, ratio: Plane) -> Float32[np.ndarray, 
 
 
 def virtual_highlights(rays: Rays, wanted: Mask) -> HighlightsThrough:
-    """As if nothing hid them, and past the near things; where it is wanted."""
+    """Follow the virtual layer's highlights as if nothing hid them, and past the near things, to wanted pixels."""
     places = np.flatnonzero(find_highlights(rays.virtual_rgba))
     whole, dark = (each.reshape(-1, 4)[places, :3] for each in (rays.virtual_rgba, rays.virtual_without_highlights))
     bright = _arriving(rays, Highlights(places, whole - dark, np.zeros(len(places), np.float32)), rays.coc_px[1], wanted)
@@ -137,7 +136,7 @@ def put_together(plate: Plate, near: Layer, blurred: Layer, rays: Rays) -> Inser
 
 
 def _shared(photo_rgb: Colours, near: Layer, blurred: Layer, rays: Rays, places: Places) -> tuple[Colours, Colours, Shares]:
-    """(photograph left, virtual light, its share of the pupil) at places where near, virtual and far may all be seen."""
+    """Return (photograph left, virtual light, its share of the pupil) at places that may see near, virtual and far."""
     means = rays.means(places)
     near_share = np.minimum(near.alpha.reshape(-1)[places].astype(np.float64), _MOST_NEAR)
     covered = np.clip(blurred.alpha.reshape(-1)[places].astype(np.float64), 0.0, 1.0)
@@ -152,7 +151,7 @@ def _shared(photo_rgb: Colours, near: Layer, blurred: Layer, rays: Rays, places:
 
 
 def _virtual_light(blurred: Layer, rays: Rays, places: Places, means: PupilMeans, free: Exact) -> ExactColours:
-    """What gets past the near things: surfaces by the part of the pupil they leave and the covariance, lights one by one."""
+    """Return the virtual light past the near things: surfaces by their part of the pupil and the covariance, highlights one by one."""
     wanted = np.zeros(blurred.alpha.shape, np.bool_)
     wanted.reshape(-1)[places] = True
     own = virtual_highlights(rays, wanted)
@@ -164,7 +163,7 @@ def _virtual_light(blurred: Layer, rays: Rays, places: Places, means: PupilMeans
 def _far_light(
     photo_rgb: Colours, near: Layer, rays: Rays, places: Places, means: PupilMeans, free: Exact, share: Exact
 ) -> tuple[ExactColours, ExactColours]:
-    """(far light in the photograph, the part of it that the virtual surface leaves visible)."""
+    """Return (far light in the photograph, the part of it that the virtual surface leaves visible)."""
     near_rgb = near.rgb.reshape(-1, 3)[places]
     surfaces = means.f_far * (free / np.maximum(means.f, _ROUND))[:, None]
     left_over = np.full_like(near.alpha, np.nan)
@@ -191,7 +190,7 @@ def _colour_change(means: PupilMeans) -> Colours:
 
 
 def _explained(photo_rgb: Colours, near_rgb: Colours, far_rgb: ExactColours) -> ExactColours:
-    """How much of the photograph is far light: what was blurred anew, and what that leaves over, shared by the squares of both."""
+    """Return the far light of the photograph: what was blurred anew, and its share, by the squares of both, of what that leaves over."""
     left_over = photo_rgb - near_rgb - far_rgb
     far_share = far_rgb**2 / np.maximum(far_rgb**2 + near_rgb**2, _ROUND)
     far_share = np.where(left_over > _UNEXPLAINED * (near_rgb + far_rgb), 1.0, far_share)

@@ -1,6 +1,6 @@
-"""Light on shading points: glTF's metallic-roughness BRDF under lights and under a panorama. Compiled with numba.
+"""Image-based lighting and glTF's metallic-roughness BRDF, compiled with numba.
 
-Panoramas filtered for lighting: cosine convolution, GGX convolution, BRDF integral. Compiled with numba.
+Panoramas are filtered by cosine and GGX convolution; shading points are lit by lights and by the filtered panorama.
 """
 
 from math import acos, atan2, cos, log2, pi, sin, sqrt
@@ -162,12 +162,12 @@ def ggx_convolved(source: PanoramaLevels, directions: np.ndarray, lobe: np.ndarr
 
 @compiled
 def brdf_integral(size: int, samples: int, out: np.ndarray) -> None:
-    """(size, size, 2): reflected share of uniform light = f0 * [..., 0] + f90 * [..., 1]; rows roughness, columns cosine.
+    """Fill (size, size, 2): reflected share of uniform light = f0 * [..., 0] + f90 * [..., 1]; rows roughness, columns cosine.
 
     The BRDF is the specification's: GGX, height-correlated Smith visibility, Schlick's Fresnel (glTF 2.0, appendix B).
     """
-    for row in range(size):
-        alpha2 = max(row / (size - 1), 1e-3) ** 4
+    for line in range(size):
+        alpha2 = max(line / (size - 1), 1e-3) ** 4
         for column in range(size):
             n_v = max(column / (size - 1), 1e-3)
             vx = sqrt(1.0 - n_v * n_v)
@@ -183,7 +183,7 @@ def brdf_integral(size: int, samples: int, out: np.ndarray) -> None:
                 share = visibility * n_l * 4.0 * v_h / n_h
                 fresnel = (1.0 - v_h) ** 5
                 first, second = first + (1.0 - fresnel) * share, second + fresnel * share
-            out[row, column, 0], out[row, column, 1] = first / samples, second / samples
+            out[line, column, 0], out[line, column, 1] = first / samples, second / samples
 
 
 LOWEST_ROUGHNESS = 0.045
@@ -192,7 +192,7 @@ LOWEST_ROUGHNESS = 0.045
 
 @compiled
 def add_emission(surfaces: Surfaces, rgb: np.ndarray) -> None:
-    """What shines by itself: emissive surfaces, and unlit ones their base colour."""
+    """Add the light of emissive surfaces, and the base colour of unlit ones."""
     for i in range(surfaces.alpha.size):
         if surfaces.alpha[i] > 0.0:
             for k in range(3):

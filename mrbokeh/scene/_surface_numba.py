@@ -1,6 +1,6 @@
-"""From a ray and the triangle it meets to a shading point: exact depth, normals, textures. Compiled with numba.
+"""Shading points of rays that meet triangles: exact depth, normals, textures. Compiled with numba.
 
-Reading packed textures: bilinear with wrap modes, trilinear over coarser levels. Compiled with numba.
+Textures are read bilinearly with wrap modes, trilinearly over coarser levels.
 """
 
 from math import floor, inf, log2, sqrt
@@ -186,7 +186,7 @@ def fill_surfaces(
 
 @compiled
 def _texture_coordinates(uvs: np.ndarray, triangle: int, w: Vector) -> Texel:
-    """Both sets of texture coordinates inside a triangle."""
+    """Interpolate both sets of texture coordinates inside a triangle."""
     return (
         w[0] * uvs[triangle, 0, 0] + w[1] * uvs[triangle, 1, 0] + w[2] * uvs[triangle, 2, 0],
         w[0] * uvs[triangle, 0, 1] + w[1] * uvs[triangle, 1, 1] + w[2] * uvs[triangle, 2, 1],

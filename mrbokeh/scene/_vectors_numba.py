@@ -1,7 +1,4 @@
-"""Three-dimensional vectors as tuples, for compiled kernels.
-
-How every kernel of this folder is compiled: cached on disk, without Python's lock, without counting references.
-"""
+"""Three-dimensional vectors as tuples, and the decorator of all compiled kernels of this folder."""
 
 from math import sqrt
 
@@ -53,17 +50,17 @@ def mixed(a: Vector, b: Vector, c: Vector, weights: Vector) -> Vector:
 
 @compiled
 def row(array: np.ndarray, i: int) -> Vector:
-    """array[i] of an (N, 3) array."""
+    """Return array[i] of an (N, 3) array."""
     return (float(array[i, 0]), float(array[i, 1]), float(array[i, 2]))
 
 
 @compiled
 def corner(array: np.ndarray, triangle: int, number: int) -> Vector:
-    """array[triangle, number] of a (T, 3, 3 or more) array."""
+    """Return array[triangle, number] of a (T, 3, 3 or more) array."""
     return (float(array[triangle, number, 0]), float(array[triangle, number, 1]), float(array[triangle, number, 2]))
 
 
 @compiled
 def write(array: np.ndarray, i: int, a: Vector) -> None:
-    """array[i] = a of an (N, 3) array."""
+    """Set array[i] = a of an (N, 3) array."""
     array[i, 0], array[i, 1], array[i, 2] = a[0], a[1], a[2]

@@ -36,7 +36,7 @@ _FLIP = (1.0, -1.0, -1.0)
 
 
 class Film(NamedTuple):
-    """What Blender says of a camera's film: pixels, pixel aspect, millimetres, shift in parts of the fitted side."""
+    """Film of a Blender camera: pixels, pixel aspect, millimetres, shift in parts of the fitted side."""
 
     width_px: int
     height_px: int
@@ -50,9 +50,9 @@ class Film(NamedTuple):
 
 
 def intrinsics(film: Film) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """(focal length in pixels, principal point in pixels, width of the film in mm that the picture covers).
+    """Return (focal length in pixels, principal point in pixels, width of the film in mm that the picture covers).
 
-    As Blender computes its view plane: the sensor's side lies along the fitted side of the picture, counted in pixel widths.
+    Follows Blender's view plane: the sensor's side lies along the fitted side of the picture, counted in pixel widths.
     """
     tallness = film.pixel_aspect[1] / film.pixel_aspect[0]
     is_wide = film.width_px >= tallness * film.height_px
@@ -66,7 +66,9 @@ def intrinsics(film: Film) -> tuple[tuple[float, float], tuple[float, float], fl
 
 
 def camera_from_world(matrix_world: Matrix) -> Matrix:
-    """(4, 4) rigid transform of our world into our camera axes, from a Blender camera's matrix_world; its scale does not count."""
+    """Return the (4, 4) rigid transform of our world into our camera axes, from a Blender camera's matrix_world; its scale does not
+    count.
+    """
     columns = [[matrix_world[row][column] for row in range(3)] for column in range(3)]
     lengths = [sum(each * each for each in column) ** 0.5 for column in columns]
     axes = [_in_our_world([flip * each / length for each in column]) for column, length, flip in zip(columns, lengths, _FLIP, strict=True)]
@@ -117,7 +119,7 @@ def film_of(scene: Any, camera: Any) -> Film:
 
 
 def check_scene(scene: Any) -> None:
-    """Raises ValueError with one sentence where a scene cannot be exported truly."""
+    """Raise ValueError with one sentence if the scene cannot be exported correctly."""
     if scene.camera is None:
         raise ValueError("the scene has no camera: choose one in the scene's properties")
     if scene.camera.data.type != "PERSP":
@@ -174,7 +176,7 @@ def set_up_render(scene: Any, folder: str) -> None:
 
 
 def export(scene: Any, folder: str, selected_only: bool = False, with_render: bool = True) -> None:
-    """Everything into `folder`, which is made."""
+    """Write objects, track and render settings into `folder`, which is created."""
     import bpy
 
     track = camera_track(scene)

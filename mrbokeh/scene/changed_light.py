@@ -1,4 +1,4 @@
-"""LightChange: what objects change on a real surface, as pictures and as a layer; see `light_change`."""
+"""LightChange: the change that objects make to the light of a real surface, as pictures and as a layer."""
 
 from dataclasses import dataclass, replace
 
@@ -20,8 +20,11 @@ LEAST_CHANGE = 1.0 / 1024
 
 @dataclass(frozen=True, eq=False)
 class LightChange:
-    """ratio: (H, W, 3) what remains of the surface's light, 0 to 1; 1 where nothing changes. added: (H, W, 3) radiance that the surface
-    sends besides. alpha: (H, W) how much of the pixel the surface covers. depth_m: (H, W) of the surface, inf where it is not."""
+    """Change of light on a real surface.
+
+    ratio: (H, W, 3) share of the surface's light that remains, 0 to 1; 1 if nothing changes. added: (H, W, 3) radiance that the surface
+    sends in addition. alpha: (H, W) coverage of the pixel by the surface. depth_m: (H, W) of the surface, inf outside it.
+    """
 
     ratio: Float32[np.ndarray, "height width 3"]
     added: Float32[np.ndarray, "height width 3"]
@@ -29,7 +32,7 @@ class LightChange:
     depth_m: Float32[np.ndarray, "height width"]
 
     def evenly(self) -> "LightChange":
-        """The same with all colours losing what their luminance loses: `as_layer` then asks nothing of the plate."""
+        """Return the same change with all colours losing what their luminance loses; `as_layer` then needs no plate."""
         share = np.where((self.ratio == 1.0).all(-1), 1.0, luminance(self.ratio)).astype(np.float32)
         return replace(self, ratio=np.repeat(share[..., None], 3, axis=2))
 
@@ -63,7 +66,7 @@ def changed(
     pixels: Int64[np.ndarray, " pixels"],
     light: tuple[Float32[np.ndarray, "pixels 3"], Float32[np.ndarray, "pixels 3"], Float32[np.ndarray, "pixels 3"]],
 ) -> LightChange:
-    """From light of some pixels (row after row): (all that there was, what of it is taken away, what is added)."""
+    """Build a LightChange from light at some pixels (row after row): (all light before, part that is taken away, part that is added)."""
     total, taken, added = light
     largest = np.maximum(total.max(-1, keepdims=True), 1e-12)
     lost = np.clip(taken / np.maximum(total, 1e-12), 0.0, 1.0)

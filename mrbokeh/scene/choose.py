@@ -1,4 +1,4 @@
-"""Which backend renders virtual objects on this machine."""
+"""Choice of the backend that renders virtual objects on this machine."""
 
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
@@ -24,7 +24,7 @@ def scene_renderer(name: str = "auto", threads: int = 0) -> EmbreeRaycaster | Wg
 
 
 def has_graphics_card() -> bool:
-    """Whether wgpu finds a device other than the processor itself."""
+    """Return whether wgpu finds a device other than the processor itself."""
     try:
         return not gpu().is_software
     except InputError:

@@ -24,8 +24,10 @@ _ROUGH_LEVELS = ((512, 16), (256, 32), (128, 64), (128, 64), (64, 128), (64, 128
 
 @dataclass(frozen=True, eq=False)
 class LightingMaps:
-    """irradiance: one panorama of irradiance / pi by normal, without its peaks. peaks: (P, 3 colours, 3) the brightest parts,
-    each adding max(0, normal . peak). reflections: GGX-blurred panoramas; level 8 * roughness**(2/3).
+    """Panorama filtered for shading.
+
+    irradiance: one panorama of irradiance / pi by normal, without its peaks. peaks: (P, 3 colours, 3) the brightest parts, each adding
+    max(0, normal . peak). reflections: GGX-blurred panoramas; level 8 * roughness**(2/3).
     """
 
     peaks: Float[np.ndarray, "peaks 3 3"]

@@ -1,7 +1,4 @@
-"""Light: directional, point and spot lights as KHR_lights_punctual defines them.
-
-Environment: the light that comes from everywhere, as a linear HDR panorama in longitude and latitude.
-"""
+"""Light of a scene: directional, point and spot lights (KHR_lights_punctual), and Environment, a linear HDR panorama."""
 
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -62,14 +59,14 @@ class Light:
         )
 
     def brighter(self, factor: float) -> "Light":
-        """The same light, factor times as strong."""
+        """Return the light with its strength times a factor."""
         red, green, blue = self.rgb
         return replace(self, rgb=(red * factor, green * factor, blue * factor))
 
     def arriving_at(
         self, points_m: Float[np.ndarray, "points 3"]
     ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
-        """(unit vectors towards the light, distance in metres, irradiance on a surface facing it), shadows not counted."""
+        """Return (unit vectors towards the light, distance in metres, irradiance on a surface facing it), without shadows."""
         if self.kind == "directional":
             towards = np.broadcast_to(-np.asarray(self.direction), points_m.shape)
             return towards, np.full(len(points_m), np.inf), np.broadcast_to(np.asarray(self.rgb), points_m.shape)
@@ -123,13 +120,13 @@ class Environment:
         return replace(self, world_from_environment=turn @ self.world_from_environment)
 
     def brighter(self, factor: float) -> "Environment":
-        """The same panorama at another exposure."""
+        """Return the panorama at another exposure."""
         return replace(self, radiance=(self.radiance * np.float32(factor)))
 
 
 @cache
 def neutral_environment(radiance: float = NEUTRAL_RADIANCE) -> Environment:
-    """The same grey light from everywhere."""
+    """Return uniform grey light from all directions."""
     return Environment(np.full((8, 16, 3), radiance, np.float32))
 
 

@@ -1,13 +1,12 @@
-"""The change of light on a real surface by the ray caster alone: shadows of lamps, and what objects hide of the environment.
-
-For machines without Mitsuba. The surface is matte; nothing is added. See `light_change`. What is hidden of the environment is drawn
-evenly, so a small sun in a panorama has to be split off first (`split_sun`), as the ray caster needs it anyway.
-
-How virtual objects change the light on a real surface: their shadow, their reflection and the light that they send there.
+"""Change of light on a real surface by virtual objects: shadow, reflection and the light that they send there.
 
 Differential rendering (Debevec 1998, "Rendering Synthetic Objects into Real Scenes"), with the two directions of change apart: light
-that objects take away is a share of what there was, so it multiplies the photograph; light that they send is added. So the
-surface's texture comes from the photograph alone, and a rough guess of its material does.
+that objects take away is a share of the light before, so it multiplies the photograph; light that they send is added. So the surface's
+texture comes from the photograph alone, and a rough guess of its material suffices.
+
+Without Mitsuba the ray caster computes shadows of lights and the part of the environment that objects hide; the surface is matte,
+nothing is added. The environment is sampled evenly, so a small sun in a panorama has to be split off first (`split_sun`), which the ray
+caster needs anyway.
 """
 
 from collections.abc import Sequence
@@ -40,7 +39,7 @@ _NO_EFFECT = LEAST_CHANGE / 8
 def cast_light_change(
     renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, samples: int = 64, seed: int = 0
 ) -> LightChange:
-    """samples: rays per pixel towards the environment, where objects may hide it."""
+    """Return the light change by the ray caster. samples: rays per pixel towards the environment where objects may hide it."""
     seen = seen_surface(EmbreeRaycaster(), camera, catcher)
     surfaces, centre_m, pixels = _met_surfaces(camera, catcher)
     nothing = np.zeros((len(pixels), 3), np.float32)
@@ -62,7 +61,7 @@ def cast_light_change(
 
 
 def _met_surfaces(camera: Camera, catcher: Mesh) -> tuple[Surfaces, Float64[np.ndarray, "3"], np.ndarray]:
-    """(white surfaces where the centres of pixels see the catcher, the point that they are relative to, those pixels)."""
+    """Return (white surfaces at the pixel centres that see the catcher, the point that they are relative to, those pixels)."""
     white = replace(catcher, material=replace(matte(1.0, 1.0, 1.0), double_sided=True))
     ground = prepared([white])
     eye_m = camera.world_from_camera[:3, 3]
@@ -78,7 +77,7 @@ def _met_surfaces(camera: Camera, catcher: Mesh) -> tuple[Surfaces, Float64[np.n
 
 
 def _lamp_light(lights: Sequence[Light], surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "points 3"]:
-    """Radiance of a white surface under the lamps alone."""
+    """Return the radiance of a white surface under the lights alone."""
     rgb = np.zeros((len(surfaces.alpha), 3))
     for light in lights:
         towards, _distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + centre_m)
@@ -87,7 +86,7 @@ def _lamp_light(lights: Sequence[Light], surfaces: Surfaces, centre_m: Float64[n
 
 
 class _Objects:
-    """What hides the sky, and the ball around it."""
+    """Objects that hide the sky, and the ball around them."""
 
     def __init__(self, drawn: list[Mesh]) -> None:
         self._rays = prepared(drawn)
@@ -97,7 +96,7 @@ class _Objects:
         self.middle_m = middle_m + self._rays.centre_m
 
     def hidden(self, points_m: Float[np.ndarray, "points 3"], towards: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, " points"]:
-        """How much of the light from infinitely far the objects keep from points."""
+        """Return the share of light from infinitely far that the objects keep from points."""
         far_m = np.full(len(points_m), np.inf)
         return 1.0 - visible(self._rays, points_m - self._rays.centre_m, towards, far_m)
 
@@ -133,7 +132,7 @@ def _drawn(
     sine2: Float[np.ndarray, " points"],
     uv: Float[np.ndarray, "points samples 2"],
 ) -> tuple[Float[np.ndarray, "points samples 3"], Float[np.ndarray, "points samples"]]:
-    """(directions, 1 / density): in the cone around the objects, or by the cosine where that is wide."""
+    """Return (directions, 1 / density), drawn in the cone around the objects, or by the cosine if that cone is wide."""
     narrow = sine2 < 1.0 - _WIDEST_CONE_COSINE**2
     off = np.where(narrow, sine2 / (1.0 + np.sqrt(np.maximum(1.0 - sine2, 0.0))), 1.0)[:, None] * uv[..., 0]
     rising = np.where(narrow[:, None], 1.0 - off, np.sqrt(1.0 - uv[..., 0]))
@@ -164,12 +163,12 @@ GREY = matte(0.5, 0.5, 0.5)
 def light_change(
     renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, surface: Material = GREY, samples: int = 64
 ) -> LightChange:
-    """What a scene's objects change on a real surface that the scene's lights and environment light.
+    """Return the change that a scene's objects make on a real surface lit by the scene's lights and environment.
 
-    catcher: its shape (also one that catches shadows); surface: about what it is made of; only light that comes from the objects
-    depends on its albedo. With a MitsubaTracer everything counts: shadows of lamps and of the environment, mirror images, colour
-    that bleeds, emissive objects; its own number of samples is taken. With any other renderer the surface is matte, and only
-    light that is taken away is counted: the renderer's shadow mask of the lamps, and what of the environment is hidden.
+    catcher: shape of the surface (also one that catches shadows). surface: its approximate material; only light that comes from the
+    objects depends on its albedo. A MitsubaTracer counts everything: shadows of lights and of the environment, mirror images, colour
+    bleeding, emissive objects; it uses its own number of samples. With any other renderer the surface is matte and only light that is
+    taken away counts: the renderer's shadow mask, and the hidden part of the environment.
     """
     if isinstance(renderer, MitsubaTracer):
         from mrbokeh.scene.mitsuba.traced_light_change import traced_light_change

@@ -43,7 +43,7 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a surface reflects and shines (glTF 2.0 specification, section 3.9 and appendix B).
+    """Reflection and emission of a surface (glTF 2.0 specification, section 3.9 and appendix B).
 
     base_color: (r, g, b, a) linear factor in [0, 1]; the texture multiplies it.
     metallic, roughness: factors in [0, 1]; the texture's blue channel multiplies metallic, its green channel roughness.

@@ -1,9 +1,4 @@
-"""Mesh: triangles with normals, texture coordinates and one material; the tangents that normal maps need.
-
-Simple meshes with exact normals: the sphere, the rectangle and the box of tests, demonstrations and shadow catchers.
-
-Whether meshes are others moved as one rigid body: then what was prepared for those serves for these.
-"""
+"""Mesh: triangles with normals, texture coordinates and one material; tangents for normal maps, simple shapes, rigid motions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -48,7 +43,7 @@ class Mesh:
             raise InputError(f"mesh {self.name!r}: expected finite positions, got infinite or undefined ones: check the transforms")
 
     def transformed(self, world_from_mesh: Float[np.ndarray, "4 4"]) -> "Mesh":
-        """The same mesh moved, turned, scaled (also unevenly) or mirrored."""
+        """Return the mesh moved, turned, scaled (also unevenly) or mirrored."""
         linear = world_from_mesh[:3, :3]
         mirrored = np.linalg.det(linear) < 0
         tangents = self.tangents
@@ -167,10 +162,10 @@ _NORMAL_TOLERANCE = 1e-5
 
 
 def rigid_motion(before: Sequence[Mesh], after: Sequence[Mesh]) -> Float64[np.ndarray, "4 4"] | None:
-    """(4, 4) after_from_before, or None where anything but a common motion without scaling changed.
+    """Return the (4, 4) after_from_before, or None if anything but a common motion without scaling changed.
 
-    Meshes count as the same where they share triangles, texture coordinates, colours and material as objects, as
-    `Mesh.transformed` leaves them; then every vertex, normal and tangent is checked.
+    Meshes count as the same if they share triangles, texture coordinates, colours and material as objects, as `Mesh.transformed` leaves
+    them; then every vertex, normal and tangent is checked.
     """
     if len(before) != len(after) or not all(map(_shares_all_but_place, before, after)):
         return None
@@ -203,7 +198,7 @@ def _fitted(before_m: Float64[np.ndarray, "points 3"], after_m: Float64[np.ndarr
 
 
 def _is_moved(one: Mesh, other: Mesh, motion: Float64[np.ndarray, "4 4"]) -> bool:
-    """Whether `other` is `one` under this motion, in all that shading looks at."""
+    """Return whether `other` is `one` under this motion, in all that shading uses."""
     turn = motion[:3, :3]
     tolerance_m = _PLACE_TOLERANCE * float(np.ptp(one.positions_m, axis=0).max(initial=0.0))
     if np.abs(one.positions_m @ turn.T + motion[:3, 3] - other.positions_m).max(initial=0.0) > tolerance_m:

@@ -18,7 +18,7 @@ _WRAPS = {"repeat": REPEAT, "clamp": CLAMP, "mirror": MIRROR}
 
 
 class PackedTriangles(NamedTuple):
-    """All triangles; positions are relative to `centre_m` and rounded to float32 as the ray tracer sees them."""
+    """Triangles of all meshes; positions are relative to `centre_m` and rounded to float32 as the ray tracer sees them."""
 
     corners_m: Float64[np.ndarray, "triangles 3 3"]
     normals: Float32[np.ndarray, "triangles 3 3"]
@@ -48,7 +48,7 @@ class PackedMaterials(NamedTuple):
 
 
 class PackedTextures(NamedTuple):
-    """All textures with their coarser levels, one after the other."""
+    """Textures with their coarser levels, one after the other."""
 
     texels: Float32[np.ndarray, "texels 4"]
     level_start: Int32[np.ndarray, " levels"]
@@ -96,7 +96,7 @@ def textures_of(material: Material) -> tuple[Texture | None, ...]:
 
 
 def _reads(texture: Texture) -> tuple[object, ...]:
-    """What decides about a texture's values: two that agree are one, such as roughness and occlusion in one picture."""
+    """Return the key of a texture's values: equal keys are one texture, such as roughness and occlusion in one picture."""
     return id(texture.texels), texture.wrap, texture.uv_set, np.asarray(texture.texture_from_uv, np.float64).tobytes()
 
 

@@ -1,9 +1,4 @@
-"""Scene: what a virtual object brings, flattened to world space: meshes, lights, environment.
-
-The protocol of everything that turns a virtual scene and a camera into a Layer.
-
-A shadow as a layer of premultiplied black: the lens blurs it like anything that lies there, "over" darkens the photograph.
-"""
+"""Scene: meshes, lights and environment in world space; the protocol of scene renderers; shadows as layers."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
@@ -85,10 +80,10 @@ class Scene:
 def world_from_scene_placing(
     scene: Scene, stands_at_m: Triple, height_m: float | None = None, turn_rad: float = 0.0
 ) -> Float[np.ndarray, "4 4"]:
-    """(4, 4) transform that stands a scene on a point: `scene.transformed(world_from_scene_placing(scene, ...))`.
+    """Return the (4, 4) transform that stands a scene on a point: `scene.transformed(world_from_scene_placing(scene, ...))`.
 
-    stands_at_m: where the middle of the underside comes to lie (up is -y). height_m: scaled to that height; None keeps its size.
-    turn_rad: about the vertical; what faced +z turns towards +x.
+    stands_at_m: place of the middle of the underside (up is -y). height_m: scaled to that height; None keeps its size. turn_rad: about
+    the vertical; what faced +z turns towards +x.
     """
     low, high = scene.bounds_m
     scale = 1.0
@@ -121,10 +116,10 @@ class SceneRenderer(Protocol):
         ...
 
     def render_shadow_mask(self, scene: Scene, camera: Camera, catcher: Mesh) -> Float32[np.ndarray, "height width"]:
-        """(H, W): what share of the lights' irradiance on the catcher the scene's meshes let through; 1 is lit.
+        """Return the (H, W) share of the lights' irradiance on the catcher that the scene's meshes let through; 1 is lit.
 
-        It is 1 where the catcher is not in the picture, turned away from the lights, or there are no lights. The catcher
-        is seen through the virtual objects, so that a soft edge of an object blends over the right value.
+        The share is 1 outside the catcher, on parts turned away from the lights, and without lights. The catcher is seen through the
+        virtual objects, so that a soft edge of an object blends over the right value.
         """
         ...
 

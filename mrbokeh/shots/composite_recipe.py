@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.compositing.choose import DEFAULT_MODE, InTouchedBox, insertion_of, touched_box
+from mrbokeh.compositing.choose import DEFAULT_MODE, InDirtyRectangle, dirty_rectangle, insertion_of
 from mrbokeh.compositing.over import OverPhotograph, behind, covered_by, occlusion_matte
 from mrbokeh.compositing.plate import Inserted, Insertion, Plate, plate_of, same_size
 from mrbokeh.images.alpha_io import coverage_with
@@ -25,7 +25,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
-from mrbokeh.shots.hooks import CameraSource, DepthSource, Description, Finisher, FocusSource, Kept, LayerSource, MatteSource, Moment
+from mrbokeh.shots.inputs import CameraSource, DepthSource, Description, Finisher, FocusSource, Kept, LayerSource, MatteSource, Moment
 from mrbokeh.shots.shot import Picture, Rgba
 from mrbokeh.stacks.photograph import Holding, lens_held
 
@@ -71,7 +71,7 @@ class BoxedInsertion:
     def __init__(self, insertion: Insertion, renderer: Renderer, *, local: bool) -> None:
         """local: whether the renderer spreads light no farther than the circle of confusion."""
         self._insertion, self._renderer = insertion, renderer
-        plain = insertion.insertion if isinstance(insertion, InTouchedBox) else insertion
+        plain = insertion.insertion if isinstance(insertion, InDirtyRectangle) else insertion
         self._keeps = local and isinstance(plain, OverPhotograph)
         self._by_depth = isinstance(plain, OverPhotograph) and plain.by_depth
         self._box, self._cut = Kept(_reached_box), Kept(_cut_layers)
@@ -102,7 +102,7 @@ def _reached_box(layers: Sequence[Layer], lens: Lens) -> Box:
     if not layers:
         return NOWHERE
     blank = np.broadcast_to(np.float32(0.0), (*layers[0].alpha.shape, 3))
-    return touched_box(plate_of(blank, lens), layers)
+    return dirty_rectangle(plate_of(blank, lens), layers)
 
 
 def _cut_layers(layers: Sequence[Layer], box: Box) -> list[Layer]:

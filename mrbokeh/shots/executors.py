@@ -1,8 +1,8 @@
-"""Crew: who makes the segments: this process, processes of this machine, or machines of a cluster.
+"""Executor: who makes the segments: this process, processes of this machine, or machines of a cluster.
 
-ProcessCrew: worker processes of this machine, one segment each at a time.
+ProcessExecutor: worker processes of this machine, one segment each at a time.
 
-DaskCrew: workers of a Dask cluster, on this machine or others, that see the same files under the same names.
+DaskExecutor: workers of a Dask cluster, on this machine or others, that see the same files under the same names.
 """
 
 import secrets
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from mrbokeh import __version__
-from mrbokeh.shots.segment_task import SegmentTask, make_segment
+from mrbokeh.shots.segment_task import SegmentTask, render_segment
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.system.resources import cores
 
@@ -27,7 +27,7 @@ Progress = Callable[[int], None]
 
 
 @runtime_checkable
-class Crew(Protocol):
+class Executor(Protocol):
     @property
     def threads(self) -> int:
         """How many cores each task may use."""
@@ -38,7 +38,7 @@ class Crew(Protocol):
         ...
 
 
-class OneProcess:
+class SerialExecutor:
     """The segments one after the other, in this process. threads: of the renderer, 0 for all cores."""
 
     def __init__(self, threads: int = 0) -> None:
@@ -46,15 +46,15 @@ class OneProcess:
 
     def run(self, tasks: Sequence[SegmentTask], progress: Progress) -> None:
         for task in tasks:
-            make_segment(task, lambda: progress(1))
+            render_segment(task, lambda: progress(1))
 
 
 _TRIES = 3
 _POLL_S = 0.25
 
 
-class ProcessCrew:
-    """A Crew. Workers are started afresh (spawn), for threads do not survive a fork; they leave when this process does.
+class ProcessExecutor:
+    """A Executor. Workers are started afresh (spawn), for threads do not survive a fork; they leave when this process does.
 
     count: of the workers. threads: of each, so that all of them together take the machine and no more.
     """
@@ -155,11 +155,11 @@ def _end_with_parent() -> None:
 
 
 def _make_here(task: SegmentTask) -> int:
-    return make_segment(task, _board.count_one if _board is not None else lambda: None)
+    return render_segment(task, _board.count_one if _board is not None else lambda: None)
 
 
-class DaskCrew:
-    """A Crew. address: of the scheduler, tcp://HOST:8786. Each task takes one core, so start workers with one thread each.
+class DaskExecutor:
+    """A Executor. address: of the scheduler, tcp://HOST:8786. Each task takes one core, so start workers with one thread each.
 
     Dask gives the segment of a dead worker to another; one that kills four workers is given up.
     """
@@ -179,7 +179,7 @@ class DaskCrew:
     def _compute(self, client: Any, tasks: Sequence[SegmentTask], progress: Progress) -> None:
         from distributed import KilledWorker, as_completed
 
-        futures = {client.submit(make_segment, task, pure=False): task for task in tasks}
+        futures = {client.submit(render_segment, task, pure=False): task for task in tasks}
         try:
             for future in as_completed(list(futures), loop=client.loop):
                 future.result()

@@ -21,7 +21,7 @@ from mrbokeh.depth.depth_filters import TemporalDepthFilter
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.optics.camera import Camera, have_same_shape
-from mrbokeh.shots.hooks import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
+from mrbokeh.shots.inputs import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys, read_focus_pull

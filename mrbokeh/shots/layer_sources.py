@@ -13,7 +13,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.staging.filming import FilmedLayers, Filming
 from mrbokeh.scene.staging.scene_file import read_scene_file
-from mrbokeh.shots.hooks import CameraSource, Description, Kept, LayerSource, Moment
+from mrbokeh.shots.inputs import CameraSource, Description, Kept, LayerSource, Moment
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
 from mrbokeh.stacks.exr_layers.deep_interleaved import interleaved
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces

@@ -1,6 +1,6 @@
 """PartsFolder: the finished segments of a shot beside its result, with a manifest that says what they were made with.
 
-A shot from beginning to end: segments that are missing are made by a crew, then joined; what is finished is never made twice.
+A shot from beginning to end: segments that are missing are made by a executor, then joined; what is finished is never made twice.
 """
 
 import hashlib
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mrbokeh import __version__
-from mrbokeh.shots.executors import Crew, Progress
+from mrbokeh.shots.executors import Executor, Progress
 from mrbokeh.shots.segment_task import SegmentTask
 from mrbokeh.shots.shot import MANIFEST, Segment, Shot
 from mrbokeh.system.atomic_files import read_json, write_json
@@ -89,7 +89,7 @@ def _stamps(paths: Iterable[Path]) -> str:
     return f"{', '.join(path.name for path in paths)} {digest.hexdigest()[:16]}"
 
 
-def make_shot(shot: Shot, crew: Crew, *, overwrite: bool = False, progress: Progress = lambda _: None) -> str:
+def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, progress: Progress = lambda _: None) -> str:
     """Returns what became of the sound. Raises InputError where the result exists, or parts of another run do, unless overwrite.
 
     progress: is told of frames as they are made, and at once of those that an interrupted run left finished.
@@ -98,7 +98,7 @@ def make_shot(shot: Shot, crew: Crew, *, overwrite: bool = False, progress: Prog
     folder = PartsFolder.opened(shot, overwrite)
     missing = folder.missing
     progress(sum(segment.frame_count for segment in shot.segments) - sum(segment.frame_count for segment in missing))
-    crew.run([SegmentTask(shot, segment, folder.path, crew.threads) for segment in missing], progress)
+    executor.run([SegmentTask(shot, segment, folder.path, executor.threads) for segment in missing], progress)
     note = shot.target.join(shot, folder.path)
     folder.remove()
     return note

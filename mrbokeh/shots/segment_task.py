@@ -58,7 +58,7 @@ class SegmentTask:
     threads: int = 1
 
 
-def make_segment(task: SegmentTask, made: Callable[[], None] = lambda: None) -> int:
+def render_segment(task: SegmentTask, made: Callable[[], None] = lambda: None) -> int:
     """Make one part, unless it is there; made: called after every frame. Returns the number of the segment."""
     shot, segment = task.shot, task.segment
     if shot.target.part(task.folder, segment).exists():

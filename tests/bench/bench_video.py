@@ -22,9 +22,9 @@ import numpy as np
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.composite_recipe import CompositeRecipe
-from mrbokeh.shots.executors import Crew, OneProcess, ProcessCrew
+from mrbokeh.shots.executors import Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import FocusPulled
-from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import SEGMENT_S, MakerRecipe, Shot
 from mrbokeh.shots.targets import VideoTarget
 from mrbokeh.video.clip import VideoWriter, probe
@@ -96,14 +96,14 @@ def write_clip(path: Path, frames: int) -> None:
             writer.write(np.ascontiguousarray(blobs[:, 3 * i : 3 * i + WIDTH] + noise[y : y + HEIGHT, x : x + WIDTH]), i / RATE)
 
 
-def rate_of(clip: Path, recipe: MakerRecipe, crew: Crew, encoding: str = "h264") -> tuple[float, float]:
+def rate_of(clip: Path, recipe: MakerRecipe, executor: Executor, encoding: str = "h264") -> tuple[float, float]:
     """(frames per second, largest memory in MB) of a whole run, from the start of the processes to the joined file."""
     out = clip.with_name(f"out.{'mp4' if encoding.startswith('h26') else 'mov'}")
     source = open_source(clip)
     shot = Shot(source, recipe, VideoTarget(out, encoding), 0, len(source.times_s), round(SEGMENT_S * RATE))
     with Memory() as memory:
         started_s = time.perf_counter()
-        make_shot(shot, crew)
+        render_shot(shot, executor)
         seconds = time.perf_counter() - started_s
     assert probe(out).frame_count == len(source.times_s)
     out.unlink()
@@ -118,18 +118,18 @@ def main() -> None:
         write_lens(lens, LENS)
         pull = FocusPulled(f"0:0.8,{frames // 2}:2.5,{frames - 1}:0.8")
         recipe = CompositeRecipe(lens, (MovingDisc(),), focus=pull)
-        runs: dict[str, tuple[MakerRecipe, Crew, str]] = {
-            "1 worker": (recipe, ProcessCrew(1, threads=1), "h264"),
-            "2 workers": (recipe, ProcessCrew(2, threads=1), "h264"),
-            "one process, 2 threads": (recipe, OneProcess(2), "h264"),
-            "2 workers, nothing put in": (Brighter(0.0), ProcessCrew(2, threads=1), "h264"),
-            "2 workers, ProRes 4444": (recipe, ProcessCrew(2, threads=1), "prores4444"),
+        runs: dict[str, tuple[MakerRecipe, Executor, str]] = {
+            "1 worker": (recipe, ProcessExecutor(1, threads=1), "h264"),
+            "2 workers": (recipe, ProcessExecutor(2, threads=1), "h264"),
+            "one process, 2 threads": (recipe, SerialExecutor(2), "h264"),
+            "2 workers, nothing put in": (Brighter(0.0), ProcessExecutor(2, threads=1), "h264"),
+            "2 workers, ProRes 4444": (recipe, ProcessExecutor(2, threads=1), "prores4444"),
         }
         with one_core():
-            rates = {"1 worker, 1 core": rate_of(clip, recipe, ProcessCrew(1, threads=1))[0]}
+            rates = {"1 worker, 1 core": rate_of(clip, recipe, ProcessExecutor(1, threads=1))[0]}
         print(f"1 worker, 1 core: {rates['1 worker, 1 core']:.2f} frames per second", flush=True)
-        for name, (each, crew, encoding) in runs.items():
-            rates[name], memory_mb = rate_of(clip, each, crew, encoding)
+        for name, (each, executor, encoding) in runs.items():
+            rates[name], memory_mb = rate_of(clip, each, executor, encoding)
             print(f"{name}: {rates[name]:.2f} frames per second, {memory_mb:.0f} MB in all processes", flush=True)
     print(f"2 workers to 1 on one core: {rates['2 workers'] / rates['1 worker, 1 core']:.2f}")
     print(f"2 workers to 1 that may use both cores: {rates['2 workers'] / rates['1 worker']:.2f}")

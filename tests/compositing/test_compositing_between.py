@@ -7,10 +7,10 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from mrbokeh.compositing.between import Between, clean_colours
-from mrbokeh.compositing.near_and_far import NO_LIGHTS, NearAndFar, cut_in_two, nearer_than
+from mrbokeh.compositing.near_and_far import NO_HIGHLIGHTS, NearAndFar, cut_in_two, nearer_than
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.pupil_shares import Rays, pupil_points, transmission
-from mrbokeh.compositing.three_parts import virtual_lights
+from mrbokeh.compositing.three_parts import virtual_highlights
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
@@ -209,7 +209,7 @@ def rays_through_flat_layers(focus_m: float = 1.0) -> Rays:
         replace(near, depth_m=np.full_like(near.alpha, NEAR_M)),
         rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32),
         np.full((HEIGHT, WIDTH), FAR_M, np.float32),
-        NO_LIGHTS,
+        NO_HIGHLIGHTS,
     )
     alpha = rng.uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32)
     virtual = Layer(alpha[..., None] * RED, alpha, np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32))
@@ -265,9 +265,9 @@ def test_lights_whose_discs_come_to_no_wanted_pixel_are_not_followed(monkeypatch
     rays.virtual.rgb[:] = 0.1 * rays.virtual.alpha[..., None]
     rays.virtual.rgb[[20, 6, 30], [70, 20, 50]] = 100.0
     wanted[:, 72:] = True
-    few = virtual_lights(rays, wanted)
+    few = virtual_highlights(rays, wanted)
     monkeypatch.setattr("mrbokeh.compositing.three_parts._arriving", lambda *given: given[1])
-    every = virtual_lights(rays, wanted)
+    every = virtual_highlights(rays, wanted)
     assert few.one[wanted].sum() > 10.0 and few.one.sum() < 0.5 * every.one.sum()
     np.testing.assert_array_equal(few.one[wanted], every.one[wanted])
     np.testing.assert_array_equal(few.both[wanted], every.both[wanted])
@@ -277,7 +277,7 @@ def test_all_light_of_a_light_arrives_where_nothing_hides_it() -> None:
     rays = rays_through_flat_layers()
     rays.virtual.rgb[:] = 0.1 * rays.virtual.alpha[..., None]
     rays.virtual.rgb[20, 70] = 100.0
-    through = virtual_lights(rays, np.ones_like(rays.virtual.alpha, bool))
+    through = virtual_highlights(rays, np.ones_like(rays.virtual.alpha, bool))
     assert through.one.sum() == pytest.approx(300.0, rel=0.02) and through.both.sum() == pytest.approx(through.one.sum(), rel=1e-5)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.compositing.between import Between, Rerendered
-from mrbokeh.compositing.choose import DEFAULT_MODE, MODES, InTouchedBox, insertion_of, touched_box
+from mrbokeh.compositing.choose import DEFAULT_MODE, MODES, InDirtyRectangle, dirty_rectangle, insertion_of
 from mrbokeh.compositing.over import OverPhotograph, SmoothedMatte
 from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.images.layer import Layer, opaque
@@ -119,9 +119,9 @@ def test_the_box_gives_what_the_whole_frame_gives(mode: str, focus_m: float) -> 
     depth_m[:, 58:61] = 0.8
     photo, layer = plate(depth_m, WIDE.focused_at(focus_m), size), card(1.3, size=size, where=np.s_[52:70, 50:74])
     boxed = MODES[mode]
-    assert isinstance(boxed, InTouchedBox)
+    assert isinstance(boxed, InDirtyRectangle)
     whole, part = (each.insert(photo, [layer], ScatterReference()) for each in (boxed.insertion, boxed))
-    box = touched_box(photo, [layer])
+    box = dirty_rectangle(photo, [layer])
     assert (box.bottom - box.top) * (box.right - box.left) < 0.75 * size[0] * size[1]
     np.testing.assert_allclose(part.rgb, whole.rgb, atol=2e-5)
     np.testing.assert_allclose(part.virtual.alpha, whole.virtual.alpha, atol=2e-5)
@@ -140,7 +140,7 @@ class Recorder:
 
 def test_circles_of_confusion_keep_their_size_in_the_box() -> None:
     photo, recorder = plate(size=(100, 150)), Recorder()
-    InTouchedBox(recorder).insert(photo, [card(1.3, size=(100, 150))], ScatterReference())
+    InDirtyRectangle(recorder).insert(photo, [card(1.3, size=(100, 150))], ScatterReference())
     part, _ = recorder.seen[0]
     width = part.rgb.shape[1]
     assert width < 120 and part.lens.coc_px(1.3, width) == pytest.approx(float(LENS.coc_px(1.3, 150)))
@@ -150,7 +150,7 @@ def test_circles_of_confusion_keep_their_size_in_the_box() -> None:
 @pytest.mark.parametrize("lens", [replace(LENS, tilt_rad=(0.05, 0.0)), replace(LENS, aperture=replace(LENS.aperture, cat_eye=0.5))])
 def test_a_lens_that_differs_over_the_frame_gets_the_whole_frame(lens: Lens) -> None:
     photo, recorder = replace(plate(size=(100, 150)), lens=lens), Recorder()
-    InTouchedBox(recorder).insert(photo, [card(1.3, size=(100, 150))], ScatterReference())
+    InDirtyRectangle(recorder).insert(photo, [card(1.3, size=(100, 150))], ScatterReference())
     assert recorder.seen[0][0].rgb.shape == (100, 150, 3)
 
 

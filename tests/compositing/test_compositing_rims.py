@@ -9,7 +9,7 @@ import pytest
 
 from mrbokeh.compositing.between import Between, Rerendered
 from mrbokeh.compositing.choose import insertion_of
-from mrbokeh.compositing.edge_refinement import RimColours, moved
+from mrbokeh.compositing.edge_refinement import EdgeColours, moved
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
@@ -26,23 +26,23 @@ def cards() -> tuple[MixedCase, ...]:
     return tuple(card_cases(120, 96, ("disc",), positions=120, radius_px=4.5))
 
 
-def found_db(case: MixedCase, *, true_rims: bool) -> float:
-    return psnr(Between(true_rims=true_rims).insert(case.plate, [case.virtual], RENDERER).rgb, case.truth)
+def found_db(case: MixedCase, *, refine_edges: bool) -> float:
+    return psnr(Between(refine_edges=refine_edges).insert(case.plate, [case.virtual], RENDERER).rgb, case.truth)
 
 
-def mean_db(cases: Sequence[MixedCase], *, true_rims: bool) -> float:
-    return float(np.mean([found_db(case, true_rims=true_rims) for case in cases]))
+def mean_db(cases: Sequence[MixedCase], *, refine_edges: bool) -> float:
+    return float(np.mean([found_db(case, refine_edges=refine_edges) for case in cases]))
 
 
 def test_exact_depth_loses_nothing() -> None:
     """Mean of three focus distances."""
-    assert mean_db(cards(), true_rims=True) > mean_db(cards(), true_rims=False) - EXACT_DB
+    assert mean_db(cards(), refine_edges=True) > mean_db(cards(), refine_edges=False) - EXACT_DB
 
 
 def test_a_pixel_too_wide_costs_less() -> None:
     """Mean of three focus distances. Colours of these cards say little; on the traced sets, which no test can carry, it is two thirds."""
     cases = [case.with_near_wider_by(1) for case in cards()]
-    exact, kept, mended = mean_db(cards(), true_rims=False), mean_db(cases, true_rims=False), mean_db(cases, true_rims=True)
+    exact, kept, mended = mean_db(cards(), refine_edges=False), mean_db(cases, refine_edges=False), mean_db(cases, refine_edges=True)
     assert exact - kept > 3.0  # there is something to win
     assert mended > kept + RECOVERED * (exact - kept)
 
@@ -69,14 +69,14 @@ def test_colours_find_the_rim(by_px: int) -> None:
     assert plate.sharp_rgb is not None and plate.depth_m is not None
     wrong = plate.depth_m < 2.0
     assert (wrong != near).sum() == 2 * abs(by_px) * SIZE[0]
-    np.testing.assert_array_equal(RimColours.of(plate.sharp_rgb, wrong, np.ones(SIZE, bool)).by_colour(), near)
+    np.testing.assert_array_equal(EdgeColours.of(plate.sharp_rgb, wrong, np.ones(SIZE, bool)).by_colour(), near)
 
 
 def test_twice_the_light_tells_the_same() -> None:
     plate, _ = strip(1, noise=0.3)
     assert plate.sharp_rgb is not None and plate.depth_m is not None
     once, twice = (
-        RimColours.of(np.float32(factor) * plate.sharp_rgb, plate.depth_m < 2.0, np.ones(SIZE, bool)).nearness for factor in (1.0, 2.0)
+        EdgeColours.of(np.float32(factor) * plate.sharp_rgb, plate.depth_m < 2.0, np.ones(SIZE, bool)).nearness for factor in (1.0, 2.0)
     )
     np.testing.assert_allclose(once, twice, atol=1e-4)
 
@@ -85,7 +85,7 @@ def test_nearness_is_fishers_line() -> None:
     """The compiled loop against NumPy at one pixel."""
     plate, _ = strip(1, noise=0.3)
     assert plate.sharp_rgb is not None and plate.depth_m is not None
-    rims = RimColours.of(plate.sharp_rgb, plate.depth_m < 2.0, np.ones(SIZE, bool))
+    rims = EdgeColours.of(plate.sharp_rgb, plate.depth_m < 2.0, np.ones(SIZE, bool))
     y, x = 20, 33
     window = np.s_[y - 5 : y + 6, x - 5 : x + 6]
     sure, near = ~rims.unsure[window] & ~rims.lit[window], rims.near[window]
@@ -105,7 +105,7 @@ def test_lights_at_a_rim_may_be_far_and_never_become_near() -> None:
     assert plate.sharp_rgb is not None and plate.depth_m is not None
     rgb = plate.sharp_rgb.copy()
     rgb[20, 33], rgb[30, 48] = 50.0, 50.0
-    told = RimColours.of(rgb, plate.depth_m < 2.0, np.ones(SIZE, bool)).by_colour()
+    told = EdgeColours.of(rgb, plate.depth_m < 2.0, np.ones(SIZE, bool)).by_colour()
     assert not told[20, 33] and not told[30, 48] and near[20, 34]
 
 
@@ -113,7 +113,7 @@ def test_a_thin_wire_keeps_its_middle() -> None:
     """Grey on grey, where colours do not tell: the proposal takes a rim of a broad thing, but never all of a thin one."""
     near = np.zeros((30, 60), bool)
     near[:, 10:12], near[:, 30:45] = True, True
-    told = RimColours.of(np.full((30, 60, 3), 0.3, np.float32), near, np.ones_like(near))
+    told = EdgeColours.of(np.full((30, 60, 3), 0.3, np.float32), near, np.ones_like(near))
     assert np.isnan(told.nearness).all() and (told.by_colour() == near).all()
     left = told.without_rim()
     assert left[2:-2, 10:12].any(axis=1).all() and left[15].sum() < near[15].sum()
@@ -134,8 +134,8 @@ def virtual_wall() -> Layer:
 @pytest.mark.parametrize("make", [Between, Rerendered])
 def test_both_modes_that_cut_the_scene_use_it(make: Callable[..., Between | Rerendered], by_px: int) -> None:
     """Against the picture by exact depth, with depth too wide or too narrow."""
-    exact, wrong = (make(true_rims=False).insert(strip(each)[0], [virtual_wall()], RENDERER).rgb for each in (0, by_px))
-    mended = make(true_rims=True).insert(strip(by_px)[0], [virtual_wall()], RENDERER).rgb
+    exact, wrong = (make(refine_edges=False).insert(strip(each)[0], [virtual_wall()], RENDERER).rgb for each in (0, by_px))
+    mended = make(refine_edges=True).insert(strip(by_px)[0], [virtual_wall()], RENDERER).rgb
     assert np.abs(mended - exact).mean() < 0.2 * np.abs(wrong - exact).mean()
 
 
@@ -147,7 +147,7 @@ def test_it_can_be_switched_off(mode: str) -> None:
 
 
 def test_large_pictures_are_compared_at_half_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    exact, wrong, mended = (Between(true_rims=rims).insert(strip(by_px)[0], [virtual_wall()], RENDERER).rgb for by_px, rims in STRIPS)
+    exact, wrong, mended = (Between(refine_edges=rims).insert(strip(by_px)[0], [virtual_wall()], RENDERER).rgb for by_px, rims in STRIPS)
     monkeypatch.setattr("mrbokeh.compositing.edge_refinement._LARGE_PX", 100)
     halved = Between().insert(strip(2)[0], [virtual_wall()], RENDERER).rgb
     assert not np.array_equal(halved, mended)  # it is another comparison
@@ -161,5 +161,5 @@ STRIPS = ((0, False), (2, False), (2, True))
 def test_a_users_matte_stays_as_it_is() -> None:
     plate, near = strip(1)
     matted = replace(plate, near_alpha=near.astype(np.float32))
-    trusted, asked = (Between(true_rims=rims).insert(matted, [virtual_wall()], RENDERER).rgb for rims in (False, True))
+    trusted, asked = (Between(refine_edges=rims).insert(matted, [virtual_wall()], RENDERER).rgb for rims in (False, True))
     np.testing.assert_array_equal(trusted, asked)

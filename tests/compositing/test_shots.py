@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_io import read_image, read_layer, write_image
-from mrbokeh.shots.executors import Crew, OneProcess, ProcessCrew
-from mrbokeh.shots.render_shot import PartsFolder, make_shot
-from mrbokeh.shots.segment_task import SegmentTask, make_segment
+from mrbokeh.shots.executors import Executor, ProcessExecutor, SerialExecutor
+from mrbokeh.shots.render_shot import PartsFolder, render_shot
+from mrbokeh.shots.segment_task import SegmentTask, render_segment
 from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Shot, Target
 from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.system.errors import InputError
@@ -80,7 +80,7 @@ def written_in_one_go(shot: Shot, path: Path, encoding: str) -> None:
 def test_joined_parts_are_the_file_written_in_one_go(tmp_path: Path, encoding: str, suffix: str) -> None:
     """Where every picture stands alone the files are the same to the byte, header and all."""
     shot = shot_of(even_clip(tmp_path), VideoTarget(tmp_path / f"out{suffix}", encoding))
-    make_shot(shot, OneProcess())
+    render_shot(shot, SerialExecutor())
     written_in_one_go(shot, tmp_path / f"whole{suffix}", encoding)
     assert packets_and_times(tmp_path / f"out{suffix}") == packets_and_times(tmp_path / f"whole{suffix}")
     assert (tmp_path / f"out{suffix}").read_bytes() == (tmp_path / f"whole{suffix}").read_bytes()
@@ -93,9 +93,9 @@ def test_joined_groups_of_pictures_keep_pictures_and_times(tmp_path: Path, encod
     shot = shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / f"out{suffix}", encoding))
     folder = PartsFolder.opened(shot)
     for segment in shot.segments:
-        make_segment(SegmentTask(shot, segment, folder.path))
+        render_segment(SegmentTask(shot, segment, folder.path))
     parts = [frame.rgb for segment in shot.segments for frame in read_frames(shot.target.part(folder.path, segment))]
-    assert make_shot(shot, OneProcess()) == "no audio"
+    assert render_shot(shot, SerialExecutor()) == "no audio"
     frames = list(read_frames(shot.target.path))
     np.testing.assert_allclose([frame.time_s for frame in frames], shot.source.times_s, atol=1e-9)
     for there, here in zip(parts, frames, strict=True):
@@ -113,13 +113,13 @@ def test_joined_groups_of_pictures_keep_pictures_and_times(tmp_path: Path, encod
     assert all(dts <= pts for dts, pts in stamps)
 
 
-@pytest.mark.parametrize("crew", [OneProcess(1), OneProcess(2)], ids=["one core", "overlapping"])
-def test_every_frame_gets_its_own_number_and_time(tmp_path: Path, crew: Crew) -> None:
-    assert isinstance(crew, Crew)
+@pytest.mark.parametrize("executor", [SerialExecutor(1), SerialExecutor(2)], ids=["one core", "overlapping"])
+def test_every_frame_gets_its_own_number_and_time(tmp_path: Path, executor: Executor) -> None:
+    assert isinstance(executor, Executor)
     shot = shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), frames=(3, 20))
     assert isinstance(shot.recipe, MakerRecipe) and isinstance(shot.recipe.build(1), FrameMaker) and isinstance(shot.target, Target)
     told: list[int] = []
-    make_shot(shot, crew, progress=told.append)
+    render_shot(shot, executor, progress=told.append)
     assert sum(told) == 17
     times_s = shot.source.times_s
     for index, before, after in zip(range(3, 20), shot.source.frames(3, 20), read_frames(tmp_path / "out.mkv"), strict=True):
@@ -131,7 +131,7 @@ def test_every_frame_gets_its_own_number_and_time(tmp_path: Path, crew: Crew) ->
 def test_sound_is_copied_where_segments_are_joined(tmp_path: Path, shared_data: Path) -> None:
     source = shared_data / "video" / "ducks_720p.mp4"
     shot = Shot(open_source(source), Brighter(0.0), VideoTarget(tmp_path / "out.mp4", audio_from=source), 30, 42, 5)
-    assert make_shot(shot, OneProcess()) == "audio copied (aac)"
+    assert render_shot(shot, SerialExecutor()) == "audio copied (aac)"
     begin_s = float(shot.source.times_s[30])
     with av.open(str(source)) as container:
         stored = {bytes(packet): float(packet.pts * packet.time_base) for packet in container.demux(audio=0) if packet.size}
@@ -149,7 +149,7 @@ def test_a_real_clip_of_uneven_times_keeps_them(tmp_path: Path, shared_data: Pat
     """The iPhone's HEVC with a variable rate, into H.265 in parts."""
     clip = shared_data / "video" / "iphone_xr_chart.mov"
     shot = Shot(open_source(clip), Brighter(0.0), VideoTarget(tmp_path / "out.mov", "h265-10bit", clip), 0, 5, 3)
-    assert make_shot(shot, OneProcess()) == "audio copied (pcm_s16le)"
+    assert render_shot(shot, SerialExecutor()) == "audio copied (pcm_s16le)"
     np.testing.assert_allclose([frame.time_s for frame in read_frames(tmp_path / "out.mov")], shot.source.times_s[:5], atol=1e-9)
     assert probe(tmp_path / "out.mov").color.transfer == 1
 
@@ -160,21 +160,21 @@ def test_numbered_pictures_in_and_out(tmp_path: Path, suffix: str) -> None:
     for number in range(1001, 1008):
         write_image(tmp_path / f"in.{number}{suffix}", rng.random((24, 32, 3), np.float32))
     shot = Shot(open_source(tmp_path / f"in.%04d{suffix}", "24"), Brighter(), SequenceTarget(tmp_path / f"out.%04d{suffix}", 1001), 2, 7, 2)
-    make_shot(shot, OneProcess())
+    render_shot(shot, SerialExecutor())
     outs = sorted(file.name for file in tmp_path.glob("out.*"))
     assert outs == [f"out.{number}{suffix}" for number in range(1003, 1008)]
     for index, frame in enumerate(shot.source.frames(2, 7), 2):
         expected = 0.5 * frame.rgb + 0.1 * (index % 5 + 1) / 5
         np.testing.assert_allclose(read_image(tmp_path / f"out.{1001 + index}{suffix}"), expected, atol=2**-11)
     with pytest.raises(InputError, match=r"out\.1003\S+ exists already"):
-        make_shot(shot, OneProcess())
-    make_shot(shot, OneProcess(), overwrite=True)
+        render_shot(shot, SerialExecutor())
+    render_shot(shot, SerialExecutor(), overwrite=True)
 
 
 def test_a_virtual_layer_alone_keeps_its_alpha(tmp_path: Path) -> None:
     """In ProRes 4444 as straight colour beside alpha, in EXR premultiplied with depth."""
     clip, recipe = clip_of_blobs(tmp_path), Brighter(as_layer=True)
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "out.mov", "prores4444-alpha"), recipe, (0, 6)), OneProcess())
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "out.mov", "prores4444-alpha"), recipe, (0, 6)), SerialExecutor())
     with av.open(str(tmp_path / "out.mov")) as container:
         stored = next(container.decode(video=0)).reformat(format="yuva444p16le")
     alpha = np.frombuffer(stored.planes[3], "<u2").reshape(48, -1)[:, :64] / 65535
@@ -182,7 +182,7 @@ def test_a_virtual_layer_alone_keeps_its_alpha(tmp_path: Path) -> None:
     first = next(open_source(clip).frames(0, 1)).rgb
     # ProRes of 10 bit: a code step is 1/876 of luma; the mean error of such blocks stays near one.
     assert np.abs(next(read_frames(tmp_path / "out.mov")).rgb - (0.5 * first + 0.02)).mean() < 0.004
-    make_shot(shot_of(clip, SequenceTarget(tmp_path / "out.%04d.exr", layers=True), recipe, (0, 6)), OneProcess())
+    render_shot(shot_of(clip, SequenceTarget(tmp_path / "out.%04d.exr", layers=True), recipe, (0, 6)), SerialExecutor())
     layer = read_layer(tmp_path / "out.0000.exr")
     np.testing.assert_allclose(layer.rgb, 0.5 * (0.5 * first + 0.02), atol=2**-11)
     assert (layer.alpha == 0.5).all() and (layer.depth_m == 2.0).all()
@@ -191,30 +191,30 @@ def test_a_virtual_layer_alone_keeps_its_alpha(tmp_path: Path) -> None:
 def test_what_a_container_cannot_hold_is_told_before_the_work(tmp_path: Path) -> None:
     clip = clip_of_blobs(tmp_path, size=(272, 136))
     with pytest.raises(InputError, match="even rates only"):
-        make_shot(shot_of(clip, VideoTarget(tmp_path / "out.mxf")), OneProcess())
+        render_shot(shot_of(clip, VideoTarget(tmp_path / "out.mxf")), SerialExecutor())
     with pytest.raises(InputError, match="too small for dnxhd"):
-        make_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mxf")), OneProcess())
+        render_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mxf")), SerialExecutor())
     for name in ("out.%04d.gif", "out.%04d"):
         with pytest.raises(InputError, match="expected numbered"):
-            make_shot(shot_of(clip, SequenceTarget(tmp_path / name)), OneProcess())
+            render_shot(shot_of(clip, SequenceTarget(tmp_path / name)), SerialExecutor())
     with pytest.raises(InputError, match=r"expected numbered \.exr, not \.png"):
-        make_shot(shot_of(clip, SequenceTarget(tmp_path / "out.%04d.png", layers=True)), OneProcess())
+        render_shot(shot_of(clip, SequenceTarget(tmp_path / "out.%04d.png", layers=True)), SerialExecutor())
     assert [file.name for file in tmp_path.iterdir()] == ["clip.mkv"]
 
 
 def test_what_is_finished_is_not_made_again(tmp_path: Path) -> None:
     clip, target = clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv")
     whole = VideoTarget(tmp_path / "whole.mkv")
-    make_shot(shot_of(clip, whole), OneProcess())
+    render_shot(shot_of(clip, whole), SerialExecutor())
     shot = shot_of(clip, target)
     folder = PartsFolder.opened(shot)
     for segment in (shot.segments[1], shot.segments[3]):
-        make_segment(SegmentTask(shot, segment, folder.path))
+        render_segment(SegmentTask(shot, segment, folder.path))
     made_at = {
         segment.number: shot.target.part(folder.path, segment).stat().st_mtime_ns for segment in shot.segments if segment.number in (1, 3)
     }
 
-    class Watching(OneProcess):
+    class Watching(SerialExecutor):
         def run(self, tasks: Any, progress: Any) -> None:
             assert [task.segment.number for task in tasks] == [0, 2, 4]
             super().run(tasks, progress)
@@ -222,7 +222,7 @@ def test_what_is_finished_is_not_made_again(tmp_path: Path) -> None:
                 assert shot.target.part(folder.path, shot.segments[number]).stat().st_mtime_ns == stamp
 
     told: list[int] = []
-    make_shot(shot, Watching(), progress=told.append)
+    render_shot(shot, Watching(), progress=told.append)
     assert told[0] == 10 and sum(told) == COUNT
     assert target.path.read_bytes() == whole.path.read_bytes()
     assert not folder.path.exists()
@@ -232,21 +232,21 @@ def test_parts_of_other_settings_are_refused(tmp_path: Path) -> None:
     clip, other = clip_of_blobs(tmp_path), tmp_path / "lens.json"
     other.write_text("one")
     begun = shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,)))
-    make_segment(SegmentTask(begun, begun.segments[0], PartsFolder.opened(begun).path))
+    render_segment(SegmentTask(begun, begun.segments[0], PartsFolder.opened(begun).path))
     changes = {
         "amount": shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.2, reads=(other,))),
         "frames": shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,)), (0, 9)),
     }
     for name, shot in changes.items():
         with pytest.raises(InputError, match=rf"other settings \({name}\): run with the same to go on, or --overwrite"):
-            make_shot(shot, OneProcess())
+            render_shot(shot, SerialExecutor())
     other.write_text("another")
     with pytest.raises(InputError, match=r"other settings \(files\)"):
-        make_shot(shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,))), OneProcess())
-    make_shot(changes["amount"], OneProcess(), overwrite=True)
+        render_shot(shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,))), SerialExecutor())
+    render_shot(changes["amount"], SerialExecutor(), overwrite=True)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["clip.mkv", "lens.json", "out.mkv"]
     with pytest.raises(InputError, match="exists already"):
-        make_shot(changes["amount"], OneProcess())
+        render_shot(changes["amount"], SerialExecutor())
 
 
 def test_a_folder_without_parts_is_not_refused(tmp_path: Path) -> None:
@@ -255,12 +255,12 @@ def test_a_folder_without_parts_is_not_refused(tmp_path: Path) -> None:
     before = PartsFolder.opened(shot_of(clip, target, Brighter(0.1)))
     assert before.path.is_dir() and not before.holds_parts and len(before.missing) == 5
     begun = PartsFolder.opened(shot_of(clip, target, Brighter(0.2)))
-    make_segment(SegmentTask(begun.shot, begun.shot.segments[0], begun.path))
+    render_segment(SegmentTask(begun.shot, begun.shot.segments[0], begun.path))
     assert begun.holds_parts and len(begun.missing) == 4
     with pytest.raises(InputError, match=r"other settings \(amount\)"):
-        make_shot(before.shot, OneProcess())
-    make_shot(begun.shot, OneProcess())
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "whole.mkv"), Brighter(0.2)), OneProcess())
+        render_shot(before.shot, SerialExecutor())
+    render_shot(begun.shot, SerialExecutor())
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "whole.mkv"), Brighter(0.2)), SerialExecutor())
     assert target.path.read_bytes() == (tmp_path / "whole.mkv").read_bytes()
 
 
@@ -283,11 +283,11 @@ def opened_once_two_work(recipe: Brighter) -> Iterator[None]:
 
 def test_worker_processes_make_the_same_file(tmp_path: Path) -> None:
     clip = clip_of_blobs(tmp_path)
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), OneProcess())
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), SerialExecutor())
     told: list[int] = []
     recipe = Brighter(gate=tmp_path / "gate", pids=tmp_path / "pids")
     with opened_once_two_work(recipe):
-        make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), ProcessCrew(2), progress=told.append)
+        render_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), ProcessExecutor(2), progress=told.append)
     assert len(list((tmp_path / "pids").iterdir())) == 2
     assert sum(told) == COUNT
     assert (tmp_path / "two.mp4").read_bytes() == (tmp_path / "one.mp4").read_bytes()
@@ -296,12 +296,12 @@ def test_worker_processes_make_the_same_file(tmp_path: Path) -> None:
 def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     """A worker is killed (signal 9) in the middle of a segment; others take over."""
     clip = clip_of_blobs(tmp_path)
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mkv")), OneProcess())
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "one.mkv")), SerialExecutor())
     fatal = tmp_path / "fatal"
     fatal.touch()
     told: list[int] = []
     shot = shot_of(clip, VideoTarget(tmp_path / "two.mkv"), Brighter(killing=fatal))
-    make_shot(shot, ProcessCrew(2), progress=told.append)
+    render_shot(shot, ProcessExecutor(2), progress=told.append)
     assert not fatal.exists()
     assert sum(told) == COUNT
     assert (tmp_path / "two.mkv").read_bytes() == (tmp_path / "one.mkv").read_bytes()
@@ -310,7 +310,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
 
 def test_a_mistake_in_a_worker_is_told_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="pictures with alpha need"):
-        make_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True)), ProcessCrew(2))
+        render_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True)), ProcessExecutor(2))
 
 
 def held_shot(folder: Path) -> Shot:
@@ -322,11 +322,11 @@ def held_shot(folder: Path) -> Shot:
 PROGRAM = """
 import sys
 from pathlib import Path
-from mrbokeh.shots.render_shot import make_shot
-from mrbokeh.shots.executors import ProcessCrew
+from mrbokeh.shots.render_shot import render_shot
+from mrbokeh.shots.executors import ProcessExecutor
 if __name__ == "__main__":
     from tests.compositing.test_shots import held_shot
-    make_shot(held_shot(Path(sys.argv[1])), ProcessCrew(2))
+    render_shot(held_shot(Path(sys.argv[1])), ProcessExecutor(2))
 """
 
 
@@ -334,7 +334,7 @@ if __name__ == "__main__":
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     """The whole program dies of signal 9 after its first segments; its workers leave by themselves; the same again ends as in one go."""
     clip = clip_of_blobs(tmp_path)
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "whole.mkv")), OneProcess())
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "whole.mkv")), SerialExecutor())
     (tmp_path / "pids").mkdir()
     root = Path(__file__).parents[2]
     (tmp_path / "program.py").write_text(PROGRAM)
@@ -351,7 +351,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert not (tmp_path / "out.mkv").exists()
     (tmp_path / "gate").touch()
     told: list[int] = []
-    make_shot(shot, OneProcess(), progress=told.append)
+    render_shot(shot, SerialExecutor(), progress=told.append)
     assert told[0] == 2 * PER_SEGMENT and sum(told) == COUNT, "what was finished is not made again"
     assert (tmp_path / "out.mkv").read_bytes() == (tmp_path / "whole.mkv").read_bytes()
     assert not shot.parts_path.exists()

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from mrbokeh import __version__
-from mrbokeh.shots.executors import Crew, DaskCrew, OneProcess, require_same_files
-from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.executors import DaskExecutor, Executor, SerialExecutor, require_same_files
+from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.targets import VideoTarget
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_shots import COUNT, clip_of_blobs, opened_once_two_work, shot_of
@@ -58,13 +58,13 @@ def address_in(told: Path) -> str:
 
 
 def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
-    clip, crew = clip_of_blobs(tmp_path), DaskCrew(address)
-    assert isinstance(crew, Crew)
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), OneProcess())
+    clip, executor = clip_of_blobs(tmp_path), DaskExecutor(address)
+    assert isinstance(executor, Executor)
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), SerialExecutor())
     told: list[int] = []
     recipe = Brighter(gate=tmp_path / "gate", pids=tmp_path / "pids")
     with opened_once_two_work(recipe):
-        make_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), crew, progress=told.append)
+        render_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), executor, progress=told.append)
     assert len(list((tmp_path / "pids").iterdir())) == 2, "both workers took part"
     assert str(os.getpid()) not in {file.name for file in (tmp_path / "pids").iterdir()}
     assert sum(told) == COUNT
@@ -75,7 +75,7 @@ def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
 def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: str) -> None:
     """One of the two is killed by signal 9 from outside in the middle of its segment; its nanny starts another."""
     clip, pids, gate = clip_of_blobs(tmp_path), tmp_path / "pids", tmp_path / "gate"
-    make_shot(shot_of(clip, VideoTarget(tmp_path / "one.mkv")), OneProcess())
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "one.mkv")), SerialExecutor())
     pids.mkdir()
     shot = shot_of(clip, VideoTarget(tmp_path / "two.mkv"), Brighter(gate=gate, held_from=2, pids=pids))
     killed: list[int] = []
@@ -91,7 +91,7 @@ def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: s
 
     killer = threading.Thread(target=kill_one, daemon=True)
     killer.start()
-    make_shot(shot, DaskCrew(address))
+    render_shot(shot, DaskExecutor(address))
     killer.join()
     assert killed
     assert (tmp_path / "two.mkv").read_bytes() == (tmp_path / "one.mkv").read_bytes()
@@ -100,12 +100,12 @@ def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: s
 def test_a_mistake_on_a_worker_is_the_users_sentence(tmp_path: Path, address: str) -> None:
     shot = shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True))
     with pytest.raises(InputError, match="pictures with alpha need"):
-        make_shot(shot, DaskCrew(address))
+        render_shot(shot, DaskExecutor(address))
 
 
 def test_nobody_answers() -> None:
-    crew = DaskCrew("tcp://127.0.0.1:9", patience_s=0.5)
-    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"), crew._client():
+    executor = DaskExecutor("tcp://127.0.0.1:9", patience_s=0.5)
+    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"), executor._client():
         pass
 
 

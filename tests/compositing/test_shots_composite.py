@@ -22,7 +22,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.scene.staging.filming import Filming
 from mrbokeh.shots.composite_recipe import BoxedInsertion, CompositeRecipe
 from mrbokeh.shots.frame_sources import DepthFiles, FocusPulled
-from mrbokeh.shots.hooks import Description, Kept, LayerSource, Moment
+from mrbokeh.shots.inputs import Description, Kept, LayerSource, Moment
 from mrbokeh.shots.layer_sources import LayerFiles, SceneLayers
 from mrbokeh.system.errors import InputError
 from tests.scenes.stage_scenes import ONE_CARD, camera, scene_file

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.shots.hooks import CameraSource, LayerSource, Moment
+from mrbokeh.shots.inputs import CameraSource, LayerSource, Moment
 from mrbokeh.shots.shot import Picture, Rgba
 
 

@@ -11,7 +11,7 @@ from mrbokeh.images.image_io import read_image, read_layer, write_image, write_l
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.shots.hooks import Moment
+from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import AmongDeep, LayerFiles, sources_by_depth
 from mrbokeh.stacks.exr_layers.deep_interleaved import cut_at, interleaved
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, merged, peeled, sliced

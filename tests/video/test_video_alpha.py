@@ -20,8 +20,8 @@ from mrbokeh.images.image_io import read_image, read_layer, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.shots.executors import OneProcess, ProcessCrew
-from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.executors import ProcessExecutor, SerialExecutor
+from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import Shot
 from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.video.clip import VideoWriter, read_frames
@@ -163,13 +163,13 @@ def test_workers_that_die_lose_no_alpha(tmp_path: Path, kind: str) -> None:
         SequenceTarget(tmp_path / f"{name}.%d.exr") if kind == "exr" else VideoTarget(tmp_path / f"{name}.mkv", "ffv1-alpha")
         for name in "ab"
     ]
-    make_shot(Shot(source, Brighter(), targets[0], 0, COUNT, 2), OneProcess())
+    render_shot(Shot(source, Brighter(), targets[0], 0, COUNT, 2), SerialExecutor())
     killing.touch()
     shot = Shot(source, Brighter(killing=killing), targets[1], 0, COUNT, 2)
     with pytest.raises(KeyboardInterrupt):
-        make_shot(shot, ProcessCrew(1), progress=_interrupting(3))
+        render_shot(shot, ProcessExecutor(1), progress=_interrupting(3))
     assert shot.was_begun and not killing.exists()
-    make_shot(shot, OneProcess())
+    render_shot(shot, SerialExecutor())
     first, second = (frames_of(open_source(target.path, *more[1:])) for target in targets)
     np.testing.assert_array_equal(first[1], second[1])
     np.testing.assert_array_equal(first[0], second[0])

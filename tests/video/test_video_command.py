@@ -125,7 +125,7 @@ def test_help_shows_an_example() -> None:
 
 
 HELD_COMMAND = """
-from mrbokeh.shots import process_crew
+from mrbokeh.shots import executors
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 
 class Held(CompositeRecipe):
@@ -134,7 +134,7 @@ class Held(CompositeRecipe):
         make = maker.make
 
         def held(index, *frame):
-            assert index < 6 or process_crew._board.stop.wait(60)
+            assert index < 6 or executors._board.stop.wait(60)
             return make(index, *frame)
 
         maker.make = held
@@ -142,9 +142,9 @@ class Held(CompositeRecipe):
 
 if __name__ == "__main__":
     from mrbokeh import cli
-    from mrbokeh.commands import _video_shot
+    from mrbokeh.commands import video
 
-    _video_shot.CompositeRecipe = Held
+    video.CompositeRecipe = Held
     cli.main()
 """
 """The command, but that its workers make no frame of the third segment, of three frames each, before they are told to stop."""

@@ -7,8 +7,8 @@ import av
 import numpy as np
 import pytest
 
-from mrbokeh.shots.executors import OneProcess
-from mrbokeh.shots.render_shot import make_shot
+from mrbokeh.shots.executors import SerialExecutor
+from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import Shot
 from mrbokeh.shots.targets import VideoTarget, held_pictures
 from mrbokeh.video.clip import VideoWriter, read_frames
@@ -109,7 +109,7 @@ def test_a_real_clip_of_uneven_times_goes_into_mxf_with_its_sound(tmp_path: Path
     """The iPhone's HEVC: 6 pictures of about 27.6 a second, held and left out for 30; its mono sound lasts as long as they do."""
     clip = shared_data / "video" / "iphone_xr_chart.mov"
     shot = Shot(open_source(clip), Brighter(0.0), VideoTarget(tmp_path / "out.mxf", None, clip, even_rate=Fraction(30)), 3, 9, 3)
-    note = make_shot(shot, OneProcess())
+    note = render_shot(shot, SerialExecutor())
     assert "(pcm_s16le, 48 kHz)" in note
     frames = list(read_frames(tmp_path / "out.mxf"))
     times_s = np.array(shot.all_times_s)

@@ -1,8 +1,7 @@
 """ColourMatch: from the renderer's light to the photograph's numbers, a gain and a black per channel, in linear light.
 
-Exposure and white balance from a patch of known reflectance in the photograph: a grey card, or anything whose colour is known.
-
-Lifted blacks: what a photograph shows where the scene sends no light (veiling glare, a black level set too low).
+The gain comes from a patch of known reflectance, such as a grey card; the black from lifted blacks, which a photograph shows where the
+scene sends no light (veiling glare, a black level set too low).
 """
 
 from dataclasses import dataclass, replace
@@ -18,10 +17,10 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ColourMatch:
-    """photograph = gain * light + black.
+    """Match by photograph = gain * light + black.
 
-    gain: per channel (linear Rec.709), above 0: exposure and white balance. black: what the photograph shows where no light is:
-    veiling glare of its lens, or a black level set too low.
+    gain: per channel (linear Rec.709), above 0: exposure and white balance. black: number of the photograph without any light: veiling
+    glare of its lens, or a black level set too low.
     """
 
     gain: Triple = (1.0, 1.0, 1.0)
@@ -89,7 +88,7 @@ class PixelBox:
         return cls(*numbers)
 
     def of(self, picture: Picture) -> Float32[np.ndarray, "rows columns 3"]:
-        """That part of a picture. Raises InputError where it is not within."""
+        """Return that part of a picture. Raises InputError if it does not lie within."""
         height, width = picture.shape[:2]
         if not (self.radius_px <= self.x_px < width - self.radius_px and self.radius_px <= self.y_px < height - self.radius_px):
             raise InputError(

@@ -1,8 +1,7 @@
-"""What the stated exposure says about brightness: how bright the photograph shows a given luminance, or the light of another photograph.
+"""Exposure and white balance that pictures state, turned into gains.
 
-The exposure that a picture states: Exif of JPEG, TIFF and PNG, or the standard attributes of an EXR header.
-
-White balance by colour temperature: how a picture that was balanced for one white looks when it is balanced for another.
+Exposure comes from the Exif of JPEG, TIFF and PNG, or from the standard attributes of an EXR header: it says how bright the photograph
+shows a given luminance, or the light of another photograph. White balance goes by colour temperature.
 """
 
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ with the usual 0.65 of lens transmission, vignetting and angle; Lagarde and de R
 
 @dataclass(frozen=True)
 class Exposure:
-    """gain: by what the picture was multiplied after it was taken (a focal stack brings its slices to one exposure)."""
+    """Exposure of a picture. gain: factor applied after it was taken (a focal stack brings its slices to one exposure)."""
 
     exposure_time_s: float
     iso: float
@@ -59,13 +58,19 @@ class Exposure:
 
 
 def matched_exposure(plate: Exposure, reference: Exposure | None = None) -> ColourMatch:
-    """reference: of the photograph that the virtual light was taken from (a panorama, another slice); None: the light is in cd/m^2."""
+    """Return the gain of a plate's exposure.
+
+    reference: exposure of the photograph that the virtual light was taken from (a panorama, another slice); None: the light is in
+    cd/m^2.
+    """
     gain = plate.value_per_luminance if reference is None else plate.brightness / reference.brightness
     return ColourMatch((gain, gain, gain))
 
 
 def exposure_of_photo(path: Path | str, f_number: float | None = None) -> Exposure:
-    """From the Exif of a JPEG, TIFF or PNG. f_number: for manual lenses, that state none. Raises InputError where something is missing."""
+    """Read the exposure from the Exif of a JPEG, TIFF or PNG. f_number: for manual lenses that state none. Raises InputError if one is
+    missing.
+    """
     tags = exif_tags(Path(path))
     iso = tags.get(_ISO)
     known = {
@@ -77,7 +82,7 @@ def exposure_of_photo(path: Path | str, f_number: float | None = None) -> Exposu
 
 
 def exposure_of_metadata(metadata: Mapping[str, Any], where: str = "the slice", f_number: float | None = None) -> Exposure:
-    """From what stack.json keeps of a slice (exposure_time_s, iso, f_number, exposure_gain)."""
+    """Return the exposure that stack.json keeps of a slice (exposure_time_s, iso, f_number, exposure_gain)."""
     stated = {**metadata, "f_number": f_number or metadata.get("f_number")}
     found = {name: positive_rational(stated.get(name)) for name in ("exposure_time_s", "iso", "f_number")}
     missing = [name for name, value in found.items() if value is None]
@@ -95,7 +100,7 @@ _OF_EXR = {"exposure_time_s": "expTime", "iso": "isoSpeed", "f_number": "apertur
 
 
 def stated_exposure(path: Path) -> Exposure:
-    """Raises InputError where something is missing."""
+    """Read the exposure that a picture's file states. Raises InputError if something is missing."""
     if path.suffix.lower() != ".exr":
         return exposure_of_photo(path)
     import OpenEXR
@@ -120,10 +125,10 @@ COLDEST_K, WARMEST_K, BLACK_BODY_TO_K, DAYLIGHT_FROM_K = 25000.0, 2000.0, 4000.0
 
 
 def white_of_kelvin(kelvin: float) -> Triple:
-    """Linear Rec.709 of a light of that temperature, green being 1.
+    """Return the linear Rec.709 of a light of that temperature, green being 1.
 
-    It is a black body up to 4000 K, daylight (CIE D) from 5000 K on, and a mixture between.
-    6504 K is (1, 1, 1), the white of Rec.709. Raises InputError outside 2000 to 25000 K.
+    The light is a black body up to 4000 K, daylight (CIE D) from 5000 K on, and a mixture between. 6504 K is (1, 1, 1), the white of
+    Rec.709. Raises InputError outside 2000 to 25000 K.
     """
     if not WARMEST_K <= kelvin <= COLDEST_K:
         raise InputError(f"expected a colour temperature of {WARMEST_K:g} to {COLDEST_K:g} K, got {kelvin:g}")
@@ -146,7 +151,7 @@ def white_balance_gain(plate_k: float, reference_k: float = 6504.0) -> Triple:
 
 
 def kelvin_of_photo(path: Path | str) -> float | None:
-    """What the Exif of a photograph says it was balanced for; None where it names no temperature (automatic)."""
+    """Read the colour temperature that the Exif of a photograph was balanced for; None if it names none (automatic)."""
     source = exif_tags(Path(path)).get(_LIGHT_SOURCE)
     return KELVIN_OF_LIGHT_SOURCE.get(source) if isinstance(source, int) else None
 

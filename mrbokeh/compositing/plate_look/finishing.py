@@ -1,20 +1,11 @@
-"""All that makes virtual light look photographed, in the order in which a camera does it.
+"""Finishing of virtual light so that it looks photographed, in the order in which a camera does it.
 
 1. Gain of the colour match: light becomes the photograph's numbers. It belongs before the blur, but blur sums light with weights
    of sum 1 and so commutes with it; after it, it costs one multiplication and the blurred layer can be matched anew without blurring.
-2. Vignetting: what of the light the lens sends to a place of the sensor, so after the blur has brought it there.
+2. Vignetting: the share of light that the lens sends to a place of the sensor, so after the blur has brought it there.
 3. Black: glare and offset lie over everything evenly, so they do not fall off towards the corners.
 4. Light wrap: light of the photograph, which has 1 to 3 in it already.
 5. Grain: made by the sensor from all light that arrives, so last.
-
-Light wrap: light of the photograph around an object spills over its soft edge. A habit of compositors, off by default: a lens's own
-flare does it, and the blurred edge shows the scene behind it already.
-
-With B the mean light of the photograph around a pixel (of what is visible, by a Gaussian), a pixel of coverage a gets
-strength * a * (1 - a) * B on top: of the light a B that the object hides there, the share strength * (1 - a). So the energy added to a
-picture is strength times the sum of a (1 - a) B, at most a quarter of B in any pixel, and nothing where a is 0 or 1.
-
-A Finishing from what a user writes on the command line, and from the photograph itself.
 """
 
 from dataclasses import dataclass, replace
@@ -46,7 +37,13 @@ _SIGMAS = 3
 
 @dataclass(frozen=True)
 class LightWrap:
-    """strength: 0 to 1. sigma_px: how far around a pixel the photograph is averaged."""
+    """Light of the photograph that spills over an object's soft edge. strength: 0 to 1. sigma_px: radius of the photograph's mean.
+
+    A habit of compositors, off by default: a lens's own flare does it, and the blurred edge shows the scene behind it already. With B
+    the mean light of the photograph around a pixel (of what is visible, by a Gaussian), a pixel of coverage a gets strength * a * (1 -
+    a) * B on top: of the light a B that the object hides there, the share strength * (1 - a). So the energy added to a picture is
+    strength times the sum of a (1 - a) B, at most a quarter of B in any pixel, and nothing where a is 0 or 1.
+    """
 
     strength: float
     sigma_px: float = 8.0
@@ -62,7 +59,9 @@ class LightWrap:
         return int(np.ceil(_SIGMAS * self.sigma_px))
 
     def wrapped(self, layer: Layer, photo_rgb: Float32[np.ndarray, "height width 3"]) -> Layer:
-        """photo_rgb: what is left of the photograph, (1 - a) P. Within reach_px of a border the mean misses what lies beyond."""
+        """Add the spilled light. photo_rgb: what is left of the photograph, (1 - a) P. Within reach_px of a border the mean misses what
+        lies beyond.
+        """
         free = 1.0 - layer.alpha
         visible, weight = self._blurred(photo_rgb), self._blurred(free)
         around = visible / np.maximum(weight, 1e-6)[..., None]
@@ -78,7 +77,7 @@ class LightWrap:
 
 @dataclass(frozen=True)
 class Finishing:
-    """None: that step is left out."""
+    """Steps of finishing; None leaves a step out."""
 
     colour: ColourMatch | None = None
     vignetting: Vignetting | None = None
@@ -155,9 +154,10 @@ class LookOptions:
 
 
 def finishing_of(options: LookOptions, plate_rgb: Picture, photo: Path | None = None, next_rgb: Picture | None = None) -> Finishing:
-    """plate_rgb: the photograph, or the first frame of a video; next_rgb: its second frame, if it is a video.
+    """Build a Finishing from a user's options and the photograph. Raises InputError if an option cannot be understood or met.
 
-    photo: the file of the plate, where its metadata are asked. Raises InputError where an option cannot be understood or met.
+    plate_rgb: the photograph, or the first frame of a video; next_rgb: its second frame, if it is a video. photo: the file of the
+    plate, for options that read its metadata.
     """
     vignetting = _vignetting(options.vignetting, photo)
     colour = _colour(options, plate_rgb, photo, vignetting)
@@ -218,7 +218,7 @@ def _grain(options: LookOptions, plate_rgb: Picture, next_rgb: Picture | None) -
 
 
 def _grain_of_video(first: Picture, second: Picture, seed: int) -> Grain:
-    """From the pair; from the first frame alone where everything moves or the encoder has copied it."""
+    """Measure grain in a pair of frames; in the first alone if everything moves or the encoder has copied it."""
     try:
         return measured_grain_of_pair(first, second, seed)
     except InputError:

@@ -1,15 +1,12 @@
-"""Grain: the noise of a camera as it stands in its linear pictures, and how it is measured in them.
+"""Grain: the noise of a camera in its linear pictures, measured, kept as a JSON file, and put on virtual light.
 
-A periodic texture of normal noise with a given correlation between neighbours and channels.
+Grain is a periodic texture of normal noise with the measured correlation between neighbours and channels. The virtual part gets as much
+as the sensor would have given the finished picture, less what the photograph has kept.
 
-Grain as a JSON file, so that one measurement serves all frames of a camera and setting.
-
-Grain on the virtual part: as much as the sensor would have given the finished picture, less what the photograph has kept.
-
-Noise belongs to the light that reaches the sensor, object and scene together. With P the photograph, V the premultiplied virtual
-light and a its coverage, the picture is M = K + V with K = (1 - a) P. A sensor would give it the variance s(M) = shot M + read. The
-photograph's own noise is in it already, scaled by 1 - a like the photograph, so with the variance (1 - a)^2 s(P). Independent
-variances add, therefore the virtual part gets
+Noise belongs to the light that reaches the sensor, object and scene together. With P the photograph, V the premultiplied virtual light
+and a its coverage, the picture is M = K + V with K = (1 - a) P. A sensor would give it the variance s(M) = shot M + read. The
+photograph's own noise is in it already, scaled by 1 - a like the photograph, so with the variance (1 - a)^2 s(P). Independent variances
+add, therefore the virtual part gets
 
     s(M) - (1 - a)^2 s(P) = shot (V + a (1 - a) P) + read a (2 - a)       (the right side for K = (1 - a) P),
 
@@ -85,7 +82,9 @@ Picture = Float32[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class Grain:
-    """level: how strong; correlation: how it hangs together; seed: which draw. The same seed and frame give the same grain."""
+    """Grain of a camera. level: strength by light. correlation: between neighbours and channels. seed: the same seed and frame give the
+    same grain.
+    """
 
     level: NoiseLevel
     correlation: Correlation = field(default_factory=white)
@@ -116,7 +115,7 @@ def measured_grain(rgb: Picture, seed: int = 0) -> Grain:
 
 
 def measured_grain_of_pair(first: Picture, second: Picture, seed: int = 0) -> Grain:
-    """From what changes between two neighbouring frames of a still camera, wherever nothing moves; texture cancels."""
+    """Measure grain by the change between two neighbouring frames of a still camera, wherever nothing moves; texture cancels."""
     return _grain_of(noise_blocks_of_pair(first, second), seed)
 
 
@@ -136,7 +135,7 @@ def write_grain(path: Path | str, grain: Grain) -> None:
 
 
 def read_grain(path: Path | str) -> Grain:
-    """Raises InputError where the file is not a grain file."""
+    """Read a grain file. Raises InputError if the file is none."""
     document = read_json(path, "a grain file")
     if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
         raise InputError(f'{path}: expected a grain file with "format": "{FORMAT}" and "version": {VERSION}: measure the grain again')
@@ -172,7 +171,7 @@ def added_variance(virtual: Layer, photo_rgb: Picture, plate_rgb: Picture, level
 def add_grain_to(
     light: Picture, alpha: Float32[np.ndarray, "height width"], photo_rgb: Picture, plate_rgb: Picture, draw: "GrainDraw"
 ) -> None:
-    """In place on light (h, w, 3), a part of the frame like the others."""
+    """Add grain in place to light (h, w, 3), a part of the frame like the others."""
     from mrbokeh.compositing._pixel_light_numba import add_grain
 
     shot, read = (np.array(each, np.float32) for each in (draw.grain.level.shot, draw.grain.level.read))
@@ -181,7 +180,7 @@ def add_grain_to(
 
 
 class GrainDraw:
-    """Which part of the texture a frame takes: drawn from seed and frame alone, so that neither the box nor the order of frames matters."""
+    """Part of the texture that a frame takes: drawn from seed and frame alone, so that neither the box nor the order of frames matters."""
 
     def __init__(self, grain: Grain, frame: int, origin_px: tuple[int, int] = (0, 0)) -> None:
         rng = np.random.default_rng((grain.seed, frame))

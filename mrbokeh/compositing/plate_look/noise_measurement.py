@@ -1,12 +1,10 @@
-"""A picture cut into blocks, to look for its noise: what is left of each when a smooth surface is taken out.
+"""Noise of a picture, measured in blocks: its variance by level, and its correlation between neighbours and channels.
 
-Variance of noise as a function of level, var = shot * level + read, from blocks of which many show more than noise.
-
-A sensor counts photons (Poisson, variance in proportion to level) and adds what its electronics do (Gauss); Foi et al. 2008, "Practical
-Poissonian-Gaussian noise modeling and fitting for single-image raw data". Texture only ever adds variance, so the blocks of noise
-alone are the lowest heap at each level: the fit starts below it and climbs until it holds the heap.
-
-How noise hangs together: between neighbours (demosaicing and compression smear it) and between channels.
+A picture is cut into blocks; noise is what is left of each after subtracting a smooth surface. The variance is var = shot * level +
+read: a sensor counts photons (Poisson, variance in proportion to level) and adds the noise of its electronics (Gauss); Foi et al. 2008,
+"Practical Poissonian-Gaussian noise modeling and fitting for single-image raw data". Texture only ever adds variance, so the blocks of
+noise alone are the lowest cluster at each level: the fit starts below it and climbs until it holds the cluster. Demosaicing and
+compression correlate neighbours.
 """
 
 from dataclasses import dataclass
@@ -25,9 +23,10 @@ _MOST_BLOCKS = 20000
 
 @dataclass(frozen=True)
 class NoiseBlocks:
-    """residual: (N, 3, P) values of P = BLOCK_PX^2 pixels less the paraboloid that fits them best. level: (N, 3) their mean.
+    """Blocks of a picture.
 
-    usable: (N,) neither clipped nor, in a difference of frames, an exact copy.
+    residual: (N, 3, P) values of P = BLOCK_PX^2 pixels less the paraboloid that fits them best. level: (N, 3) their mean. usable: (N,)
+    neither clipped nor, in a difference of frames, an exact copy.
     """
 
     level: Float64[np.ndarray, "blocks 3"]
@@ -42,7 +41,7 @@ class NoiseBlocks:
 
     @property
     def kurtosis(self) -> Float64[np.ndarray, "blocks 3"]:
-        """3 for normal noise of any strength; edges and specks have more. Its test is independent of the variance (Basu's theorem)."""
+        """Kurtosis: 3 for normal noise of any strength; edges and specks have more. Independent of the variance (Basu's theorem)."""
         second = np.einsum("ncp,ncp->nc", self.residual, self.residual, dtype=np.float64)
         squares = self.residual.astype(np.float64) ** 2
         fourth = np.einsum("ncp,ncp->nc", squares, squares)
@@ -239,7 +238,7 @@ def _mean_products(blocks: NoiseBlocks, level: NoiseLevel) -> Correlation:
 
 @cache
 def _residual_from_true() -> Float64[np.ndarray, "lags2 lags2"]:
-    """What a covariance of 1 at one lag (column) makes of the mean products of residuals at each (row)."""
+    """Return the mean products of residuals at each lag (row) for a covariance of 1 at one lag (column)."""
     masks = np.stack([_pairs_of_lag(dy, dx) for dy in range(-REACH_PX, REACH_PX + 1) for dx in range(-REACH_PX, REACH_PX + 1)])
     counts = masks.sum(axis=(1, 2))
     seen = np.stack([_without_smooth(mask).ravel() for mask in masks])
@@ -247,13 +246,13 @@ def _residual_from_true() -> Float64[np.ndarray, "lags2 lags2"]:
 
 
 def _without_smooth(covariance: Float64[np.ndarray, "pixels pixels"]) -> Float64[np.ndarray, "pixels pixels"]:
-    """(1 - P) C (1 - P), by way of the few columns of the basis."""
+    """Return (1 - P) C (1 - P), by way of the few columns of the basis."""
     basis = smooth_basis()
     left, right = basis.T @ covariance, covariance @ basis
     return covariance - basis @ left - right @ basis.T + basis @ (left @ basis) @ basis.T
 
 
 def _pairs_of_lag(dy: int, dx: int) -> Float64[np.ndarray, "pixels pixels"]:
-    """1 where the second pixel of a block lies (dy, dx) from the first."""
+    """Return 1 for pairs of pixels whose second lies (dy, dx) from the first."""
     y, x = (each.ravel() for each in np.mgrid[:BLOCK_PX, :BLOCK_PX])
     return ((y[None] - y[:, None] == dy) & (x[None] - x[:, None] == dx)).astype(np.float64)

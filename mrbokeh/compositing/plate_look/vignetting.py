@@ -3,7 +3,7 @@
 Coverage stays as it is: a dark corner of an opaque object hides what is behind it like a bright one. Lenses whose kernels lose light
 towards the corners (measured banks) have their falloff in the blur already: use one or the other.
 
-Vignetting of a lens from lensfun's measurements (lensfun.github.io; data CC-BY-SA 3.0, in the lensfunpy wheel of the capture extra).
+Coefficients can come from lensfun's measurements (lensfun.github.io; data CC-BY-SA 3.0, in the lensfunpy wheel of the capture extra).
 """
 
 from dataclasses import dataclass
@@ -28,18 +28,19 @@ _DEGREE, _CELLS = 6, 64
 
 @runtime_checkable
 class Vignetting(Protocol):
-    """What share of its light a lens sends to each pixel, 1 in the middle of the frame."""
+    """Share of its light that a lens sends to each pixel, 1 in the middle of the frame."""
 
     def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:
-        """(h, w, 1 or 3) of the pixels of a box within a frame of (height, width)."""
+        """Return the gain, (h, w, 1 or 3), of the pixels of a box within a frame of (height, width)."""
         ...
 
 
 @dataclass(frozen=True)
 class RadialFalloff:
-    """1 + k1 r^2 + k2 r^4 + k3 r^6, lensfun's "pa" model; r is 1 in the corner of the frame, times `reach`.
+    """Falloff 1 + k1 r^2 + k2 r^4 + k3 r^6, lensfun's "pa" model; r is 1 in the corner of the frame, times `reach`.
 
-    reach: the frame's diagonal as a share of the one that the coefficients were measured on (a smaller sensor sees less of the falloff).
+    reach: the frame's diagonal as a share of the one that the coefficients were measured on (a smaller sensor sees less of the
+    falloff).
     """
 
     k1: float
@@ -92,9 +93,9 @@ class FlatField:
 
 
 def flat_field_of(rgb: Float32[np.ndarray, "height width 3"]) -> FlatField:
-    """From a photograph of an even surface: the polynomial of degree 6 in x and y that fits it best, as which any "pa" falloff is exact.
+    """Fit a photograph of an even surface by a polynomial of degree 6 in x and y, with which any "pa" falloff is exact.
 
-    Its grain averages away; the hard shadow of a lens hood is no polynomial and is smoothed. Raises InputError where the middle is black.
+    Grain averages away; the hard shadow of a lens hood is no polynomial and is smoothed. Raises InputError if the middle is black.
     """
     import cv2
 
@@ -123,7 +124,7 @@ def darkened(layer: Layer, gain: Gain) -> Layer:
 
 
 def falloff_at(vignetting: Vignetting, x_px: int, y_px: int, frame_px: tuple[int, int]) -> Triple:
-    """At one pixel of a frame (height, width), for `grey_card_match`."""
+    """Return the falloff at one pixel of a frame (height, width), for `grey_card_match`."""
     return triple_of(np.broadcast_to(vignetting.gain(Box(y_px, y_px + 1, x_px, x_px + 1), frame_px)[0, 0], 3))
 
 
@@ -136,7 +137,7 @@ _EXIF_IFD, _MAKER, _MODEL, _LENS_MODEL = 0x8769, 0x010F, 0x0110, 0xA434
 
 @dataclass(frozen=True)
 class CameraAndLens:
-    """As Exif names them, such as Canon, Canon EOS 450D and EF100mm f/2.8 Macro USM."""
+    """Camera and lens by their names in Exif, such as Canon, Canon EOS 450D and EF100mm f/2.8 Macro USM."""
 
     camera_maker: str
     camera_model: str
@@ -144,9 +145,9 @@ class CameraAndLens:
 
 
 def falloff_of_photo(path: Path | str) -> RadialFalloff:
-    """Of the camera, lens, focal length, f-number and focus distance that the Exif of a photograph state.
+    """Look up the falloff of the camera, lens, focal length, f-number and focus distance that a photograph's Exif states.
 
-    Raises InputError where they do not.
+    Raises InputError if it does not state them.
     """
     names, size_px = _camera_and_lens(path)
     facts = read_facts(path, size_px)
@@ -171,7 +172,10 @@ def _camera_and_lens(path: Path | str) -> tuple[CameraAndLens, tuple[int, int]]:
 
 
 def lensfun_falloff(names: CameraAndLens, focal_length_mm: float, f_number: float, focus_m: float = FAR_M) -> RadialFalloff:
-    """Raises MissingExtraError without lensfunpy, InputError where lensfun knows no such lens or has not measured its vignetting."""
+    """Look up a lens in lensfun.
+
+    Raises MissingExtraError without lensfunpy, InputError if lensfun knows no such lens or has not measured its vignetting.
+    """
     try:
         import lensfunpy
     except ImportError as missing:

@@ -1,8 +1,5 @@
-"""Where on a shadow catcher a scene's shadow can fall at all. Compiled with numba.
-
-Finding pixels beside which something else begins. Compiled with numba.
-
-Walking along projected silhouette edges. Compiled with numba.
+"""Kernels that mark rays and pixels: rays to a catcher in reach of a shadow, pixels at edges, pixels under silhouettes. Compiled with
+numba.
 """
 
 from math import ceil
@@ -53,7 +50,7 @@ def mark_reachable(
 
 @compiled
 def _meets_box(start: Vector, towards: Vector, half: Vector, end: float) -> bool:
-    """Whether start + t towards, t from 0 to end, meets the box (Kay and Kajiya 1986)."""
+    """Return whether start + t towards, t from 0 to end, meets the box (Kay and Kajiya 1986)."""
     first, last = 0.0, end
     for axis in range(3):
         if towards[axis] == 0.0:

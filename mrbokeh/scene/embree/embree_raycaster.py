@@ -81,11 +81,13 @@ class EmbreeRaycaster:
     """
 
     def __init__(self, threads: int | None = None, most_layers: int = 16, edge_samples: int = 16, shadow_step_px: int = 1) -> None:
-        """threads: None or 0 takes all cores. most_layers: how many see-through surfaces a ray follows behind each other.
+        """Set up the ray caster.
 
-        For pictures that are drawn again and again: edge_samples: rays in a pixel at an edge, 16 or 4; with 4 the coverage of an
-        edge comes in steps of a quarter. shadow_step_px: of shadow masks only every so manieth pixel is traced, and what lies
-        between is interpolated.
+        threads: None or 0 uses all cores. most_layers: number of see-through surfaces that a ray follows behind each other.
+
+        Two settings make pictures quicker that are drawn again and again. edge_samples: rays in a pixel at an edge, 16 or 4; with 4,
+        coverage at an edge has steps of a quarter. shadow_step_px: shadow masks are traced at every n-th pixel only and interpolated
+        between.
         """
         if most_layers < 1 or (threads or 0) < 0:
             raise InputError(f"expected at least one thread and one layer, got {threads} and {most_layers}")
@@ -131,7 +133,7 @@ class EmbreeRaycaster:
         return Layer(rgb.reshape(height, width, 3), alpha.reshape(height, width), depth_m.reshape(height, width))
 
     def render_shadow_mask(self, scene: Scene, camera: Camera, catcher: Mesh) -> Float32[np.ndarray, "height width"]:
-        """(H, W) share of the lights' irradiance on the catcher that the scene lets through, 1 is lit; see SceneRenderer."""
+        """Return the (H, W) share of the lights' irradiance that reaches the catcher past the scene, 1 is lit; see SceneRenderer."""
         placed = self._kept.placed(scene)
         if placed is None or not scene.lighting[0]:
             return np.ones((camera.height_px, camera.width_px), np.float32)

@@ -1,6 +1,7 @@
-"""Which pixels need more than one sample, and where in the pixel those samples lie.
+"""Pixels that need more than one sample, and the places of those samples.
 
-Silhouette edges of a scene's triangles: where, from a given eye, a surface ends, however thin it is in the picture.
+Samples are needed at borders between surfaces and along silhouettes, the edges where a surface ends as seen from the eye, however thin
+it is in the picture.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""PreparedScenes: what a ray caster keeps of scenes, catchers and panoramas between pictures.
-
-PreparedScene: packed triangles with their Embree hierarchies (Wald et al. 2014).
-"""
+"""Scenes prepared for ray casting: packed triangles with Embree hierarchies (Wald et al. 2014), kept between pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +51,7 @@ class PreparedScene:
     def surfaces(
         self, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "rays 3"], hits: Int32[np.ndarray, " rays"], footprint: float
     ) -> Surfaces:
-        """What rays meet at the triangles `hits`. footprint: the width of what a ray stands for, at a distance of 1."""
+        """Return the shading points of rays at the triangles `hits`. footprint: width that a ray stands for, at a distance of 1."""
         surfaces = empty_surfaces(len(hits))
         fill_surfaces(self.triangles, self.materials, self.textures, eye[None], directions, hits, footprint, False, surfaces)
         return surfaces
@@ -129,10 +126,9 @@ class PlacedScene:
 
 
 class PreparedScenes:
-    """Everything is kept as long as its scene, catcher or panorama lives; the scene prepared last also beyond that.
+    """Cache of prepared scenes, catchers and panoramas; entries live as long as their keys, the last scene also beyond that.
 
-    Where a new scene is the last one moved as a rigid body, it is not prepared again; where it only has the same textures,
-    those are kept.
+    A new scene that is the last one moved as a rigid body is not prepared again; one with the same textures reuses them.
     """
 
     def __init__(self) -> None:
@@ -142,7 +138,7 @@ class PreparedScenes:
         self._last: PreparedScene | None = None
 
     def placed(self, scene: Scene) -> PlacedScene | None:
-        """None where the scene has nothing to draw."""
+        """Return the prepared scene and its place; None if there is nothing to draw."""
         if scene not in self._scenes:
             drawn = [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
             if not drawn:

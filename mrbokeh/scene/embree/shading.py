@@ -1,7 +1,4 @@
-"""Rays through a prepared scene: colour, coverage and depth of what they meet.
-
-How much of the lights reaches points, past what a prepared scene holds.
-"""
+"""Shading of rays through a prepared scene: colour, coverage and depth; the share of the lights that reaches a point."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +23,7 @@ def visible(
     towards: Float[np.ndarray, "points 3"],
     distance_m: Float[np.ndarray, " points"],
 ) -> Float32[np.ndarray, " points"]:
-    """How much of a light's rays reach the origins: 0 behind opaque surfaces, the product of 1 - alpha behind others."""
+    """Return the share of a light's rays that reach the origins: 0 behind opaque surfaces, the product of 1 - alpha behind others."""
     reaching = np.ones(len(origins), np.float32)
     if scene.opaque_rays is not None and len(origins):
         blocked = scene.opaque_rays.run(*float32(origins, towards), np.minimum(distance_m, 1e37).astype(np.float32), query="OCCLUDED")
@@ -126,8 +123,11 @@ def _in_reach(
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """What N rays see. rgb is premultiplied; mesh, normal and lit (the mean share of the lights that is not in shadow, 1 where
-    there are none) belong to the first surface that covers anything."""
+    """Colour, coverage and depth along N rays.
+
+    rgb is premultiplied; mesh, normal and lit (mean share of the lights that is not in shadow, 1 if there are none) belong to the first
+    surface that covers anything.
+    """
 
     rgb: Float32[np.ndarray, "rays 3"]
     alpha: Float32[np.ndarray, " rays"]
@@ -187,7 +187,7 @@ def shaded(
 def _radiance(
     scene: PreparedScene, surfaces: Surfaces, lights: Sequence[Light], maps: LightingMaps | None
 ) -> tuple[Float32[np.ndarray, "rays 3"], Float32[np.ndarray, " rays"]]:
-    """(light that leaves the shading points towards the camera, mean share of the lights that is not in shadow)."""
+    """Return (light that leaves the shading points towards the camera, mean share of the lights that is not in shadow)."""
     rgb = np.zeros((len(surfaces.alpha), 3), np.float32)
     not_shadowed = np.ones(len(surfaces.alpha), np.float32)
     add_emission(surfaces, rgb)

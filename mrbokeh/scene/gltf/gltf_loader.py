@@ -1,6 +1,6 @@
-"""GLB files to Scene: nodes flattened to world space, skins and morph targets applied at a moment of an animation.
+"""GLB files to Scene: nodes posed at a moment of an animation, flattened to world space, skins and morph targets applied.
 
-Poses: where a glTF file's nodes stand at a moment of an animation (glTF 2.0 specification, section 3.11, appendix C).
+See the glTF 2.0 specification, section 3.11 and appendix C.
 """
 
 from collections.abc import Iterator

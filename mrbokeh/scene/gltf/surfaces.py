@@ -1,6 +1,6 @@
-"""glTF materials and textures to Material and Texture, colours decoded to linear light.
+"""Materials and primitives of a glTF file.
 
-Primitives of a glTF file: vertex attributes with morph targets, linear blend skinning, flat normals.
+Materials: textures decoded to linear light. Primitives: vertex attributes with morph targets, linear blend skinning, flat normals.
 """
 
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 
 
 def materials_of(file: GltfFile) -> tuple[Material, ...]:
-    """All materials of a file in their order."""
+    """Return the materials of a file in their order."""
     textures = _Textures(file)
     return tuple(_material(textures, material) for material in file.gltf.materials)
 
@@ -141,7 +141,7 @@ class Primitive:
         return Primitive(positions, self.triangles, self.uvs, normals, tangents, self.colors, self.joints, self.weights)
 
     def mesh(self, material: Material, name: str) -> Mesh:
-        """As a Mesh; without normals each triangle gets vertices of its own and is flat."""
+        """Convert to a Mesh; without normals each triangle gets its own vertices and is flat."""
         if self.normals is not None:
             tangents = None if self.tangents is None else self.tangents.astype(np.float32)
             normals = self.normals.astype(np.float32)

@@ -1,7 +1,4 @@
-"""An Environment as a source of light for path tracing: looked up, and drawn from in proportion to its light.
-
-Lamps for path tracing: lights without extent, and triangles that shine.
-"""
+"""Light sources for path tracing: the environment as a panorama, lights without extent, and emissive triangles."""
 
 from collections.abc import Sequence
 from math import cos
@@ -48,7 +45,7 @@ class EnvironmentTables:
         return (1 - down) * ((1 - right) * a + right * b) + down * ((1 - right) * c + right * d)
 
     def drawn(self, uv: Any, active: Any) -> tuple[Any, Any]:
-        """(direction, density per steradian) for uniform numbers."""
+        """Return (direction, density per steradian) for uniform numbers."""
         texel, share, within = self._drawing.sample(uv, active)
         longitude = (mi.Float(texel.x) + within.x) / mi.Float(self._width) * dr.two_pi - dr.pi
         upper, lower = self._borders(texel.y)
@@ -60,7 +57,7 @@ class EnvironmentTables:
         return mi.Vector3f(*turned), self._per_steradian(share, upper, lower)
 
     def density(self, direction: Any, active: Any) -> Any:
-        """How often `drawn` gives a direction, per steradian."""
+        """Return the density per steradian with which `drawn` gives a direction."""
         column, row = self._place(direction)
         texel = mi.Point2u(dr.minimum(mi.UInt32(column), self._width - 1), dr.minimum(mi.UInt32(row), self._height - 1))
         return self._per_steradian(self._drawing.pdf(texel, active), *self._borders(texel.y))
@@ -111,7 +108,7 @@ class PointLights:
         return self._lights[number].casts_shadow
 
     def arriving(self, number: int, point: Any) -> tuple[Any, Any, Any]:
-        """(unit vectors towards the light, distance, irradiance on a surface facing it)."""
+        """Return (unit vectors towards the light, distance, irradiance on a surface facing it)."""
         entries = [dr.gather(mi.Float, self._rows, mi.UInt32(12 * number + entry)) for entry in range(12)]
         rgb, travel = mi.Color3f(*entries[:3]), mi.Vector3f(*entries[6:9])
         kind = self._lights[number].kind
@@ -141,12 +138,12 @@ class ShiningTriangles:
         self._per_area = mi.Float((shares / np.maximum(areas, 1e-300)).astype(np.float32))
 
     def drawn(self, which: Any, uv: Any, active: Any) -> tuple[Any, Any]:
-        """(number of a triangle, place in it as two weights), evenly over its area."""
+        """Return (number of a triangle, place in it as two weights), evenly over its area."""
         index, _share = self._drawing.sample_pmf(which, active)
         return dr.gather(mi.UInt32, self._numbers, index, active), mi.warp.square_to_uniform_triangle(uv)
 
     def density(self, triangle: Any, distance: Any, cosine: Any, active: Any) -> Any:
-        """How often a point of a triangle is drawn, per steradian of whoever sees it at a distance, tilted by a cosine."""
+        """Return the density with which a point of a triangle is drawn, per steradian of a viewer at a distance, tilted by a cosine."""
         per_area = dr.gather(mi.Float, self._per_area, triangle, active)
         return per_area * dr.square(distance) / dr.maximum(dr.abs(cosine), 1e-6)
 

@@ -1,12 +1,8 @@
-"""MitsubaTracer: virtual scenes to Layers by path tracing, compiled by Mitsuba 3 (Jakob et al. 2022).
+"""MitsubaTracer: virtual scenes to Layers by path tracing, compiled by Mitsuba 3 (Jakob et al. 2022) with its LLVM variant.
 
-Mitsuba 3 on the processor: its compiled (LLVM) variant, and its scenes of bare triangles.
-
-Path-traced colour cleaned of its noise by Intel's Open Image Denoise (Afra 2019), which the package `pyoidn` brings for processors.
-
-It pays where paths are few. Against 4096 paths it gained 4.0 to 5.6 dB with 4 paths per pixel, 0.2 to 2.8 dB with 16; with 64 it
-gained 1.4 dB on smooth balls under a small lamp and lost 3.2 dB on a finely textured helmet (pictures of 160x90 and 213x120). So it
-is off by default.
+Noise can be removed by Intel's Open Image Denoise (Afra 2019), which the package `pyoidn` brings for processors. Denoising pays with
+few paths. Against 4096 paths it gained 4.0 to 5.6 dB with 4 paths per pixel, 0.2 to 2.8 dB with 16; with 64 it gained 1.4 dB on smooth
+balls under a small light and lost 3.2 dB on a finely textured helmet (pictures of 160x90 and 213x120). So it is off by default.
 """
 
 import os
@@ -73,9 +69,9 @@ def find_llvm() -> Path | None:
 
 @dataclass(frozen=True, eq=False)
 class Guides:
-    """What paths found in some pixels: mean over those that met a surface. share: how many did.
+    """Means over the paths of some pixels that met a surface. share: how many did.
 
-    albedo, normal (in the world, shorter than 1 where several are mixed): of the first surface.
+    albedo, normal (in the world, shorter than 1 if several are mixed): of the first surface.
     """
 
     color: Float32[np.ndarray, "pixels 3"]
@@ -85,7 +81,7 @@ class Guides:
 
 
 def require_denoiser() -> None:
-    """Raises MissingExtraError where pyoidn is not installed."""
+    """Raise MissingExtraError if pyoidn is not installed."""
     try:
         import pyoidn  # noqa: F401
     except ImportError:
@@ -125,11 +121,13 @@ class MitsubaTracer:
         denoise: bool = False,
         shows_progress: bool = True,
     ) -> None:
-        """samples: paths per pixel, rounded up to what divides into a grid. most_bounces: surfaces that light meets on its way to
-        the camera; 1 is direct light only. threads: 0 leaves the compiler's number, all cores at first. denoise: pays with
-        few samples, see `path_denoising`; needs `pyoidn`. shows_progress: a bar while a picture takes long; not within another bar.
+        """Set up the tracer and Mitsuba's compiler.
 
-        Raises MissingExtraError where Mitsuba or the denoiser is not installed and InputError where its compiler is missing.
+        samples: paths per pixel, rounded up to a number that divides into a grid. most_bounces: surfaces that light meets on its way to
+        the camera; 1 is direct light only. threads: 0 leaves the compiler's number, all cores at first. denoise: pays with few samples;
+        needs `pyoidn`. shows_progress: a bar while a picture takes long; not within another bar.
+
+        Raises MissingExtraError if Mitsuba or the denoiser is not installed and InputError if its compiler is missing.
         """
         if samples < 1 or most_bounces < 0 or threads < 0:
             raise InputError(
@@ -144,7 +142,7 @@ class MitsubaTracer:
         self._kept: tuple[Scene, tuple[Mesh, ...], Any] | None = None
 
     def bar(self, description: str) -> str | None:
-        """What a progress bar is to say; None for no bar."""
+        """Return the text of a progress bar; None for no bar."""
         return description if self._shows_progress else None
 
     def prepare(self) -> None:
@@ -170,11 +168,13 @@ class MitsubaTracer:
         return Layer(rgb.reshape(shapes.rgb.shape), shapes.alpha, shapes.depth_m)
 
     def render_shadow_mask(self, scene: Scene, camera: Camera, catcher: Mesh) -> Float32[np.ndarray, "height width"]:
-        """(H, W) share of the lights' irradiance on the catcher that the scene lets through; the ray caster's, see SceneRenderer."""
+        """Return the (H, W) share of the lights' irradiance that reaches the catcher past the scene, by the ray caster; see
+        SceneRenderer.
+        """
         return self.caster.render_shadow_mask(scene, camera, catcher)
 
     def _traced(self, scene: Scene, camera: Camera, surroundings: Sequence[Mesh], pixels: Int64[np.ndarray, " pixels"]) -> Guides:
-        """What paths find in some pixels."""
+        """Trace paths through some pixels."""
         self.prepare()
         import mitsuba as mi
 

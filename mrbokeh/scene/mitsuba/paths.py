@@ -1,8 +1,7 @@
 """Path tracing with multiple importance sampling (Veach 1997; Pharr, Jakob and Humphreys 2023, section 13.4), by Mitsuba's compiler.
 
-Light from drawn points of the environment and of shining triangles (next event estimation), with Mitsuba's compiler.
-
-Camera rays for path tracing: any focal lengths, any principal point, many rays in each of some pixels.
+Camera rays may have any focal lengths and principal point. At every surface, points of the environment and of emissive triangles are
+drawn as well (next event estimation).
 """
 
 from collections.abc import Iterator
@@ -42,7 +41,10 @@ def environment_light(world: World, reflects: Reflection, sampler: Any, active: 
 
 
 def shining_light(world: World, origin: Any, value_of: Any, sampler: Any, active: Any) -> Any:
-    """value_of(direction) -> (BRDF times cosine, density of the other ways in which that direction is drawn)."""
+    """Return the light of a drawn point of the emissive triangles.
+
+    value_of(direction) -> (BRDF times cosine, density of the other ways in which that direction is drawn).
+    """
     which, place = world.shining.drawn(sampler.next_1d(active), sampler.next_2d(active), active)
     emitted, towards, distance, density = world.shine(which, place, origin, active)
     value, other_density = value_of(towards)
@@ -65,10 +67,10 @@ _NOTHING = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Rays:
-    """Where paths start. density: of their directions per steradian where shining triangles are drawn for besides, else 0.
+    """Starts of paths.
 
-    from_camera: surfaces that are invisible from behind let them pass, and the environment does not count.
-    width_per_m: what a ray stands for is so wide at one metre.
+    density: of the directions per steradian if emissive triangles are drawn for as well, else 0. from_camera: surfaces that are
+    invisible from behind let rays pass, and the environment does not count. width_per_m: width that a ray stands for at one metre.
     """
 
     origin: Any
@@ -80,8 +82,8 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What came along the rays. stands: whether there was a surface; first: number of its triangle; albedo, normal: of it."""
+class PathResult:
+    """Light along the rays. stands: whether there was a surface; first: number of its triangle; albedo, normal: of it."""
 
     radiance: Any
     stands: Any
@@ -91,10 +93,10 @@ class Seen:
 
 
 class _Path(NamedTuple):
-    """What paths bring along, of each ray.
+    """State of every path.
 
     carried: the share of light that gets from here to the start. density: of the direction in which it was drawn. passed: metres from
-    where it started through surfaces that let it pass. first, albedo, normal: of the first surface that did not.
+    its start through surfaces that let it pass. first, albedo, normal: of the first surface that did not.
     """
 
     origin: Any
@@ -119,7 +121,7 @@ class _Path(NamedTuple):
 
 
 class _Meeting(NamedTuple):
-    """What paths come upon: met, and then through (the surface lets them pass) or stands. distance: to it in metres."""
+    """Surface that paths meet: met, and then through (the surface lets them pass) or stands. distance: to it in metres."""
 
     point: Any
     surface: Any
@@ -129,14 +131,14 @@ class _Meeting(NamedTuple):
     stands: Any
 
 
-def followed(world: World, rays: Rays, sampler: Any, most_bounces: int) -> Seen:
+def followed(world: World, rays: Rays, sampler: Any, most_bounces: int) -> PathResult:
     """Radiance along rays. most_bounces: how many surfaces light may meet on its way; 1 is direct light only."""
     most = dr.opaque(mi.UInt32, most_bounces)
     start = tuple(_started(rays, sampler))
     ends = dr.while_loop(start, lambda *path: _Path(*path).active, lambda *path: tuple(_stepped(world, rays, most, _Path(*path))))
     path = _Path(*ends)
     finite = dr.isfinite(path.radiance.x + path.radiance.y + path.radiance.z)
-    return Seen(dr.select(finite, path.radiance, 0.0), path.first != _NOTHING, path.first, path.albedo, path.normal)
+    return PathResult(dr.select(finite, path.radiance, 0.0), path.first != _NOTHING, path.first, path.albedo, path.normal)
 
 
 def _started(rays: Rays, sampler: Any) -> _Path:
@@ -158,7 +160,7 @@ def _started(rays: Rays, sampler: Any) -> _Path:
 
 
 def _stepped(world: World, rays: Rays, most: Any, path: _Path) -> _Path:
-    """From one surface to the next. most: bounces."""
+    """Advance paths from one surface to the next. most: bounces."""
     meets = _meeting(world, rays, path)
     path = _lit_from_afar(world, rays, path, path.active & ~meets.met)
     path = _glowed_upon(world, _first_noted(path, meets), meets)
@@ -181,7 +183,7 @@ def _meeting(world: World, rays: Rays, path: _Path) -> _Meeting:
 
 
 def _lit_from_afar(world: World, rays: Rays, path: _Path, missed: Any) -> _Path:
-    """By the environment, where nothing was met."""
+    """Add the environment's light to paths that met nothing."""
     if world.environment is None:
         return path
     free = missed & (mi.Bool(not rays.from_camera) | ~path.at_start)
@@ -200,7 +202,7 @@ def _first_noted(path: _Path, meets: _Meeting) -> _Path:
 
 
 def _glowed_upon(world: World, path: _Path, meets: _Meeting) -> _Path:
-    """By what the surface shines by itself."""
+    """Add the light that the surface emits."""
     point, weight = meets.point, mi.Float(1.0)
     if world.shining.any:
         facing = dr.dot(point.face, path.direction)
@@ -215,7 +217,7 @@ def _reflects_on(path: _Path, meets: _Meeting, most: Any) -> Any:
 
 
 def _gone_on(world: World, path: _Path, meets: _Meeting, reflects: Reflection, reflects_on: Any) -> _Path:
-    """Through the surface, away from it in a drawn direction, or not at all: faint paths end by chance (Russian roulette)."""
+    """Continue paths through the surface or in a drawn direction, or end them; faint paths end by chance (Russian roulette)."""
     surface, sampler, through = meets.surface, path.sampler, meets.through
     onward = reflects.drawn(sampler.next_1d(reflects_on), sampler.next_2d(reflects_on))
     value, density = reflects.value(onward)
@@ -253,9 +255,9 @@ class CameraRays:
         self._width_per_m = dr.opaque(mi.Float, (camera.focal_px[0] * camera.focal_px[1] * self.samples) ** -0.5)
 
     def parts(self, pixels: Int64[np.ndarray, " pixels"], seed: int, description: str | None) -> Iterator[tuple[Any, Any, Any, Any]]:
-        """(origin, direction, width of what a ray stands for at one metre, sampler) for as many pixels as are traced at once.
+        """Yield (origin, direction, width that a ray stands for at one metre, sampler) for as many pixels as are traced at once.
 
-        description: for a progress bar, if there are several parts; None shows none.
+        description: of the progress bar if there are several parts; None shows none.
         """
         at_once = max(1, _RAYS_AT_ONCE // self.samples)
         starts = range(0, len(pixels), at_once)
@@ -276,8 +278,8 @@ class CameraRays:
         towards = mi.Vector3f(*(rest[3 * axis] * x + rest[3 * axis + 1] * y + rest[3 * axis + 2] for axis in range(3)))
         return mi.Point3f(*rest[9:]), dr.normalize(towards)
 
-    def means(self, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(share that stands (pixels,), radiance, albedo, normal (pixels, 3)): means over the rays of each pixel."""
+    def means(self, seen: PathResult) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return (share that stands (pixels,), radiance, albedo, normal (pixels, 3)): means over the rays of each pixel."""
         stands = dr.select(seen.stands, mi.Float(1.0), 0.0)
         share, *rest = self.sums(stands, *seen.radiance, *seen.albedo, *seen.normal)
         means = np.stack(rest, axis=-1) / np.float32(self.samples)

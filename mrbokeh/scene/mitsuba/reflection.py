@@ -1,9 +1,9 @@
-"""glTF's metallic-roughness reflection for path tracing: its value, and directions drawn in proportion to it.
+"""Metallic-roughness reflection of glTF for path tracing: its value, and directions drawn in proportion to it.
 
-The compiled twin for lights without extent is `add_light` in `_lighting_numba`. What a rough surface's facets pass on to each other is
-given back by a factor on the reflection (Turquin 2019, "Practical multiple scattering compensation for microfacet models"), so that a
-white metal in uniform light shows that light. Below a reflection at most what it leaves is scattered: the specification's own weight
-of the albedo would make surfaces seen at grazing angles brighter than the light around them.
+The compiled twin for lights without extent is `add_light` in `_lighting_numba`. Light that a rough surface's facets pass on to each
+other is given back by a factor on the reflection (Turquin 2019, "Practical multiple scattering compensation for microfacet models"), so
+that a white metal in uniform light shows that light. Below a reflection at most the remaining light is scattered: the specification's
+own weight of the albedo would make surfaces seen at grazing angles brighter than the light around them.
 """
 
 from dataclasses import dataclass
@@ -24,14 +24,14 @@ def luminance(color: Any) -> Any:
 
 
 class ShareTable:
-    """What a surface reflects of uniform light, by roughness and viewing angle."""
+    """Share of uniform light that a surface reflects, by roughness and viewing angle."""
 
     def __init__(self) -> None:
         table = reflected_share_table()
         self._last, self._shares = len(table) - 1, mi.Float(table.ravel())
 
     def read(self, roughness: Any, n_v: Any) -> Any:
-        """(factor of f0, factor of f90), bilinearly."""
+        """Return (factor of f0, factor of f90), bilinearly."""
         y, x = roughness * self._last, dr.clip(n_v, 0.0, 1.0) * self._last
         top, left = dr.minimum(mi.UInt32(y), self._last - 1), dr.minimum(mi.UInt32(x), self._last - 1)
         down, right, width = y - mi.Float(top), x - mi.Float(left), self._last + 1
@@ -54,7 +54,7 @@ class Reflection:
     mirror_share: Any
 
     def value(self, towards: Any) -> tuple[Any, Any]:
-        """(BRDF times the cosine towards the light, density with which `drawn` gives that direction per steradian)."""
+        """Return (BRDF times the cosine towards the light, density with which `drawn` gives that direction per steradian)."""
         surface, n_v, alpha2 = self.surface, self.n_v, self.alpha2
         n_l = dr.dot(surface.normal, towards)
         half = dr.normalize(towards + surface.to_viewer)

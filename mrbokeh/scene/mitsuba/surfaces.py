@@ -1,6 +1,6 @@
-"""From a ray and the triangle it meets to a shading point, by Mitsuba's compiler; the compiled twin is `_surface_numba`.
+"""Shading points of rays that meet triangles, by Mitsuba's compiler; the compiled twin is `_surface_numba`.
 
-Packed textures read by Mitsuba's compiler: bilinear with wrap modes, from the level that has about one texel per ray.
+Packed textures are read bilinearly with wrap modes, from the level that has about one texel per ray.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,9 @@ class TextureTables:
         self._affine = mi.Float(textures.texture_from_uv.ravel())
 
     def read(self, texture: Any, uv: tuple[Any, Any], width: tuple[Any, Any], active: Any) -> Any:
-        """(r, g, b, a) of textures (by number) at uv, both sets of coordinates; width: of what a ray stands for, in each set's."""
+        """Return (r, g, b, a) of textures (by number) at uv, both sets of coordinates. width: that a ray stands for, in each set's
+        coordinates.
+        """
         second = dr.gather(mi.UInt32, self._uv_set, texture, active) == 1
         at, width = dr.select(second, uv[1], uv[0]), dr.select(second, width[1], width[0])
         m = [dr.gather(mi.Float, self._affine, 6 * texture + entry, active) for entry in range(6)]
@@ -50,7 +52,7 @@ class TextureTables:
 
 
 def _neighbours(s: Any, size: Any, wrap: Any) -> tuple[Any, Any, Any]:
-    """(texel before, texel after, how far between their centres) of a coordinate in [0, 1] and beyond."""
+    """Return (texel before, texel after, distance between their centres) of a coordinate in [0, 1] and beyond."""
     folded = dr.abs(s - 2 * dr.round(s / 2))
     s = dr.select(wrap == REPEAT, s - dr.floor(s), dr.select(wrap == MIRROR, folded, dr.clip(s, 0.0, 1.0)))
     x = s * mi.Float(size) - 0.5
@@ -67,7 +69,7 @@ _Pair = tuple[Any, Any]
 
 @dataclass(frozen=True)
 class Point:
-    """Where a ray meets a triangle: facing is 1 in front of it and -1 behind, face its unit normal on the viewer's side."""
+    """Point at which a ray meets a triangle: facing is 1 in front of it and -1 behind, face its unit normal on the viewer's side."""
 
     triangle: Any
     weights: tuple[Any, Any, Any]
@@ -86,9 +88,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Surface:
-    """What light meets at a Point. origin: where rays from here start. diffuse: albedo below the reflection.
+    """Surface at a Point. origin: start of rays from here. diffuse: albedo below the reflection.
 
-    smooth: the normal without its map; what leaves below it is in the surface.
+    smooth: the normal without its map; directions below it are in the surface.
     """
 
     normal: Any
@@ -122,7 +124,7 @@ class SurfaceTables:
         self._gap = dr.opaque(mi.Float, gap_m)
 
     def point(self, hit: Any, direction: Any, width: Any, active: Any) -> Point:
-        """width: of what the ray stands for, in metres."""
+        """Return the points of a hit. width: that the ray stands for, in metres."""
         triangle, b1, b2 = hit.prim_index, hit.prim_uv.x, hit.prim_uv.y
         weights = (1.0 - b1 - b2, b1, b2)
         a, b, c = self._three(mi.Point3f, self._corners, triangle, active)
@@ -222,7 +224,7 @@ class SurfaceTables:
 
 
 def _material_rows(materials: PackedMaterials) -> np.ndarray:
-    """(materials, 20): what is gathered four at a time."""
+    """Return (materials, 20): rows that are gathered four numbers at a time."""
     count = len(materials.f90)
     rows = np.zeros((count, 5, 4), np.float32)
     rows[:, 0] = materials.base_color

@@ -53,7 +53,7 @@ class _Ball:
     radius: Any
 
     def cone(self, origin: Any) -> tuple[Any, Any, Any]:
-        """(direction of the axis, squared sine of the half angle, 1 - its cosine); nothing is drawn from within the ball."""
+        """Return (direction of the axis, squared sine of the half angle, 1 - its cosine); nothing is drawn from within the ball."""
         offset = self.centre - origin
         sine2 = dr.square(self.radius) / dr.squared_norm(offset)
         return dr.normalize(offset), sine2, sine2 / (1.0 + dr.safe_sqrt(1.0 - sine2))
@@ -84,7 +84,7 @@ class _Table:
         self._ball = _ball_around(scene, self.centre_m)
 
     def light(self, origin: Any, direction: Any, sampler: Any, most_bounces: int) -> list[tuple[Any, ...]]:
-        """What rays from the camera meet, part by part: (whether the surface, its light, what is taken of it, what is added)."""
+        """Return, part by part: (whether rays meet the surface, its light, the light taken of it, the light added)."""
         hit = self._real.met(mi.Ray3f(origin, direction), mi.Bool(True))
         met = hit.is_valid()
         point = self._real.surfaces.point(hit, direction, mi.Float(0.0), met)
@@ -105,7 +105,7 @@ class _Table:
         return dr.select(met, mi.Float(1.0), 0.0), *total, *taken, *added
 
     def _value(self, reflects: Reflection, towards: Any) -> tuple[Any, Any]:
-        """(BRDF times cosine, density of a direction in all ways together)."""
+        """Return (BRDF times cosine, density of a direction in all ways together)."""
         value, density = reflects.value(towards)
         density = density + self._ball.density(reflects.surface.origin, towards)
         if self._real.environment is not None:
@@ -113,7 +113,7 @@ class _Table:
         return value, density
 
     def _one_way(self, way: int, reflects: Reflection, sampler: Any, met: Any, most_bounces: int) -> tuple[Any, ...]:
-        """way: 0 draws from the reflection, 1 from the environment, 2 from the cone around the objects."""
+        """Return the part of one way of drawing: 0 from the reflection, 1 from the environment, 2 from the cone around the objects."""
         origin, which, uv = reflects.surface.origin, sampler.next_1d(), sampler.next_2d()
         if way == 0:
             towards = reflects.drawn(which, uv)

@@ -26,7 +26,9 @@ def drawn_meshes(scene: Scene) -> list[Mesh]:
 
 
 def world_of(scene: Scene, surroundings: Sequence[Mesh], like: "World | None" = None) -> "World":
-    """What a scene draws and, behind its triangles, real surfaces. like: its textures are used where they are the same."""
+    """Build the world of a scene's drawn meshes and, behind their triangles, real surfaces. like: a world whose equal textures are
+    reused.
+    """
     drawn = drawn_meshes(scene)
     # The middle of what is drawn: real surfaces may reach far, where nobody needs millimetres.
     points = np.concatenate([mesh.positions_m[mesh.triangles].reshape(-1, 3) for mesh in drawn or surroundings])
@@ -36,7 +38,7 @@ def world_of(scene: Scene, surroundings: Sequence[Mesh], like: "World | None" = 
 
 
 class World:
-    """Everything is relative to centre_m. All meshes take part in the light, also those that catch shadows."""
+    """Meshes and lights relative to centre_m. All meshes take part in the light, also those that catch shadows."""
 
     def __init__(
         self,
@@ -46,7 +48,7 @@ class World:
         centre_m: Float64[np.ndarray, "3"],
         like: "World | None" = None,
     ) -> None:
-        """meshes: at least one triangle. like: its textures are used where they are the same."""
+        """Upload the meshes, at least one triangle. like: a world whose equal textures are reused."""
         triangles, materials, textures = packed(meshes, centre_m, None if like is None else like.textures)
         self.centre_m = centre_m
         self.textures: KeptTextures = textures
@@ -65,11 +67,13 @@ class World:
         return self._all.ray_intersect_preliminary(ray, active=active)
 
     def past(self, point: Point, direction: Any) -> Any:
-        """Where a ray goes on that passes through a surface."""
+        """Return the point from which a ray continues that passes through a surface."""
         return point.position + direction * self._gap
 
     def open_share(self, origin: Any, towards: Any, distance: Any, active: Any) -> Any:
-        """How much of the light from a direction and distance arrives: 0 behind opaque surfaces, the product of 1 - alpha behind others."""
+        """Return the share of light from a direction and distance that arrives: 0 behind opaque surfaces, the product of 1 - alpha
+        behind others.
+        """
         visible = dr.select(active, mi.Float(1.0), 0.0)
         if self._opaque is not None:
             ray = mi.Ray3f(origin, towards)
@@ -114,7 +118,7 @@ class World:
         return dr.select(lit, light * arrives, 0.0)
 
     def shine(self, triangle: Any, place: Any, origin: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """(radiance of a point of a triangle towards an origin, direction to it, distance, density of its being drawn)."""
+        """Return (radiance of a point of a triangle towards an origin, direction to it, distance, density with which it is drawn)."""
         hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(triangle))
         hit.prim_index, hit.prim_uv = triangle, place
         at = self.surfaces.point(hit, mi.Vector3f(0.0, 0.0, 1.0), mi.Float(0.0), active)

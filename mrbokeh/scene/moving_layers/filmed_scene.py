@@ -1,7 +1,4 @@
-"""FilmedScene: what is filmed, by time.
-
-ShutterTiming: when which row of a frame is exposed.
-"""
+"""FilmedScene: scene and camera by time; ShutterTiming: the exposure of each row of a frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -39,7 +36,7 @@ class ShutterTiming:
 
     @property
     def exposure_s(self) -> float:
-        """How long each row is open."""
+        """Exposure time of each row."""
         return self.angle_deg / 360.0 / self.frame_rate
 
     @property
@@ -56,12 +53,12 @@ class ShutterTiming:
         return self.first_row_middle_s(time_s) + 0.5 * self.readout_s
 
     def row_delay_s(self, y_px: float, height_px: int) -> float:
-        """How much later than the upper edge of the sensor a height in a rendered picture is exposed."""
+        """Return the delay of a height in a rendered picture behind the upper edge of the sensor."""
         top, bottom = self.rows_px or (0.0, float(height_px))
         return (y_px - top) / (bottom - top) * self.readout_s
 
     def within(self, overscan: Camera, plate: Camera) -> "ShutterTiming":
-        """The same shutter for pictures with overscan; that distortion bends the plate's rows is left out."""
+        """Return this shutter for pictures with overscan; the bending of the plate's rows by distortion is ignored."""
         enlarged = overscan.focal_px[1] / plate.focal_px[1]
         top = overscan.principal_px[1] - plate.principal_px[1] * enlarged
         return replace(self, rows_px=(top, top + plate.height_px * enlarged))
@@ -72,9 +69,10 @@ _KEPT = 8
 
 @dataclass(frozen=True)
 class FilmedScene:
-    """scene_at, camera_at: by the time in seconds, any time around a frame's. What does not move should be the very same Scene.
+    """Scene and camera by time, with their shutter.
 
-    The camera keeps its number of pixels; it may zoom.
+    scene_at, camera_at: functions of the time in seconds, any time around a frame's. A part that does not move should be the very same
+    Scene. The camera keeps its number of pixels; it may zoom.
     """
 
     scene_at: Callable[[float], Scene]
@@ -82,11 +80,11 @@ class FilmedScene:
     shutter: ShutterTiming
 
     def remembering(self) -> "FilmedScene":
-        """The same, but scenes and cameras of the last few moments are kept: posing a skin costs as much as following it."""
+        """Return a copy that caches scenes and cameras of the last few moments: posing a skin costs as much as following it."""
         return replace(self, scene_at=lru_cache(_KEPT)(self.scene_at), camera_at=lru_cache(_KEPT)(self.camera_at))
 
     def is_still(self, times_s: tuple[float, ...]) -> bool:
-        """Whether scene and camera are the same at all these times."""
+        """Return whether scene and camera are the same at all these times."""
         return self.is_scene_still(times_s) and self.is_camera_still(times_s)
 
     def is_scene_still(self, times_s: tuple[float, ...]) -> bool:

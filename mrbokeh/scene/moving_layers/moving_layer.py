@@ -1,10 +1,7 @@
-"""A layer of moving things: one picture with motion channels where paths are straight, an accumulation where they are bent.
+"""Layers of moving objects and of their shadows.
 
-The plain slow way: pictures at many moments of the shutter, averaged; every band of rows at its own times.
-
-Rolling shutter: a picture of one moment becomes one whose rows are seen one after the other.
-
-The shadow on a catcher while scene and camera move.
+Straight paths give one picture with motion channels, moved row by row for a rolling shutter; bent paths give the average of many
+pictures.
 """
 
 from collections.abc import Callable
@@ -115,10 +112,11 @@ _LEAST_SAMPLES = 8
 
 @dataclass(frozen=True)
 class MotionQuality:
-    """most_bend_px: what paths may bend, or run unevenly, before pictures are averaged in place of one with straight paths.
+    """Limits between one picture with motion channels and an average.
 
-    A body that turns by an angle a bends the path of a point at a radius of r pixels by r (1 - cos(a / 2)): half a pixel is 11
-    degrees at 100 px, 3.6 degrees at 1000 px. most_samples: of averaged pictures; fewer where paths are shorter in pixels.
+    most_bend_px: largest deviation of a path from even motion before pictures are averaged. A body that turns by an angle a bends the
+    path of a point at a radius of r pixels by r (1 - cos(a / 2)): half a pixel is 11 degrees at 100 px, 3.6 degrees at 1000 px.
+    most_samples: number of averaged pictures; fewer if paths are shorter in pixels.
     """
 
     most_bend_px: float = 0.5
@@ -158,7 +156,7 @@ def followed(rendering: Rendering, filmed: FilmedScene, time_s: float, quality: 
 
 
 def samples_for(paths: Paths | None, quality: MotionQuality) -> int:
-    """As many pictures as the longest path has pixels, within bounds; the most where paths are unknown."""
+    """Return as many pictures as the longest path has pixels, within bounds; the most if paths are unknown."""
     if paths is None:
         return quality.most_samples
     return min(max(int(np.ceil(paths.length_px)), _LEAST_SAMPLES), quality.most_samples)

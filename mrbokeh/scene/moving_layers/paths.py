@@ -1,6 +1,6 @@
 """Paths over the picture of the surfaces that are seen in the middle of the shutter's time.
 
-Where the surface that a pixel shows is at another moment, for scenes that move as bodies or bend: skins, morphs, single parts.
+Surfaces are followed in scenes that move as rigid bodies or bend: skins, morphs, single parts.
 """
 
 from collections.abc import Sequence
@@ -35,10 +35,10 @@ class SurfacePoints:
     points_m: Float64[np.ndarray, "points 3"]
 
     def at(self, scene: Scene, every: int = 1) -> Float64[np.ndarray, "some 3"] | None:
-        """The same points of the surface, or every so manieth, in another pose of the scene; None where its triangles are others.
+        """Return the same points of the surface, or every n-th, in another pose of the scene; None if its triangles are others.
 
-        All of it moved as one body is exact; else points follow their triangles, and are NaN where they lie on none, as where a
-        layer states the depth of another place in its pixel.
+        A rigid motion of the whole is exact; else points follow their triangles, and are NaN where they lie on none, for instance where
+        a layer states the depth of another place in its pixel.
         """
         if scene is self.scene:
             return self.points_m[::every]
@@ -102,10 +102,11 @@ Places = Float64[np.ndarray, "points 2"]
 
 @dataclass(frozen=True)
 class Paths:
-    """motion_px: (h, w, 2) over a box of the picture, from the beginning to the end of the span, at the places of its middle.
+    """Motion of a picture over a time span.
 
-    bend_px: how far paths run beside the even motion between their ends, by curving or by going unevenly. length_px: of the
-    longest path, piece by piece.
+    motion_px: (h, w, 2) over a box of the picture, from the beginning to the end of the span, at the places of its middle. bend_px:
+    largest deviation from even motion between the ends, by curving or by uneven speed. length_px: length of the longest path, piece by
+    piece.
     """
 
     box: Box
@@ -140,7 +141,7 @@ def paths_of(layer: Layer, filmed: FilmedScene, middle_s: float, span_s: float) 
 
 
 def _seen_px(points: SurfacePoints, filmed: FilmedScene, moment_s: float, every: int) -> Places | None:
-    """Where points are seen at a moment, NaN behind the camera and where they were not found again."""
+    """Return the places at which points are seen at a moment; NaN behind the camera and for points that were not found again."""
     moved_m, camera = points.at(filmed.scene_at(moment_s), every), filmed.camera_at(moment_s)
     return None if moved_m is None else _projected(camera, moved_m)
 

@@ -1,4 +1,4 @@
-"""Filming: how a staged scene becomes the layers of a plate: by which backend, through which distortion, with which shutter and shadow."""
+"""Filming: render settings that turn a staged scene into layers of a plate: backend, distortion, shutter and shadow."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -29,10 +29,11 @@ CameraAt = Callable[[float], Camera]
 
 @dataclass(frozen=True)
 class Filming:
-    """backend: a name of `mrbokeh.scene.choose`; samples: paths per pixel of "mitsuba". distortion: of the plate's lens.
+    """Render settings of a staged scene.
 
-    catches: "shadow", of the scene's lights as dark as the scene says, or "light": all that the objects change on the ground
-    (`mrbokeh.scene.light_change`). shutter: blurs by motion; None stands still.
+    backend: a name of `mrbokeh.scene.choose`. samples: paths per pixel of "mitsuba". distortion: of the plate's lens. catches:
+    "shadow", as dark as the scene says, or "light": all that the objects change on the ground (`mrbokeh.scene.light_change`). shutter:
+    motion blur; None for none.
     """
 
     backend: str = "auto"
@@ -65,7 +66,7 @@ class FilmedLayers:
 
     @property
     def changes_by_itself(self) -> bool:
-        """Whether the layers can differ between two moments that show the same camera: by animation, or by what the shutter sees."""
+        """Whether layers can differ between two moments that show the same camera: by animation, or by the shutter."""
         return self._staged.is_animated or self._filming.shutter is not None
 
     def at(self, camera_at: CameraAt, time_s: float = 0.0, sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None) -> list[Layer]:

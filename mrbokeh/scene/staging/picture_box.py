@@ -40,10 +40,10 @@ class PictureBox:
 
 
 def box_around(points_m: Float[np.ndarray, "points 3"], camera: Camera, lens: Lens) -> PictureBox | None:
-    """What the camera sees of the points, with room for their blur; None where that touches nothing of the frame.
+    """Return the box of the points as the camera sees them, with room for their blur; None if it touches nothing of the frame.
 
-    Lenses whose blur depends on the place in the frame need the whole frame. Points behind the camera or too near
-    for a picture may project anywhere: then the box is as large as it can be.
+    Lenses whose blur depends on the place in the frame need the whole frame. Points behind the camera or too near for a picture may
+    project anywhere: then the box is as large as it can be.
     """
     depth_m = points_m @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
     if not len(points_m) or depth_m.max() < NEAREST_M:
@@ -65,7 +65,7 @@ def box_around(points_m: Float[np.ndarray, "points 3"], camera: Camera, lens: Le
 
 
 def largest_reach_px(lens: Lens, nearest_m: float, farthest_m: float, frame_width_px: int) -> int:
-    """How many whole pixels the light of anything between two depths travels, and one for the pixel's own edge; at most a frame."""
+    """Return how many whole pixels light between two depths can travel, plus one for the pixel's own edge; at most a frame."""
     coc_px = np.abs(lens.coc_px(np.array([nearest_m, farthest_m]), frame_width_px)).max()
     return min(reach_px(lens.aperture, float(coc_px)) + 1, frame_width_px)
 
@@ -81,7 +81,7 @@ def drawn_points_m(scene: Scene, catcher: Mesh | None) -> Float[np.ndarray, "poi
 
 
 def shadow_box(scene: Scene, camera: Camera, catcher: Mesh) -> Box:
-    """What of a camera's frame may see hard shadows of the lights on the level catcher; all of it where the camera is too near to tell."""
+    """Return the part of the frame that may see hard shadows on the level catcher; the whole frame if the camera is too near to tell."""
     points_m = [mesh.positions_m for mesh in scene.meshes if not mesh.catches_shadow]
     lights = [light for light in scene.lighting[0] if light.casts_shadow]
     if not points_m or not lights:

@@ -1,7 +1,4 @@
-"""SceneDescription: what a scene file says, checked, before anything is loaded.
-
-A scene of one object that stands before a camera: what the options of a command say, as a SceneDescription.
-"""
+"""SceneDescription: the checked content of a scene file, before anything is loaded; OneObject: one object before a camera."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +13,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PlacedObject:
-    """position_m: in the tracker's world. scale counts only where height_m is None. animation None stands still."""
+    """Object of a scene file. position_m: in the tracker's world. scale counts only if height_m is None. animation: None stands still."""
 
     name: str
     glb: Path
@@ -54,7 +51,7 @@ class ShadowPlane:
 
 @dataclass(frozen=True)
 class RealThings:
-    """Either a mask, or depth and the camera that saw it."""
+    """Real things that hide virtual ones: a mask, or depth and the camera that saw it."""
 
     depth: Path | None = None
     camera: Path | None = None
@@ -63,7 +60,7 @@ class RealThings:
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """What the scene file says; angles in radians, paths absolute or relative to the working folder."""
+    """Content of a scene file; angles in radians, paths absolute or relative to the working folder."""
 
     path: Path
     up: str = "-z"
@@ -84,11 +81,11 @@ class SceneDescription:
 
 @dataclass(frozen=True)
 class OneObject:
-    """Where an object stands and what lights it.
+    """Object that stands before a camera, with its light, described by the options of a command.
 
-    stands_at_m: in camera axes (x right, y down, z forward). tilt_rad: how far the camera looks down.
-    height_m: scaled to it; None keeps the size of the file. turn_rad: about the vertical, clockwise seen from above.
-    shadow: how dark the shadow is, 0 to 1; shadow_size_m: side of the part of the ground that catches it.
+    stands_at_m: in camera axes (x right, y down, z forward). tilt_rad: how far the camera looks down. height_m: scaled to it; None
+    keeps the size of the file. turn_rad: about the vertical, clockwise seen from above. shadow: darkness of the shadow, 0 to 1.
+    shadow_size_m: side of the part of the ground that catches it.
     """
 
     glb: Path

@@ -55,7 +55,7 @@ from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD
 
 
 class SceneValues(Values):
-    """A TOML table; messages name the file, the table and the key."""
+    """Table of a TOML file; messages name the file, the table and the key."""
 
     @classmethod
     def of(cls, document: Any, where: str, known: Collection[str]) -> "SceneValues":

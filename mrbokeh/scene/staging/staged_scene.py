@@ -1,7 +1,4 @@
-"""StagedScene: what a scene file describes, loaded, and stood on the table at any moment of its animations.
-
-Assets: opened GLB files and lighting, kept until their files change, so that an edit of the scene reloads only what it touched.
-"""
+"""StagedScene: a scene file's content, loaded and posed at any moment; Assets: opened files, kept until they change."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -27,7 +24,7 @@ _GREY, _SUN = 0.45, 1.6
 
 
 class Assets:
-    """Not thread-safe: belongs to the thread that loads scenes."""
+    """Opened GLB files and lighting, kept until their files change. Not thread-safe: use it in the thread that loads scenes."""
 
     def __init__(self) -> None:
         self._kept: dict[object, tuple[object, Any]] = {}
@@ -50,7 +47,7 @@ class Assets:
 
 
 def modified_s(path: Path) -> float:
-    """When a file was written last; -1 where there is none."""
+    """Return the time of a file's last change; -1 if it does not exist."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -59,7 +56,7 @@ def modified_s(path: Path) -> float:
 
 @cache
 def _even_grey(radiance: float) -> Environment:
-    """The same object for the same light: a backend spends a second on each."""
+    """Return uniform light; the same object for the same radiance, since a backend spends a second on each."""
     return Environment(np.full((8, 16, 3), radiance, np.float32))
 
 
@@ -143,7 +140,7 @@ class StagedObject:
 
     @cached_property
     def _upright_from_asset(self) -> Float[np.ndarray, "4 4"]:
-        """From the first moment of the animation, so that the object neither jumps nor breathes while it moves."""
+        """Transform by the first moment of the animation, so that the object neither jumps nor breathes while it moves."""
         low, high = self._first.bounds_m
         height_m = self.placed.height_m or float(high[1] - low[1]) * self.placed.scale
         return world_from_scene_placing(self._first, turned(self.placed.position_m, self.up), height_m, self.placed.yaw_rad)
@@ -159,7 +156,7 @@ class StagedScene:
         lighting: tuple[Environment | None, tuple[Light, ...]],
         moment_s: float = MOMENT_S,
     ) -> None:
-        """moment_s: scenes are posed at whole multiples of this; 0 for any time, as a shutter asks for."""
+        """Set up one version of a scene. moment_s: scenes are posed at whole multiples of this; 0 for any time, as a shutter needs."""
         self.description, self.objects, self._lighting, self._moment_s = description, objects, lighting, moment_s
         self._made: tuple[float, Scene, Mapping[str, Scene]] | None = None
         self._points: tuple[Scene, Float[np.ndarray, "points 3"]] | None = None
@@ -186,7 +183,7 @@ class StagedScene:
         return shadow_catcher(y, (x, z), 0.5 * shadow.size_m)
 
     def scene_at(self, time_s: float) -> Scene:
-        """All visible objects, lit; the very same Scene for the same moment, because backends keep what they prepared for it."""
+        """Return the visible objects, lit; the very same Scene for the same moment, because backends keep what they prepared for it."""
         return self._made_at(time_s)[0]
 
     def parts_at(self, time_s: float) -> Mapping[str, Scene]:

@@ -60,7 +60,7 @@ def fill_depth(
 
 @compiled
 def _met(corners: np.ndarray, triangle: int, eye: Vector, ray: Vector) -> tuple[float, bool]:
-    """(depth of the triangle's plane, whether the ray meets the triangle): Moeller and Trumbore 1997."""
+    """Return (depth of the triangle's plane, whether the ray meets the triangle): Moeller and Trumbore 1997."""
     a = corner(corners, triangle, 0)
     side_1, side_2, to_origin = sub(corner(corners, triangle, 1), a), sub(corner(corners, triangle, 2), a), sub(eye, a)
     p, q = cross(ray, side_2), cross(to_origin, side_1)

@@ -59,7 +59,7 @@ class Gpu:
         return np.frombuffer(self.device.queue.read_buffer(buffer, first * size, count * size), dtype, count)
 
     def texture(self, size: tuple[int, int, int], texel: str, samples: int = 1, usage: str = "RENDER_ATTACHMENT|TEXTURE_BINDING") -> Any:
-        """size: width, height, layers; texel: the format's name in WebGPU."""
+        """Create a texture. size: width, height, layers; texel: the format's name in WebGPU."""
         return self.device.create_texture(size=size, format=texel, sample_count=samples, usage=usage)
 
     def shader(self, *names: str) -> Any:

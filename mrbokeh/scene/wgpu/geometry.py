@@ -1,6 +1,7 @@
-"""Triangles and materials on the graphics device, in the order in which they are drawn: solid, cut out, blended.
+"""Triangles, materials and textures on the graphics device.
 
-Textures on the graphics device: all texels of a scene's textures, with their coarser levels, in one long array.
+Triangles are in the order in which they are drawn: solid, cut out, blended. All texels of a scene's textures, with their coarser
+levels, lie in one long array.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,7 +67,7 @@ def _described(levels: PackedTextures, skip: int, start: int) -> UInt32[np.ndarr
 
 
 def _skipped_levels(textures: Sequence[Texture]) -> list[int]:
-    """How many fine levels of each texture to leave out so that all fit."""
+    """Return how many fine levels of each texture to leave out so that all fit."""
     skips = [0] * len(textures)
     sizes = [texture.texels.shape[0] * texture.texels.shape[1] * 4 / 3 for texture in textures]
     while sum(size / 4**skip for size, skip in zip(sizes, skips, strict=True)) > _MOST_TEXELS:
@@ -170,7 +171,7 @@ def _large(meshes: Sequence[Mesh]) -> Bool[np.ndarray, " meshes"]:
 def _packed(
     meshes: Sequence[Mesh], centre_m: Float64[np.ndarray, "3"], is_large: Bool[np.ndarray, " meshes"]
 ) -> tuple[PackedTriangles, PackedMaterials, tuple[Texture, ...]]:
-    """As `packed`, sorted by alpha mode and cluster, and without the textures' texels, as making their levels takes long."""
+    """Pack like `packed`, sorted by alpha mode and cluster, without the textures' texels, whose levels take long to make."""
     materials = list({id(mesh.material): mesh.material for mesh in meshes}.values())
     textures = list({id(t): t for material in materials for t in textures_of(material) if t is not None}.values())
     number = {id(material): index for index, material in enumerate(materials)}
@@ -192,7 +193,7 @@ def _triangle_rows(triangles: PackedTriangles) -> Float32[np.ndarray, "triangles
 
 
 def _material_rows(materials: PackedMaterials) -> Float32[np.ndarray, "materials 24"]:
-    """struct Material of geometry.wgsl."""
+    """Return rows of struct Material of geometry.wgsl."""
     floats = np.concatenate(
         [
             materials.base_color,

@@ -1,7 +1,4 @@
-"""Shading: from the triangles that samples see to colour and coverage, in one compute pass per layer.
-
-Lights with their shadow maps, and filtered panoramas, as the shading reads them.
-"""
+"""Shading of the triangles that samples see, in one compute pass per layer, under lights with shadow maps and filtered panoramas."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +24,9 @@ _ROWS_OF_PANORAMA = 5 + 16 + 3 * 16
 
 @dataclass(frozen=True, eq=False)
 class GpuLights:
-    """lights: struct Light of light.wgsl each. maps: layers of triangle numbers; veils: how many of them are see-through, per view."""
+    """Lights on the device. lights: struct Light of light.wgsl each. maps: layers of triangle numbers. veils: see-through layers per
+    view.
+    """
 
     count: int
     lights: Any
@@ -37,7 +36,7 @@ class GpuLights:
 
 @dataclass(frozen=True, eq=False)
 class GpuPanorama:
-    """struct Panorama of light.wgsl and its values; is_lit is False where there is no panorama."""
+    """Panorama on the device: struct Panorama of light.wgsl and its values; is_lit is False without a panorama."""
 
     header: Any
     values: Any
@@ -121,7 +120,7 @@ _HEADER = 16
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """What lights a picture. caster: the geometry whose triangles the shadow maps number."""
+    """Lights and panorama of a picture. caster: the geometry whose triangles the shadow maps number."""
 
     caster: GpuGeometry
     lights: GpuLights
@@ -213,7 +212,7 @@ class Shading:
         return self._pipelines[key]
 
     def read(self, canvas: Canvas, camera: Camera) -> tuple[Float32[np.ndarray, "h w 4"], UInt32[np.ndarray, "h w"]]:
-        """(colour and coverage, deciding surface)."""
+        """Return (colour and coverage, deciding surface)."""
         size, count = (camera.height_px, camera.width_px), camera.height_px * camera.width_px
         rgba = self._gpu.read(canvas.rgba, np.float32, 4 * count)
         return rgba.reshape(*size, 4), self._gpu.read(canvas.pixels, np.uint32, count).reshape(size)
@@ -224,13 +223,13 @@ class Shading:
         return np.minimum(self._gpu.read(canvas.pixels, np.float32, count, first=count), np.float32(1.0)).reshape(size)
 
     def is_done(self, canvas: Canvas) -> bool:
-        """Whether the layer drawn last has shown nothing any more."""
+        """Return whether the layer drawn last shows nothing any more."""
         return not self._gpu.read(canvas.work, np.uint32, 5)[[0, 4]].any()
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What to shade: a geometry in the picture of a camera, as a scene or as a catcher of shadows.
+    """Geometry to shade in the picture of a camera, as a scene or as a catcher of shadows.
 
     group binds the geometry for drawing, shading_group with the materials of the casters for shading.
     """
@@ -248,7 +247,7 @@ class Job:
 
 
 def _frame_words(job: Job, layer: int, is_last: bool) -> Float32[np.ndarray, "96"]:
-    """struct Frame of frame.wgsl; positions are relative to the geometry's centre."""
+    """Return struct Frame of frame.wgsl; positions are relative to the geometry's centre."""
     geometry, camera, lighting = job.geometry, job.camera, job.lighting
     rows = np.zeros((24, 4), np.float32)
     whole = rows.view(np.uint32)

@@ -1,6 +1,6 @@
-"""Drawing: which triangle each sample of a picture sees, from a camera (17 samples per pixel) or a light (one).
+"""Drawing of the triangle that each sample of a picture sees, from a camera (17 samples per pixel) or a light (one).
 
-How cameras and lights look at a scene: the matrices and rays that the visibility shader takes.
+Views are the matrices and rays by which cameras and lights look at a scene.
 """
 
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ _WIDEST_TANGENT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """struct View of visibility.wgsl, without its flags; points are relative to the geometry's centre.
+    """View of a camera or light: struct View of visibility.wgsl, without its flags; points are relative to the geometry's centre.
 
-    way, way_right, way_down: of a camera the ray through (0, 0) of the picture and its change per pixel; of a sun the origin.
-    texel: width of a pixel, at unit depth of a camera, in metres of a sun.
+    way, way_right, way_down: for a camera the ray through (0, 0) of the picture and its change per pixel; for a sun the origin. texel:
+    width of a pixel, at unit depth of a camera, in metres of a sun.
     """
 
     clip_from_point: Float64[np.ndarray, "4 4"]
@@ -73,7 +73,7 @@ def camera_view(camera: Camera, centre_m: Float[np.ndarray, "3"], nearest_m: flo
 
 
 def nearest_m(camera: Camera, centre_m: Float[np.ndarray, "3"], box_m: Float[np.ndarray, "8 3"]) -> float:
-    """Where the near plane has to lie so that the box's content is seen and depth is told apart well."""
+    """Return the near plane that shows all of the box and leaves the depth test its precision."""
     depth_m = (box_m + centre_m) @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
     reach_m = float(np.ptp(box_m, axis=0).max())
     return max(0.9 * float(depth_m.min()), _NEAREST * reach_m, 1e-9)
@@ -111,7 +111,7 @@ def _axes_along(forward: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
 def _lamp_view(
     position: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"], half: float, box_m: Float[np.ndarray, "8 3"], size_px: int
 ) -> View:
-    """half: tangent of half the field of view."""
+    """Return the view of a point or spot light. half: tangent of half the field of view."""
     camera_from_point = np.eye(4)
     camera_from_point[:3, :3], camera_from_point[:3, 3] = axes, -axes @ position
     focal_px = size_px / (2 * half)
@@ -150,7 +150,7 @@ MARGIN_PX = 1
 
 
 def sample_places() -> tuple[Float[np.ndarray, "16 2"], Float[np.ndarray, "16 2"]]:
-    """(places in the pixel from 0 to 1, how many texels further right and down they are found), pass by pass."""
+    """Return (places in the pixel from 0 to 1, how many texels further right and down they are found), pass by pass."""
     places = (_SHIFTS[:, None] + _OF_FOUR).reshape(-1, 2)
     return places % 1.0, MARGIN_PX - np.floor(places)
 
@@ -223,7 +223,7 @@ class Visibility:
     def draw_camera(
         self, encoder: Any, geometry: GpuGeometry, group: Any, camera: Camera, into: Targets, layer: int | None, near_m: float
     ) -> None:
-        """All samples of what is solid or cut out (layer None), or after that of one layer of what is blended."""
+        """Draw the samples of solid and cut-out triangles (layer None), or of one layer of blended ones after it."""
         # The targets may be larger than the picture; the same pixels lie at the same places.
         width, height = into.size_px
         shifts = [np.zeros(2), *(MARGIN_PX - _SHIFTS)]
@@ -280,7 +280,7 @@ class Visibility:
 
 
 def _in_turn(depths: Sequence[Any], layer: int) -> tuple[Any, Any]:
-    """(depth to draw this layer, depth of the layer before)."""
+    """Return (depth to draw this layer, depth of the layer before)."""
     return depths[layer % 2], depths[1 - layer % 2]
 
 

@@ -84,7 +84,7 @@ class WgpuRasterizer:
         return picture
 
     def render_shadow_mask(self, scene: Scene, camera: Camera, catcher: Mesh) -> Float32[np.ndarray, "height width"]:
-        """(H, W) share of the lights' irradiance on the catcher that the scene lets through, 1 is lit; see SceneRenderer."""
+        """Return the (H, W) share of the lights' irradiance that reaches the catcher past the scene, 1 is lit; see SceneRenderer."""
         mask = np.ones((camera.height_px, camera.width_px), np.float32)
         ready = self._ready(scene)
         if ready is None or not scene.lighting[0] or not len(catcher.triangles):
@@ -125,7 +125,7 @@ class WgpuRasterizer:
         return _kept(self._pools, key, _KEPT_POOLS) or _keep(self._pools, key, texel_pool(self._gpu, textures))
 
     def _ready(self, scene: Scene) -> _Ready | None:
-        """What depends on the scene only; None where it has nothing to draw."""
+        """Return the data that depend on the scene only; None if there is nothing to draw."""
         if scene in self._scenes:
             return self._scenes[scene]
         drawn = [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
