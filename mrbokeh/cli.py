@@ -57,7 +57,7 @@ SUB_COMMANDS = {
 
 
 def _placeholder(name: str, summary: str) -> Any:
-    """What the list of commands shows in place of a command that is not loaded."""
+    """Return a command that stands in the list for one that is not loaded."""
     app = typer.Typer(add_completion=False)
     app.command(name, help=summary)(lambda: None)
     return get_command(app)
@@ -102,7 +102,7 @@ def _root(
 
 
 def main() -> None:
-    """The console script: mistakes of the user end in one sentence and exit code 2, without a traceback."""
+    """Run the console script: mistakes of the user end in one sentence and exit code 2, without a traceback."""
     interrupted = _noted_interrupts()
     try:
         app()
@@ -124,7 +124,7 @@ def main() -> None:
 
 
 def _noted_interrupts() -> list[int]:
-    """Ctrl-C raises KeyboardInterrupt as ever, which compilers may turn into another error: whoever handles that one asks here."""
+    """Return a list that fills with interrupts. Ctrl-C raises KeyboardInterrupt, but compilers may turn that into another error."""
     noted: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -137,7 +137,7 @@ def _noted_interrupts() -> list[int]:
 
 
 def _refused(error: OSError) -> str:
-    """What the system would not do with a file or folder; of a file that is being written under a temporary name, its folder."""
+    """Describe what the system refused to do with a file or folder; for a temporary file, name its folder."""
     path = Path(os.fsdecode(error.filename))
     shown = path.parent if path.name.startswith(".") and ".part" in path.name else path
     if isinstance(error, IsADirectoryError):

@@ -1,9 +1,8 @@
-"""Refocusing: new slices of a focal stack, between and beyond the captured ones, from its all-in-focus picture and depth.
+"""New slices of a focal stack, between and beyond the captured ones; and transfer, one lens's blur on an all-in-focus photograph.
 
-What the renderer does not reproduce of a captured slice (its residual: the true shape of the blur, errors of the all-in-focus picture)
-can be carried over to a new focus nearby.
-
-Transfer: the blur of any lens on a photograph in which all is sharp (Mandl et al. 2024, Section 5).
+Refocusing renders from the all-in-focus picture and depth. The difference to a captured slice that rendering leaves (its residual: the
+true shape of the blur, errors of the all-in-focus picture) can be carried over to a new focus nearby. Transfer: Mandl et al. 2024,
+Section 5.
 """
 
 from collections.abc import Iterator
@@ -41,7 +40,7 @@ RESIDUAL_BLUR, RESIDUAL_LARGEST_BLUR_PX = 0.85, 2.0
 
 
 def lens_at(stack: FocalStack, focus_m: float, lens: Lens | None = None) -> Lens:
-    """The stack's lens at any focus, with the blur of its registered slices: f-number and scale go over evenly in dioptres.
+    """Return the stack's lens at any focus, with the blur of its registered slices: f-number and scale interpolate in dioptres.
 
     lens: another one, which takes the focus and nothing else of the stack's.
     """
@@ -61,7 +60,7 @@ def lens_at(stack: FocalStack, focus_m: float, lens: Lens | None = None) -> Lens
 
 
 class _Carry(NamedTuple):
-    """How much of a slice's residual goes over; its circles of confusion differ from the new ones by coc_step_px everywhere."""
+    """Share of a slice's residual that is carried over; its circles of confusion differ from the new ones by coc_step_px everywhere."""
 
     weight: np.float32
     light_weight: np.float32
@@ -74,9 +73,10 @@ class _Carry(NamedTuple):
 
 @dataclass(frozen=True)
 class Refocusing:
-    """stack: merged, with focus distances. residuals: whether to carry over what rendering misses of the slices next to the new focus.
+    """Renderer of new slices of a merged stack with focus distances.
 
-    Without them captured slices are rendered like all others, so that nothing tells them apart in a focus pull.
+    residuals: whether to carry over the residuals of the slices next to the new focus. Without them captured slices are rendered like
+    all others, so that nothing tells them apart in a focus pull.
     """
 
     stack: FocalStack
@@ -85,9 +85,10 @@ class Refocusing:
     residuals: bool = True
 
     def slice_at(self, focus_m: float, leave_out: int | None = None) -> Rgb:
-        """(H, W, 3) linear Rec.709 as focused at focus_m (inf is allowed). With residuals a captured focus gives the captured slice.
+        """Return (H, W, 3) linear Rec.709 as focused at focus_m (inf is allowed). With residuals a captured focus gives the captured
+        slice.
 
-        leave_out: a slice that is not looked at, to see how well it is predicted. Raises InputError where focus distances are unknown.
+        leave_out: a slice that is not used, to measure how well it is predicted. Raises InputError if focus distances are unknown.
         """
         captured = self._captured(leave_out)
         if not self.residuals or self.lens is not None:
@@ -109,7 +110,7 @@ class Refocusing:
         return self.renderer.render([self._sharp()], self.lens_at(focus_m)).rgb
 
     def residuals_of(self, index: int) -> tuple[Rgb, Rgb]:
-        """What a captured slice has that rendering it does not give, and the same at lights; each 0 elsewhere, and without data."""
+        """Return (residual of a captured slice against its rendering, residual at highlights); each 0 elsewhere, and without data."""
         masks, captured = self.stack.slice_masks(index), self.stack.slice_rgb(index)
         rendered = self.rendered(float(self._captured(None)[index]))
         residual = np.where(masks.valid[..., None], captured - rendered, np.float32(0.0))
@@ -129,7 +130,9 @@ class Refocusing:
         return {index: distance for index, distance in distances.items() if index != leave_out}
 
     def _carried(self, captured: dict[int, float], focus_m: float) -> dict[int, "_Carry"]:
-        """The slices on either side of the focus, evenly in dioptres, less the farther their blur is from the new one."""
+        """Return the slices on either side of the focus, evenly in dioptres, weighted less the more their blur differs from the new
+        one.
+        """
         wanted = 1.0 / focus_m
         nearer = [index for index in captured if 1.0 / captured[index] >= wanted]
         farther = [index for index in captured if 1.0 / captured[index] < wanted]
@@ -186,9 +189,9 @@ _CLIPPED_FROM, _CLIPPED_AT = 0.97, 0.995
 
 @dataclass(frozen=True)
 class SharpPhotograph:
-    """photograph: all in focus; depth at its size. focus_m: where a phone had focused, in the unit of its depth, or None.
+    """Photograph all in focus with depth at its size.
 
-    stack: the focal stack that it is the all-in-focus picture of, or None.
+    focus_m: focus of a phone, in the unit of its depth, or None. stack: the focal stack whose all-in-focus picture it is, or None.
     """
 
     photograph: Photograph
@@ -202,8 +205,10 @@ class SharpPhotograph:
 
 
 def open_sharp(photo: Path, depth: Path | None, settings: DepthSettings) -> SharpPhotograph:
-    """depth: None where the photograph itself holds it (a phone's GDepth). Of a phone's photograph with a blurred face the sharp original
-    inside is taken, of a merged focal stack its all-in-focus picture and its depth. Raises InputError where there is no depth.
+    """Open a photograph with its depth. Raises InputError if there is no depth.
+
+    depth: None if the photograph itself holds it (a phone's GDepth). A phone's photograph with a blurred face gives the sharp original
+    inside, a merged focal stack its all-in-focus picture and its depth.
     """
     if photo.is_dir():
         return _of_stack(read_focal_stack(photo), depth, settings)
@@ -238,9 +243,9 @@ def seen_like(lens: Lens, photograph: Photograph, photo: Path) -> Lens:
 
 
 def with_recovered_highlights(rgb: Rgb, stops: float) -> Rgb:
-    """What is clipped at white, taken to be so many stops brighter than it is stored. A guess, which the user makes and not the program.
+    """Brighten clipped white by so many stops. A guess, which the user makes and not the program.
 
-    Goes over smoothly from codes of 0.97 to 0.995, so that the rim of a highlight does not become a line.
+    The change is smooth from codes of 0.97 to 0.995, so that the edge of a highlight does not become a line.
     """
     code = np.clip(linear_to_srgb(rgb.max(axis=2)), 0.0, 1.0)
     clipped = np.clip((code - _CLIPPED_FROM) / (_CLIPPED_AT - _CLIPPED_FROM), 0.0, 1.0)

@@ -1,1 +1,1 @@
-"""One file per command of `mrbokeh` that needs this package alone."""
+"""Commands of `mrbokeh` that need this package alone, one file each."""

@@ -1,4 +1,4 @@
-"""What `mrbokeh composite` puts in: layers of other renderers, an object, a scene; as options say."""
+"""Layers that `mrbokeh composite` inserts, by its options: layers of other renderers, an object, a scene."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,7 +31,9 @@ LayersFor = Callable[[Plate], list[Layer]]
 def layers_by(
     virtual: VirtualOptions, standing: ObjectOptions, rendering: RenderingOptions, first: Plate, bundle: CaptureBundle | None
 ) -> LayersFor:
-    """first: the plate on whose pixel the object stands. Raises InputError where there is nothing to put in."""
+    """Return the layers of the options. first: the plate on whose pixel the object stands. Raises InputError if there is nothing to
+    insert.
+    """
     files = _FileLayers.of(virtual.layer or (), virtual.object_names)
     still = [*files.flat, *(bundle.layers if bundle else ())]
     rendered = []
@@ -51,8 +53,10 @@ def layers_by(
 
 
 def standing_on_pixel(layers: Sequence[Layer], plate: Plate, x_px: float, y_px: float) -> list[Layer]:
-    """Layers with all their depth scaled about the camera, which leaves their picture as it is, so that what of them is at the pixel, or
-    nearest to it, lies as far as the photograph there. Raises InputError where nothing of them has a depth.
+    """Scale the depth of all layers about the camera, which leaves their picture as it is, so that they stand on a pixel.
+
+    The part of them that is at the pixel, or nearest to it, then lies as far as the photograph there. Raises InputError if none of them
+    has a depth.
     """
     surface_m = plate.point_under_pixel_m(x_px, y_px)[2]
     whole = flatten(layers)
@@ -80,7 +84,7 @@ class _FileLayers:
         return cls(flat, [each.samples(each.frames[0]) for each in sequences if each.is_deep])
 
     def among(self, layers: list[Layer]) -> list[Layer]:
-        """The deep ones among others, front first."""
+        """Return the deep layers among others, front first."""
         if not self.deep:
             return layers
         from mrbokeh.stacks.exr_layers.deep_interleaved import interleaved
@@ -114,7 +118,7 @@ def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
 
 
 def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) -> LayersFor:
-    """Without a camera file the world of the scene is the plate's camera."""
+    """Return the layers of a scene file; without a camera file the world of the scene is the plate's camera."""
     from mrbokeh.scene.staging.scene_file import read_scene_file
     from mrbokeh.shots.frame_sources import scene_track
 

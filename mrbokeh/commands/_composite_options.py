@@ -28,7 +28,7 @@ OutOption = Annotated[
 
 @dataclass(frozen=True)
 class PlateOptions(shared.NearOptions):
-    """disparity: NEAR:FAR as typed."""
+    """Options of the photograph and its depth. disparity: NEAR:FAR as typed."""
 
     slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.", rich_help_panel=PLATE)] = (
         None
@@ -97,7 +97,7 @@ class ObjectOptions:
 
 @dataclass(frozen=True)
 class RenderingOptions(shared.RenderingOptions):
-    """time: of the animations, in seconds."""
+    """Options of rendering in a photograph. time: of the animations, in seconds."""
 
     scene_renderer: shared.BackendOption = "embree"
     time: Annotated[float, typer.Option(help="Second of the animations that is shown.", rich_help_panel=VIRTUAL)] = 0.0
@@ -105,7 +105,7 @@ class RenderingOptions(shared.RenderingOptions):
 
 @dataclass(frozen=True)
 class LensOptions:
-    """focus: distance of the photograph in metres."""
+    """Options of the lens. focus: distance of the photograph in metres."""
 
     lens: Annotated[
         Path | None,

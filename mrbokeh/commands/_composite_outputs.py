@@ -1,7 +1,4 @@
-"""What `mrbokeh composite` writes: the picture, or with .exr all that it was put together from, and what was asked for beside it.
-
-The plate of `mrbokeh composite`, as options say, and the way in which layers go into it.
-"""
+"""Plate of `mrbokeh composite` by its options, and its results: the picture, with .exr all layers, and files beside it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,7 +25,7 @@ from mrbokeh.video.image_sequence import read_numbers
 def plate_by(
     photo: Path, options: PlateOptions, colour: ColourOptions, bundle: CaptureBundle | None, *, lens: Lens | None, focus_m: float | None
 ) -> Plate:
-    """The photograph, slice or bundle, with depth and matte where files of them are given; lens, focus_m: in place of its own."""
+    """Open the photograph, slice or bundle, with depth and matte from their files. lens, focus_m: in place of its own."""
     if bundle is None:
         plate = open_plate(photo, 0 if options.all_slices else options.slice_, lens, focus_m)
     else:
@@ -42,7 +39,7 @@ def plate_by(
 
 
 def best_mode(plate: Plate) -> str:
-    """That what is known of the plate allows."""
+    """Return the best mode that the known data of the plate allow."""
     if plate.near_alpha is not None or (plate.depth_m is not None and plate.sharp_rgb is not None):
         return "between"
     return "over" if plate.depth_m is not None else "front"
@@ -59,7 +56,7 @@ def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:
 
 
 def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None], *, all_slices: bool) -> None:
-    """read: the files that the command reads. Raises InputError where a file would be lost, or cannot be what is asked for."""
+    """Raise InputError if a file would be lost, or cannot be what is asked for. read: the files that the command reads."""
     for path, name in ((result.save_layer, "--save-layer"), (result.deep_out, "--deep-out")):
         if path is not None:
             require_suffix(path, (".exr",), name)
@@ -73,7 +70,7 @@ def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None],
 
 
 def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
-    """The lens that blurred, and how much; where metres are guessed, what was measured: pixels."""
+    """Describe the lens and its blur; if metres are guessed, give the measured pixels."""
     lens, width_px = plate.lens, plate.rgb.shape[1]
     unit = GUESSED if plate.metres_guessed else "m"
     told = "blur as measured in the slices," if plate.lens_guessed else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
@@ -99,7 +96,7 @@ def _size_px(sharp: Sequence[Layer]) -> str:
 def write_results(
     out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions, result: ResultOptions
 ) -> None:
-    """sharp: the layers that were put in, front first."""
+    """Write the picture and the files beside it. sharp: the inserted layers, front first."""
     from mrbokeh.images.image_io import write_layer
     from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 
@@ -111,7 +108,7 @@ def write_results(
 
 
 def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions) -> None:
-    """With an output space the picture alone; else linear Rec.709 with its layers, or sRGB."""
+    """Write the picture alone if it has an output space; else linear Rec.709 with its layers, or sRGB."""
     from mrbokeh.images.alpha_io import write_finished
 
     if out.suffix.lower() == ".exr" and colour.of_result is None:
@@ -121,7 +118,7 @@ def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[L
 
 
 def alpha_lost(out: Path, plate: Plate) -> str | None:
-    """What to tell where the plate's alpha cannot be kept."""
+    """Return a warning if the plate's alpha cannot be kept, else None."""
     if plate.alpha is None or out.suffix.lower() in HOLDING_ALPHA:
         return None
     return f"the plate has alpha, which {out.suffix} cannot hold: what it does not cover is black in {out} (write .png, .tif or .exr)"

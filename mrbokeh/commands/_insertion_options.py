@@ -1,7 +1,4 @@
-"""Options that `mrbokeh composite` and `mrbokeh video` have in common.
-
-Options of `mrbokeh composite` and `mrbokeh video` that make virtual light look photographed.
-"""
+"""Options that `mrbokeh composite` and `mrbokeh video` have in common: what is inserted, how it is rendered, colour spaces, look."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +21,7 @@ OverwriteOption = Annotated[bool, typer.Option(help="Replace what exists.", rich
 
 @dataclass(frozen=True)
 class NearOptions:
-    """What of the plate stands in front of virtual things. near_distance: in metres."""
+    """Options of what stands in front of virtual things. near_distance: in metres."""
 
     matte: Annotated[
         Path | None,
@@ -80,12 +77,12 @@ class VirtualOptions:
 
     @property
     def files(self) -> tuple[Path | None, ...]:
-        """That are read."""
+        """Input files of these options."""
         return (*(self.layer or ()), self.scene, self.camera)
 
     @property
     def object_names(self) -> tuple[str, ...]:
-        """As typed in --objects, without commas. Raises InputError where there is no layer to take them from."""
+        """Names in --objects. Raises InputError if there is no layer to take them from."""
         if self.objects is not None and not self.layer:
             raise InputError(f"--objects {self.objects} are taken out of layers: give --layer RENDER.exr with a Cryptomatte")
         return () if self.objects is None else tuple(self.objects.split(","))
@@ -93,7 +90,7 @@ class VirtualOptions:
 
 @dataclass(frozen=True)
 class RenderingOptions:
-    """How --scene and --object are rendered."""
+    """Options of rendering --scene and --object."""
 
     scene_renderer: BackendOption = "auto"
     samples: Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.", rich_help_panel=VIRTUAL)] = 64
@@ -111,7 +108,7 @@ class RenderingOptions:
     ] = None
 
     def filming(self, shutter: "ShutterTiming | None" = None) -> "Filming":
-        """shutter: None stands still."""
+        """Return the render settings. shutter: None for no motion blur."""
         from mrbokeh.distortion.distortion import read_distortion
         from mrbokeh.scene.staging.filming import Filming
 
@@ -156,7 +153,7 @@ LOOK = "Its look"
 
 @dataclass(frozen=True)
 class LookGroup:
-    """Texts as typed, as `mrbokeh.compositing.plate_look.finishing.LookOptions` has them."""
+    """Options that make virtual light look photographed: texts as typed, see `mrbokeh.compositing.plate_look.finishing.LookOptions`."""
 
     match_grey: Annotated[
         str | None,

@@ -1,7 +1,4 @@
-"""How `mrbokeh render` blurs: the renderer with its bank of PSFs, and the lens with its focus.
-
-What `mrbokeh render` blurs: a picture with depth and motion, layers in front of it and behind it, from their files.
-"""
+"""Inputs of `mrbokeh render`: a picture with depth and motion, layers in front of it and behind it, the lens with its focus."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -99,7 +96,7 @@ def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
 
 
 def _moving(sharp: dict[str, Layer], sources: Sources) -> dict[str, Layer]:
-    """With motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
+    """Add motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
     from mrbokeh.layering.motion import with_motion
     from mrbokeh.stacks.exr_layers.render_channels import read_motion, taken_from_channels
 

@@ -32,7 +32,7 @@ OutOption = Annotated[
 
 @dataclass(frozen=True)
 class ClipOptions(shared.NearOptions):
-    """What of the clip is taken, what its frames are called, and how far what it shows is."""
+    """Options of the clip: which frames are taken, their numbers, and depth."""
 
     rate: Annotated[
         str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001.", rich_help_panel=PLATE)
@@ -58,7 +58,7 @@ class ClipOptions(shared.NearOptions):
 
 @dataclass(frozen=True)
 class RenderingOptions(shared.RenderingOptions):
-    """How --scene is filmed. shutter: angle in degrees; readout, scene_begin: in seconds."""
+    """Options of filming --scene. shutter: angle in degrees; readout, scene_begin: in seconds."""
 
     scene_begin: Annotated[
         float, typer.Option(help="Second of the clip at which the animations of --scene begin.", rich_help_panel=VIRTUAL)
@@ -89,7 +89,7 @@ class BlurOptions:
 
 @dataclass(frozen=True)
 class ResultOptions:
-    """What is written, and how."""
+    """Options of the written result."""
 
     encoding: Annotated[
         str | None,
@@ -116,7 +116,7 @@ class ResultOptions:
 
 @dataclass(frozen=True)
 class WorkOptions:
-    """workers: processes here; cluster: a scheduler elsewhere; segment: in seconds."""
+    """Options of the workers. workers: processes here; cluster: a scheduler elsewhere; segment: in seconds."""
 
     workers: Annotated[int, typer.Option(min=0, help="Processes on this machine; 0 takes one for each core.", rich_help_panel=WORK)] = 0
     cluster: Annotated[

@@ -75,7 +75,7 @@ def composite(
 
 
 def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions) -> None:
-    """What of a stack's metres is guessed, and what follows for layers."""
+    """Print which of a stack's metres are guessed, and what follows for layers."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
     from mrbokeh.stacks.guessed_metres import metres_note
 

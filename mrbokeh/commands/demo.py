@@ -13,10 +13,10 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything it makes.")] = Path("demo_out"),
     minutes: Annotated[float, typer.Option(min=0.05, help="Training time of the first network; the second takes a third of it.")] = 2.3,
 ) -> None:
-    """From RAW photographs to virtual objects with the blur of their lens: capture, train, composite, report.
+    """Run the whole path from RAW photographs to virtual objects with the blur of their lens: capture, train, composite, report.
 
-    Runs the commands of mrbokeh on shipped photographs and writes report.html. Finished stages are skipped when run again,
-    an interrupted one goes on.
+    Runs the commands of mrbokeh on shipped photographs and writes report.html. Finished stages are skipped when run again, an
+    interrupted one goes on.
 
     Example: mrbokeh demo --out demo_out
     """

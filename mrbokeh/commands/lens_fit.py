@@ -1,7 +1,4 @@
-"""`mrbokeh lens fit`: a bank of PSFs measured from focal stacks and from pictures of points of light.
-
-`mrbokeh lens match`: the lens of one photograph from its out-of-focus lights.
-"""
+"""`mrbokeh lens fit` and `mrbokeh lens match`: lenses measured in focal stacks, in pictures of points of light, and in one photograph."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -129,7 +126,7 @@ def _stacks(folders: list[Path]) -> list:  # type: ignore[type-arg]
 
 
 def _lights(behind: list[Path], in_front: list[Path]) -> "tuple[list[PointLight], tuple[int, int] | None]":
-    """All lights of all frames, and the size of the frames."""
+    """Return the points of light of all frames, and the size of the frames."""
     from mrbokeh.images.image_io import read_linear
     from mrbokeh.lens_measuring.fitting.point_lights import find_lights
 

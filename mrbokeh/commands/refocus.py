@@ -95,7 +95,7 @@ def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float,
 
 
 def _make_room(out: Path, overwrite: bool) -> None:
-    """Only what this command wrote is ever replaced; a run that was stopped has no stack.json yet and goes on."""
+    """Remove a finished result of this command, if --overwrite asks for it; a run that was stopped has no stack.json yet and goes on."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 
     if out.exists() and not (out / _SETTINGS).is_file():
@@ -122,7 +122,7 @@ def _way(source: FocalStack, f_number: float | None, lens: Path | None, renderer
 
 
 def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, settings: dict, overwrite: bool) -> tuple[Slice, ...]:
-    """Slices that are there already, made with the same settings by a run that was stopped, are kept."""
+    """Write the slices; those that a stopped run made with the same settings are kept."""
     from mrbokeh.figures.stack_pictures import write_upright_png
     from mrbokeh.images.image_io import write_image
     from mrbokeh.stacks.focus_places import slice_names
@@ -144,7 +144,7 @@ def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, se
 
 
 def _growth(way: Refocusing, distance_m: float) -> dict:
-    """How fast blur grows in a new slice, where that was measured of the captured ones."""
+    """Return how fast blur grows in a new slice, if that was measured in the captured ones."""
     from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH
 
     width_px = way.stack.slices[0].metadata.get(GROWTH_WIDTH)
@@ -154,7 +154,7 @@ def _growth(way: Refocusing, distance_m: float) -> dict:
 
 
 def _times_as_fast(way: Refocusing) -> float:
-    """How the blur of another lens compares with that of the stack's, where both focus as the reference slice."""
+    """Return the growth of another lens's blur relative to the stack's lens, both focused as the reference slice."""
     focus_m = way.stack.lens_of(way.stack.reference).focus_distance_m
     return way.lens_at(focus_m).coc_px_per_dioptre(1) / Refocusing(way.stack, way.renderer).lens_at(focus_m).coc_px_per_dioptre(1)
 

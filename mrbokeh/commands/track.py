@@ -134,7 +134,7 @@ def _told(tracked: "BoardTrack", out: Path) -> str:
 
 
 def _ranges(numbers: tuple[int, ...]) -> str:
-    """3-5, 9: at most six of them."""
+    """Format frame numbers as ranges such as "3-5, 9", at most six of them."""
     starts = [number for number in numbers if number - 1 not in numbers]
     ends = [number for number in numbers if number + 1 not in numbers]
     texts = [str(start) if start == end else f"{start}-{end}" for start, end in zip(starts, ends, strict=True)]

@@ -1,6 +1,6 @@
 """`mrbokeh transfer`: the blur of any lens, measured, learned or modelled, on a photograph in which all is sharp.
 
-What `mrbokeh transfer` writes: one picture, a folder that is a focal stack, or a focus pull as a film.
+The result is one picture, a folder that is a focal stack, or a focus pull as a film.
 """
 
 import shutil
@@ -29,7 +29,7 @@ _MADE = "transferred_with_depth"
 
 
 def check_out(out: Path, count: int) -> None:
-    """Raises InputError where several pictures would go into one file."""
+    """Raise InputError if several pictures would go into one file."""
     if count > 1 and out.suffix and out.suffix.lower() not in FILMS:
         raise InputError(f"--focus states {count} distances: give a folder or a film ({', '.join(FILMS)}) to write to, got {out}")
 
@@ -58,7 +58,7 @@ def _write_film(out: Path, distances_m: Sequence[float], blurred: Blurred, frame
 
 
 def is_transferred(folder: Path) -> bool:
-    """Whether a folder is a focal stack of this command's, which --overwrite may replace."""
+    """Return whether a folder is a focal stack of this command, which --overwrite may replace."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 
     return (folder / FILE_NAME).is_file() and _MADE in read_focal_stack(folder).metadata
@@ -199,7 +199,7 @@ def _require_outputs(out: Path, sheet: Path | None, save_depth: Path | None, inp
 
 
 def _distances(lens: Lens, sharp: SharpPhotograph, focus: str | None, focus_at: str | None) -> tuple[float, ...]:
-    """From --focus, from the depth at a pixel, else where the phone had focused, else as the lens file says."""
+    """Return the focus distances: from --focus, from the depth at a pixel, else of the phone, else of the lens file."""
     from mrbokeh.commands._render_inputs import focused
     from mrbokeh.stacks.focus_places import Seen, parse_focus
 

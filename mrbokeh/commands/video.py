@@ -47,7 +47,7 @@ def recipe_of(
     *,
     virtual_only: bool,
 ) -> CompositeRecipe:
-    """How every frame is made. Raises InputError where options do not go together."""
+    """Return the recipe of every frame. Raises InputError if options do not go together."""
     _check_virtual(virtual, rendering)
     objects = virtual.object_names
     files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
@@ -82,7 +82,7 @@ def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour:
 
 
 def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, frames: str, segment_s: float) -> Shot:
-    """frames: START:STOP as typed."""
+    """Return the shot. frames: START:STOP as typed."""
     (start, stop), count = parse_frames(frames), len(source.times_s)
     if start >= count:
         raise InputError(f"--frames {frames} leaves nothing of {source.path}: expected a range within its {count} frames")
@@ -91,7 +91,7 @@ def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, fram
 
 
 def parse_frames(text: str) -> tuple[int, int | None]:
-    """START:STOP, either of which may be missing, as (first frame, first one left out or None)."""
+    """Parse START:STOP, either of which may be missing, as (first frame, first one left out or None)."""
     start, colon, stop = text.partition(":")
     try:
         parsed = int(start or 0), int(stop) if stop else None
@@ -137,7 +137,7 @@ def _look(look: LookGroup, source: PictureSource, taken: options.ClipOptions) ->
 
 
 def _holding(source: PictureSource, lens: Path) -> Holding:
-    """Told here and once, for every worker turns the lens alike."""
+    """Return the orientation of the camera; told here once, for every worker turns the lens alike."""
     holding = Holding((source.info.width_px, source.info.height_px), source.info.quarter_turns)
     lens_held(read_lens(lens), holding, source.path)
     return holding
@@ -148,7 +148,7 @@ def _first_number(source: PictureSource, taken: options.ClipOptions) -> int:
 
 
 def _renderer(name: str) -> str:
-    """A network as an absolute path, for workers may stand elsewhere."""
+    """Return the renderer's name, a network as an absolute path, for workers may stand elsewhere."""
     return str(Path(name).resolve()) if name not in BY_NAME and name.endswith(".onnx") else name
 
 
@@ -193,7 +193,7 @@ def video(
 
 
 def _alpha_lost(clip: Path, source: PictureSource, target: Target) -> str | None:
-    """What to tell of the clip where its alpha is not read, or cannot be kept."""
+    """Return a warning if the clip's alpha is not read, or cannot be kept, else None."""
     if source.info.has_alpha:
         return target.lacks_alpha and f"has alpha, but {target.lacks_alpha}: what it does not cover is black in {target.path.name}"
     if source.file_of(0) is None and has_alpha_apart(clip):
@@ -209,7 +209,7 @@ def _executor(work: options.WorkOptions, segments: int) -> Executor:
 
 
 def _try_first_frame(shot: Shot) -> None:
-    """Mistakes in files and options are told at once, and not by a worker."""
+    """Render the first frame, so that mistakes in files and options are told at once, and not by a worker."""
     frame = next(shot.source.frames(shot.start, shot.start + 1))
     shot.recipe.build(1).make(shot.start, frame.rgb, frame.time_s, frame.alpha)
 

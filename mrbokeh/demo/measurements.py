@@ -1,7 +1,4 @@
-"""What the demo measures: merged stacks against the truth they were made from, the network against its baselines.
-
-The truth that the demo's simulated photographs were made from, and the two passes over a stack that are held against it.
-"""
+"""Measurements of the demo: merged stacks against the truth that they were made from, the network against its baselines."""
 
 import csv
 from collections import defaultdict
@@ -24,7 +21,7 @@ FIRST_PASS_FOLDER = "first_pass"
 
 @dataclass(frozen=True)
 class Truth:
-    """What a pinhole in the middle of the lens sees. all_in_focus: linear Rec.709; depth_m: along the optical axis."""
+    """Picture and depth that a pinhole in the middle of the lens sees. all_in_focus: linear Rec.709; depth_m: along the optical axis."""
 
     all_in_focus: Float32[np.ndarray, "height width 3"]
     depth_m: Float32[np.ndarray, "height width"]
@@ -63,7 +60,7 @@ LARGEST_SIDESTEP = 0.02
 
 @dataclass(frozen=True)
 class Measurement:
-    """One number of the report: what it is, its text, what was wanted, and whether it is so."""
+    """Number of the report: its subject, its text, the wanted value, and whether that is met."""
 
     what: str
     text: str
@@ -72,7 +69,7 @@ class Measurement:
 
 
 def merge_measurements(stack_folder: Path, truth_folder: Path) -> list[Measurement]:
-    """All-in-focus picture (linear, clipped to 1) and depth (where it is trusted) against the pinhole truth, with the first pass's."""
+    """Measure all-in-focus picture (linear, clipped to 1) and trusted depth against the pinhole truth, also of the first pass."""
     stack, truth = read_focal_stack(stack_folder), read_truth(truth_folder)
     passes = [first_pass(stack), stack] if has_second_pass(stack) else [stack]
     decibels = [psnr(each.all_in_focus(), truth.all_in_focus) for each in passes]
@@ -98,7 +95,7 @@ def merge_measurements(stack_folder: Path, truth_folder: Path) -> list[Measureme
 
 @dataclass(frozen=True)
 class DepthError:
-    """median: relative, where depth is trusted. trusted: that share of the picture."""
+    """Error of depth. median: relative, of trusted depth. trusted: share of the picture."""
 
     median: float
     trusted: float
@@ -131,7 +128,7 @@ def spread_m(cameras: Sequence[Camera]) -> float:
 
 
 def placement_measurement(layer: Path, at_pixel: str) -> Measurement:
-    """Whether a virtual object stands upright over the pixel that it was put on; its shadow is no more than half opaque."""
+    """Measure whether a virtual object stands upright over its pixel; its shadow is no more than half opaque."""
     alpha = read_layer(layer).alpha
     solid = np.nonzero(alpha > OPAQUE)[1]
     off_px = abs(float(solid.mean()) + 0.5 - float(at_pixel.split(",")[0])) if len(solid) else float("inf")

@@ -1,7 +1,4 @@
-"""What the demo does: the list of its commands, from RAW files to composites.
-
-The stages of the demo that capture: from photographs to stacks with depth and a report on them.
-"""
+"""Plan of the demo: the list of its commands, from RAW files to composites."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,8 +28,10 @@ def merged_stages(folder: Path, what: str, source: Path, names: tuple[str, ...],
 
 
 def deepened_stages(folder: Path, names: tuple[str, ...]) -> list[Stage]:
-    """Optional: where poses cannot be found, depth stays that from focus. `scale` always finds anew, since one that was interrupted
-    leaves a scale without calibrated focus."""
+    """Return stages that find poses, scale and dense depth; optional, since without poses depth stays that from focus.
+
+    `scale` always runs anew, since an interrupted run leaves a scale without calibrated focus.
+    """
     scene = folder / "scene"
     reconstruction = scene / "reconstruction"
     depth = Stage(
@@ -110,7 +109,7 @@ BOARD = (
 
 
 def demo_stages(out: Path, minutes: float) -> list[Stage]:
-    """Both stacks the whole way. minutes: training time of the desk's network; the board's takes a third of it."""
+    """Return the stages of both stacks. minutes: training time of the desk's network; the board's takes a third of it."""
     desk, board = out / "desk", out / "board"
     return [
         *merged_stages(desk, "RAW photographs of a desk (simulated camera, known truth)", DATA / "raw_stack", VIEWS, []),

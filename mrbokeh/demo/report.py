@@ -1,9 +1,4 @@
-"""report.html of the demo: pictures of every stage, numbers against truth, times and versions.
-
-Pictures of the demo's report that show a second pass: depth before and after, its confidence, how far it is off.
-
-Puts the results of the demo together: measurements, pictures, report.html.
-"""
+"""Report of the demo: report.html with measurements against truth, pictures of every stage, times and versions."""
 
 import html
 import os
@@ -107,7 +102,7 @@ WORST = 0.1
 
 
 def write_depth_pictures(stack: FocalStack, truth: Truth, out: Path) -> list[tuple[Path, str]]:
-    """(file, caption) of what `mrbokeh capture depth` changed; [] where there was no second pass."""
+    """Return (file, caption) of pictures of depth before and after `mrbokeh capture depth`; [] if there was no second pass."""
     if not has_second_pass(stack):
         return []
     passes = {"from focus alone": first_pass(stack), "from focus and all viewpoints": stack}
@@ -123,7 +118,7 @@ def write_depth_pictures(stack: FocalStack, truth: Truth, out: Path) -> list[tup
 
 
 def _views(stack: FocalStack, name: str, truth: Truth) -> dict[str, tuple[Rgb, str]]:
-    """(picture, caption) of each kind."""
+    """Return (picture, caption) of each kind."""
     error = np.abs(stack.depth_m() / truth.depth_m - 1.0)
     return {
         "depth": (depth_picture(stack), f"depth {name}; grey where it is a guess"),
@@ -142,7 +137,7 @@ def _colours(level: Plane) -> Rgb:
 
 
 def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
-    """report.html, numbers.json and previews in `out`; returns the measurements."""
+    """Write report.html, numbers.json and previews into `out`; return the measurements."""
     measurements = _measurements(out / "desk", out / "board")
     sections = [*_desk_sections(out / "desk", out / "report.html"), _board_section(out / "board", out / "report.html")]
     write_json(out / "numbers.json", [vars(each) for each in measurements])
@@ -219,7 +214,7 @@ def _depth_figures(stack: Path, page: Path) -> list[str]:
 
 
 def _stack_figures(stack: Path, page: Path) -> list[str]:
-    """Without the depth where a second pass found it, for that has figures of its own."""
+    """Return figures of a stack, without depth if a second pass found it, which has figures of its own."""
     read = read_focal_stack(stack)
     pictures = write_stack_pictures(read, page.parent / "pictures")
     return [figure(path, page, caption) for path, caption in (pictures[:-1] if has_second_pass(read) else pictures)]

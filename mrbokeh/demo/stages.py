@@ -1,7 +1,4 @@
-"""Stages of the demo: commands of `mrbokeh` run one after the other, each skipped when it is done already.
-
-What a stage of the demo was last run with: whether it can be skipped, goes on where it stopped, or has to be made anew.
-"""
+"""Stages of the demo: commands of `mrbokeh` run one after the other, skipped if their records say that they are done already."""
 
 import os
 import signal
@@ -34,12 +31,12 @@ class Record:
     seconds: float | None = None
 
     def still_holds(self, arguments: Sequence[str], inputs: Mapping[str, str]) -> bool:
-        """Whether the stage would do the same today; a feeding stage that ran since has another name of its run."""
+        """Return whether the stage would do the same today; a feeding stage that ran since has another name of its run."""
         return self.arguments == tuple(arguments) and dict(self.inputs) == dict(inputs)
 
 
 def read_record(path: Path) -> Record | None:
-    """None where the stage never began. Records of earlier versions hold for nothing."""
+    """Read the record of a stage; None if it never began. Records of earlier versions hold for nothing."""
     if not path.is_file():
         return None
     document = read_json(path, "the record of a stage")
@@ -52,8 +49,10 @@ def write_record(path: Path, record: Record) -> None:
 
 
 def must_be_anew(record: Record | None, arguments: Sequence[str], inputs: Mapping[str, str]) -> bool:
-    """Of a stage that has to run: whether what it left behind must be replaced. What an interrupted run has of today's goes on;
-    one that was interrupted while it replaced may have left older parts."""
+    """Return whether a stage that has to run must replace what it left behind.
+
+    An interrupted run with the same arguments goes on; one that was interrupted while it replaced may have left older parts.
+    """
     if record is None:
         return False
     return record.anew or record.seconds is not None or not record.still_holds(arguments, inputs)
@@ -80,7 +79,7 @@ class Stage:
         return " ".join(("mrbokeh", *self.arguments))
 
     def feeds(self, later: "Stage") -> bool:
-        """An output of this stage, or a folder around it, is named by the later one."""
+        """Return whether the later stage names an output of this one, or a folder around it."""
         named = [Path(argument) for argument in later.arguments]
         return any(path == output or path in output.parents for output in self.outputs for path in named)
 

@@ -1,10 +1,8 @@
-"""CompositeRecipe: virtual layers put into each frame of a clip, blurred by its lens as it is focused in that frame.
+"""CompositeRecipe: virtual layers in each frame of a clip, blurred by its lens as it is focused in that frame.
 
-Insertion frame after frame: only the box that virtual light can reach, and what did not change since the last frame is kept.
-
-The simple modes (front, over) blur the layers alone, so their blur is the same in every frame in which neither the layers nor the
-focus nor the depth of the photograph change. Other modes look at the picture itself and are done anew, in boxes of their own
-(mrbokeh.compositing.choose).
+Only the dirty rectangle that virtual light can reach is computed, and results are reused while their inputs stay the same. The simple
+modes (front, over) blur the layers alone, so their blur is the same in every frame in which neither the layers nor the focus nor the
+depth of the photograph change. Other modes look at the picture itself and run for every frame.
 """
 
 from collections.abc import Sequence
@@ -35,13 +33,13 @@ Plane = Float32[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Part:
-    """What is put into one part of a frame; box None is the whole."""
+    """Insertion in one part of a frame; box None is the whole."""
 
     box: Box | None
     inserted: Inserted
 
     def over(self, rgb: Rgb) -> Rgb:
-        """The frame with it; other pixels stay bit for bit."""
+        """Return the frame with the part; other pixels stay bit for bit."""
         if self.box is None:
             return self.inserted.rgb
         result = rgb.copy()
@@ -49,7 +47,7 @@ class Part:
         return result
 
     def covered(self, alpha: Plane) -> Plane:
-        """The frame's own alpha with it; other pixels stay bit for bit."""
+        """Return the frame's own alpha with the part; other pixels stay bit for bit."""
         if self.box is None:
             return coverage_with(alpha, self.inserted.virtual.alpha)
         result = alpha.copy()
@@ -57,7 +55,7 @@ class Part:
         return result
 
     def whole(self, rgb: Rgb) -> Inserted:
-        """As if it had been made in the whole frame."""
+        """Return the insertion in the whole frame."""
         if self.box is None:
             return self.inserted
         photo_rgb = rgb.copy()
@@ -66,10 +64,10 @@ class Part:
 
 
 class BoxedInsertion:
-    """insert: as of an Insertion, but a Part. Give it the very same layers, depth and lens as long as they do not change."""
+    """Insertion that returns a Part. Give it the very same layers, depth and lens as long as they do not change."""
 
     def __init__(self, insertion: Insertion, renderer: Renderer, *, local: bool) -> None:
-        """local: whether the renderer spreads light no farther than the circle of confusion."""
+        """Set up an insertion. local: whether the renderer spreads light no farther than the circle of confusion."""
         self._insertion, self._renderer = insertion, renderer
         plain = insertion.insertion if isinstance(insertion, InDirtyRectangle) else insertion
         self._keeps = local and isinstance(plain, OverPhotograph)
@@ -90,7 +88,7 @@ class BoxedInsertion:
         return Part(box, Inserted(behind(box.cut(plate.rgb, "edge"), virtual), virtual))
 
     def _blur(self, layers: Sequence[Layer], lens: Lens, frame_width_px: int) -> Layer:
-        """With so much of the sensor as sees the box, so that circles of confusion keep their size."""
+        """Blur layers with the part of the sensor that sees the box, so that circles of confusion keep their size."""
         if not any(layer.alpha.any() or layer.rgb.any() for layer in layers):
             return flatten(layers)
         box = Box(0, layers[0].height_px, 0, layers[0].width_px)
@@ -98,7 +96,7 @@ class BoxedInsertion:
 
 
 def _reached_box(layers: Sequence[Layer], lens: Lens) -> Box:
-    """Within the frame, for the photograph is not blurred again."""
+    """Return the box that light reaches within the frame, for the photograph is not blurred again."""
     if not layers:
         return NOWHERE
     blank = np.broadcast_to(np.float32(0.0), (*layers[0].alpha.shape, 3))

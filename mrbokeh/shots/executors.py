@@ -1,9 +1,4 @@
-"""Executor: who makes the segments: this process, processes of this machine, or machines of a cluster.
-
-ProcessExecutor: worker processes of this machine, one segment each at a time.
-
-DaskExecutor: workers of a Dask cluster, on this machine or others, that see the same files under the same names.
-"""
+"""Executors: who renders the segments of a shot: this process, worker processes of this machine, or a Dask cluster."""
 
 import secrets
 import signal
@@ -30,16 +25,16 @@ Progress = Callable[[int], None]
 class Executor(Protocol):
     @property
     def threads(self) -> int:
-        """How many cores each task may use."""
+        """Number of cores that each task may use."""
         ...
 
     def run(self, tasks: Sequence[SegmentTask], progress: Progress) -> None:
-        """Make every segment; a worker that dies loses nothing but what it was at. What is finished stays, whatever happens."""
+        """Render every segment; a worker that dies loses only the segment that it was at. Finished segments stay."""
         ...
 
 
 class SerialExecutor:
-    """The segments one after the other, in this process. threads: of the renderer, 0 for all cores."""
+    """Executor that renders the segments one after the other in this process. threads: of the renderer, 0 for all cores."""
 
     def __init__(self, threads: int = 0) -> None:
         self.threads = threads
@@ -54,9 +49,10 @@ _POLL_S = 0.25
 
 
 class ProcessExecutor:
-    """A Executor. Workers are started afresh (spawn), for threads do not survive a fork; they leave when this process does.
+    """Executor with worker processes, one segment each at a time.
 
-    count: of the workers. threads: of each, so that all of them together take the machine and no more.
+    Workers are started afresh (spawn), for threads do not survive a fork; they leave when this process does. count: of the workers.
+    threads: of each, so that all of them together take the machine and no more.
     """
 
     def __init__(self, count: int, threads: int = 0) -> None:
@@ -64,7 +60,7 @@ class ProcessExecutor:
         self.threads = threads or max(1, cores() // count)
 
     def run(self, tasks: Sequence[SegmentTask], progress: Progress) -> None:
-        """Raises InputError where workers keep dying without finishing anything."""
+        """Render every segment. Raises InputError if workers keep dying without finishing anything."""
         missing, deaths = list(tasks), 0
         while missing:
             done = self._try(missing, progress)
@@ -77,7 +73,7 @@ class ProcessExecutor:
                 )
 
     def _try(self, tasks: Sequence[SegmentTask], progress: Progress) -> set[int]:
-        """The numbers of the segments finished until all are, or a worker died."""
+        """Return the numbers of the segments finished until all are, or a worker died."""
         context = get_context("spawn")
         board = _Board(context.Value("i", 0), context.Event())
         pool = ProcessPoolExecutor(min(self.count, len(tasks)), context, _begin, (board,))
@@ -105,7 +101,7 @@ class ProcessExecutor:
 
 
 class _Board:
-    """What the workers and their parent share: how many frames were made, and whether to stop."""
+    """State that workers share with their parent: how many frames were made, and whether to stop."""
 
     def __init__(self, made: Any, stop: Any) -> None:
         self.made, self.stop = made, stop
@@ -118,7 +114,7 @@ class _Board:
 
 
 class _Shown:
-    """How much of the board the user has been told."""
+    """Progress that the user has been told."""
 
     def __init__(self, board: _Board, progress: Progress) -> None:
         self._board, self._progress, self._told = board, progress, 0
@@ -140,7 +136,7 @@ _board: _Board | None = None
 
 
 def _begin(board: _Board) -> None:
-    """In a new worker: Ctrl-C is the parent's to handle, and a worker without parent ends."""
+    """Set up a new worker: Ctrl-C is the parent's to handle, and a worker without parent ends."""
     global _board
     _board = board
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -159,9 +155,10 @@ def _make_here(task: SegmentTask) -> int:
 
 
 class DaskExecutor:
-    """A Executor. address: of the scheduler, tcp://HOST:8786. Each task takes one core, so start workers with one thread each.
+    """Executor on a Dask cluster whose workers see the same files under the same names.
 
-    Dask gives the segment of a dead worker to another; one that kills four workers is given up.
+    address: of the scheduler, tcp://HOST:8786. Each task takes one core, so start workers with one thread each. Dask gives the segment
+    of a dead worker to another; one that kills four workers is given up.
     """
 
     threads = 1
@@ -204,7 +201,7 @@ class DaskExecutor:
 
 
 def require_same_files(client: Any, folder: Path, clip: Path) -> None:
-    """Every worker must read what is written here, see the clip and run this version. Raises InputError otherwise."""
+    """Raise InputError unless every worker reads what is written here, sees the clip and runs this version."""
     token, secret = folder / f"token-{secrets.token_hex(4)}", secrets.token_hex(16)
     token.write_text(secret, encoding="utf-8")
     try:
@@ -224,7 +221,7 @@ def require_same_files(client: Any, folder: Path, clip: Path) -> None:
 
 
 def _report(token: str, clip: str) -> tuple[str, bool, str]:
-    """On a worker: (what stands in the token, whether the clip is there, version)."""
+    """Return, on a worker, (content of the token, whether the clip is there, version)."""
     from mrbokeh.video.image_sequence import NumberedFiles, is_pattern
 
     try:

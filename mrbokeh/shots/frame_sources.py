@@ -1,9 +1,4 @@
-"""Camera, focus and depth of each frame, from files.
-
-The camera of a scene file: a track whose world points up as the scene's does.
-
-ClipLook: what makes virtual light look as if the clip's camera had taken it, measured in the first frames.
-"""
+"""Camera, focus, depth, matte and look of each frame, from files and from the clip itself."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -33,11 +28,13 @@ from mrbokeh.video.picture_source import PictureSource, open_source
 
 
 def scene_track(path: Path, size_px: tuple[int, int], scene_up: str) -> CameraTrack:
-    """size_px: (width, height) of the plate. scene_up: what points up in the world of the scene, in which its objects are placed.
+    """Read a camera track whose world points up as the scene's does.
 
-    A file of one camera does not say what is up, so it is the scene's. Any other track has an axis of its own; where that is another
-    one, places of objects and poses of the camera are not of one world, and no turn can tell which of them is meant: InputError. So it is
-    where the track's pictures have another shape than the plate.
+    size_px: (width, height) of the plate. scene_up: what points up in the world of the scene, in which its objects are placed.
+
+    A file of one camera does not say what is up, so it is the scene's. Any other track has an axis of its own; if that is another one,
+    places of objects and poses of the camera are not of one world, and no turn can tell which of them is meant: InputError. Pictures of
+    the track with another shape than the plate raise InputError too.
     """
     is_single = _is_single_camera(path)
     track = read_track(path, TrackOptions(up=scene_up, size_px=size_px) if is_single else TrackOptions(size_px=size_px))
@@ -63,7 +60,7 @@ def _is_single_camera(path: Path) -> bool:
 
 
 def _remark(path: Path) -> str:
-    """What is no more than usual may be stated otherwise."""
+    """Return a hint that COLMAP's usual axis may be stated otherwise."""
     return " (as in most of COLMAP's maps; state another by --up in that conversion)" if format_of_file(path) == "colmap" else ""
 
 
@@ -99,7 +96,7 @@ class _OpenedTrack:
         self._track, self._timed, self._frame_rate = track, track.timed(frame_rate), frame_rate
 
     def camera_at(self, moment: Moment, after_s: float = 0.0) -> Camera:
-        """Beyond the ends of the track the camera stays where it was."""
+        """Return the camera of a frame; beyond the ends of the track it stays where it was."""
         camera = (self._track.at(moment.number) if after_s == 0.0 else self._around(moment, after_s)).camera
         return camera if (camera.width_px, camera.height_px) == moment.size_px else camera.resized(*moment.size_px)
 
@@ -117,7 +114,7 @@ class FocusPulled:
 
     @classmethod
     def of(cls, text: str) -> "FocusPulled":
-        """What the command line says: a file by its suffix .csv, else keys."""
+        """Parse the command line's text: a file by its suffix .csv, else keys."""
         return cls(path=Path(text).resolve()) if text.lower().endswith(".csv") else cls(text)
 
     @property
@@ -193,7 +190,9 @@ class _SteadyDepth:
         return _of_size(self._plane, moment, self._described.path)
 
     def _still_to_go(self, number: int) -> Sequence[int]:
-        """The next one; where the filter starts anew those before, and at the clip's beginning first those behind it, backwards."""
+        """Return the numbers to filter: the next one; a new filter first sees the frames before, at the clip's beginning those behind,
+        backwards.
+        """
         if self._next == number:
             return [number]
         self._filter = TemporalDepthFilter()
@@ -220,7 +219,8 @@ class ClipLook:
     """Description of a Finisher: options as typed, and the clip whose frames `start` and the next are measured, by every worker alike.
 
     Exposures are those that numbered pictures state, each its own: a camera that steps its exposure from frame to frame takes the
-    virtual light with it. One that the user states is that of all frames. first_number: of the clip's frame 0. space: of its numbers.
+    virtual light with it. An exposure that the user states is that of all frames. first_number: of the clip's frame 0. space: of its
+    numbers.
     """
 
     options: LookOptions
@@ -245,7 +245,7 @@ class ClipLook:
         return _ExposedLook(finishing, self._exposures(source))
 
     def _exposures(self, source: PictureSource) -> Callable[[int], float]:
-        """How much brighter a frame shows the same light than the frame `start`, by the frame's number."""
+        """Return, by a frame's number, how much brighter it shows the same light than the frame `start`."""
 
         def brightness(index: int) -> float:
             path = source.file_of(index)
@@ -265,7 +265,7 @@ class _Look:
 
 
 class _ExposedLook:
-    """With a gain for every frame."""
+    """Look with a gain for every frame."""
 
     def __init__(self, finishing: Finishing, change: Callable[[int], float]) -> None:
         self._finishing, self._change = finishing, change

@@ -1,10 +1,8 @@
-"""What a frame is made of, each behind a protocol, so that any of them can be exchanged.
+"""Inputs of a frame, each behind a protocol, so that any of them can be exchanged.
 
 Descriptions travel to the workers: frozen dataclasses of absolute paths, names and numbers, which say what files they read and are
-opened there once. What they open is asked frame by frame, by the number of the frame. Whatever gives the very same object for two
-frames says that nothing changed between them; what was made from it is then kept.
-
-Kept: a function that is not called again while it is given the very same things.
+opened there once. An opened source is asked frame by frame, by the number of the frame. A source that returns the very same object for
+two frames says that nothing changed between them; results made from it are then reused (Kept).
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +22,7 @@ _Result = TypeVar("_Result")
 
 
 class Kept(Generic[_Given, _Result]):
-    """Keeps the last result only. Things count as the same when they are one object (numbers and texts: when they are equal)."""
+    """Function with a cache of its last result. Arguments are the same if they are one object (numbers and texts: if they are equal)."""
 
     def __init__(self, function: Callable[_Given, _Result]) -> None:
         self._function = function
@@ -54,7 +52,7 @@ Opened = TypeVar("Opened", covariant=True)
 
 @dataclass(frozen=True)
 class Moment:
-    """number: of the frame, by which files name it. time_s: within the clip. size_px: (width, height) of the plate."""
+    """Frame of a shot. number: by which files name it. time_s: within the clip. size_px: (width, height) of the plate."""
 
     number: int
     time_s: float
@@ -79,14 +77,14 @@ class LayerSource(Protocol):
 @runtime_checkable
 class CameraSource(Protocol):
     def camera_at(self, moment: Moment, after_s: float = 0.0) -> Camera:
-        """With its pose in the world of the scene; after_s: so much later, or earlier, while the shutter is open."""
+        """Return the camera in the world of the scene. after_s: so much later, or earlier, while the shutter is open."""
         ...
 
 
 @runtime_checkable
 class FocusSource(Protocol):
     def at(self, frame: float | int) -> float:
-        """The focus distance in metres at a frame's number (mrbokeh.tracking.camera_track.FocusPull is one)."""
+        """Return the focus distance in metres at a frame's number (mrbokeh.tracking.camera_track.FocusPull is one)."""
         ...
 
 
@@ -100,14 +98,14 @@ class DepthSource(Protocol):
 @runtime_checkable
 class MatteSource(Protocol):
     def near_alpha_at(self, moment: Moment) -> Float32[np.ndarray, "height width"]:
-        """What of the photographed scene stands in front of the virtual objects: its coverage, sharp, 0 to 1."""
+        """Return the coverage of what stands in front of the virtual objects, sharp, 0 to 1."""
         ...
 
 
 @runtime_checkable
 class Finisher(Protocol):
-    """What makes virtual light look photographed (mrbokeh.compositing.plate_look)."""
+    """Source of the look that makes virtual light look photographed (mrbokeh.compositing.plate_look)."""
 
     def finished(self, inserted: Inserted, plate: Plate, number: int) -> Inserted:
-        """Whole frames; the photograph's own pixels stay as they are."""
+        """Finish whole frames; the photograph's own pixels stay as they are."""
         ...

@@ -1,7 +1,4 @@
-"""Layers of a frame from EXR files of other renderers (of a scene rendered here: mrbokeh.shots.layer_sources).
-
-Layers of a frame: a staged scene, rendered here.
-"""
+"""Layers of a frame: EXR files of other renderers, or a staged scene that is rendered here."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -40,7 +37,7 @@ class LayerFiles:
 
 
 def layer_sequence(path: Path, objects: tuple[str, ...] = ()) -> ExrSequence:
-    """One file or numbered ones, of which only some objects may be wanted."""
+    """Open one file or numbered ones, of which only some objects may be wanted."""
     return ExrSequence.of(path, ObjectSplit(objects=objects, with_rest=False) if objects else None)
 
 
@@ -121,7 +118,7 @@ class SceneLayers:
 
 
 class _OpenedScene:
-    """Filmed anew only where the camera or the scene moved."""
+    """Opened scene, filmed anew only if the camera or the scene moved."""
 
     def __init__(self, described: SceneLayers, filmed: FilmedLayers) -> None:
         self._described, self._filmed = described, filmed
@@ -141,6 +138,6 @@ class _OpenedScene:
 
 
 def same_view(one: Camera, other: Camera) -> bool:
-    """Whether two cameras see the same."""
+    """Return whether two cameras see the same."""
     facts = [(each.width_px, each.height_px, each.focal_px, each.principal_px) for each in (one, other)]
     return facts[0] == facts[1] and np.array_equal(one.camera_from_world, other.camera_from_world)

@@ -1,6 +1,6 @@
-"""PartsFolder: the finished segments of a shot beside its result, with a manifest that says what they were made with.
+"""Rendering of a shot from beginning to end: an executor renders the missing segments, then they are joined.
 
-A shot from beginning to end: segments that are missing are made by a executor, then joined; what is finished is never made twice.
+Finished segments lie in a folder beside the result, with a manifest of their settings; a segment is never rendered twice.
 """
 
 import hashlib
@@ -53,7 +53,7 @@ class PartsFolder:
 
     @property
     def holds_parts(self) -> bool:
-        """Finished ones: half files and signs of workers have other names."""
+        """Whether finished parts are there: half files and signs of workers have other names."""
         return any(each.stem.isdigit() for each in self.path.iterdir())
 
     def remove(self) -> None:
@@ -61,7 +61,7 @@ class PartsFolder:
 
 
 def settings_of(shot: Shot) -> dict[str, str]:
-    """All that the parts depend on, by name; files go in with their size and the time of their last change."""
+    """Return all that the parts depend on, by name; files with their size and the time of their last change."""
     recipe: Any = shot.recipe
     of_recipe = (
         {each.name: repr(getattr(recipe, each.name)) for each in fields(recipe)} if is_dataclass(recipe) else {"recipe": repr(recipe)}
@@ -90,9 +90,10 @@ def _stamps(paths: Iterable[Path]) -> str:
 
 
 def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, progress: Progress = lambda _: None) -> str:
-    """Returns what became of the sound. Raises InputError where the result exists, or parts of another run do, unless overwrite.
+    """Render a shot; return what became of the sound.
 
-    progress: is told of frames as they are made, and at once of those that an interrupted run left finished.
+    Raises InputError if the result exists, or parts of another run do, unless overwrite. progress: is told of frames as they are made,
+    and at once of those that an interrupted run left finished.
     """
     shot.target.require_new(shot, overwrite or shot.was_begun)
     folder = PartsFolder.opened(shot, overwrite)

@@ -1,7 +1,4 @@
-"""SegmentTask: one segment of a shot, made from the clip to its part; the same in this process, in another and on another machine.
-
-The frames of a segment on their way: decoded, made and written, a few at a time; decoding and writing run beside the making.
-"""
+"""SegmentTask: one segment of a shot, rendered from the clip to its part; the same in this process, in another and on another machine."""
 
 import pickle
 import threading
@@ -24,9 +21,10 @@ AT_ONCE = 2
 
 
 def stream(frames: Iterator[Frame], first: int, make: Make, write: Write, *, overlap: bool = True) -> None:
-    """Everything happens in the order of the frames, of which the first has the number `first`.
+    """Decode, render and write frames in their order; the first has the number `first`.
 
-    overlap: False does all in the calling thread, for a worker that has one core.
+    Decoding and writing run beside the rendering, a few frames at a time. overlap: False does all in the calling thread, for a worker
+    that has one core.
     """
     numbered = enumerate(frames, first)
     with _one_thread(overlap) as decoding, _one_thread(overlap) as encoding:
@@ -50,7 +48,7 @@ _built = threading.local()
 
 @dataclass(frozen=True, eq=False)
 class SegmentTask:
-    """folder: of the parts. threads: how many cores it may use; with one, nothing runs beside anything else."""
+    """Segment to render. folder: of the parts. threads: number of cores it may use; with one, nothing runs beside anything else."""
 
     shot: Shot
     segment: Segment
@@ -59,7 +57,7 @@ class SegmentTask:
 
 
 def render_segment(task: SegmentTask, made: Callable[[], None] = lambda: None) -> int:
-    """Make one part, unless it is there; made: called after every frame. Returns the number of the segment."""
+    """Render one part, unless it is there; return the number of the segment. made: called after every frame."""
     shot, segment = task.shot, task.segment
     if shot.target.part(task.folder, segment).exists():
         return segment.number
@@ -79,7 +77,7 @@ def render_segment(task: SegmentTask, made: Callable[[], None] = lambda: None) -
 
 
 def _maker(recipe: MakerRecipe, threads: int) -> FrameMaker:
-    """The one built last in this thread, as long as the recipe stays the same: it may hold tables and scenes."""
+    """Return the maker built last in this thread, as long as the recipe stays the same: it may hold tables and scenes."""
     key = pickle.dumps((recipe, threads))
     if getattr(_built, "key", None) != key:
         _built.key, _built.maker = None, None

@@ -1,9 +1,4 @@
-"""Shot: a stretch of a clip, what makes its frames and where they go; cut into segments that can be made one without the other.
-
-Segment: a few seconds of a shot, made and kept as one.
-
-What makes the frames of a shot: a recipe that travels to the workers, and the maker that each worker builds from it once.
-"""
+"""Shot: a stretch of a clip, the recipe of its frames and their target; cut into segments that can be rendered independently."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -50,7 +45,7 @@ Picture = Float32[np.ndarray, "height width 3"] | Rgba | Layer
 
 @runtime_checkable
 class FrameMaker(Protocol):
-    """Makes one frame of the result out of one of the clip. What it keeps from frame to frame may only save time."""
+    """Maker of one frame of the result from one of the clip. Caches from frame to frame may only save time."""
 
     def make(
         self,
@@ -59,7 +54,7 @@ class FrameMaker(Protocol):
         time_s: float,
         alpha: Float32[np.ndarray, "height width"] | None = None,
     ) -> Picture:
-        """index: of the frame within the clip. rgb: (H, W, 3) linear Rec.709, not to be changed. time_s: within the clip.
+        """Make one frame. index: within the clip. rgb: (H, W, 3) linear Rec.709, not to be changed. time_s: within the clip.
 
         alpha: (H, W), the clip's own, by which rgb is multiplied; None is opaque, and so is the result then.
         """
@@ -68,15 +63,15 @@ class FrameMaker(Protocol):
 
 @runtime_checkable
 class MakerRecipe(Protocol):
-    """A frozen dataclass of names, numbers and absolute paths, which can be pickled and says all that the result depends on."""
+    """Frozen dataclass of names, numbers and absolute paths, which can be pickled and says all that the result depends on."""
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Every file that is read, patterns of sequences too: when one changes, parts made before do not fit any more."""
+        """Files that are read, patterns of sequences too: when one changes, parts made before do not fit any more."""
         ...
 
     def build(self, threads: int) -> FrameMaker:
-        """threads: how many cores it may use, 0 for all."""
+        """Build the maker. threads: number of cores it may use, 0 for all."""
         ...
 
 
@@ -86,9 +81,10 @@ MANIFEST = "manifest.json"
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """start, stop: the frames of the clip that are taken. segment_frames: how many make a segment, whoever makes it.
+    """Stretch of a clip to render.
 
-    Everything in it can be pickled, and paths are absolute.
+    start, stop: the frames of the clip that are taken. segment_frames: number of frames of a segment, for any executor. All of it can
+    be pickled, and paths are absolute.
     """
 
     source: PictureSource
@@ -109,7 +105,7 @@ class Shot:
 
     @property
     def parts_path(self) -> Path:
-        """Where finished segments wait for the others."""
+        """Folder in which finished segments wait for the others."""
         return self.target.path.with_name(self.target.path.name + ".parts")
 
     @property
@@ -118,27 +114,29 @@ class Shot:
         return (self.parts_path / MANIFEST).is_file()
 
     def times_s(self, segment: Segment) -> list[float]:
-        """When the frames of a segment are shown in the result."""
+        """Return the times of a segment's frames in the result."""
         return [float(time_s) - self.begin_s for time_s in self.source.times_s[segment.start : segment.stop]]
 
     @property
     def all_times_s(self) -> list[float]:
-        """Of all frames of the shot."""
+        """Times of all frames of the shot."""
         return self.times_s(Segment(0, self.start, self.stop))
 
 
 @runtime_checkable
 class PartSink(Protocol):
-    """Takes the frames of one segment in their order."""
+    """Sink for the frames of one segment in their order."""
 
     def write(self, picture: Picture, index: int, time_s: float) -> None:
-        """index: within the clip. time_s: within the result."""
+        """Write a frame. index: within the clip. time_s: within the result."""
         ...
 
 
 @runtime_checkable
 class Target(Protocol):
-    """Where frames go. A part exists as a file only when all of its frames are written; so what exists need not be made again."""
+    """Destination of frames. A part exists as a file only when all of its frames are written; so an existing part need not be made
+    again.
+    """
 
     @property
     def path(self) -> Path:
@@ -147,16 +145,16 @@ class Target(Protocol):
 
     @property
     def settings(self) -> dict[str, str]:
-        """What the parts depend on beside the pictures."""
+        """Settings that the parts depend on beside the pictures."""
         ...
 
     @property
     def lacks_alpha(self) -> str | None:
-        """Why coverage of finished pictures is left out, and what keeps it; None where it is stored."""
+        """Reason why coverage of finished pictures is left out, and what keeps it; None if it is stored."""
         ...
 
     def require_new(self, shot: Shot, overwrite: bool) -> None:
-        """Raises InputError where the result exists already, or cannot hold such pictures and times."""
+        """Raise InputError if the result exists already, or cannot hold such pictures and times."""
         ...
 
     def part(self, folder: Path, segment: Segment) -> Path:
@@ -164,9 +162,9 @@ class Target(Protocol):
         ...
 
     def writing(self, shot: Shot, segment: Segment, folder: Path) -> AbstractContextManager[PartSink]:
-        """A block in which the frames of a segment are written."""
+        """Open a block in which the frames of a segment are written."""
         ...
 
     def join(self, shot: Shot, folder: Path) -> str:
-        """Make the result out of its parts. Returns what became of the sound, for the user to read."""
+        """Join the parts to the result. Returns what became of the sound, for the user to read."""
         ...

@@ -1,13 +1,11 @@
-"""The colour space in which a shot is written, where the user names one.
+"""Targets of a shot: numbered pictures, and videos out of parts that are encoded on their own and joined packet by packet.
 
-SequenceTarget: numbered pictures; EXR linear in half, PNG and TIFF in 16-bit sRGB.
+Numbered EXR is linear in half, PNG and TIFF are 16-bit sRGB.
 
-VideoTarget: a video out of parts that are encoded on their own and joined packet by packet.
-
-Parts are in the final encoding already, so that joining takes no time and no light away. That needs groups of pictures that do not
-refer to others (each part begins with a keyframe, and H.265 is told to close its groups) and encoders whose output does not depend
-on who runs them (one thread). The cut into segments never depends on the number of workers, so neither does the file: for ProRes,
-DNxHR and FFV1, where every picture stands alone, it is the one that would be written in one go; H.264 and H.265 get a keyframe
+Parts of a video are in the final encoding already, so that joining takes no time and no light away. That needs groups of pictures that
+do not refer to others (each part begins with a keyframe, and H.265 is told to close its groups) and encoders whose output does not
+depend on who runs them (one thread). The cut into segments never depends on the number of workers, so neither does the file: for
+ProRes, DNxHR and FFV1, where every picture stands alone, it is the one that would be written in one go; H.264 and H.265 get a keyframe
 at every segment.
 """
 
@@ -34,9 +32,10 @@ from mrbokeh.video.writer import PacketWriter, VideoWriter, packets_of
 
 
 def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
-    """A copy in that space; None leaves linear Rec.709.
+    """Return the picture in a named colour space; None leaves linear Rec.709.
 
-    Curves are for straight colour: what has coverage is divided by it before them and multiplied after; light without coverage is lost.
+    Curves are for straight colour: pictures with coverage are divided by it before them and multiplied after; light without coverage is
+    lost.
     """
     if isinstance(picture, (Layer, Rgba)):
         return replace(picture, rgb=in_named_space(picture.rgb, picture.alpha, space))
@@ -94,7 +93,7 @@ class SequenceTarget:
         return "no audio"
 
     def file(self, index: int) -> Path:
-        """Of a frame of the clip."""
+        """Return the file of a frame of the clip."""
         return numbered(self.path, self.first_number + index)
 
 
@@ -195,7 +194,7 @@ class VideoTarget:
         return writer.audio_note
 
     def _placed(self, packets: list[Any], shot: Shot, segment: Segment) -> tuple[list[Any], list[float]]:
-        """The packets of a part with the times at which they are shown; some more than once and others never for an even rate."""
+        """Return the packets of a part with the times at which they are shown; for an even rate some come twice and others never."""
         if self.even_rate is None:
             return packets, shot.times_s(segment)
         first, last = segment.start - shot.start, segment.stop - shot.start
@@ -211,7 +210,7 @@ class VideoTarget:
 
 
 def held_pictures(times_s: Sequence[float], rate: Fraction) -> list[int]:
-    """Which picture is the nearest in time at 0, 1/rate, 2/rate and so on, as long as the last of them is shown (1/rate)."""
+    """Return the picture that is nearest in time at 0, 1/rate, 2/rate and so on, as long as the last of them is shown (1/rate)."""
     shown_s = np.asarray(times_s, np.float64)
     ticks_s = np.arange(max(1, round(shown_s[-1] * rate) + 1)) / float(rate)
     later = np.searchsorted((shown_s[1:] + shown_s[:-1]) / 2, ticks_s, side="right")

@@ -39,7 +39,7 @@ def linear_from_planes(
 
 @njit(cache=True, nogil=True)
 def bgr8_from_planes(y: np.ndarray, cb: np.ndarray, cr: np.ndarray, zeros: tuple, gains: tuple, matrix: tuple) -> np.ndarray:
-    """As `linear_from_planes`, but the code values themselves as 8 bit (H, W, 3), blue first, rounded."""
+    """Convert like `linear_from_planes`, but to the code values themselves as 8 bit (H, W, 3), blue first, rounded."""
     height, width = y.shape
     out = np.empty((height, width, 3), np.uint8)
     red_cr, green_cb, green_cr, blue_cb = matrix

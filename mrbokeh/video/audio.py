@@ -65,12 +65,12 @@ class CarriedAudio:
         return _Encoded(_heard(container, audio, samples, self._start_s), audio, self._target, (codec, samples))
 
     def copy_until(self, time_s: float) -> None:
-        """What sounds before `time_s` of the new video, so that picture and sound lie side by side in the file."""
+        """Copy the sound before `time_s` of the new video, so that picture and sound lie side by side in the file."""
         if self._feed is not None:
             self._feed.copy_until(time_s)
 
     def finish(self, time_s: float) -> None:
-        """The rest, up to the end of the new video."""
+        """Copy the rest, up to the end of the new video."""
         if self._feed is not None:
             self._feed.copy_until(time_s)
             self._feed.flush(time_s)
@@ -84,7 +84,7 @@ class _Feed(Protocol):
 
 
 class _Copied:
-    """Packet by packet."""
+    """Feed that copies packet by packet."""
 
     def __init__(self, container: Any, audio: Any, target: Any, start_s: float) -> None:
         self._packets, self._target, self._start_s = container.demux(audio), target, start_s
@@ -107,7 +107,7 @@ class _Copied:
             self._waiting = None
 
     def flush(self, time_s: float) -> None:
-        """Nothing waits."""
+        """Do nothing: no packet waits."""
 
     def _mux(self, packet: Any) -> None:
         shift = round(self._start_s / packet.time_base)
@@ -117,7 +117,7 @@ class _Copied:
 
 
 class _Encoded:
-    """Sample by sample: the sound begins and ends with the pictures, and silence fills what the source leaves out."""
+    """Feed that encodes samples: the sound begins and ends with the pictures, and silence fills gaps of the source."""
 
     def __init__(self, heard: "Iterator[tuple[int, np.ndarray]]", audio: Any, target: Any, encoder: tuple[str, str]) -> None:
         codec, self._format = encoder
@@ -141,7 +141,7 @@ class _Encoded:
         self._target.mux(self._stream.encode(None))
 
     def _take(self) -> bool:
-        """Some samples more; False at the end."""
+        """Take some more samples; False at the end."""
         for begin, samples in self._heard:
             gap = begin - self._written
             gap = 0 if self._written and abs(gap) <= _JITTER else gap
@@ -161,7 +161,7 @@ class _Encoded:
 
 
 def _heard(container: Any, audio: Any, samples: str, start_s: float) -> "Iterator[tuple[int, np.ndarray]]":
-    """(place of the first one in the new video, (channels, count)) of samples at RATE."""
+    """Yield (place of the first one in the new video, (channels, count)) of samples at RATE."""
     import av
 
     resampler: Any = av.AudioResampler(format=samples, layout=_layout(audio), rate=RATE)
@@ -171,5 +171,5 @@ def _heard(container: Any, audio: Any, samples: str, start_s: float) -> "Iterato
 
 
 def _layout(audio: Any) -> str:
-    """Some cameras count channels without saying which they are."""
+    """Return the layout of channels; some cameras count channels without saying which they are."""
     return {1: "mono", 2: "stereo"}.get(audio.channels, str(audio.layout.name))

@@ -1,6 +1,6 @@
-"""Videos to and from scene-linear Rec.709 pictures with their times. Colour tags are explicit both ways (see `video_color`).
+"""Videos decoded to scene-linear Rec.709 pictures with their times, by PyAV; files that would be shown wrongly are refused.
 
-Opening a video and taking its stored frames out of it, by PyAV; refuses what would be shown wrongly.
+Colour tags are explicit (see `video.color`).
 """
 
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ _PLACES_CHROMA = ("h264", "hevc", "av1", "mpeg1video", "mpeg2video", "mjpeg")
 
 @contextmanager
 def opened(path: Path, threads: int = 0) -> Iterator[tuple[Any, Any]]:
-    """(container, first video stream); threads: of the decoder, 0 leaves it to FFmpeg."""
+    """Open a video as (container, first video stream). threads: of the decoder, 0 leaves it to FFmpeg."""
     import av
 
     if not Path(path).is_file():
@@ -45,7 +45,7 @@ def opened(path: Path, threads: int = 0) -> Iterator[tuple[Any, Any]]:
 
 
 def decoded(path: Path, start: int, stop: int | None) -> Iterator[tuple[Any, float]]:
-    """(PyAV frame, its time in seconds) of the frames from `start` to `stop`, decoded from the beginning on."""
+    """Yield (PyAV frame, its time in seconds) of the frames from `start` to `stop`, decoded from the beginning on."""
     with opened(path) as (container, stream), told_as_damage(path):
         rate = frame_rate(stream)
         placed = chroma_placement(stream)
@@ -58,7 +58,7 @@ def decoded(path: Path, start: int, stop: int | None) -> Iterator[tuple[Any, flo
 
 @contextmanager
 def told_as_damage(path: Path) -> Iterator[None]:
-    """What FFmpeg cannot decode is told as a sentence."""
+    """Turn FFmpeg's decoding errors into one sentence."""
     import av
 
     try:
@@ -73,9 +73,9 @@ def frame_rate(stream: Any) -> Fraction:
 
 
 def chroma_placement(stream: Any) -> Callable[[Any], Any]:
-    """Says of frames whose decoder leaves it open that their chroma lies on the left columns, as all but JPEG have it.
+    """Return a function that marks the chroma of frames as lying on the left columns, if their decoder leaves that open.
 
-    Without that FFmpeg spreads chroma half a pixel too far to the right (seen on ProRes 4:2:2).
+    All but JPEG have it there. Without the mark FFmpeg spreads chroma half a pixel too far to the right (seen on ProRes 4:2:2).
     """
     import av
 
@@ -92,7 +92,7 @@ def chroma_placement(stream: Any) -> Callable[[Any], Any]:
 
 
 def quarter_turns(frame: Any, path: Path) -> int:
-    """How often the decoded picture is to be turned by 90 degrees counter-clockwise; refuses what is not a plain upright film."""
+    """Return the quarter turns, counter-clockwise, that bring the decoded picture upright. Raises InputError if the film is not plain."""
     if frame.interlaced_frame:
         raise InputError(f"{path} is interlaced: deinterlace it first, for instance with FFmpeg's bwdif filter")
     if frame.rotation % 90:
@@ -104,7 +104,7 @@ def quarter_turns(frame: Any, path: Path) -> int:
 
 @dataclass(frozen=True)
 class Frame:
-    """rgb: (H, W, 3) linear Rec.709, upright. time_s: from the start of the video, as it is written in the file.
+    """Decoded frame. rgb: (H, W, 3) linear Rec.709, upright. time_s: from the start of the video, as it is written in the file.
 
     alpha: (H, W) in [0, 1], by which rgb is multiplied; None is opaque.
     """
@@ -116,7 +116,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class DisplayFrame:
-    """bgr: (H, W, 3) the video's own code values in 8 bit, blue first, upright, for a preview."""
+    """Frame of a preview. bgr: (H, W, 3) the video's own code values in 8 bit, blue first, upright."""
 
     bgr: UInt8[np.ndarray, "height width 3"]
     time_s: float
@@ -124,9 +124,10 @@ class DisplayFrame:
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video's header and first frame say. Sizes are those of the upright picture; frame_count is None where unknown.
+    """Facts of a video's header and first frame. Sizes are those of the upright picture; frame_count is None if unknown.
 
-    rotation_deg: counter-clockwise, that brings the stored picture upright. has_alpha: whether frames hold coverage, be they opaque.
+    rotation_deg: counter-clockwise, that brings the stored picture upright. has_alpha: whether frames hold coverage, even if all is
+    opaque.
     """
 
     width_px: int
@@ -140,7 +141,7 @@ class VideoInfo:
 
     @property
     def quarter_turns(self) -> int:
-        """Counter-clockwise, that bring the stored picture upright."""
+        """Quarter turns, counter-clockwise, that bring the stored picture upright."""
         return self.rotation_deg // 90 % 4
 
 
@@ -157,9 +158,9 @@ def probe(path: Path, *, as_codes: bool = False) -> VideoInfo:
 
 
 def read_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-    """Frames `start` to `stop` (excluded) of a video as linear light, one at a time; times are kept, also variable ones.
+    """Yield frames `start` to `stop` (excluded) of a video as linear light, one at a time, with their times, also variable ones.
 
-    Coverage is left out: colour is as it is stored, straight (`mrbokeh.video.picture_sources` has both).
+    Coverage is left out: colour is as it is stored, straight (`mrbokeh.video.picture_source` has both).
     """
     for stored, time_s in decoded(path, start, stop):
         yield upright_frame(stored, time_s, path)
@@ -180,13 +181,13 @@ def upright_alpha(stored: Any, path: Path) -> Float32[np.ndarray, "height width"
 
 
 def has_alpha_apart(path: Path) -> bool:
-    """Whether a video keeps coverage apart from its pictures, as VP8 and VP9 do, where FFmpeg's own decoders do not read it."""
+    """Return whether a video keeps coverage outside its pictures, as VP8 and VP9 do, where FFmpeg's own decoders do not read it."""
     with opened(path) as (_, stream):
         return bool(stream.metadata.get("alpha_mode") == "1")
 
 
 def read_display_frames(path: Path, width_px: int, height_px: int) -> Iterator[DisplayFrame]:
-    """All frames scaled to a size as 8-bit code values; quicker than `read_frames`, for previews. Primaries stay as they are."""
+    """Yield all frames scaled to a size as 8-bit code values; quicker than `read_frames`, for previews. Primaries stay as they are."""
     for stored, time_s in decoded(path, 0, None):
         turns = quarter_turns(stored, path)
         size = (height_px, width_px) if turns % 2 else (width_px, height_px)

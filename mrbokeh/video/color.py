@@ -1,9 +1,9 @@
-"""What the code values of a video mean: its tags, what stands in for missing ones, and the way to scene-linear Rec.709.
+"""Meaning of a video's code values: its tags, defaults for missing ones, and the way to scene-linear Rec.709.
 
-Transfer. A video tagged BT.709 (or BT.601, BT.2020, or not at all) is decoded by the inverse of the camera curve of
-BT.709 (the OETF), so that the numbers are proportional to the light that fell on the sensor, which is what lens blur
-and "over" need. The display curve of BT.1886 would give the light of the screen instead, with a contrast raised by a
-power of about 1.2. Writing uses the same curve, so that reading and writing undo each other.
+Transfer. A video tagged BT.709 (or BT.601, BT.2020, or not at all) is decoded by the inverse of the camera curve of BT.709 (the OETF),
+so that the numbers are proportional to the light that fell on the sensor, which is what lens blur and "over" need. The display curve of
+BT.1886 would give the light of the screen instead, with a contrast raised by a power of about 1.2. Writing uses the same curve, so that
+reading and writing undo each other.
 """
 
 from dataclasses import dataclass

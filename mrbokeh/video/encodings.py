@@ -7,9 +7,10 @@ from mrbokeh.system.errors import InputError
 
 
 class Encoding(NamedTuple):
-    """options: of the FFmpeg encoder. tag: the four letters that players of MP4 and QuickTime expect, where FFmpeg's own are others.
+    """Encoding of a video.
 
-    alpha: whether pictures with coverage are stored. least_px: the smallest width and height that the encoder takes.
+    options: of the FFmpeg encoder. tag: the four letters that players of MP4 and QuickTime expect, if FFmpeg's own are others. alpha:
+    whether pictures with coverage are stored. least_px: the smallest width and height that the encoder takes.
     """
 
     codec: str
@@ -27,7 +28,7 @@ class Encoding(NamedTuple):
         return ".nut" not in self.suffixes
 
     def part_suffix(self, suffix: str) -> str:
-        """Of a file that holds a part of the video: NUT keeps packets of H.264 and H.265 as they left the encoder."""
+        """Return the suffix of a part of the video: NUT keeps packets of H.264 and H.265 as they left the encoder."""
         return ".nut" if ".nut" in self.suffixes else suffix
 
 
@@ -70,7 +71,10 @@ def with_alpha(path: Path) -> str | None:
 
 
 def encoding_name(path: Path, name: str | None = None) -> str:
-    """Usual are .mp4 h264, .mov prores4444, .mxf dnxhr-hqx, .mkv ffv1 (lossless, 16 bit). Raises InputError where it does not fit."""
+    """Return the encoding's name. Raises InputError if it does not fit the suffix.
+
+    Usual are .mp4 h264, .mov prores4444, .mxf dnxhr-hqx, .mkv ffv1 (lossless, 16 bit).
+    """
     suffix = Path(path).suffix.lower()
     name = name or _BY_SUFFIX.get(suffix)
     if name is None:

@@ -1,9 +1,7 @@
-"""Between one stored video frame (PyAV) and pictures: linear light, 8-bit codes for a preview, and back.
+"""Conversion of stored video frames (PyAV) to pictures: linear light, 8-bit codes for a preview, alpha; and back.
 
-FFmpeg scales chroma and bit depth; the step between luma-chroma and RGB is ours, because FFmpeg's (swscale 9) goes
-through truncated 8 bit whatever the depth, and is half an 8-bit step too dark in the mean.
-
-Coverage in stored video frames (PyAV), whatever their format of pixels; FFmpeg brings it into a plane of its own, without loss.
+FFmpeg scales chroma and bit depth; the step between luma-chroma and RGB is ours, because FFmpeg's (swscale 9) goes through truncated 8
+bit whatever the depth, and is half an 8-bit step too dark in the mean.
 """
 
 from typing import Any
@@ -28,12 +26,12 @@ from mrbokeh.video.encodings import encoding_for as encoding_for
 
 
 def has_alpha(frame: Any) -> bool:
-    """Whether a frame holds coverage, be it opaque everywhere."""
+    """Return whether a frame holds coverage, even if it is opaque everywhere."""
     return any(component.is_alpha for component in frame.format.components)
 
 
 def stored_alpha(frame: Any) -> Float32[np.ndarray, "height width"]:
-    """Of a frame that has some, in [0, 1], the way up in which it is stored; it uses the full range of codes, whatever colour does."""
+    """Return the coverage of a frame that has some, in [0, 1], the way up in which it is stored; it uses the full range of codes."""
     bits = next(component.bits for component in frame.format.components if component.is_alpha)
     plane = _with_plane(frame, bits).planes[-1]
     codes = np.frombuffer(plane, np.uint8 if bits == 8 else "<u2").reshape(frame.height, -1)[:, : frame.width]
@@ -79,7 +77,7 @@ def _full_chroma(frame: Any, color: VideoColor, size: tuple[int, int] | None = N
 
 
 def _grey_planes(frame: Any, width: int, height: int) -> list[np.ndarray]:
-    """A picture without chroma with neutral chroma; FFmpeg would take it for full range, whatever its tag says."""
+    """Return a picture without chroma with neutral chroma; FFmpeg would take it for full range, whatever its tag says."""
     bits = frame.format.components[0].bits
     pixel_format = frame.format.name.replace("ya16be", "gray16le").replace("ya16", "gray16").replace("ya8", "gray")
     luma = _planes(frame.reformat(width=width, height=height, format=pixel_format), 1)[0].copy()
@@ -90,7 +88,7 @@ def _grey_planes(frame: Any, width: int, height: int) -> list[np.ndarray]:
 def _code_scale(
     color: VideoColor, bits: int, stored_bits: int
 ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float]]:
-    """(zeros, gains, matrix) of `_video_frames_numba` for codes of `bits`, shifted up to `stored_bits` (H.273, 8.3)."""
+    """Return (zeros, gains, matrix) of `_frames_numba` for codes of `bits`, shifted up to `stored_bits` (H.273, 8.3)."""
     unit = 2.0 ** (stored_bits - 8)
     if color.code_range == LIMITED:
         zeros, gains = (16 * unit, 128 * unit), (1 / (219 * unit), 1 / (224 * unit))

@@ -1,10 +1,7 @@
-"""Files of one sequence, by a pattern such as frames.%04d.exr or frames.####.exr, or by the folder that holds nothing else.
+"""ImageSequence: numbered pictures as the frames of a shot; EXR and HDR are linear, integers of PNG and TIFF are sRGB.
 
-The numbers of a picture as its file stores them, for a colour space that the user names.
-
-ImageSequence: numbered pictures as the frames of a shot; EXR and HDR are linear, integers of PNG and TIFF are sRGB.
-
-Photographs are brought upright as EXIF says. Alpha is read where the first picture holds some; others without it are opaque.
+Files are named by a pattern such as frames.%04d.exr or frames.####.exr, or by the folder that holds nothing else. Photographs are
+brought upright as EXIF says. Alpha is read if the first picture holds some; others without it are opaque.
 """
 
 import re
@@ -30,7 +27,7 @@ _LAST_DIGITS = re.compile(r"\d+(?=\D*$)")
 
 
 def is_pattern(path: Path | str) -> bool:
-    """Whether a name stands for many files."""
+    """Return whether a name stands for many files."""
     return _NUMBER.search(Path(path).name) is not None
 
 
@@ -44,7 +41,7 @@ class NumberedFiles:
 
     @classmethod
     def found(cls, pattern: Path) -> "NumberedFiles":
-        """What there is on the disk. Raises InputError where there is nothing, or a number is missing."""
+        """Find the files of a pattern. Raises InputError if there is none, or a number is missing."""
         place = _NUMBER.search(pattern.name)
         if place is None:
             raise InputError(f"expected a pattern such as frames.%04d.exr, got {pattern}")
@@ -101,7 +98,7 @@ def _width(place: "re.Match[str]") -> int:
 
 
 def read_numbers(path: Path) -> Float32[np.ndarray, "height width 3"]:
-    """Integers as 0 to 1 without a curve; EXR without regard to the primaries that it states."""
+    """Read a picture's stored numbers, for a named colour space: integers as 0 to 1 without a curve; EXR without its stated primaries."""
     return read_exr(path)[0].stacked("RGB") if path.suffix.lower() == ".exr" else read_image(path, "linear")
 
 
@@ -151,7 +148,7 @@ class ImageSequence:
             yield self._frame(path, float(index / self.info.frame_rate))
 
     def _frame(self, path: Path, time_s: float) -> Frame:
-        """Curves of a space are for straight colour: what is multiplied by alpha is divided before them."""
+        """Read a frame. Curves of a space are for straight colour: premultiplied pictures are divided by alpha before them."""
         alpha, multiplied = self._alpha(path), not is_straight(path)
         if self.space is None:
             rgb = upright(read_image(path), self.orientation)
@@ -166,7 +163,7 @@ class ImageSequence:
         return Frame(rgb if alpha is None or multiplied else rgb * alpha[..., None], time_s, alpha)
 
     def _alpha(self, path: Path) -> Float32[np.ndarray, "height width"] | None:
-        """Of an opaque picture among others too, for results are to be alike."""
+        """Return the alpha, 1 for an opaque picture among others, so that results are alike."""
         if not self.info.has_alpha:
             return None
         stored = read_alpha(path)
@@ -175,7 +172,7 @@ class ImageSequence:
         return upright(stored, self.orientation)
 
     def _require_same_way(self, path: Path) -> None:
-        """The lens is turned once, for all frames."""
+        """Raise InputError if a picture is turned otherwise than the first: the lens is turned once, for all frames."""
         orientation = stored_orientation(path)
         if orientation != self.orientation:
             told = f"EXIF says orientation {orientation} of {path}, but {self.orientation} of {self.numbered.file(0)}"

@@ -1,7 +1,4 @@
-"""PictureSource: the frames of a clip, any stretch of them at once.
-
-A source of frames by its name on the command line.
-"""
+"""PictureSource: the frames of a clip, any stretch of them at once, from a video or from numbered pictures."""
 
 from collections.abc import Iterator
 from fractions import Fraction
@@ -20,7 +17,7 @@ from mrbokeh.video.video_source import VideoSource
 
 @runtime_checkable
 class PictureSource(Protocol):
-    """What every source owes (tests/video/test_picture_sources.py asks all of them).
+    """Source of frames (tests/video/test_picture_sources.py asks all of them).
 
     It can be pickled and opened again by another process or machine that sees the same files. `frames(i, j)` are the frames that
     reading all of them gives from the i-th on, picture and time, wherever a decoder has to begin for that.
@@ -36,7 +33,7 @@ class PictureSource(Protocol):
 
     @property
     def times_s(self) -> Float64[np.ndarray, " frames"]:
-        """When each frame is shown, as the file has it."""
+        """Time of each frame, as the file has it."""
         ...
 
     @property
@@ -62,11 +59,9 @@ class PictureSource(Protocol):
 
 
 def open_source(clip: Path, rate: str | None = None, space: NamedSpace | None = None) -> PictureSource:
-    """A video, or numbered pictures (a pattern or their folder) with a rate in frames per second ("25", "23.976" or "24000/1001").
+    """Open a video, or numbered pictures (a pattern or their folder) with a rate in frames per second ("25", "23.976" or "24000/1001").
 
-    Paths become absolute.
-
-    space: what the numbers of the clip mean, in place of what its files say.
+    Paths become absolute. space: meaning of the clip's numbers, in place of what its files say.
     """
     clip = pattern_of_folder(clip) if clip.is_dir() else clip
     if is_pattern(clip):

@@ -1,7 +1,4 @@
-"""FrameIndex: which frame of a video is shown when, and where decoding can begin; read from its packets, without decoding.
-
-VideoSource: a video whose frames are counted once and then read from anywhere.
-"""
+"""VideoSource: a video whose frames are counted once, from its packets and without decoding, and then read from anywhere."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,10 +16,11 @@ from mrbokeh.video.clip import Frame, VideoInfo, chroma_placement, frame_rate, o
 
 @dataclass(frozen=True, eq=False)
 class FrameIndex:
-    """shown: times of the frames in units of time_base, growing. is_key: whether decoding can begin at that frame.
+    """Times of a video's frames, and the frames at which decoding can begin.
 
-    decoded: when the decoder gets the packet of that frame, which is what containers seek by. has_times is False where packets
-    carry none: then frames can only be counted from the beginning on, and `shown` is their count.
+    shown: times of the frames in units of time_base, growing. is_key: whether decoding can begin at that frame. decoded: when the
+    decoder gets the packet of that frame, by which containers seek. has_times is False if packets carry none: then frames can only be
+    counted from the beginning on, and `shown` is their count.
     """
 
     shown: Int64[np.ndarray, " frames"]
@@ -33,7 +31,7 @@ class FrameIndex:
 
     @classmethod
     def of(cls, path: Path) -> "FrameIndex":
-        """Packets that are not shown (before the first keyframe, cut off by an edit list) do not count."""
+        """Read the index. Packets that are not shown (before the first keyframe, cut off by an edit list) do not count."""
         with opened(path) as (container, stream), told_as_damage(path):
             rate = frame_rate(stream)
             packets = [_Facts.of(packet) for packet in container.demux(stream) if packet.size and not packet.is_discard]
@@ -125,7 +123,7 @@ class VideoSource:
             raise InputError(f"{self.path}: frame {expected} cannot be decoded; the file is damaged or cut off there")
 
     def _frame(self, stored: Any, time_s: float) -> Frame:
-        """Colour is stored straight, and multiplied by alpha once it is light."""
+        """Convert a frame. Colour is stored straight, and multiplied by alpha once it is light."""
         frame = upright_frame(stored, time_s, self.path, as_codes=self.space is not None)
         rgb = frame.rgb if self.space is None else self.space.to_rec709(frame.rgb)
         if not self.info.has_alpha:
@@ -134,7 +132,7 @@ class VideoSource:
         return replace(frame, rgb=rgb * alpha[..., None], alpha=alpha)
 
     def _numbered_from(self, start: int, container: Any, stream: Any) -> Iterator[tuple[int, Any]]:
-        """(number, PyAV frame) from a keyframe on; the first is not after `start`."""
+        """Yield (number, PyAV frame) from a keyframe on; the first is not after `start`."""
         if not self.index.has_times:
             yield from enumerate(container.decode(stream))
             return

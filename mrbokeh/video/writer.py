@@ -1,7 +1,4 @@
-"""VideoWriter: linear pictures into a video file with its times and its sound.
-
-PacketWriter: a video out of parts that are encoded already, packet by packet, at new times and with sound.
-"""
+"""VideoWriter: linear pictures into a video file with its times and its sound; PacketWriter: the same from encoded parts."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -121,7 +118,7 @@ class VideoWriter:
         return tick
 
     def _container_options(self) -> dict[str, str]:
-        """The same pictures make the same file: without random numbers in it, and without the hour.
+        """Return options with which the same pictures make the same file: without random numbers in it, and without the hour.
 
         QuickTime stores when each stream begins in a unit of its own, 1 ms unless told otherwise: a finer multiple of ours.
         """
@@ -154,7 +151,7 @@ class VideoWriter:
         self._mux(self._stream.encode(None))
 
     def _mux(self, packets: list[Any]) -> None:
-        """x265 leaves the times of decoding to chance where a video has fewer pictures than it looks ahead."""
+        """Write packets; x265 leaves the times of decoding to chance if a video has fewer pictures than it looks ahead."""
         for packet in packets:
             self._first_shown = packet.pts if self._first_shown is None else self._first_shown
             earliest = self._first_shown - _REORDERED * self._ticks_per_frame
@@ -186,7 +183,7 @@ def _require_storable(path: Path, encoding: Encoding, size_px: tuple[int, int]) 
 
 @contextmanager
 def told_as_mistake(path: Path) -> Iterator[None]:
-    """What FFmpeg refuses to write is told as a sentence."""
+    """Turn FFmpeg's writing errors into one sentence."""
     import av
 
     try:
@@ -227,11 +224,11 @@ class PacketWriter(VideoWriter):
             self._audio.copy_until(times_s[-1])
 
     def _decoded_at(self, place: int) -> int:
-        """A packet is decoded when the picture so many places before it is shown; before the first of all, time goes on evenly."""
+        """Return the time of decoding: when the picture so many places before is shown; before the first of all, time goes on evenly."""
         return self._shown[place] if place >= 0 else self._shown[0] + place * self._ticks_per_frame
 
     def _flush(self) -> None:
-        """Nothing waits in an encoder that got nothing."""
+        """Do nothing: no packet waits in an encoder that got nothing."""
 
 
 def packets_of(part: Path) -> tuple[list[Any], int]:
@@ -244,6 +241,6 @@ def packets_of(part: Path) -> tuple[list[Any], int]:
 
 
 def _ranks(packets: Sequence[Any]) -> list[int]:
-    """When each packet's picture is shown, counted in pictures."""
+    """Return the place of each packet's picture in the order of showing."""
     ranks: list[int] = np.argsort(np.argsort([packet.pts for packet in packets], kind="stable"), kind="stable").tolist()
     return ranks
