@@ -68,9 +68,9 @@ def matchmove_command(
         f"{out}: {len(made.track.frames)} of {made.frame_count} frames from {len(made.model.views)} keyframes{lost}; {scale}; "
         f"residual {made.residual_px:.2f} px RMS, median parallax {made.parallax_deg:.1f} degrees"
     )
-    if made.doubts:
+    if made.warnings:
         typer.echo(
-            f"warning: this track may be wrong: {'; '.join(made.doubts)}; lay a grid on the ground and look before you trust it", err=True
+            f"warning: this track may be wrong: {'; '.join(made.warnings)}; lay a grid on the ground and look before you trust it", err=True
         )
     if missing:
         typer.echo(f"{out} cannot hold and lacks: {', '.join(missing)}", err=True)

@@ -142,14 +142,6 @@ def sharp_all_in_focus(
     return picture
 
 
-def all_in_focus(registered: Iterable[Rgb], focus_index: Plane, crossover: float = NARROW_CROSSOVER, bands: int = BANDS) -> Rgb:
-    """Blend registered slices by `slice_weight`, read one at a time; bands: 0 mixes pixels, without regard to seams."""
-    blend = BandBlend(focus_index.shape, bands)
-    for index, rgb in enumerate(registered):
-        blend.add(rgb, slice_weight(focus_index, index, crossover))
-    return blend.result()
-
-
 def painted(picture: Rgb, slices: Iterable[tuple[Rgb, Plane]], share: Plane, bands: int = BANDS) -> Rgb:
     """Blend slices into a picture, each by its share (H, W); what lies beyond the reach of the bands stays bit for bit.
 

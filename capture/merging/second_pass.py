@@ -100,15 +100,15 @@ class ForegroundOcclusion:
     light: Rgb
 
 
-def second_pass(stack: FocalStack, depth_m: Float[np.ndarray, "height width"], optics: SliceOptics | None = None) -> Rgb:
+def second_pass(stack: FocalStack, depth_m: Float[np.ndarray, "height width"]) -> Rgb:
     """Return the all-in-focus picture of a merged stack in its camera RGB, guided by depth along the axis (metres, inf allowed).
 
-    optics: focus and blur of each slice where they were calibrated; None takes what the stack states, which must be metric.
+    The stack must be metric.
     """
     if not stack.merged:
         raise InputError(f"{stack.folder} is not merged yet: run `mrbokeh capture merge` before its depth is found")
     first = read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path))
-    optics = SliceOptics.of_stack(stack, first.shape[1]) if optics is None else optics
+    optics = SliceOptics.of_stack(stack, first.shape[1])
 
     def valid(index: int) -> Bool[np.ndarray, "height width"]:
         return stack.slice_masks(index).valid

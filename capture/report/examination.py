@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.report.exclusion import Disagreement, moving
+from capture.report.exclusion import LEAST_CONFIDENCE, Disagreement, moving
 from capture.report.findings import SliceFindings, StackFindings, focus_curve
 from capture.report.gates import DEPTH_OFF_PX
 from capture.report.picture_sharpness import PictureEvidence, PictureLook
@@ -24,7 +24,6 @@ Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 
 STEP_PX = 1.0
-LEAST_CONFIDENCE = 0.1
 _WIDEST_BORDER = 0.1
 _LEAST_JUDGED = 0.1
 _DISC_RADII_PX = (0.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, np.inf)

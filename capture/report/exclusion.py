@@ -56,15 +56,13 @@ class Disagreement:
     counted: Mask
 
 
-def exclusion_masks(
-    stack: FocalStack, moving: Bool[np.ndarray, "rows columns"] | None, least_confidence: float = LEAST_CONFIDENCE
-) -> dict[str, Mask]:
+def exclusion_masks(stack: FocalStack, moving: Bool[np.ndarray, "rows columns"] | None) -> dict[str, Mask]:
     """Return masks by reason, at the size of the stack. Slices are read one at a time.
 
     moving: at any size, None where nobody looked. saturated: in any slice. border: no data in some slice. board: where
     `mrbokeh capture scale` found a calibration board, as SCENE/reconstruction/scale.json says.
     """
-    low_confidence = stack.depth_confidence() < least_confidence
+    low_confidence = stack.depth_confidence() < LEAST_CONFIDENCE
     saturated, border = np.zeros_like(low_confidence), np.zeros_like(low_confidence)
     for index in range(len(stack)):
         masks = stack.slice_masks(index)

@@ -119,8 +119,8 @@ class StackFindings:
         return registration_drift(self.stack, *self.full_size_px)
 
 
-def focus_curve(focus_index: Plane, confidence: Plane, slices: int, least_confidence: float = _TRUSTED) -> FocusCurve:
-    trusted = confidence >= least_confidence
+def focus_curve(focus_index: Plane, confidence: Plane, slices: int) -> FocusCurve:
+    trusted = confidence >= _TRUSTED
     index = focus_index[trusted]
     if index.size == 0:
         return FocusCurve(np.zeros(slices), 0.0, 0.0, 0.0)

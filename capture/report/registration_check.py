@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
 from capture.merging.registration.plane_transforms import Transform, middle_of, moved, scale_of
+from capture.merging.registration.registration_file import FILE_NAME
 from capture.report.picture_sharpness import display_luminance
 from mrbokeh.stacks.focal_stack import FocalStack
 
@@ -31,7 +32,6 @@ _ROUNDS = 20
 _LEAST_SCATTER_PX = 0.05
 _SURELY = 3.0
 """Standard errors by which nothing lies apart by chance."""
-FILE_NAME = "registration.json"
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

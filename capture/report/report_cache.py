@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from capture.merging.registration.registration_file import FILE_NAME as REGISTRATION_FILE
 from capture.report.examination import Examination
 from capture.report.findings import StackFindings, findings_document, findings_from
 from capture.report.pictures import Shown, ShownPlace
-from capture.report.registration_check import FILE_NAME as REGISTRATION_FILE
 from capture.report.stack_view import Reblur
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
 from mrbokeh.stacks.focal_stack import FocalStack

@@ -23,6 +23,8 @@ _ROUNDS = 4
 _HUBER = 1.345
 _DARK = 0.02
 _RIDGE = 1e-6
+_SURELY = 3.0
+"""Standard errors by which nothing differs by chance."""
 _NEIGHBOURHOOD_PX = 6.0
 _SIGMAS = 4.0
 _LEAST_FILLED = 0.6
@@ -56,9 +58,9 @@ class Change:
     value: float
     error: float
 
-    def exceeds(self, limit: float, sigmas: float = 3.0) -> bool:
+    def exceeds(self, limit: float) -> bool:
         """Return whether it is larger than the limit, and that not by chance."""
-        return abs(self.value) > limit and abs(self.value) > sigmas * self.error
+        return abs(self.value) > limit and abs(self.value) > _SURELY * self.error
 
 
 @dataclass(frozen=True)

@@ -98,18 +98,12 @@ def evened_out(reference: LowFrequency, slice_: LowFrequency, stated: float | No
     a stop where metadata spoke, one stop where it did not: beyond that the pictures show different things.
     """
     start = stated or 1.0
-    measured = measure_gain(reference, slice_)
-    residual = None if measured is None else measured / start
+    fit = fit_gain(reference, slice_)
+    residual = None if fit is None else fit.gain / start
     limit = _RESIDUAL_LIMIT if stated else _UNSTATED_LIMIT
     if residual is None or abs(math.log(residual)) <= math.log1p(_DEAD_ZONE):
         return ExposureGain(start, 1.0, residual)
     return ExposureGain(start, min(max(residual, 1.0 / limit), limit), residual)
-
-
-def measure_gain(reference: LowFrequency, slice_: LowFrequency) -> float | None:
-    """Return the gain that brings the slice's light to the reference's, or None where too little of both is usable."""
-    fit = fit_gain(reference, slice_)
-    return None if fit is None else fit.gain
 
 
 def overlap_gain(reference: LowFrequency, other: LowFrequency) -> float | None:

@@ -3,7 +3,7 @@ import itertools
 import cv2
 import numpy as np
 
-from capture.merging.all_in_focus import all_in_focus, sharp_all_in_focus, slice_weight
+from capture.merging.all_in_focus import sharp_all_in_focus, slice_weight
 from capture.merging.depth_from_focus import FocusMap, aggregate_costs, focus_map, peak_parabola
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import find_lights, no_lights
@@ -12,6 +12,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
+from tests.scenes.blended_slices import all_in_focus
 
 SLICES = 5
 COC_STEP_PX = 2.5

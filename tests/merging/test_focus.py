@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.all_in_focus import BANDS, BandBlend, all_in_focus, crossover_of, slice_weight
+from capture.merging.all_in_focus import BANDS, BandBlend, crossover_of, slice_weight
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import FocusVolume, focus_energy, focus_volume
 from capture.merging.lights import no_lights
@@ -16,6 +16,7 @@ from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from tests.scenes.blended_slices import all_in_focus
 
 SIZE = (96, 128)
 SLICES = 7

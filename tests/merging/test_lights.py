@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.all_in_focus import all_in_focus
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, Lights, find_lights, no_lights
@@ -14,11 +13,12 @@ from capture.merging.registration.alignment import register_stack
 from capture.merging.registration.plane_transforms import warp
 from capture.merging.restored_lights import Discs, measured_discs, restored_lights, with_restored_lights
 from capture.merging.second_pass import SliceOptics, all_in_focus_from_depth
-from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
-from datasets_scripts.traced_scene import DiscLight, Quad, Scene, emissive_quad
+from datasets_scripts.tracers.thin_lens import camera_for_lens, trace, trace_pinhole
+from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, emissive_quad
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
+from tests.scenes.blended_slices import all_in_focus
 
 SIZE = (64, 256)
 AT_PX = np.array([40.3, 30.6])

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.merging.all_in_focus import all_in_focus
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import no_lights
@@ -24,6 +23,7 @@ from capture.merging.preferred_side import (
 )
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from tests.scenes.blended_slices import all_in_focus
 from tests.scenes.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, THREAD, crossing_slices, crossing_stack, threads, unmoved, wall
 
 INSIDE = (slice(12, -12), slice(12, -12))

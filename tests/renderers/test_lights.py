@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from capture.merging.all_in_focus import all_in_focus
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Lights, find_lights, no_lights
@@ -12,6 +11,7 @@ from capture.photos.libraw import neutral_where_full
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
+from tests.scenes.blended_slices import all_in_focus
 
 SIZE = (80, 400)
 LIGHT_AT = (40, 60)

@@ -82,8 +82,8 @@ class Registration:
         return tuple(scale_of(transform, middle_px) for transform in self.reference_from_slice)
 
 
-def read_registration(path: Path | str, slices: int | None = None, size_px: tuple[int, int] | None = None) -> Registration:
-    """Read registration.json. Raises InputError if it is not a registration of so many slices of that (width, height)."""
+def read_registration(path: Path | str, slices: int | None = None) -> Registration:
+    """Read registration.json. Raises InputError if it is not a registration of so many slices."""
     document = read_json(path, "a registration")
     if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
         raise InputError(f"{path}: expected format {FORMAT!r} version {VERSION}: delete the file, and merging registers the slices anew")
@@ -91,7 +91,9 @@ def read_registration(path: Path | str, slices: int | None = None, size_px: tupl
         registration = _registration(document)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path} is incomplete ({error!r}): delete it, and merging registers the slices anew") from None
-    _require_fit(registration, path, slices, size_px)
+    count = len(registration.reference_from_slice)
+    if slices is not None and slices != count:
+        raise InputError(f"{path} registers {count} slices, but the stack has {slices}: give the registration of a stack like this one")
     return registration
 
 
@@ -153,17 +155,6 @@ def _transform(rows: Any) -> Transform:
     if matrix.shape not in ((2, 3), (3, 3)) or not np.isfinite(matrix).all() or not abs(np.linalg.det(matrix[:2, :2])) > 0:
         raise ValueError(f"{rows} is no transform of 2 or 3 rows and 3 columns")
     return matrix
-
-
-def _require_fit(registration: Registration, path: Path | str, slices: int | None, size_px: tuple[int, int] | None) -> None:
-    count = len(registration.reference_from_slice)
-    if slices is not None and slices != count:
-        raise InputError(f"{path} registers {count} slices, but the stack has {slices}: give the registration of a stack like this one")
-    if size_px is not None and registration.size_px is not None and size_px != registration.size_px:
-        expected, given = (" x ".join(map(str, each)) for each in (size_px, registration.size_px))
-        raise InputError(
-            f"{path} registers slices of {given} px, but the stack has {expected} px: give the registration of a stack like it"
-        )
 
 
 def _told_by_pictures(lens_scales: Sequence[float], unknown: Collection[int], measured: Mapping[Pair, float]) -> list[float]:
