@@ -95,7 +95,7 @@ def _by_order(report: CheckReport, shot: Shot, plate: Shot, frames: tuple[int, i
 def _note_missing(report: CheckReport, where: str, names: list[str]) -> None:
     if names:
         text = f"{len(names)} pictures are missing: {', '.join(names[:12])}{' ...' if len(names) > 12 else ''}"
-        report.findings.append(Finding("missing", where, text, float(len(names)), 0.0))
+        report.findings.append(Finding(check="missing", where=where, text=text, value=float(len(names)), limit=0.0))
 
 
 def _readable(picture: CheckedPicture | str, plate: Shot) -> CheckedPicture:
@@ -135,7 +135,7 @@ def check_shot(shot: Shot, plate: Shot | None, settings: CheckSettings) -> tuple
     still = {name: read_layer(path) for name, path in settings.layers.items() if not path.is_dir()}
     for index, (picture, other) in enumerate(passed):
         if isinstance(picture, str):
-            report.findings.append(Finding("damaged", shot.path.name, picture, 1.0, 0.0))
+            report.findings.append(Finding(check="damaged", where=shot.path.name, text=picture, value=1.0, limit=0.0))
             flicker.skip()
             continue
         report.pictures += 1

@@ -87,7 +87,11 @@ def read_picture(path: Path) -> CheckedPicture:
     has_alpha = any("A" in part.channels for part in parts)
     is_half = any(part.channels.get("R", np.empty(0)).dtype == np.float16 for part in parts)
     return CheckedPicture(
-        path.name, layer.rgb, Storage(True, _HALF_STEP if is_half else 0.0), layer.alpha if has_alpha else None, _layers(parts)
+        name=path.name,
+        rgb=layer.rgb,
+        storage=Storage(True, _HALF_STEP if is_half else 0.0),
+        alpha=layer.alpha if has_alpha else None,
+        layers=_layers(parts),
     )
 
 
@@ -158,7 +162,7 @@ def open_shot(path: Path) -> Shot:
     if path.is_dir():
         return _stack(path) if (path / FILE_NAME).is_file() else _numbered(path)
     if path.suffix.lower() in _PICTURES:
-        return Shot(path, (0,), (), False, lambda: iter([read_picture(path)]))
+        return Shot(path=path, numbers=(0,), missing=(), is_sequence=False, pictures=lambda: iter([read_picture(path)]))
     return _film(path)
 
 
@@ -175,14 +179,16 @@ def _numbered(folder: Path) -> Shot:
     if len(by_number) < len(files):
         raise InputError(f"{folder}: {len(files)} pictures share {len(by_number)} numbers: keep one sequence per folder")
     missing = tuple(sorted(set(range(min(by_number), max(by_number) + 1)) - set(by_number)))
-    return Shot(folder, tuple(by_number), missing, True, lambda: _read(list(by_number.values())))
+    return Shot(path=folder, numbers=tuple(by_number), missing=missing, is_sequence=True, pictures=lambda: _read(list(by_number.values())))
 
 
 def _stack(folder: Path) -> Shot:
     paths = [folder / each.path for each in read_focal_stack(folder).slices]
     missing = tuple(index for index, path in enumerate(paths) if not path.is_file())
     present = [index for index in range(len(paths)) if index not in missing]
-    return Shot(folder, tuple(present), missing, False, lambda: _read([paths[index] for index in present]))
+    return Shot(
+        path=folder, numbers=tuple(present), missing=missing, is_sequence=False, pictures=lambda: _read([paths[index] for index in present])
+    )
 
 
 def _read(paths: list[Path]) -> Iterator[CheckedPicture | str]:
@@ -197,7 +203,7 @@ def _film(path: Path) -> Shot:
     from mrbokeh.video.clip import probe
 
     probe(path)
-    return Shot(path, None, (), True, lambda: _frames(path))
+    return Shot(path=path, numbers=None, missing=(), is_sequence=True, pictures=lambda: _frames(path))
 
 
 def _frames(path: Path) -> Iterator[CheckedPicture]:

@@ -119,7 +119,9 @@ def _note(
 ) -> None:
     if bad.any():
         y, x = np.argwhere(bad)[0]
-        report.findings.append(Finding(check, where, f"{what} in {int(bad.sum())} px, the first at {x},{y}", value, limit))
+        report.findings.append(
+            Finding(check=check, where=where, text=f"{what} in {int(bad.sum())} px, the first at {x},{y}", value=value, limit=limit)
+        )
 
 
 def check_energy(report: CheckReport, picture: CheckedPicture, tolerance: float) -> None:
@@ -141,7 +143,9 @@ def check_energy(report: CheckReport, picture: CheckedPicture, tolerance: float)
         lost = ratio < 1.0 - tolerance and not _leaves_the_frame(blurred)
         if ratio > 1.0 + tolerance or lost or not np.isfinite(ratio):
             sentence = f"{what} of the virtual layer was {before:.6g} before the blur and is {after:.6g} after it ({ratio - 1:+.2%})"
-            report.findings.append(Finding("energy", picture.name, sentence, ratio, 1.0 - tolerance if lost else 1.0 + tolerance))
+            report.findings.append(
+                Finding(check="energy", where=picture.name, text=sentence, value=ratio, limit=1.0 - tolerance if lost else 1.0 + tolerance)
+            )
 
 
 def _light(values: np.ndarray) -> float:
@@ -205,7 +209,7 @@ class LeakMap:
         if leaked.any():
             y, x = np.argwhere(leaked)[0]
             text = f"{int(leaked.sum())} pixels outside the reach of virtual light were changed, the first at {x},{y}"
-            report.findings.append(Finding("leak", picture.name, text, share, 0.0))
+            report.findings.append(Finding(check="leak", where=picture.name, text=text, value=share, limit=0.0))
 
     def write(self, path: Path) -> bool:
         """Write a PNG with the leaked pixels in white, darker if in few pictures only. Returns False if there are none."""
@@ -255,7 +259,11 @@ class FlickerScore:
             self.own_changes.append(mean_change(plate_rgb, plate_before, static))
             self.names.append(name)
             if (rgb == before).all() and not (plate_rgb == plate_before).all():
-                report.findings.append(Finding("frozen", name, "the frame repeats the one before, but its plate does not", 1.0, 0.0))
+                report.findings.append(
+                    Finding(
+                        check="frozen", where=name, text="the frame repeats the one before, but its plate does not", value=1.0, limit=0.0
+                    )
+                )
         self._previous = rgb, plate_rgb
 
     def skip(self) -> None:
@@ -270,7 +278,7 @@ class FlickerScore:
         report.measures |= {"flicker": score, "flicker of the plate": own}
         if score - own > limit:
             text = f"the mean change between frames where the plate stands still is {score:.3%}, the plate's own {own:.3%}"
-            report.findings.append(Finding("flicker", "all frames", text, score - own, limit))
+            report.findings.append(Finding(check="flicker", where="all frames", text=text, value=score - own, limit=limit))
         self._judge_pops(report, limit)
 
     def _judge_pops(self, report: CheckReport, limit: float) -> None:
@@ -282,4 +290,6 @@ class FlickerScore:
             usual = float(np.median(np.delete(beyond[low:high], index - low)))
             if change > limit + _POP_FACTOR * usual:
                 text = f"the change from the frame before is {change:.3%}, around it {usual:.3%}"
-                report.findings.append(Finding("pop", self.names[index], text, float(change), limit + _POP_FACTOR * usual))
+                report.findings.append(
+                    Finding(check="pop", where=self.names[index], text=text, value=float(change), limit=limit + _POP_FACTOR * usual)
+                )

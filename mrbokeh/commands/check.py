@@ -1,5 +1,6 @@
 """`mrbokeh check`: what is broken in a finished picture, sequence, focal stack or film; for render farms."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +9,7 @@ import typer
 from mrbokeh.checks.check_shot import CheckSettings, check_shot
 from mrbokeh.checks.checked_picture import open_shot
 from mrbokeh.checks.picture_checks import CheckReport
-from mrbokeh.optics.lens import Lens
+from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
@@ -16,37 +17,64 @@ app = typer.Typer(add_completion=False)
 _SHOWN = 25
 
 
-@app.command()
-def check(
-    out: Annotated[Path, typer.Argument(help="A picture, a folder of numbered pictures, a focal stack or a film.")],
+@dataclass(frozen=True)
+class SourceOptions:
+    """Files that OUT was made from, and its lens."""
+
     against: Annotated[
         Path | None, typer.Option(metavar="PLATE", help="The photograph, stack, sequence or clip that it was made from.")
-    ] = None,
+    ] = None
     virtual: Annotated[
         Path | None,
         typer.Option(help="Blurred virtual layer (EXR with alpha), or a folder with one for each picture; else from layered EXR."),
-    ] = None,
+    ] = None
     sharp: Annotated[
         Path | None, typer.Option(help="The same before the blur, for the ledger of light, and with --lens for the reach.")
-    ] = None,
-    lens: Annotated[Path | None, typer.Option(help="LENS.json as it was focused for OUT: how far light of --sharp may reach.")] = None,
-    frames: Annotated[str, typer.Option(metavar="START:STOP", help="Frames of PLATE from which OUT was made; STOP is left out.")] = ":",
+    ] = None
+    lens: Annotated[Path | None, typer.Option(help="LENS.json as it was focused for OUT: how far light of --sharp may reach.")] = None
+    frames: Annotated[str, typer.Option(metavar="START:STOP", help="Frames of PLATE from which OUT was made; STOP is left out.")] = ":"
+
+    @property
+    def files(self) -> tuple[Path | None, ...]:
+        """Input files of these options."""
+        return self.against, self.virtual, self.sharp, self.lens
+
+
+@dataclass(frozen=True)
+class LimitOptions:
+    """Differences that are not yet faults."""
+
     tolerance: Annotated[
         float | None,
         typer.Option(
             min=0.0, help="What an untouched pixel may differ from PLATE: of the sRGB code, in EXR of the light. Default: by the format."
         ),
-    ] = None,
+    ] = None
     energy_tolerance: Annotated[
         float, typer.Option(min=0.0, help="Share of light that may come or go; more where vignetting or exposure changes it.")
-    ] = 0.01,
+    ] = 0.01
     flicker_limit: Annotated[
         float, typer.Option(min=0.0, help="Mean change between frames beyond PLATE's own; more, or inf, where virtual things move.")
-    ] = 0.002,
-    json_out: Annotated[Path | None, typer.Option("--json", help="Also write all that was found as JSON.")] = None,
+    ] = 0.002
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Files of the report."""
+
+    json_out: Annotated[Path | None, typer.Option("--json", help="Also write all that was found as JSON.")] = None
     map_out: Annotated[
         Path | None, typer.Option("--map", help="Where leaked pixels are shown (.png), written only where there are some.")
-    ] = None,
+    ] = None
+
+
+@app.command()
+@grouped
+def check(
+    out: Annotated[Path, typer.Argument(help="A picture, a folder of numbered pictures, a focal stack or a film.")],
+    made: SourceOptions,
+    limits: LimitOptions,
+    result: ReportOptions,
 ) -> None:
     """Look for NaN, alpha outside 0 to 1, negative light, light made or lost, leaks, flicker, and missing frames.
 
@@ -57,37 +85,34 @@ def check(
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.system.atomic_files import require_safe_outputs, write_json
 
-    for name, path, suffix in (("--map", map_out, ".png"), ("--json", json_out, ".json")):
+    for name, path, suffix in (("--map", result.map_out, ".png"), ("--json", result.json_out, ".json")):
         if path is not None:
             require_suffix(path, (suffix,), name)
-    require_safe_outputs((json_out, map_out), (out, against, virtual, sharp, lens), overwrite=True)
-    if lens is not None and sharp is None:
+    require_safe_outputs((result.json_out, result.map_out), (out, *made.files), overwrite=True)
+    if made.lens is not None and made.sharp is None:
         raise InputError("--lens tells how far light of the sharp layer reaches: give --sharp LAYER.exr too")
-    plate = None if against is None else open_shot(against)
-    settings = CheckSettings(_layer_files(virtual, sharp), _lens(lens), energy_tolerance, flicker_limit, tolerance, _frames(frames))
-    report, leaks = check_shot(open_shot(out), plate, settings)
+    plate = None if made.against is None else open_shot(made.against)
+    report, leaks = check_shot(open_shot(out), plate, _settings(made, limits))
     _print(report)
-    if json_out is not None:
-        write_json(json_out, report.to_json())
-    if map_out is not None and leaks.write(map_out):
-        typer.echo(f"wrote {map_out}")
+    if result.json_out is not None:
+        write_json(result.json_out, report.to_json())
+    if result.map_out is not None and leaks.write(result.map_out):
+        typer.echo(f"wrote {result.map_out}")
     raise typer.Exit(0 if report.is_clean else 1)
 
 
-def _layer_files(virtual: Path | None, sharp: Path | None) -> dict[str, Path]:
-    return {name: path for name, path in (("virtual", virtual), ("sharp", sharp)) if path is not None}
-
-
-def _lens(path: Path | None) -> Lens | None:
+def _settings(made: SourceOptions, limits: LimitOptions) -> CheckSettings:
+    from mrbokeh.commands.video import parse_frames
     from mrbokeh.optics.lens_file import read_lens
 
-    return None if path is None else read_lens(path)
-
-
-def _frames(text: str) -> tuple[int, int | None]:
-    from mrbokeh.commands.video import parse_frames
-
-    return parse_frames(text)
+    return CheckSettings(
+        layer_files={name: path for name, path in (("virtual", made.virtual), ("sharp", made.sharp)) if path is not None},
+        lens=None if made.lens is None else read_lens(made.lens),
+        energy_tolerance=limits.energy_tolerance,
+        flicker_limit=limits.flicker_limit,
+        tolerance=limits.tolerance,
+        frames=parse_frames(made.frames),
+    )
 
 
 def _print(report: CheckReport) -> None:

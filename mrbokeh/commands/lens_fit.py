@@ -1,29 +1,59 @@
 """`mrbokeh lens fit` and `mrbokeh lens match`: lenses measured in focal stacks, in pictures of points of light, and in one photograph."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.errors import InputError
 
+if TYPE_CHECKING:
+    from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit
+    from mrbokeh.lens_measuring.fitting.point_lights import PointLight
+    from mrbokeh.optics.psf_bank import PsfBank
+
+RINGS = 4
 _SIDES = {"behind": 1, "front": -1}
 
 
+@dataclass(frozen=True)
+class LightOptions:
+    """Place of the lights, and meaning of the file's integers."""
+
+    side: Annotated[str, typer.Option(help="Where the lights are: behind the focus, or in front.")] = "behind"
+    depth_m: Annotated[float | None, typer.Option(help="Depth of the lights in metres; inf is allowed.")] = None
+    encoding: Annotated[str, typer.Option(help="What integers of the file mean: srgb or linear.")] = "srgb"
+
+
+@dataclass(frozen=True)
+class StatedOptions:
+    """Facts in place of the photograph's metadata."""
+
+    focus_distance_m: Annotated[
+        float | None, typer.Option("--focus", help="Focus distance from the lens in metres (else of the metadata).")
+    ] = None
+    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", help="Focal length in mm (else of the metadata).")] = None
+    f_number: Annotated[float | None, typer.Option(help="Stated f-number (else of the metadata).")] = None
+    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", help="Sensor width in mm (else of the metadata).")] = None
+
+
+@dataclass(frozen=True)
+class MatchResultOptions:
+    """Picture beside OUT, and replacement."""
+
+    evidence: Annotated[Path | None, typer.Option(help="A picture to write of what was found (.png, .pdf or .svg).")] = None
+    overwrite: Annotated[bool, typer.Option(help="Replace OUT and EVIDENCE where they exist.")] = False
+
+
+@grouped
 def match(
     photo: Annotated[Path, typer.Argument(help="A photograph with out-of-focus lights: JPEG, TIFF, PNG, WebP, EXR or HDR.")],
     out: Annotated[Path, typer.Option(help="The lens file to write, e.g. lens.json.")],
-    evidence: Annotated[Path | None, typer.Option(help="A picture to write of what was found (.png, .pdf or .svg).")] = None,
-    side: Annotated[str, typer.Option(help="Where the lights are: behind the focus, or in front.")] = "behind",
-    depth_m: Annotated[float | None, typer.Option(help="Depth of the lights in metres; inf is allowed.")] = None,
-    focus_distance_m: Annotated[
-        float | None, typer.Option("--focus", help="Focus distance from the lens in metres (else of the metadata).")
-    ] = None,
-    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", help="Focal length in mm (else of the metadata).")] = None,
-    f_number: Annotated[float | None, typer.Option(help="Stated f-number (else of the metadata).")] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", help="Sensor width in mm (else of the metadata).")] = None,
-    encoding: Annotated[str, typer.Option(help="What integers of the file mean: srgb or linear.")] = "srgb",
-    overwrite: Annotated[bool, typer.Option(help="Replace OUT and EVIDENCE where they exist.")] = False,
+    result: MatchResultOptions,
+    lights: LightOptions,
+    stated: StatedOptions,
 ) -> None:
     """Estimate a lens from the discs that out-of-focus lights make in a photograph, and from its metadata.
 
@@ -39,58 +69,78 @@ def match(
     from mrbokeh.optics.lens_file import write_lens
     from mrbokeh.system.atomic_files import atomic_path, refuse_existing
 
-    _check_match(side, encoding, evidence)
-    for path in (out, *([evidence] if evidence else [])):
-        refuse_existing(path, overwrite)
-    rgb = read_image(photo, "linear" if encoding == "linear" else "srgb")
-    facts = read_facts(photo, (rgb.shape[1], rgb.shape[0])).given(
-        focal_length_mm=focal_length_mm, f_number=f_number, sensor_width_mm=sensor_width_mm, focus_distance_m=focus_distance_m
-    )
+    _check_match(lights, result)
+    for path in (out, *([result.evidence] if result.evidence else [])):
+        refuse_existing(path, result.overwrite)
+    rgb = read_image(photo, "linear" if lights.encoding == "linear" else "srgb")
+    facts = read_facts(photo, (rgb.shape[1], rgb.shape[0])).given(**vars(stated))
     facts.require(photo)
     largest = 1.0 if photo.suffix.lower() in ENCODED_SUFFIXES else float("inf")
-    found = match_lens(rgb, facts, side=_SIDES[side], depth_m=depth_m, largest_value=largest)
+    found = match_lens(rgb, facts, side=_SIDES[lights.side], depth_m=lights.depth_m, largest_value=largest)
     write_lens(out, found.lens)
     typer.echo(as_text(table_of(found)))
-    if evidence:
-        with atomic_path(evidence) as temporary:
+    if result.evidence:
+        with atomic_path(result.evidence) as temporary:
             draw_match(rgb, found).savefig(temporary, dpi=110)
-    typer.echo(f"wrote {out}" + (f" and {evidence}" if evidence else ""))
+    typer.echo(f"wrote {out}" + (f" and {result.evidence}" if result.evidence else ""))
 
 
-def _check_match(side: str, encoding: str, evidence: Path | None) -> None:
-    if side not in _SIDES:
-        raise InputError(f"expected --side behind or front, got {side!r}")
-    if encoding not in ("srgb", "linear"):
-        raise InputError(f"expected --encoding srgb or linear, got {encoding!r}")
-    if evidence and evidence.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise InputError(f"cannot draw {evidence}: expected .png, .pdf or .svg")
+def _check_match(lights: LightOptions, result: MatchResultOptions) -> None:
+    if lights.side not in _SIDES:
+        raise InputError(f"expected --side behind or front, got {lights.side!r}")
+    if lights.encoding not in ("srgb", "linear"):
+        raise InputError(f"expected --encoding srgb or linear, got {lights.encoding!r}")
+    if result.evidence and result.evidence.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise InputError(f"cannot draw {result.evidence}: expected .png, .pdf or .svg")
 
 
-if TYPE_CHECKING:
-    from mrbokeh.lens_measuring.fitting.lens_fit import LensFit
-    from mrbokeh.lens_measuring.fitting.point_lights import PointLight
-    from mrbokeh.optics.psf_bank import PsfBank
+@dataclass(frozen=True)
+class EvidenceOptions:
+    """Pictures of points of light."""
 
-RINGS = 4
+    lights: Annotated[list[Path] | None, typer.Option(help="Linear picture of points of light behind the focus, isolated, not full.")] = (
+        None
+    )
+    near_lights: Annotated[list[Path] | None, typer.Option(help="The same in front of the focus.")] = None
 
 
-def fit(
-    out: Annotated[Path, typer.Option(help="The folder to write: a bank of PSFs, kernels.png and evidence.png.")],
-    stacks: Annotated[list[Path] | None, typer.Argument(help="Merged focal stacks, or scenes of them.")] = None,
-    lights: Annotated[
-        list[Path] | None, typer.Option(help="Linear picture of points of light behind the focus, isolated, not full.")
-    ] = None,
-    near_lights: Annotated[list[Path] | None, typer.Option(help="The same in front of the focus.")] = None,
-    symmetric: Annotated[bool, typer.Option(help="Kernels depend on eccentricity and turn with the place.")] = False,
+@dataclass(frozen=True)
+class FittingOptions:
+    """Settings of the fit."""
+
+    symmetric: Annotated[bool, typer.Option(help="Kernels depend on eccentricity and turn with the place.")] = False
     regions: Annotated[
         str, typer.Option(help="Columns and rows of the frame that have kernels of their own, e.g. 3x3; 1x1 is one for all.")
-    ] = "3x3",
+    ] = "3x3"
     diameters: Annotated[
         str, typer.Option(help="Diameters in px around which shapes are solved for, e.g. 8,20 (two that suit where not given).")
-    ] = "",
-    smoothness: Annotated[float, typer.Option(help="More trusts noisy pictures less, and rounds off shapes.")] = 1.0,
-    pixels: Annotated[int, typer.Option(help="How many pixels of the stacks to use, at most.")] = 120_000,
-    seed: Annotated[int, typer.Option(help="Seed of the choice of pixels.")] = 0,
+    ] = ""
+    smoothness: Annotated[float, typer.Option(help="More trusts noisy pictures less, and rounds off shapes.")] = 1.0
+    pixels: Annotated[int, typer.Option(help="How many pixels of the stacks to use, at most.")] = 120_000
+    seed: Annotated[int, typer.Option(help="Seed of the choice of pixels.")] = 0
+
+    def parsed(self) -> "FitSettings":
+        """Return the settings of the fit. Raises InputError if an option is out of range or no number."""
+        from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings
+
+        if not self.smoothness > 0.0 or self.pixels < 1:
+            raise InputError(f"expected --smoothness above 0 and --pixels from 1 up, got {self.smoothness} and {self.pixels}")
+        return FitSettings(
+            diameters_px=_diameters(self.diameters),
+            regions=_regions(self.regions),
+            rings=RINGS if self.symmetric else 0,
+            smoothness=self.smoothness,
+            pixels=self.pixels,
+            seed=self.seed,
+        )
+
+
+@grouped
+def fit(
+    out: Annotated[Path, typer.Option(help="The folder to write: a bank of PSFs, kernels.png and evidence.png.")],
+    evidence: EvidenceOptions,
+    fitting: FittingOptions,
+    stacks: Annotated[list[Path] | None, typer.Argument(help="Merged focal stacks, or scenes of them.")] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False,
 ) -> None:
     """Measure the kernels of a lens over signed blur, field and colour.
@@ -101,14 +151,13 @@ def fit(
     Example: mrbokeh lens fit scene --out my_lens --regions 3x3
     """
     from mrbokeh.lens_measuring.fitting.fit_results import bank_of
-    from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
+    from mrbokeh.lens_measuring.fitting.lens_fit import fit_lens
     from mrbokeh.optics.psf_bank_file import refuse_existing_bank, write_bank
     from mrbokeh.stacks.guessed_metres import metres_notes
 
     refuse_existing_bank(out, overwrite)
-    _check_fit(smoothness, pixels)
-    settings = FitSettings(_diameters(diameters), _regions(regions), RINGS if symmetric else 0, smoothness, pixels, seed=seed)
-    found, frame = _lights(lights or [], near_lights or [])
+    settings = fitting.parsed()
+    found, frame = _lights(evidence)
     given = _stacks(stacks or [])
     if note := metres_notes(given):
         typer.echo(f"{note} (kernels are measured over blur in pixels, which needs no metres)")
@@ -125,12 +174,13 @@ def _stacks(folders: list[Path]) -> list:  # type: ignore[type-arg]
     return [stack for folder in folders for stack in find_focal_stacks(folder)]
 
 
-def _lights(behind: list[Path], in_front: list[Path]) -> "tuple[list[PointLight], tuple[int, int] | None]":
+def _lights(evidence: EvidenceOptions) -> "tuple[list[PointLight], tuple[int, int] | None]":
     """Return the points of light of all frames, and the size of the frames."""
     from mrbokeh.images.image_io import read_linear
     from mrbokeh.lens_measuring.fitting.point_lights import find_lights
 
     found, size = [], None
+    behind, in_front = evidence.lights or [], evidence.near_lights or []
     for path, near in [*((path, False) for path in behind), *((path, True) for path in in_front)]:
         frame = read_linear(path)
         size = (frame.shape[1], frame.shape[0])
@@ -141,11 +191,6 @@ def _lights(behind: list[Path], in_front: list[Path]) -> "tuple[list[PointLight]
             )
         found += mine
     return found, size
-
-
-def _check_fit(smoothness: float, pixels: int) -> None:
-    if not smoothness > 0.0 or pixels < 1:
-        raise InputError(f"expected --smoothness above 0 and --pixels from 1 up, got {smoothness} and {pixels}")
 
 
 def _diameters(text: str) -> tuple[float, ...]:

@@ -1,57 +1,103 @@
 """`mrbokeh lens psf` and `mrbokeh lens spreadlets`: banks of point spread functions, and what a renderer splats of them."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.errors import InputError
 
+if TYPE_CHECKING:
+    from mrbokeh.psf_models.build import ModelOptions
 
-def psf(
-    model: Annotated[str, typer.Argument(help="simple, combined (defocus and motion), physical, volume or stylized.")],
-    out: Annotated[Path, typer.Option(help="The folder of the bank; a half-built one is completed.")],
-    lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None,
-    image: Annotated[Path | None, typer.Option(help="The picture of a PSF (model stylized).")] = None,
-    diameter: Annotated[float | None, typer.Option(help="Largest circle of confusion in px (simple, combined, stylized).")] = None,
-    motion: Annotated[float | None, typer.Option(help="Longest motion in px per shutter (combined).")] = None,
-    prescription: Annotated[
-        Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")
-    ] = None,
+
+@dataclass(frozen=True)
+class BankOptions:
+    """Options of the models; None leaves a model's default."""
+
+    lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None
+    image: Annotated[Path | None, typer.Option(help="The picture of a PSF (model stylized).")] = None
+    diameter: Annotated[float | None, typer.Option(help="Largest circle of confusion in px (simple, combined, stylized).")] = None
+    motion: Annotated[float | None, typer.Option(help="Longest motion in px per shutter (combined).")] = None
+    prescription: Annotated[Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")] = (
+        None
+    )
     focus_distance_m: Annotated[
         float | None, typer.Option("--focus", help="Where the lens is focused in metres, inf is allowed (physical; else 2 m).")
-    ] = None,
-    f_number: Annotated[float | None, typer.Option(help="Closes the iris to this f-number (physical; open without).")] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", help="Sensor width in mm (physical; else 36).")] = None,
+    ] = None
+    f_number: Annotated[float | None, typer.Option(help="Closes the iris to this f-number (physical; open without).")] = None
+    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", help="Sensor width in mm (physical; else 36).")] = None
     sensor_height_mm: Annotated[
         float | None, typer.Option("--sensor-height", help="Sensor height in mm (physical; else two thirds of the width).")
-    ] = None,
+    ] = None
     image_width_px: Annotated[
         int | None, typer.Option("--image-width", help="Width in px of the pictures to blur (physical; else 1024).")
-    ] = None,
-    nearest_m: Annotated[float | None, typer.Option("--near", help="Nearest depth of the bank in metres (physical; else 0.5).")] = None,
+    ] = None
+    nearest_m: Annotated[float | None, typer.Option("--near", help="Nearest depth of the bank in metres (physical; else 0.5).")] = None
     farthest_m: Annotated[
         float | None, typer.Option("--far", help="Farthest depth of the bank in metres (physical: else 100; volume: else 5).")
-    ] = None,
+    ] = None
     vignetting: Annotated[
         bool | None,
         typer.Option("--vignetting/--no-vignetting", help="Whether kernels darken off the axis (physical; else they do)."),
-    ] = None,
-    density_per_m: Annotated[float | None, typer.Option(help="Collisions per metre (volume; else 0.9).")] = None,
-    anisotropy: Annotated[float | None, typer.Option(help="Henyey-Greenstein's g, -1 to 1 (volume; else 0.8).")] = None,
-    focal_px: Annotated[float | None, typer.Option(help="Focal length of the picture in px (volume; else 1024).")] = None,
+    ] = None
+    density_per_m: Annotated[float | None, typer.Option(help="Collisions per metre (volume; else 0.9).")] = None
+    anisotropy: Annotated[float | None, typer.Option(help="Henyey-Greenstein's g, -1 to 1 (volume; else 0.8).")] = None
+    focal_px: Annotated[float | None, typer.Option(help="Focal length of the picture in px (volume; else 1024).")] = None
     counts: Annotated[
         str | None, typer.Option(help="Steps of the grid along each coordinate, e.g. 100 or 75,75 (combined: of the paper's grid).")
-    ] = None,
-    cells: Annotated[int | None, typer.Option(help="At most so many kernels, in proportion to their size (combined; else 400).")] = None,
-    rays: Annotated[
-        int | None, typer.Option(help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the rays.")] = 0,
+    ] = None
+    cells: Annotated[int | None, typer.Option(help="At most so many kernels, in proportion to their size (combined; else 400).")] = None
     device: Annotated[
         str, typer.Option(help="cuda, cuda:1 or cpu: rays are traced by torch there; without it by compiled loops on the CPU.")
-    ] = "",
-    overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False,
+    ] = ""
+
+    def parsed(self) -> "ModelOptions":
+        """Return the options as the models take them. Raises InputError if the steps are no numbers."""
+        from mrbokeh.psf_models.build import ModelOptions
+
+        return ModelOptions(
+            lens=self.lens,
+            image=self.image,
+            diameter_px=self.diameter,
+            motion_px=self.motion,
+            prescription=self.prescription,
+            focus_distance_m=self.focus_distance_m,
+            f_number=self.f_number,
+            sensor_width_mm=self.sensor_width_mm,
+            sensor_height_mm=self.sensor_height_mm,
+            image_width_px=self.image_width_px,
+            nearest_m=self.nearest_m,
+            farthest_m=self.farthest_m,
+            vignetting=self.vignetting,
+            density_per_m=self.density_per_m,
+            anisotropy=self.anisotropy,
+            focal_px=self.focal_px,
+            counts=None if self.counts is None else _steps(self.counts),
+            cells=self.cells,
+            device=self.device or None,
+        )
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """Rays and replacement of the bank."""
+
+    rays: Annotated[int | None, typer.Option(help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")] = (
+        None
+    )
+    seed: Annotated[int, typer.Option(help="Seed of the rays.")] = 0
+    overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False
+
+
+@grouped
+def psf(
+    model: Annotated[str, typer.Argument(help="simple, combined (defocus and motion), physical, volume or stylized.")],
+    out: Annotated[Path, typer.Option(help="The folder of the bank; a half-built one is completed.")],
+    made: BankOptions,
+    work: BuildOptions,
 ) -> None:
     """Build a bank of point spread functions. An interrupted build goes on when the same command is given again.
 
@@ -60,32 +106,11 @@ def psf(
     Example: mrbokeh lens psf physical --prescription dgauss.50mm.dat --focus 1.5 --f-number 2.8 --sensor-width 23.5
     --image-width 1920 --counts 40,40 --out double_gauss
     """
-    from mrbokeh.psf_models.build import ModelOptions, build_bank, choose_model
+    from mrbokeh.psf_models.build import build_bank, choose_model
     from mrbokeh.system.console import kept_when_interrupted
 
-    options = ModelOptions(
-        lens=lens,
-        image=image,
-        diameter_px=diameter,
-        motion_px=motion,
-        prescription=prescription,
-        focus_distance_m=focus_distance_m,
-        f_number=f_number,
-        sensor_width_mm=sensor_width_mm,
-        sensor_height_mm=sensor_height_mm,
-        image_width_px=image_width_px,
-        nearest_m=nearest_m,
-        farthest_m=farthest_m,
-        vignetting=vignetting,
-        density_per_m=density_per_m,
-        anisotropy=anisotropy,
-        focal_px=focal_px,
-        counts=None if counts is None else _steps(counts),
-        cells=cells,
-        device=device or None,
-    )
-    with kept_when_interrupted(f"finished kernels are kept in {out}", overwrite):
-        bank = build_bank(choose_model(model, options), out, rays, seed, overwrite=overwrite)
+    with kept_when_interrupted(f"finished kernels are kept in {out}", work.overwrite):
+        bank = build_bank(choose_model(model, made.parsed()), out, work.rays, work.seed, overwrite=work.overwrite)
     typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px")
 
 

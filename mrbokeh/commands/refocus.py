@@ -1,11 +1,12 @@
 """`mrbokeh refocus`: new slices of a focal stack at any focus, with its own lens or another."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from mrbokeh.commands._option_groups import grouped
 from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.errors import InputError
@@ -15,7 +16,34 @@ app = typer.Typer(add_completion=False)
 _SETTINGS = "refocus.json"
 
 
+@dataclass(frozen=True)
+class BlurOptions:
+    """Lens and renderer of the new slices."""
+
+    f_number: Annotated[float | None, typer.Option(help="Another opening of the stack's lens.")] = None
+    lens: Annotated[Path | None, typer.Option(help="LENS.json or LENS.onnx in place of the stack's lens.")] = None
+    renderer: Annotated[
+        str | None, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
+    ] = None
+    residuals: Annotated[
+        bool,
+        typer.Option(
+            "--residuals/--no-residuals",
+            help="Carry over what rendering misses of the slices next to the focus. Without: all rendered alike, for a focus pull.",
+        ),
+    ] = True
+
+
+@dataclass(frozen=True)
+class ResultOptions:
+    """Files beside OUT, and its replacement."""
+
+    sheet: Annotated[Path | None, typer.Option(help="Also write a contact sheet of the new slices (.png).")] = None
+    overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False
+
+
 @app.command()
+@grouped
 def refocus(
     stack: Annotated[Path, typer.Argument(help="Folder of a merged focal stack.")],
     focus: Annotated[
@@ -26,20 +54,8 @@ def refocus(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the new focal stack.")],
-    f_number: Annotated[float | None, typer.Option(help="Another opening of the stack's lens.")] = None,
-    lens: Annotated[Path | None, typer.Option(help="LENS.json or LENS.onnx in place of the stack's lens.")] = None,
-    renderer: Annotated[
-        str | None, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
-    ] = None,
-    residuals: Annotated[
-        bool,
-        typer.Option(
-            "--residuals/--no-residuals",
-            help="Carry over what rendering misses of the slices next to the focus. Without: all rendered alike, for a focus pull.",
-        ),
-    ] = True,
-    sheet: Annotated[Path | None, typer.Option(help="Also write a contact sheet of the new slices (.png).")] = None,
-    overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
+    blur: BlurOptions,
+    result: ResultOptions,
 ) -> None:
     """Make slices between and beyond the captured ones, from the all-in-focus picture and the depth, through the lens of the stack.
 
@@ -52,33 +68,33 @@ def refocus(
     """
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.stacks.focal_stack import read_focal_stack, write_focal_stack
-    from mrbokeh.stacks.focus_places import Seen, parse_focus
+    from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
     from mrbokeh.stacks.guessed_metres import inherited_facts, metres_note, unit_of
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import kept_when_interrupted
 
     if out.resolve() == stack.resolve():
         raise InputError("--out must be another folder than the stack's own")
-    if sheet is not None:
-        require_suffix(sheet, (".png",), "--sheet")
-        require_safe_outputs((sheet,), (lens, out), overwrite)
+    if result.sheet is not None:
+        require_suffix(result.sheet, (".png",), "--sheet")
+        require_safe_outputs((result.sheet,), (blur.lens, out), result.overwrite)
     source = read_focal_stack(stack)
-    distances_m = parse_focus(focus, Seen.of(source))
+    distances_m = parse_focus(focus, FocusLookup.of(source))
     if note := metres_note(source):
         typer.echo(note)
-    way = _way(source, f_number, lens, renderer, residuals)
+    way = _refocusing(source, blur)
     if note and way.lens is not None:
         typer.echo(f"the blur of this lens grows {_times_as_fast(way):.2f} times as fast as in the slices")
-    _make_room(out, overwrite)
-    settings = {"stack": str(stack.resolve()), "f_number": f_number, "lens": str(lens), "renderer": renderer, "residuals": residuals}
-    with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
-        slices = _write_slices(way, distances_m, out, settings, overwrite)
+    _make_room(out, result.overwrite)
+    settings = {"stack": str(stack.resolve()), **vars(blur), "lens": str(blur.lens)}
+    with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
+        slices = _write_slices(way, distances_m, out, settings, result.overwrite)
     metadata = {"refocused": settings} | inherited_facts(source, with_lens=way.lens is None)
     made = FocalStack(out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata=metadata)
     _write_sharp(source, made, distances_m)
     write_focal_stack(made)
-    if sheet is not None:
-        _write_sheet(sheet, made)
+    if result.sheet is not None:
+        _write_sheet(result.sheet, made)
     typer.echo(f"wrote {out} ({len(slices)} slices, in focus at {', '.join(f'{each:.3g}' for each in distances_m)} {unit_of(source)})")
 
 
@@ -110,15 +126,15 @@ def _make_room(out: Path, overwrite: bool) -> None:
     (out / FILE_NAME).unlink()
 
 
-def _way(source: FocalStack, f_number: float | None, lens: Path | None, renderer: str | None, residuals: bool) -> Refocusing:
+def _refocusing(source: FocalStack, blur: BlurOptions) -> Refocusing:
     from mrbokeh.renderers.choose import lens_and_renderer
 
-    if f_number is not None and not f_number > 0:
-        raise InputError(f"expected --f-number above 0, got {f_number:g}")
-    chosen, blurs = lens_and_renderer(lens, renderer)
-    if f_number is not None:
-        chosen = replace(chosen or source.lens_of(source.reference), f_number=f_number)
-    return Refocusing(source, blurs, chosen, residuals)
+    if blur.f_number is not None and not blur.f_number > 0:
+        raise InputError(f"expected --f-number above 0, got {blur.f_number:g}")
+    lens, renderer = lens_and_renderer(blur.lens, blur.renderer)
+    if blur.f_number is not None:
+        lens = replace(lens or source.lens_of(source.reference), f_number=blur.f_number)
+    return Refocusing(source, renderer, lens, blur.residuals)
 
 
 def _write_slices(way: Refocusing, distances_m: tuple[float, ...], out: Path, settings: dict, overwrite: bool) -> tuple[Slice, ...]:

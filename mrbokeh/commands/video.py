@@ -22,7 +22,7 @@ from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
 from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import Shot, Target
 from mrbokeh.shots.targets import SequenceTarget, VideoTarget
-from mrbokeh.stacks.photograph import Holding, lens_held
+from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
 from mrbokeh.system.errors import InputError
@@ -136,10 +136,10 @@ def _look(look: LookGroup, source: PictureSource, taken: options.ClipOptions) ->
     return ClipLook(look.wanted, source.path, taken.rate, start, _first_number(source, taken), source.space)
 
 
-def _holding(source: PictureSource, lens: Path) -> Holding:
+def _holding(source: PictureSource, lens: Path) -> SensorOrientation:
     """Return the orientation of the camera; told here once, for every worker turns the lens alike."""
-    holding = Holding((source.info.width_px, source.info.height_px), source.info.quarter_turns)
-    lens_held(read_lens(lens), holding, source.path)
+    holding = SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns)
+    lens_for_orientation(read_lens(lens), holding, source.path)
     return holding
 
 

@@ -28,7 +28,7 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
-from mrbokeh.stacks.photograph import lens_as_held, read_photograph
+from mrbokeh.stacks.photograph import lens_for_photograph, read_photograph
 from mrbokeh.system.errors import InputError
 
 
@@ -96,7 +96,7 @@ def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = 
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}")
     photograph = read_photograph(photo)
-    lens = photograph.lens(photo, focus_m) if lens is None else lens_as_held(lens, photograph, photo)
+    lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     return with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
 

@@ -17,7 +17,7 @@ from mrbokeh.system.errors import InputError
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
-Seen = Float32[np.ndarray, "rows columns 3"]
+Shown = Float32[np.ndarray, "rows columns 3"]
 Given = Float32[np.ndarray, "rows columns"]
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -136,7 +136,7 @@ def _size(shape: Any, layout: str, photo_rgb: Rgb, wants: NetworkInput) -> tuple
     return (fixed[1] if isinstance(fixed[1], int) else columns), (fixed[0] if isinstance(fixed[0], int) else rows)
 
 
-def _fitted_in(codes: Rgb, size: tuple[int, int], wants: NetworkInput) -> tuple[Seen, tuple[int, int, int, int]]:
+def _fitted_in(codes: Rgb, size: tuple[int, int], wants: NetworkInput) -> tuple[Shown, tuple[int, int, int, int]]:
     """Return the picture at the network's size, and the rows and columns (top, bottom, left, right) that are picture and not padding."""
     import cv2
 
@@ -150,7 +150,7 @@ def _fitted_in(codes: Rgb, size: tuple[int, int], wants: NetworkInput) -> tuple[
     return cv2.copyMakeBorder(_resized(codes, inner), *beyond, cv2.BORDER_REFLECT), (top, top + inner[1], left, left + inner[0])
 
 
-def _resized(codes: Rgb, size: tuple[int, int]) -> Seen:
+def _resized(codes: Rgb, size: tuple[int, int]) -> Shown:
     import cv2
 
     if codes.shape[1::-1] == size:

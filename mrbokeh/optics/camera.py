@@ -77,7 +77,13 @@ class Camera:
         scale = np.array([width_px / self.width_px, height_px / self.height_px])
         fx, fy = np.asarray(self.focal_px) * scale
         cx, cy = np.asarray(self.principal_px) * scale
-        return Camera(width_px, height_px, (float(fx), float(fy)), (float(cx), float(cy)), self.camera_from_world)
+        return Camera(
+            width_px=width_px,
+            height_px=height_px,
+            focal_px=(float(fx), float(fy)),
+            principal_px=(float(cx), float(cy)),
+            camera_from_world=self.camera_from_world,
+        )
 
 
 def have_same_shape(size_px: tuple[int, int], other_px: tuple[int, int], within: float = _SAME_SHAPE) -> bool:
@@ -99,7 +105,13 @@ def camera_from_json(document: dict[str, Any], where: str = "camera") -> Camera:
     try:
         (fx, fy), (cx, cy) = document["focal_px"], document["principal_px"]
         pose = np.asarray(document["camera_from_world"], np.float64)
-        return Camera(int(document["width_px"]), int(document["height_px"]), (float(fx), float(fy)), (float(cx), float(cy)), pose)
+        return Camera(
+            width_px=int(document["width_px"]),
+            height_px=int(document["height_px"]),
+            focal_px=(float(fx), float(fy)),
+            principal_px=(float(cx), float(cy)),
+            camera_from_world=pose,
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: expected width_px, height_px, focal_px, principal_px and camera_from_world ({error!r})") from None
 

@@ -192,14 +192,14 @@ def lens_from_json(document: dict[str, Any], where: str = "lens", folder: Path |
     tilt_x_deg, tilt_y_deg = values.numbers("tilt_deg", 2)
     try:
         return Lens(
-            values.number("focal_length_mm"),
-            values.number("f_number"),
-            values.number("focus_distance_m", null=np.inf),
-            values.number("sensor_width_mm"),
-            _aperture_from_json(document["aperture"], where, Path(folder)),
-            (float(np.radians(tilt_x_deg)), float(np.radians(tilt_y_deg))),
-            values.number("petzval_radius_mm", default=np.inf, null=np.inf),
-            None if document.get("sensor_height_mm") is None else values.number("sensor_height_mm"),
+            focal_length_mm=values.number("focal_length_mm"),
+            f_number=values.number("f_number"),
+            focus_distance_m=values.number("focus_distance_m", null=np.inf),
+            sensor_width_mm=values.number("sensor_width_mm"),
+            aperture=_aperture_from_json(document["aperture"], where, Path(folder)),
+            tilt_rad=(float(np.radians(tilt_x_deg)), float(np.radians(tilt_y_deg))),
+            petzval_radius_mm=values.number("petzval_radius_mm", default=np.inf, null=np.inf),
+            sensor_height_mm=None if document.get("sensor_height_mm") is None else values.number("sensor_height_mm"),
         )
     except InputError as error:
         raise error if str(error).startswith(where) else InputError(f"{where}: {error}") from None
@@ -216,12 +216,12 @@ def _aperture_from_json(document: Any, where: str, folder: Path) -> Aperture:
     else:
         plain = _of_shape(values, folder)
     return Aperture(
-        plain.outlines,
-        plain.weights,
-        values.number("cat_eye", default=0.0),
-        values.number("spherical_aberration", default=0.0),
-        values.three("axial_chromatic"),
-        values.three("lateral_chromatic"),
+        outlines=plain.outlines,
+        weights=plain.weights,
+        cat_eye=values.number("cat_eye", default=0.0),
+        spherical_aberration=values.number("spherical_aberration", default=0.0),
+        axial_chromatic=values.three("axial_chromatic"),
+        lateral_chromatic=values.three("lateral_chromatic"),
     )
 
 

@@ -51,8 +51,17 @@ class BankHead:
 
 
 def head_of(bank: PsfBank) -> BankHead:
-    facts = (bank.axes, bank.counts, bank.nested, bank.turns, bank.near_side_turned, dict(bank.settings), bank.knee_px)
-    return BankHead(bank.model, bank.channels, *facts)
+    return BankHead(
+        model=bank.model,
+        channels=bank.channels,
+        axes=bank.axes,
+        counts=bank.counts,
+        nested=bank.nested,
+        turns=bank.turns,
+        near_side_turned=bank.near_side_turned,
+        settings=dict(bank.settings),
+        knee_px=bank.knee_px,
+    )
 
 
 def cell_path(folder: Path | str, cell: int) -> Path:
@@ -124,8 +133,17 @@ def read_bank(folder: Path | str) -> PsfBank:
             f"--out {folder}` again, it goes on where it stopped"
         )
     kernels = tuple(_read_cell(cell_path(folder, cell), head.channels) for cell in range(cells))
-    facts = (head.turns, head.near_side_turned, head.nested, head.settings, head.knee_px)
-    return PsfBank(head.model, head.axes, head.counts, kernels, *facts)
+    return PsfBank(
+        model=head.model,
+        axes=head.axes,
+        counts=head.counts,
+        kernels=kernels,
+        turns=head.turns,
+        near_side_turned=head.near_side_turned,
+        nested=head.nested,
+        settings=head.settings,
+        knee_px=head.knee_px,
+    )
 
 
 def _read_cell(path: Path, channels: int) -> np.ndarray:

@@ -134,8 +134,17 @@ def bank_head(model: PsfModel, rays: int, seed: int) -> BankHead:
     """
     nested = model.knee_px is None and len(model.axes) > 1 and not any(axis.is_signed for axis in model.axes)
     settings = json.loads(json.dumps({**model.settings, "rays": rays, "seed": seed}))
-    facts = (model.axes, model.counts, nested, model.turns, model.near_side_turned, settings, model.knee_px)
-    return BankHead(model.name, model.channels, *facts)
+    return BankHead(
+        model=model.name,
+        channels=model.channels,
+        axes=model.axes,
+        counts=model.counts,
+        nested=nested,
+        turns=model.turns,
+        near_side_turned=model.near_side_turned,
+        settings=settings,
+        knee_px=model.knee_px,
+    )
 
 
 def build_bank(

@@ -26,7 +26,7 @@ def biconvex_lens(
         if radius_mm <= semi_mm:
             raise InputError(f"one bi-convex lens of index {index:g} cannot have f/{f_number:g}: choose a larger f-number")
         thickness_mm = edge_mm + 2.0 * (radius_mm - sqrt(radius_mm**2 - semi_mm**2))
-    front = Surface(radius_mm, thickness_mm, index, 2.0 * semi_mm, abbe_number)
+    front = Surface(radius_mm=radius_mm, distance_mm=thickness_mm, index=index, diameter_mm=2.0 * semi_mm, abbe_number=abbe_number)
     return LensPrescription("biconvex", (front, Surface(-radius_mm, 0.0, 1.0, 2.0 * semi_mm)))
 
 
@@ -71,7 +71,14 @@ def _surface(words: list[str], index_before: float, abbe_before: float) -> Surfa
     abbe = numbers[3] if len(numbers) == 5 and index not in (0.0, 1.0) else inf
     if index == 0.0:
         index, abbe = index_before, abbe_before
-    return Surface(inf if is_stop else radius_mm, distance_mm, index, diameter_mm, abbe, is_stop)
+    return Surface(
+        radius_mm=inf if is_stop else radius_mm,
+        distance_mm=distance_mm,
+        index=index,
+        diameter_mm=diameter_mm,
+        abbe_number=abbe,
+        is_stop=is_stop,
+    )
 
 
 def with_estimated_abbe_numbers(lens: LensPrescription) -> LensPrescription:

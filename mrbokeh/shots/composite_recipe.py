@@ -25,7 +25,7 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Description, Finisher, FocusSource, Kept, LayerSource, MatteSource, Moment
 from mrbokeh.shots.shot import Picture, Rgba
-from mrbokeh.stacks.photograph import Holding, lens_held
+from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -136,7 +136,7 @@ class CompositeRecipe:
     look: Description[Finisher] | None = None
     first_number: int = 0
     virtual_only: bool = False
-    holding: Holding | None = None
+    holding: SensorOrientation | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -153,7 +153,7 @@ class CompositeMaker:
 
     def __init__(self, recipe: CompositeRecipe, threads: int) -> None:
         lens = read_lens(recipe.lens)
-        self._recipe, self._lens = recipe, lens if recipe.holding is None else lens_held(lens, recipe.holding)
+        self._recipe, self._lens = recipe, lens if recipe.holding is None else lens_for_orientation(lens, recipe.holding)
         self._sources = [each.opened(threads) for each in recipe.layers]
         self._camera = None if recipe.camera is None else recipe.camera.opened(threads)
         self._focus = None if recipe.focus is None else recipe.focus.opened(threads)

@@ -85,5 +85,10 @@ def read_bundle(folder: Path) -> CaptureBundle:
     if len(sizes) > 1:
         raise InputError(f"{folder}: expected plate, camera and layers of one size, got {sorted(sizes)} (height, width): capture again")
     return CaptureBundle(
-        plate, layers, read_lens(folder / head["lens"]), camera, str(head.get("renderer", "polygon")), head.get("facts", {})
+        plate_rgb=plate,
+        layers=layers,
+        lens=read_lens(folder / head["lens"]),
+        camera=camera,
+        renderer=str(head.get("renderer", "polygon")),
+        facts=head.get("facts", {}),
     )

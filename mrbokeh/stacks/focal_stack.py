@@ -122,7 +122,7 @@ class FocalStack:
         return self.to_rec709(self.all_in_focus_camera_rgb())
 
     def exclusions(self) -> dict[str, Bool[np.ndarray, "height width"]]:
-        """Read (H, W) masks of what not to learn from, by reason: moving, saturated, border, low_confidence, board; {} if none are known."""
+        """Read (H, W) masks of pixels not to learn from, by reason: moving, saturated, border, low_confidence, board; {} if unknown."""
         return read_masks(self.exclusion_path)
 
     def depth_m(self) -> Float32[np.ndarray, "height width"]:
@@ -155,7 +155,7 @@ class FocalStack:
         return self.lens.focused_at(distance)
 
     def lens_of(self, index: int) -> Lens:
-        """Return the lens of one slice; if its blur was calibrated (`mrbokeh capture scale`), with the f-number that gives the blur found."""
+        """Return the lens of one slice; after `mrbokeh capture scale` calibrated its blur, with the f-number that gives that blur."""
         lens, metadata = self.stated_lens_of(index), self.slices[index].metadata
         if GROWTH not in metadata:
             return lens
@@ -163,7 +163,7 @@ class FocalStack:
         return replace(lens, f_number=lens.f_number / found)
 
     def registered_lens_of(self, index: int) -> Lens:
-        """Return the lens that blurs as a registered slice is blurred: registration enlarged it to a larger picture of less of the sensor."""
+        """Return the lens of a registered slice: registration enlarged it to a larger picture of less of the sensor."""
         lens = self.lens_of(index)
         return replace(lens, sensor_width_mm=lens.sensor_width_mm / self.slices[index].scale)
 

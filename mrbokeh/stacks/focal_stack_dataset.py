@@ -159,11 +159,11 @@ def read_focal_stack_dataset(folder: Path | str) -> FocalStackDataset:
         )
     try:
         return FocalStackDataset(
-            folder,
-            str(document["licence"]),
-            float(document["radiance_scale"]),
-            tuple(record_from_json(each) for each in document["stacks"]),
-            document["metadata"],
+            folder=folder,
+            licence=str(document["licence"]),
+            radiance_scale=float(document["radiance_scale"]),
+            stacks=tuple(record_from_json(each) for each in document["stacks"]),
+            metadata=document["metadata"],
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder / FILE_NAME} is incomplete ({error!r}): write it again with `mrbokeh capture dataset`") from None

@@ -21,7 +21,7 @@ _EXPECTED = (
 
 
 @dataclass(frozen=True)
-class Seen:
+class FocusLookup:
     """Lookup of focus places. depth_m: of the picture, or None. slices_m: focus distances of the slices, in their order."""
 
     lens: Lens
@@ -29,7 +29,7 @@ class Seen:
     slices_m: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, stack: FocalStack) -> "Seen":
+    def of(cls, stack: FocalStack) -> "FocusLookup":
         slices_m = tuple(each for each in stack.focus_distances_m if each is not None)
         return cls(stack.lens_of(stack.reference), stack.depth_m(), slices_m)
 
@@ -50,14 +50,14 @@ class Seen:
         return _distance(float(np.interp(position, np.arange(len(self.slices_m)), [1.0 / each for each in self.slices_m])))
 
 
-def parse_focus(text: str, seen: Seen) -> tuple[float, ...]:
+def parse_focus(text: str, seen: FocusLookup) -> tuple[float, ...]:
     """Return focus distances in metres, all different."""
     if not (places := _places(text, seen)) or not all(each > 0 for each in places) or len(set(places)) < len(places):
         raise InputError(f"--focus: {_EXPECTED}, got {text!r}")
     return places
 
 
-def _places(text: str, seen: Seen) -> tuple[float, ...]:
+def _places(text: str, seen: FocusLookup) -> tuple[float, ...]:
     """Return nothing where the text is not as expected."""
     try:
         if parts := re.fullmatch(rf"({_PLACE}):({_PLACE}):(\d+)", text):
@@ -72,7 +72,7 @@ def _places(text: str, seen: Seen) -> tuple[float, ...]:
     return ()
 
 
-def _place(text: str, seen: Seen) -> float:
+def _place(text: str, seen: FocusLookup) -> float:
     if text[0] not in "@#":
         return float(text)
     numbers = tuple(float(each) for each in text[1:].split(","))

@@ -88,7 +88,7 @@ def read_photograph(path: Path | str) -> Photograph:
 
 
 @dataclass(frozen=True)
-class Holding:
+class SensorOrientation:
     """Orientation of the sensor when a picture was taken.
 
     whole_px: (width, height) of all that it took, upright, of which the picture may be a part. quarter_turns: counter-clockwise, that
@@ -100,10 +100,10 @@ class Holding:
     quarter_turns: int = 0
 
 
-def lens_as_held(lens: Lens, photograph: Photograph, path: Path) -> Lens:
+def lens_for_photograph(lens: Lens, photograph: Photograph, path: Path) -> Lens:
     """Return the lens for the upright picture of a photograph; logs one line about what was assumed if that is not plain."""
     height_px, width_px = photograph.rgb.shape[:2]
-    held = lens_held(lens, Holding(photograph.cut_from_px or (width_px, height_px), photograph.quarter_turns), path)
+    held = lens_for_orientation(lens, SensorOrientation(photograph.cut_from_px or (width_px, height_px), photograph.quarter_turns), path)
     if photograph.cut_from_px is not None:
         left_mm = held.sensor_width_mm * width_px / photograph.cut_from_px[0]
         _log.warning(
@@ -113,7 +113,7 @@ def lens_as_held(lens: Lens, photograph: Photograph, path: Path) -> Lens:
     return held
 
 
-def lens_held(lens: Lens, holding: Holding, path: Path | None = None) -> Lens:
+def lens_for_orientation(lens: Lens, holding: SensorOrientation, path: Path | None = None) -> Lens:
     """Return the lens for upright pictures of a sensor orientation. path: the file to name in a line about what was assumed."""
     held = _held(lens, holding)
     told = _way_told(lens, held, holding)
@@ -122,7 +122,7 @@ def lens_held(lens: Lens, holding: Holding, path: Path | None = None) -> Lens:
     return held
 
 
-def _way_told(lens: Lens, held: Lens, holding: Holding) -> str:
+def _way_told(lens: Lens, held: Lens, holding: SensorOrientation) -> str:
     """Return what was assumed in words, '' if the lens needs no correction and may well be right."""
     width_px, height_px = holding.whole_px
     if held.sensor_width_mm != lens.sensor_width_mm:
@@ -145,7 +145,7 @@ def turned_by(lens: Lens, quarters: int) -> Lens:
     return replace(lens, aperture=lens.aperture.rotated(-quarters * np.pi / 2), tilt_rad=(right_rad, down_rad))
 
 
-def _held(lens: Lens, holding: Holding) -> Lens:
+def _held(lens: Lens, holding: SensorOrientation) -> Lens:
     width_px, height_px = holding.whole_px
     is_for_upright = (lens.sensor_height_mm or 0.0) > lens.sensor_width_mm
     held = lens if is_for_upright else turned_by(lens, holding.quarter_turns)

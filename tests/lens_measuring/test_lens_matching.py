@@ -20,7 +20,7 @@ from mrbokeh.layering.layering import Layering
 from mrbokeh.lens_measuring.matching.discs import Disc, find_discs
 from mrbokeh.lens_measuring.matching.lens_match import LensMatch, depth_from_size, effective_f_number, focus_from_size, match_lens
 from mrbokeh.lens_measuring.matching.match_report import table_of
-from mrbokeh.lens_measuring.matching.outline_fit import Opening, fit_outlines, outline_radius
+from mrbokeh.lens_measuring.matching.outline_fit import BladedOpening, fit_outlines, outline_radius
 from mrbokeh.lens_measuring.matching.photo_facts import PhotoFacts, read_facts
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
@@ -230,9 +230,15 @@ def test_discs_larger_than_the_stated_f_number_allows() -> None:
 
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize(
-    "opening", [Opening(0, cat_eye=0.5), Opening(7, 0.4, 0.0, 1.2, -0.4), Opening(6, 0.1, -0.3), Opening(9, 0.2, 0.6, 0.8, 0.3)]
+    "opening",
+    [
+        BladedOpening(0, cat_eye=0.5),
+        BladedOpening(7, 0.4, 0.0, 1.2, -0.4),
+        BladedOpening(6, 0.1, -0.3),
+        BladedOpening(9, 0.2, 0.6, 0.8, 0.3),
+    ],
 )
-def test_radius_over_angle_is_that_of_the_aperture(opening: Opening, side: int) -> None:
+def test_radius_over_angle_is_that_of_the_aperture(opening: BladedOpening, side: int) -> None:
     """Against the polygons that renderers splat; a circle is one of 64 sides there, which strays by 1.2e-3."""
     field = np.array([[0.5, 0.3]])
     angles = np.linspace(-3.0, 3.0, 61)[None]
@@ -246,7 +252,7 @@ def test_radius_over_angle_is_that_of_the_aperture(opening: Opening, side: int) 
     np.testing.assert_allclose(outline_radius(opening, angles, field, side)[0], met, atol=2.5e-3)
 
 
-def contours_of(opening: Opening, noise_px: float, seed: int) -> list[Disc]:
+def contours_of(opening: BladedOpening, noise_px: float, seed: int) -> list[Disc]:
     """Exact contours with noise, of 12 discs of 10 to 20 px all over the frame."""
     rng, discs = np.random.default_rng(seed), []
     for _ in range(12):
@@ -259,15 +265,15 @@ def contours_of(opening: Opening, noise_px: float, seed: int) -> list[Disc]:
 
 
 def test_exact_contours_give_the_opening_back() -> None:
-    truth = Opening(7, 0.3, 0.3, 1.2, 0.4)
-    found = fit_outlines(contours_of(truth, 0.0, 0), Opening(7, 0.2, 0.5, 1.0, 0.3), 1).opening
+    truth = BladedOpening(7, 0.3, 0.3, 1.2, 0.4)
+    found = fit_outlines(contours_of(truth, 0.0, 0), BladedOpening(7, 0.2, 0.5, 1.0, 0.3), 1).opening
     for name in ("rotation_rad", "curvature", "squeeze", "cat_eye"):
         assert getattr(found, name) == pytest.approx(getattr(truth, name), abs=2e-3)
 
 
 def test_standard_errors_cover_the_spread_of_repeated_fits() -> None:
     """They hold a bias of the grid of pixels, which these contours lack, and are no more than a few times the spread."""
-    truth = Opening(7, 0.3, 0.3, 1.2, 0.4)
+    truth = BladedOpening(7, 0.3, 0.3, 1.2, 0.4)
     fits = [fit_outlines(contours_of(truth, 0.3, seed), truth, 1) for seed in range(8)]
     for name in ("rotation_rad", "curvature", "squeeze", "cat_eye"):
         spread = float(np.sqrt(np.mean([(getattr(fit.opening, name) - getattr(truth, name)) ** 2 for fit in fits])))

@@ -18,7 +18,7 @@ from mrbokeh.refocus import leave_one_out
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
-from mrbokeh.stacks.focus_places import Seen, parse_focus, slice_names
+from mrbokeh.stacks.focus_places import FocusLookup, parse_focus, slice_names
 from mrbokeh.stacks.guessed_metres import (
     POSITION,
     POSITION_ERROR,
@@ -80,7 +80,7 @@ def test_the_note_names_what_is_guessed_and_the_way_out(known: FocalStack, guess
 
 def test_places_between_slices_and_at_pixels(known: FocalStack) -> None:
     """Slices at 0.5, 0.55 and 0.7 m; the card is at 0.5 m and the wall at 0.7 m."""
-    seen = Seen.of(known)
+    seen = FocusLookup.of(known)
     assert parse_focus("#1", seen) == (0.55,)
     assert parse_focus("#0.5", seen)[0] == pytest.approx(2.0 / (1 / 0.5 + 1 / 0.55))
     assert parse_focus(f"@{ON_CARD},#1,@{ON_WALL},inf", seen) == pytest.approx((0.5, 0.55, 0.7, float("inf")))
@@ -94,10 +94,10 @@ def test_places_between_slices_and_at_pixels(known: FocalStack) -> None:
 )
 def test_places_that_are_not_there_are_refused(known: FocalStack, text: str, match: str) -> None:
     with pytest.raises(InputError, match=match):
-        parse_focus(text, Seen.of(known))
+        parse_focus(text, FocusLookup.of(known))
     for place, needed in (("#1", "a focal stack, for a picture has no slices"), ("@1,1", "needs the depth of the picture")):
         with pytest.raises(InputError, match=needed):
-            parse_focus(place, Seen(LENS))
+            parse_focus(place, FocusLookup(LENS))
 
 
 def test_names_of_slices_close_together_differ() -> None:

@@ -17,7 +17,7 @@ from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens, write_lens
-from mrbokeh.stacks.photograph import Photograph, lens_as_held, read_photograph, turned_by
+from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph, turned_by
 
 LEVEL = Lens(50.0, 2.0, 2.0, 36.0)
 UPRIGHT = Lens(50.0, 2.0, 2.0, 24.0, sensor_height_mm=36.0)
@@ -82,8 +82,8 @@ def test_the_opening_turns_as_the_picture_does(quarters: int) -> None:
 def test_a_lens_described_upright_is_left_as_it_is_there(tmp_path: Path) -> None:
     tall = replace(UPRIGHT, aperture=Aperture.heart())
     picture = Photograph(np.zeros((96, 64, 3), np.float32), orientation=6)
-    assert lens_as_held(tall, picture, tmp_path) == tall
-    turned = lens_as_held(replace(LEVEL, aperture=Aperture.heart()), picture, tmp_path)
+    assert lens_for_photograph(tall, picture, tmp_path) == tall
+    turned = lens_for_photograph(replace(LEVEL, aperture=Aperture.heart()), picture, tmp_path)
     assert not np.allclose(turned.aperture.outlines[0], tall.aperture.outlines[0])
 
 

@@ -19,7 +19,7 @@ from mrbokeh.refocus import Refocusing, leave_one_out, lens_at
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from mrbokeh.stacks.focus_places import Seen, parse_focus
+from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
 from mrbokeh.system.errors import InputError
 from tests.scenes.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 
@@ -182,13 +182,13 @@ def test_an_interrupted_run_goes_on_and_other_settings_start_anew(tmp_path: Path
 @pytest.mark.parametrize("text", ["", "0.8,0.8", "-1", "a", "1:2", "0:2:3"])
 def test_odd_distances_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="--focus"):
-        parse_focus(text, Seen(LENS))
+        parse_focus(text, FocusLookup(LENS))
 
 
 def test_distances_evenly_in_dioptres() -> None:
     """From 0.5 m to infinity in five: 2, 1.5, 1, 0.5 and 0 dioptres."""
-    assert parse_focus("0.5:inf:5", Seen(LENS)) == pytest.approx((0.5, 2 / 3, 1.0, 2.0, float("inf")))
-    assert parse_focus("0.8,inf", Seen(LENS)) == (0.8, float("inf"))
+    assert parse_focus("0.5:inf:5", FocusLookup(LENS)) == pytest.approx((0.5, 2 / 3, 1.0, 2.0, float("inf")))
+    assert parse_focus("0.8,inf", FocusLookup(LENS)) == (0.8, float("inf"))
 
 
 # ---- one virtual scene in all slices

@@ -211,7 +211,7 @@ SIMPLEST_FIRST = (
 
 
 def simplest_of(errors: Sequence[Sequence[float]]) -> int:
-    """Return the first description, of those given from the simplest on, that is no worse than the best. errors: of each, slice by slice."""
+    """Return the first description, given from the simplest on, that is no worse than the best. errors: of each, slice by slice."""
     squares = np.square(np.asarray(errors, np.float64))
     if squares.size == 0:
         return len(squares) - 1

@@ -1,4 +1,4 @@
-"""Results of a fit: its kernels as a bank of PSFs, and a picture of how well they explain the slices and of what they were measured from."""
+"""Results of a fit: its kernels as a bank of PSFs, and a picture of its evidence (residuals of slices, pixels and lights of knots)."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ def bank_of(fit: LensFit) -> PsfBank:
     boxes = physical_boxes(axes, NestedGrid(counts, nested=False))
     kernels = tuple(_kernel(fit, box) for box in track(list(boxes), "bank"))
     turns = "field" if fit.knots.rings else "none"
-    return PsfBank("measured", axes, counts, kernels, turns, nested=False, settings=_settings(fit, boxes))
+    return PsfBank(model="measured", axes=axes, counts=counts, kernels=kernels, turns=turns, nested=False, settings=_settings(fit, boxes))
 
 
 def _axes(fit: LensFit) -> tuple[tuple[Axis, ...], tuple[int, ...]]:

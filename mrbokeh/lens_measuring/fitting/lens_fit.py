@@ -99,7 +99,7 @@ def fit_lens(
     largest_px = max([largest_diameter_px(stacks), *(abs(light.diameter_px) for light in lights)])
     knots = _knots(settings, largest_px, size)
     grid = PupilGrid.for_diameter(largest_px, settings.cell_px, _most_side(len(knots)))
-    fitting = _Fitting(slices, list(lights), grid, knots, settings)
+    fitting = _Fitting(slices=slices, lights=list(lights), grid=grid, knots=knots, settings=settings)
     pictures = fitting.even(Aperture.disc())
     for number in range(_ROUNDS):
         if number and stacks:
@@ -112,7 +112,17 @@ def fit_lens(
     sharing, pictures = candidates[chosen]
     counts = light_count(fitting.lights, knots)
     errors = evidence.errors(pictures)
-    return LensFit(grid, knots, pictures, largest_px, evidence.counts, counts, errors, scores[chosen], sharing)
+    return LensFit(
+        grid=grid,
+        knots=knots,
+        pictures=pictures,
+        largest_px=largest_px,
+        pixels=evidence.counts,
+        lights=counts,
+        errors=errors,
+        scores=scores[chosen],
+        sharing=sharing,
+    )
 
 
 def _knots(settings: FitSettings, largest_px: float, size: tuple[int, int]) -> Knots:
@@ -155,7 +165,7 @@ class _Fitting:
         return found
 
     def tied(self, evidence: Evidence, pictures: Pictures) -> list[tuple[Sharing, Pictures]]:
-        """Return pictures that share nothing but are tied to their neighbours, firmly first; last those given, which have the weakest ties."""
+        """Return pictures that share nothing but are tied to their neighbours, firmly first; last those given, with the weakest ties."""
         firmly = sorted((factor for factor in _TIES if factor > 1.0 and self.holds_out), reverse=True)
         made = [solve(evidence, self.grid, self.knots, self._smoothness.tied(factor)) for factor in firmly]
         return [(NOTHING, each) for each in [*made, pictures]]

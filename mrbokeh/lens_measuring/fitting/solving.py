@@ -114,7 +114,17 @@ class _Problem:
         steepest += tied[:, None] + 2.0 * smoothness.colour + 8.0 * smoothness.total_variation / _SOFT
         sides = evidence.sides[told] * (smoothness.evidence / total)
         step = 1.0 / steepest[..., None]
-        return cls(matrices, sides, grid.used, ties, smoothness, scale, total, disc.astype(np.float64), step)
+        return cls(
+            matrices=matrices,
+            sides=sides,
+            used=grid.used,
+            ties=ties,
+            smoothness=smoothness,
+            scale=scale,
+            total=total,
+            start=disc.astype(np.float64),
+            step=step,
+        )
 
     def gradient(self, q: Float64[np.ndarray, "knots channels cells"]) -> Float64[np.ndarray, "knots channels cells"]:
         out = np.matmul(self.matrices, q[..., None].astype(np.float32))[..., 0] * self.scale - self.sides

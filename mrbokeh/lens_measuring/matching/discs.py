@@ -179,7 +179,15 @@ def _disc_in(grey: Float32[np.ndarray, "height width"], box: Box, largest_value:
         return None
     full = float((values >= _FULL * largest_value).mean()) > _FULL_SHARE
     contour = even_points(contours[1] + corner, POINTS)
-    return softness / float(radii[1]), Disc(contour, centroid, float(radii[1]), level, around, _field_xy(grey.shape, centroid), full)
+    return softness / float(radii[1]), Disc(
+        contour_px=contour,
+        centroid_px=centroid,
+        radius_px=float(radii[1]),
+        level=level,
+        around=around,
+        field_xy=_field_xy(grey.shape, centroid),
+        full=full,
+    )
 
 
 def _edge(crop: Crop, middle_px: Float64[np.ndarray, "2"], size_px: tuple[int, int]) -> tuple[Sequence[Contour], float] | None:

@@ -103,7 +103,17 @@ def size_facts(
     )
 
     def made(f_number: float, f_error: float | None, focus_m: float, focus_error_m: float | None, known: bool, note: str) -> Sizes:
-        return Sizes(f_number, f_error, stated.f_number, focus_m, focus_error_m, known, diameter, error, note)
+        return Sizes(
+            f_number=f_number,
+            f_number_error=f_error,
+            stated_f_number=stated.f_number,
+            focus_distance_m=focus_m,
+            focus_error_m=focus_error_m,
+            focus_known=known,
+            diameter_px=diameter,
+            diameter_error_px=error,
+            note=note,
+        )
 
     if facts.focus_distance_m is not None and depth_m is not None:
         f_number, f_error = _with_error(lambda size: effective_f_number(stated, side * size, depth_m, image_width_px), diameter, error)
@@ -196,13 +206,15 @@ def match_lens(
     mostly_full = 2 * sum(disc.full for disc in discs) > len(discs)
     sizes = size_facts(facts, 2.0 * own[:, 2], side, depth_m, grey.shape[1], mostly_full)
     lens = Lens(
-        float(facts.focal_length_mm or 0.0),
-        sizes.f_number,
-        sizes.focus_distance_m,
-        float(facts.sensor_width_mm or 0.0),
-        _aperture(choice, mean, unknown, rim),
+        focal_length_mm=float(facts.focal_length_mm or 0.0),
+        f_number=sizes.f_number,
+        focus_distance_m=sizes.focus_distance_m,
+        sensor_width_mm=float(facts.sensor_width_mm or 0.0),
+        aperture=_aperture(choice, mean, unknown, rim),
     )
-    return LensMatch(lens, side, found, discs, own, choice, mean, rim, unknown, sizes)
+    return LensMatch(
+        lens=lens, side=side, found=found, discs=discs, own=own, choice=choice, mean=mean, rim=rim, unknown=unknown, sizes=sizes
+    )
 
 
 def _enough(found: list[Disc]) -> tuple[Disc, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from mrbokeh.lens_measuring.matching.discs import Disc, inside
-from mrbokeh.lens_measuring.matching.outline_fit import Opening, OutlineFit, fit_outlines, names_of
+from mrbokeh.lens_measuring.matching.outline_fit import BladedOpening, OutlineFit, fit_outlines, names_of
 from mrbokeh.optics.aperture import Aperture
 
 BLADES = range(5, 12)
@@ -27,7 +27,7 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class BladeChoice:
-    """Opening that explains the discs best.
+    """BladedOpening that explains the discs best.
 
     found: how many discs there were; discs: those that agree. log_evidence: of each number of blades over a round opening, natural
     logarithm (half the difference of Schwarz's BIC).
@@ -59,7 +59,7 @@ def choose_opening(discs: Sequence[Disc], side: int) -> BladeChoice:
 
 
 def _choose(discs: list[Disc], side: int) -> BladeChoice:
-    rounds = [fit_outlines(discs, Opening(0, cat_eye=sign * _START_CAT_EYE), side) for sign in (1.0, -1.0)]
+    rounds = [fit_outlines(discs, BladedOpening(0, cat_eye=sign * _START_CAT_EYE), side) for sign in (1.0, -1.0)]
     best_round = max(rounds, key=lambda fit: fit.log_likelihood)
     fits = {count: _bladed(discs, best_round, count, side) for count in BLADES}
     evidence = {count: _log_evidence(fit) - _log_evidence(best_round) for count, fit in fits.items()}

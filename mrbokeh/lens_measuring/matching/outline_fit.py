@@ -24,7 +24,7 @@ Angles = Float64[np.ndarray, "discs points"]
 
 
 @dataclass(frozen=True)
-class Opening:
+class BladedOpening:
     """Parameters of an opening with blades.
 
     blades: 0 is round, which has neither rotation nor curvature. The others as in `mrbokeh.optics.aperture.Aperture`.
@@ -42,7 +42,7 @@ class Opening:
         return Aperture(plain.outlines, plain.weights, self.cat_eye, spherical_aberration)
 
 
-def outline_radius(opening: Opening, angles_rad: Angles, field_xy: Float64[np.ndarray, "discs 2"], side: int) -> Angles:
+def outline_radius(opening: BladedOpening, angles_rad: Angles, field_xy: Float64[np.ndarray, "discs 2"], side: int) -> Angles:
     """Return the distance of the outline from the origin of the pupil in directions of the picture, from x towards y.
 
     side: +1 shows the opening as it is, -1 (in front of the focus) mirrored through the origin, with what cuts it.
@@ -58,8 +58,8 @@ def outline_radius(opening: Opening, angles_rad: Angles, field_xy: Float64[np.nd
     return np.minimum(radius, along + np.sqrt(np.maximum(1.0 - apart + along**2, 1e-9)))
 
 
-def _blades_radius(opening: Opening, angles_rad: Angles) -> Angles:
-    """Return the radius of arcs of radius 1 / |curvature| between corners on the unit circle, by the law of cosines about the arc's centre."""
+def _blades_radius(opening: BladedOpening, angles_rad: Angles) -> Angles:
+    """Return the radius of arcs (1 / |curvature|) between corners on the unit circle, by the law of cosines about the arc's centre."""
     if opening.blades == 0:
         return np.ones_like(angles_rad)
     half = np.pi / opening.blades
@@ -79,7 +79,7 @@ Own = Float64[np.ndarray, "discs 3"]
 Residuals = Float64[np.ndarray, "discs points"]
 
 
-def names_of(opening: Opening) -> tuple[str, ...]:
+def names_of(opening: BladedOpening) -> tuple[str, ...]:
     """Return the parameters of an opening that are fitted."""
     return ("rotation_rad", "curvature", "squeeze", "cat_eye") if opening.blades else ("squeeze", "cat_eye")
 
@@ -119,13 +119,13 @@ class Contours:
     def of(cls, discs: Sequence[Disc], side: int) -> "Contours":
         return cls(np.stack([disc.contour_px for disc in discs]), np.array([disc.field_xy for disc in discs]), side)
 
-    def residuals(self, opening: Opening, own: Own) -> Residuals:
+    def residuals(self, opening: BladedOpening, own: Own) -> Residuals:
         """Return residuals along the radius, px; positive outside. own: centre x, y and radius of the unit pupil of each disc."""
         away = self.points_px - own[:, None, :2]
         radius = outline_radius(opening, np.arctan2(away[..., 1], away[..., 0]), self.field_xy, self.side)
         return np.asarray(np.hypot(away[..., 0], away[..., 1]) - own[:, 2:] * radius)
 
-    def equations(self, opening: Opening, own: Own, scale_px: float) -> OutlineEquations:
+    def equations(self, opening: BladedOpening, own: Own, scale_px: float) -> OutlineEquations:
         """Return the equations of weighted least squares, with Huber's weights at this scale."""
         errors = self.residuals(opening, own)
         root = np.sqrt(np.minimum(1.0, _HUBER_TIMES * scale_px / np.maximum(np.abs(errors), 1e-12)))[..., None]
@@ -140,7 +140,7 @@ class Contours:
             shared_t @ shared - cross @ by_shared, (shared_t @ weighted - cross @ by_errors)[..., 0], by_errors[..., 0], by_shared
         )
 
-    def _slope(self, opening: Opening, own: Own, name: str, errors: Residuals) -> Residuals:
+    def _slope(self, opening: BladedOpening, own: Own, name: str, errors: Residuals) -> Residuals:
         """Return the derivative by a parameter. Steps of cat_eye lead away from zero, across which two rims cut opposite ends: a mere
         shift.
         """
@@ -152,7 +152,7 @@ class Contours:
         moved = replace(opening, **{name: value + step})  # type: ignore[arg-type]
         return np.asarray((self.residuals(moved, own) - errors) / step)
 
-    def _own_slope(self, opening: Opening, own: Own, index: int, errors: Residuals) -> Residuals:
+    def _own_slope(self, opening: BladedOpening, own: Own, index: int, errors: Residuals) -> Residuals:
         step = _OWN_STEP_PX * np.eye(3)[index]
         return np.asarray((self.residuals(opening, own + step) - errors) / _OWN_STEP_PX)
 
@@ -175,7 +175,7 @@ class OutlineFit:
     """
 
     contours: Contours
-    opening: Opening
+    opening: BladedOpening
     own: Own
     residuals_px: Residuals
 
@@ -201,7 +201,7 @@ class OutlineFit:
         return -0.5 * self.samples * float(np.log((size**2).mean() + NOISE_FLOOR_PX**2))
 
 
-def fit_outlines(discs: Sequence[Disc], start: Opening, side: int, own: Own | None = None) -> OutlineFit:
+def fit_outlines(discs: Sequence[Disc], start: BladedOpening, side: int, own: Own | None = None) -> OutlineFit:
     """Fit the opening with as many blades as `start` that is nearest to the contours, from these values on."""
     contours, opening, damping = Contours.of(discs, side), start, 1e-3
     if own is None:
@@ -225,12 +225,12 @@ def fit_outlines(discs: Sequence[Disc], start: Opening, side: int, own: Own | No
     return OutlineFit(contours, opening, own, errors)
 
 
-def _prior(opening: Opening, scale_px: float) -> Float64[np.ndarray, " shared"]:
+def _prior(opening: BladedOpening, scale_px: float) -> Float64[np.ndarray, " shared"]:
     """Return the prior that keeps what no disc tells where it started."""
     return np.array([(max(scale_px, _PRIOR_PX) / _PRIOR_SPREAD[name]) ** 2 for name in names_of(opening)])
 
 
-def _moved(opening: Opening, step: Float64[np.ndarray, " shared"]) -> Opening:
+def _moved(opening: BladedOpening, step: Float64[np.ndarray, " shared"]) -> BladedOpening:
     values = {name: getattr(opening, name) + float(change) for name, change in zip(names_of(opening), step, strict=True)}
     values["cat_eye"] = float(np.clip(values["cat_eye"], -LARGEST_CAT_EYE, LARGEST_CAT_EYE))
     values["squeeze"] = float(np.clip(values["squeeze"], 1.0 / LARGEST_SQUEEZE, LARGEST_SQUEEZE))
@@ -239,8 +239,8 @@ def _moved(opening: Opening, step: Float64[np.ndarray, " shared"]) -> Opening:
     return replace(opening, **values)
 
 
-def _standard_errors(contours: Contours, opening: Opening, own: Own) -> dict[str, float]:
-    """Return errors by name: the bootstrap's over discs (one step from the fit for each draw) and a bias that all share, added as squares."""
+def _standard_errors(contours: Contours, opening: BladedOpening, own: Own) -> dict[str, float]:
+    """Return errors by name: the bootstrap's over discs (one step from the fit per draw) and a shared bias, added as squares."""
     scale = scale_of(contours.residuals(opening, own))
     equations = contours.equations(opening, own, scale)
     prior, count = np.diag(_prior(opening, scale)), len(own)

@@ -71,7 +71,7 @@ def read_motion(path: Path | str) -> Float32[np.ndarray, "height width 2"]:
 
 
 def taken_from_channels(layer: Layer, shutter: float) -> Layer:
-    """Return the layer with its extra channels forward.u and forward.v (times alpha, as all extra channels) as its motion; else unchanged."""
+    """Return the layer with extra channels forward.u and forward.v (times alpha, as all extra channels) as its motion; else unchanged."""
     if not {"forward.u", "forward.v"} <= layer.extra.keys():
         return layer
     alpha = np.maximum(layer.alpha, np.float32(1e-6))[..., None]
@@ -111,7 +111,7 @@ class RenderChannels:
         by_part = [(part.name, part.channels if of_parts else _of_view(part.channels, chosen, views)) for part in mine]
         metadata = {key: value for part in reversed(parts) for key, value in part.attributes.items()}
         stored = tuple(sorted({name for part in mine for name in part.channels}))
-        return cls(path, _named(by_part), stored, stated_primaries(mine[0], parts), metadata)
+        return cls(path=path, channels=_named(by_part), stored=stored, primaries=stated_primaries(mine[0], parts), metadata=metadata)
 
     def colour_layer(self, wanted: str | None = None) -> str:
         """Return the layer whose R, G and B are the picture. Raises InputError if none is stated and several or none could be meant."""

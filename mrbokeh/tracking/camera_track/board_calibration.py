@@ -98,7 +98,9 @@ def _solved(board: CharucoBoard, views: Sequence[Corners], size_px: tuple[int, i
     camera = Camera(*size_px, (focal_px, focal_px), (float(matrix[0, 2]) + 0.5, float(matrix[1, 2]) + 0.5))
     distortion = {name: float(value) for name, value in zip(("k1", "k2"), coefficients[:2], strict=True) if value}
     criterion = count * np.log(rms_px**2) + _PARAMETERS[freed] * np.log(count)
-    return float(criterion), Calibration(camera, distortion, focal_sigma, float(rms_px), len(views))
+    return float(criterion), Calibration(
+        camera=camera, distortion=distortion, focal_sigma=focal_sigma, residual_px=float(rms_px), views=len(views)
+    )
 
 
 def _scaled(factor: float) -> Float64[np.ndarray, "3 3"]:

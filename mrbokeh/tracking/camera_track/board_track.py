@@ -48,7 +48,13 @@ class Intrinsics:
     def _turned_once(self) -> "Intrinsics":
         """Return the intrinsics after one quarter turn: a point (x, y) comes to (y, width - x)."""
         (fx, fy), (cx, cy), width_px = self.camera.focal_px, self.camera.principal_px, self.camera.width_px
-        camera = Camera(self.camera.height_px, width_px, (fy, fx), (cy, width_px - cx), np.eye(4))
+        camera = Camera(
+            width_px=self.camera.height_px,
+            height_px=width_px,
+            focal_px=(fy, fx),
+            principal_px=(cy, width_px - cx),
+            camera_from_world=np.eye(4),
+        )
         if self.distortion is None:
             return Intrinsics(camera)
         p1, p2 = (self.distortion.get(name, 0.0) for name in ("p1", "p2"))
@@ -264,14 +270,14 @@ def _judged(corners: Sequence[Corners], found: dict[int, PoseFit], shot: _Shot, 
     lost = tuple(number for number in range(len(corners)) if number not in poses)
     after_px, before_px = (residual_px(observed, each, shot.board, shot.camera) for each in (poses, measured))
     return BoardTrack(
-        CameraTrack(frames, "-z"),
-        len(corners),
-        len(fits),
-        tuple(sorted(bridged)),
-        lost,
-        after_px,
-        before_px,
-        tuple(sorted(set(found) - set(fits))),
+        track=CameraTrack(frames, "-z"),
+        frame_count=len(corners),
+        seen=len(fits),
+        bridged=tuple(sorted(bridged)),
+        lost=lost,
+        residual_px=after_px,
+        measured_residual_px=before_px,
+        unsure=tuple(sorted(set(found) - set(fits))),
     )
 
 

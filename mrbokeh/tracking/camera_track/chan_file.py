@@ -66,7 +66,13 @@ def _camera(values: Sequence[float], size_px: tuple[int, int], order: str) -> Ca
     # Lower case stands for fixed axes, in the order of application.
     turn = Rotation.from_euler(order.lower(), _in_order(angles_deg, order), degrees=True)
     pose = from_opengl(rigid(turn.as_matrix(), np.asarray(place, np.float64)))
-    return Camera(width_px, height_px, (float(focal_px), float(focal_px)), (width_px / 2.0, height_px / 2.0), pose)
+    return Camera(
+        width_px=width_px,
+        height_px=height_px,
+        focal_px=(float(focal_px), float(focal_px)),
+        principal_px=(width_px / 2.0, height_px / 2.0),
+        camera_from_world=pose,
+    )
 
 
 def _in_order(xyz_deg: Sequence[float], order: str) -> list[float]:

@@ -75,7 +75,13 @@ def tracked_frame(image: ColmapImage, camera: ColmapCamera, options: TrackOption
     focal_px = (told.get("fx", told.get("f", 0.0)), told.get("fy", told.get("f", 0.0)))
     pose = rigid(_rotation(image.turn, where), np.array(image.shift, np.float64))
     distortion = {name: told[name] for name in DISTORTION_NAMES if name in told} if options.keep_distortion else {}
-    made = Camera(camera.width_px, camera.height_px, focal_px, (told["cx"], told["cy"]), pose)
+    made = Camera(
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        focal_px=focal_px,
+        principal_px=(told["cx"], told["cy"]),
+        camera_from_world=pose,
+    )
     return TrackedFrame(made, distortion=distortion if any(distortion.values()) else None)
 
 

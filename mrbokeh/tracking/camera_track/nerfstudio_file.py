@@ -84,7 +84,9 @@ def _camera(document: Mapping[str, Any], pose: np.ndarray, where: str) -> Camera
     if focal_x is None or focal_y is None:
         raise InputError(f"{where}: expected a focal length as fl_x or camera_angle_x")
     principal_px = float(document.get("cx", width_px / 2.0)), float(document.get("cy", height_px / 2.0))
-    return Camera(width_px, height_px, (focal_x, focal_y), principal_px, from_opengl(pose))
+    return Camera(
+        width_px=width_px, height_px=height_px, focal_px=(focal_x, focal_y), principal_px=principal_px, camera_from_world=from_opengl(pose)
+    )
 
 
 def _focal_px(document: Mapping[str, Any], axis: str, side_px: int) -> float | None:

@@ -114,7 +114,9 @@ def camera_on_stage(
     offset = lens.get("projectionOffset", {"x": 0.0, "y": 0.0})
     focal_px = focal_mm * width_px / width_mm, focal_mm * height_px / height_mm
     principal_px = (0.5 + float(offset["x"]) / width_mm) * width_px, (0.5 + float(offset["y"]) / height_mm) * height_px
-    return Camera(width_px, height_px, focal_px, principal_px, camera_from_world), focal_mm
+    return Camera(
+        width_px=width_px, height_px=height_px, focal_px=focal_px, principal_px=principal_px, camera_from_world=camera_from_world
+    ), focal_mm
 
 
 def distortion_of(lens: Mapping[str, Any], focal_mm: float, where: str) -> Distortion | None:
@@ -251,7 +253,9 @@ def _frame(sample: Mapping[str, Any], static: Mapping[str, Any], options: TrackO
         raise ValueError("transforms with a scale are not read")
     camera, focal_mm = camera_on_stage(static, lens, camera_from_stage(sample), options, where)
     distortion = distortion_of(lens, focal_mm, where) if options.keep_distortion else None
-    return TrackedFrame(camera, known(lens, "focusDistance"), known(lens, "fStop"), time_s, distortion)
+    return TrackedFrame(
+        camera=camera, focus_distance_m=known(lens, "focusDistance"), f_number=known(lens, "fStop"), time_s=time_s, distortion=distortion
+    )
 
 
 def _sample(frame: TrackedFrame, sensor_mm: float) -> dict[str, Any]:

@@ -60,11 +60,11 @@ Pose = Float64[np.ndarray, "4 4"]
 def between(one: TrackedFrame, other: TrackedFrame, share: float) -> TrackedFrame:
     """Interpolate two frames: share 0 is one, 1 is the other; what only one of them knows is not known in between."""
     return TrackedFrame(
-        camera_between(one.camera, other.camera, share),
-        focus_between_m(one.focus_distance_m, other.focus_distance_m, share),
-        stop_between(one.f_number, other.f_number, share),
-        _linear(one.time_s, other.time_s, share),
-        _distortion(one.distortion, other.distortion, share),
+        camera=camera_between(one.camera, other.camera, share),
+        focus_distance_m=focus_between_m(one.focus_distance_m, other.focus_distance_m, share),
+        f_number=stop_between(one.f_number, other.f_number, share),
+        time_s=_linear(one.time_s, other.time_s, share),
+        distortion=_distortion(one.distortion, other.distortion, share),
     )
 
 
@@ -74,7 +74,13 @@ def camera_between(one: Camera, other: Camera, share: float) -> Camera:
         tuple((1.0 - share) * x + share * y for x, y in zip(*pair, strict=True))
         for pair in ((one.focal_px, other.focal_px), (one.principal_px, other.principal_px))
     )
-    return Camera(one.width_px, one.height_px, (focal[0], focal[1]), (principal[0], principal[1]), pose)
+    return Camera(
+        width_px=one.width_px,
+        height_px=one.height_px,
+        focal_px=(focal[0], focal[1]),
+        principal_px=(principal[0], principal[1]),
+        camera_from_world=pose,
+    )
 
 
 def pose_between(one: Pose, other: Pose, share: float) -> Pose:
