@@ -1,8 +1,6 @@
-"""The searches of mrbokeh.layering.hidden_background, compiled. Pixels are called by place: row times width plus column.
+"""Compiled searches of mrbokeh.layering.hidden_background: depth edges, mixed edge pixels, and the background behind them.
 
-Edges of the depth map for layering.hidden_background, compiled. Whether a pixel needs a closer look at all is asked of whole rows.
-
-How mrbokeh.layering.hidden_background parts the pixels of a rim, compiled.
+A place is a pixel's number: row times width plus column.
 """
 
 import math
@@ -19,8 +17,8 @@ def snap(snapped: np.ndarray, coc_px: np.ndarray, lit: np.ndarray, step_px: floa
     """Rows top to bottom of circles of confusion in which no pixel floats in the air between two surfaces, as antialiased or
     resized depth makes them.
 
-    A pixel between two even surfaces, each at most 2 pixels away on opposite sides, takes the nearer value of the two; a lit one
-    does not, for lamps do hang in the air.
+    A pixel between two even surfaces, each at most 2 pixels away on opposite sides, takes the nearer value of the two; a highlight does
+    not, for lamps do hang in the air.
     """
     height, width = coc_px.shape
     lowest, highest, even_px = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32), np.float32(0.5 * step_px)
@@ -41,8 +39,9 @@ def snap(snapped: np.ndarray, coc_px: np.ndarray, lit: np.ndarray, step_px: floa
 
 @njit(cache=True, nogil=True)
 def find_rims(rim: np.ndarray, coc_px: np.ndarray, step_px: float, top: int, bottom: int) -> None:
-    """Rows top to bottom of rim (H, W), bool: pixels with something more than `step_px` nearer beside them; they may hold some of
-    its colour."""
+    """Set rows top to bottom of rim (H, W), bool: True if a neighbour is more than `step_px` nearer, so that the pixel may hold some of
+    its colour.
+    """
     width = coc_px.shape[1]
     lowest, highest, least_px = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32), np.float32(step_px)
     for y in range(top, bottom):
@@ -54,7 +53,9 @@ def find_rims(rim: np.ndarray, coc_px: np.ndarray, step_px: float, top: int, bot
 
 @njit(cache=True, nogil=True)
 def _extremes_of_columns(lowest: np.ndarray, highest: np.ndarray, coc_px: np.ndarray, y: int) -> None:
-    """The least and the greatest of rows y - 1 to y + 1 (those there are), one pixel on the left; the ends are repeated."""
+    """Set the least and the greatest value of rows y - 1 to y + 1 of each column, padded by one pixel on either side; the ends are
+    repeated.
+    """
     height, width = coc_px.shape
     above, here, below = coc_px[max(y - 1, 0)], coc_px[y], coc_px[min(y + 1, height - 1)]
     low, high = lowest[1 : width + 1], highest[1 : width + 1]
@@ -101,11 +102,11 @@ def unmix_rims(
 ) -> None:
     """Split rim pixels into what the nearer neighbour gave, in front, and the rest, which replaces what was filled in behind.
 
-    rims: (R,) places. front: (R, C), the pixels before; behind: (N, C), at of_behind (R,) what was filled in.
-    Of the nearer neighbours the one counts that differs most from what is filled in: it is the least mixed itself. Its share
-    explains the pixel best as a mixture of the two, is smaller the worse the mixture explains it, and at most 0.6, as the pixel's
-    own depth is that behind. One brighter than the neighbour is no mixture of it (a lamp behind a wire) and stays whole.
-    Front and rest together are the pixel: no light is lost.
+    rims: (R,) places. front: (R, C), the pixels before; behind: (N, C), at of_behind (R,) what was filled in. The nearer neighbour that
+    differs most from the filled-in colour counts, being the least mixed itself. Its share is the one that explains the pixel best as a
+    mixture of the two, less the worse that explanation is, and at most 0.6, because the pixel's own depth is the one behind. A pixel
+    brighter than that neighbour is no mixture (a lamp behind a wire) and stays whole. Front and rest together are the pixel: no light is
+    lost.
     """
     width, channels = values.shape[1:]
     for i in range(len(rims)):
@@ -131,7 +132,9 @@ def unmix_rims(
 
 @njit(cache=True, nogil=True)
 def _most_different(values: np.ndarray, coc_px: np.ndarray, y: int, x: int, filled: np.ndarray, step_px: float) -> tuple[int, int, float]:
-    """Of the nearer neighbours the one whose colour is farthest from what is filled in, and the square of that distance; else -1."""
+    """Return row and column of the nearer neighbour whose colour differs most from the filled-in background, and the squared difference;
+    rows -1 if there is none.
+    """
     height, width, _ = values.shape
     fy, fx, most = -1, -1, 0.0
     for ny in range(max(0, y - 1), min(height, y + 2)):
@@ -147,7 +150,7 @@ def _most_different(values: np.ndarray, coc_px: np.ndarray, y: int, x: int, fill
 
 @njit(cache=True, nogil=True)
 def _lamp_in_front(values: np.ndarray, coc_px: np.ndarray, y: int, x: int, step_px: float) -> bool:
-    """Whether the brightest of the 5x5 pixels around, the lamp whose light a pixel holds, is nearer than the pixel."""
+    """Return whether the brightest of the 5x5 pixels around, the highlight whose light the pixel holds, is nearer than the pixel."""
     height, width, _ = values.shape
     brightest, nearer = -1.0, False
     for ny in range(max(0, y - 2), min(height, y + 3)):
@@ -160,7 +163,7 @@ def _lamp_in_front(values: np.ndarray, coc_px: np.ndarray, y: int, x: int, step_
 
 @njit(cache=True, nogil=True)
 def pure_neighbours(places: np.ndarray, coc_px: np.ndarray, pure: np.ndarray, step_px: float, radius_px: int) -> np.ndarray:
-    """For each of the places, not pure itself, the nearest pure pixel of the same surface; -1 where none is within `radius_px`."""
+    """Return for each mixed pixel of `places` the place of the nearest pure pixel of the same surface; -1 if none is within `radius_px`."""
     height, width = coc_px.shape
     nearest = np.full(len(places), -1, np.int32)
     for i in range(len(places)):
@@ -186,7 +189,7 @@ def nearest_behind(
     pure: np.ndarray,
     step_px: float,
 ) -> None:
-    """Set seeds (H W, zeros before) to one more than the place of the nearest pure pixel that lies more than `step_px` behind.
+    """Set seeds (H W, zeros before) to one plus the place of the nearest pure pixel that lies more than `step_px` behind.
 
     Where the lens sees none they stay 0. rims: places of rim pixels; pure: the pure pixel beside each, or -1.
     The lens sees past an edge by half the difference of the two circles of confusion (and a rim's width more is searched).
@@ -222,8 +225,9 @@ def _pass_on(
     nearer_px: float,
     step_px: float,
 ) -> int:
-    """Let those around (y, x) with a smaller circle of confusion than `nearer_px` take its seed and queue, if that lies behind them,
-    within sight, and nearer than the seed they have; the new end of the queue."""
+    """Offer a seed to the pixels around (y, x) whose circle of confusion is below `nearer_px`, and return the new end of the queue. A
+    pixel takes the seed and is queued if the seed lies behind it, within sight, and nearer than the seed that it has.
+    """
     height, width = coc_px.shape
     sy, sx, seed_px = seed // width, seed % width, coc_px[seed // width, seed % width]
     for ny in range(max(0, y - 1), min(height, y + 2)):
@@ -243,7 +247,7 @@ def _pass_on(
 
 @njit(cache=True, nogil=True, inline="always")
 def _is_on(coc_px: np.ndarray, y: int, x: int, surface_coc_px: float, surface_px: float) -> bool:
-    """Whether there is a pixel in this place, and it lies on the surface with this circle of confusion."""
+    """Return whether (y, x) is a pixel that lies on the surface with this circle of confusion."""
     return 0 <= y < coc_px.shape[0] and 0 <= x < coc_px.shape[1] and abs(coc_px[y, x] - surface_coc_px) <= surface_px
 
 
@@ -262,8 +266,8 @@ def interpolate(
 ) -> None:
     """Set filled (N, C) and its circles of confusion, first to end, to what is around each of the places on its seed's surface.
 
-    The first pure pixels (of coc_px; others are NaN) along 8 paths, up to twice as far as the seed, weighted by one over the squared
-    distance; on each path the mean of a quarter as many pixels as they are far. So behind a thin wire this interpolates
+    They are the first pure pixels (mixed ones have coc_px NaN) along 8 paths, up to twice as far as the seed, weighted by one over the
+    squared distance; each path gives the mean of a quarter as many pixels as the first is far. So behind a thin wire this interpolates
     between both sides, and behind a broad object it continues what is beside it, ever smoother, as a guess should be.
     """
     width, channels = values.shape[1:]

@@ -1,11 +1,4 @@
-"""The search of mrbokeh.layering.highlights, compiled: a bound that vectorises, then a count where the bound does not decide.
-
-The loop over pixels of mrbokeh.layering.motion.
-
-The loop over pixels of mrbokeh.layering.pixel_box.
-
-The loop of mrbokeh.layering.padded_layers, compiled.
-"""
+"""Compiled loops over the pixels of one layer, before it is cut into slices: highlights, paths of motion, the box that is lit, margins."""
 
 import math
 
@@ -20,8 +13,8 @@ _MOST = 13  # of 25
 def mark_rows(lit: np.ndarray, values: np.ndarray, ratio: np.float32, top: int, bottom: int) -> None:
     """Rows top to bottom of lit (H, W): pixels of values (H, W, 3 or more) more than `ratio` times as bright as most of the 5x5 around.
 
-    A pixel's brightness is its strongest channel. Where most of 5 columns of 5 are that much darker, most of one column are; so one
-    that is not so much brighter than the least of the columns' medians needs no count.
+    A pixel's brightness is its strongest channel. If most of the 25 are that much darker, so are most of at least one column: a pixel that
+    is not `ratio` times the least of the columns' medians needs no count. That bound vectorises.
     """
     height, width, _ = values.shape
     first, end = max(0, top - 2), min(height, bottom + 2)
@@ -43,7 +36,7 @@ def mark_rows(lit: np.ndarray, values: np.ndarray, ratio: np.float32, top: int, 
 
 @njit(cache=True, nogil=True)
 def _medians_of_columns(medians: np.ndarray, brightness: np.ndarray, y: int) -> None:
-    """The medians of the 5 rows around y, two pixels on the left; beyond the ends the last row or column is repeated."""
+    """Set the medians of the 5 rows around y, padded by two pixels on either side; beyond the ends the last row or column is repeated."""
     rows, width = brightness.shape
     a, b, c = brightness[max(y - 2, 0)], brightness[max(y - 1, 0)], brightness[y]
     d, e = brightness[min(y + 1, rows - 1)], brightness[min(y + 2, rows - 1)]
@@ -93,7 +86,7 @@ def draw_out(
 def _put(
     value: np.ndarray, coc_px: float, x: float, y: float, share: float, out: np.ndarray, coc_sum: np.ndarray, weight_sum: np.ndarray
 ) -> None:
-    """One place between four pixels."""
+    """Add one place between four pixels to the sums."""
     height, width, channels = out.shape
     left, top = int(math.floor(x)), int(math.floor(y))
     for row in range(top, top + 2):
@@ -109,7 +102,7 @@ def _put(
 
 @njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def widen(box: np.ndarray, flat: np.ndarray, channels: int) -> None:
-    """Widen the box (top, bottom, left, right) by all pixels of rows (H, W * channels) that are not 0."""
+    """Widen the box (top, bottom, left, right) so that it holds all pixels of the rows (H, W * channels) that are not 0."""
     height, count = flat.shape
     for y in range(height):
         touched = 0
@@ -128,7 +121,7 @@ def widen(box: np.ndarray, flat: np.ndarray, channels: int) -> None:
 
 @njit(cache=True, nogil=True)
 def put_side_by_side(values: np.ndarray, rgb: np.ndarray, alpha: np.ndarray, margin_px: int, top: int, bottom: int) -> None:
-    """Rows top to bottom of rgb (H, W, 3) and alpha (H, W) into the first four channels of values, which has a margin all around."""
+    """Copy rows top to bottom of rgb (H, W, 3) and alpha (H, W) into the first four channels of values, which has a margin all around."""
     width = alpha.shape[1]
     for y in range(top, bottom):
         for x in range(width):

@@ -1,11 +1,8 @@
-"""The loops over pixels of mrbokeh.layering.slices, compiled.
+"""Compiled loops of mrbokeh.layering.slices: what covers what, pixels sorted into slices, their light laid out and claimed, components.
 
-Pixels of a layer go by their number; their places, row times width plus column, ascend. Runs of numbers are of one slice and
-one row, without gaps: what is done for a pixel is done for neighbours in memory.
-
-The loops of mrbokeh.layering.slices, compiled: a grid of square cells lies over the frame; runs are those of slice_sorting.
-
-So little work that other threads need not be let in meanwhile, as nogil would: to get back among them takes longer.
+Pixels of a layer go by their number; their places, row times width plus column, ascend. A run is a range of numbers in one slice and
+one row, without gaps, so that neighbours in memory are worked through together. Components are found on a grid of square cells over
+the frame; those loops are so short that releasing the GIL (nogil) would cost more than it saves.
 """
 
 import numpy as np
@@ -23,7 +20,7 @@ def mark_cells(cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.nda
 
 @njit(cache=True)
 def label_components(cells: np.ndarray) -> int:
-    """Number marked cells from 1 on, those that touch at a side or a corner alike; how many numbers there are."""
+    """Number the marked cells from 1 on, cells that touch at a side or a corner alike, and return how many numbers there are."""
     rows, columns = cells.shape
     count, stack = 0, np.empty(cells.size, np.int64)
     for start in range(cells.size):
@@ -44,7 +41,9 @@ def label_components(cells: np.ndarray) -> int:
 
 @njit(cache=True)
 def components_of_runs(boxes: np.ndarray, cells: np.ndarray, cell_px: int, runs: np.ndarray, places: np.ndarray, width: int) -> np.ndarray:
-    """(R,) which component, from 0 on, each run belongs to; widens boxes (components, 4: first and end row, first and end column) by them."""
+    """Return (R,) the component, from 0 on, of each run, and widen boxes (components, 4: first and end row, first and end column) by
+    the runs.
+    """
     components = np.empty(len(runs), np.int32)
     for r in range(len(runs)):
         y, x = places[runs[r, 0]] // width, places[runs[r, 0]] % width
@@ -57,7 +56,9 @@ def components_of_runs(boxes: np.ndarray, cells: np.ndarray, cell_px: int, runs:
 
 @njit(cache=True)
 def join_components(boxes: np.ndarray, reach: int, pixels_per_spread: int) -> np.ndarray:
-    """(components,) which other component, or itself, each is joined with, where one window for both costs less than two; boxes are widened."""
+    """Return (components,) the component that each is joined with, itself if none: one window for both costs less than two. Widens
+    boxes.
+    """
     joined = np.arange(len(boxes))
     changed = True
     while changed:
@@ -95,10 +96,10 @@ def cover(
     first_place: int,
     end_place: int,
 ) -> None:
-    """Let pixels of values (N, C) take what they cover from what is free (H W); shown (N,) is what was free at their places before.
-    Those from one place to another, so that bands of the frame can be worked through side by side.
+    """Let pixels of values (N, C) cover what is free (H W) from one place to another; shown (N,) is what was free at their places before.
 
-    crossing (N,): the rest, where they lie behind the focus and the nearest so far (nearest_px, (H W), not above 0) in front of it.
+    crossing (N,): the rest, if the pixel lies behind the focus and the nearest so far (nearest_px (H W), not above 0) in front of it.
+    Ranges of places can be worked through side by side.
     """
     one, nothing = np.float32(1.0), np.float32(0.0)
     for i in range(np.searchsorted(places, first_place), np.searchsorted(places, end_place)):
@@ -114,7 +115,7 @@ def cover(
 def runs_of_slices(
     places: np.ndarray, coc_px: np.ndarray, shares: np.ndarray, width: int, step_px: np.float32, first: int, end: int
 ) -> np.ndarray:
-    """(R, 3) slice, first number and end of the runs of pixels that have a share, among those from first to end."""
+    """Return (R, 3): slice, first number and end of each run of pixels that have a share, among the numbers from first to end."""
     slices = np.empty(end - first, np.int32)
     none = np.int32(-(1 << 31))
     for i in range(first, end):
@@ -139,7 +140,7 @@ def runs_of_slices(
 
 @njit(cache=True)
 def extent(runs: np.ndarray, places: np.ndarray, width: int) -> tuple[int, int, int, int]:
-    """First and end row, first and end column of runs (R, 2), at least one."""
+    """Return first and end row, first and end column of runs (R, 2), at least one."""
     left, right = width, 0
     for r in range(len(runs)):
         column = places[runs[r, 0]] % width
@@ -162,7 +163,7 @@ def place_light(
 ) -> np.ndarray:
     """Put pixels times their shares into light (h, w, C), a window of the frame, zero where nothing is.
 
-    Pixels outside the window and such that cover nothing are left out. Returns those whose place is taken, as runs.
+    Pixels outside the window and pixels that cover nothing are left out. Returns the runs of pixels whose place is taken.
     """
     rows, columns, channels = light.shape
     waiting = [0 for _ in range(0)]
@@ -191,7 +192,7 @@ def place_light(
 
 @njit(cache=True, nogil=True)
 def _is_free(light: np.ndarray, values: np.ndarray) -> bool:
-    """Whether all these pixels of four channels cover something, and their places are empty."""
+    """Return whether all these pixels of four channels cover something, and their places are empty."""
     least, most = np.float32(np.inf), np.float32(0.0)
     for i in range(3, len(values), 4):
         least, most = min(least, values[i]), max(most, light[i])
@@ -200,7 +201,7 @@ def _is_free(light: np.ndarray, values: np.ndarray) -> bool:
 
 @njit(cache=True, nogil=True)
 def _put_all(light: np.ndarray, values: np.ndarray, shares: np.ndarray) -> None:
-    """Pixels of four channels times their shares, without a branch so that it vectorises."""
+    """Set pixels of four channels times their shares, without a branch so that it vectorises."""
     for i in range(len(shares)):
         for c in range(4):
             light[4 * i + c] = values[4 * i + c] * shares[i]
@@ -222,7 +223,8 @@ def remove_light(
 
 @njit(cache=True, nogil=True)
 def claim(colour: np.ndarray, taken: np.ndarray, light: np.ndarray, top: int, left: int) -> None:
-    """Let light (h, w, 3 + K + E) take what is still free of the pupil; in place on colour (H, W, 3 + E) and taken (H, W, K), K 1 or 3.
+    """Add light (h, w, 3 + K + E) to colour (H, W, 3 + E) as far as the pupil is still free, and its coverage to taken (H, W, K), K 1 or
+    3.
 
     The light's first row and column are `top` and `left` in the frame, which may lie outside; what falls outside is lost.
     """
@@ -238,7 +240,7 @@ def claim(colour: np.ndarray, taken: np.ndarray, light: np.ndarray, top: int, le
 
 @njit(cache=True, nogil=True)
 def _claim_row(colour: np.ndarray, taken: np.ndarray, light: np.ndarray) -> None:
-    """Pixels of R, G, B and one coverage, without a branch so that it vectorises."""
+    """Claim for pixels of R, G, B and one coverage, without a branch so that it vectorises."""
     one, nothing = np.float32(1.0), np.float32(0.0)
     for x in range(len(taken)):
         coverage = light[4 * x + 3]
@@ -251,7 +253,7 @@ def _claim_row(colour: np.ndarray, taken: np.ndarray, light: np.ndarray) -> None
 
 @njit(cache=True, nogil=True)
 def _claim_any_row(colour: np.ndarray, taken: np.ndarray, light: np.ndarray) -> None:
-    """Each colour by its own coverage, or all by the only one; other channels go with green."""
+    """Claim for each colour by its own coverage, or for all by the only one; other channels go with green."""
     width, colours = colour.shape
     kinds = taken.shape[1]
     for x in range(width):
@@ -270,7 +272,7 @@ def _claim_any_row(colour: np.ndarray, taken: np.ndarray, light: np.ndarray) -> 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def share_out(colour: np.ndarray, taken: np.ndarray, least: np.float32) -> None:
-    """Divide colour (H, W, 3 + E) by what is taken (H, W, K), at least `least`, which then is 1."""
+    """Divide colour (H, W, 3 + E) by what is taken (H, W, K), at least `least`; taken becomes 1."""
     height, width, colours = colour.shape
     kinds = taken.shape[2]
     for y in range(height):

@@ -1,11 +1,10 @@
-"""What a picture does not show: the background behind the edges of what is near, and how edge pixels mix the two.
+"""Background that a picture does not show: filled in behind the edges of what is near, or known from another view.
 
-A pixel beside something nearer holds some of its colour (antialiasing), though its depth is one or the other: such rims
-would stay behind as sharp ghosts of a blurred wire, and a lamp's as a bright dot. They are taken apart. The lens looks past
-an edge by half the difference of the two circles of confusion; no farther is anything filled in. Lights are no source
-for it, or a single lamp beside an edge would shine twice.
-
-Another view of the same scene, moved into this camera: what lies behind the edges of a picture need not be guessed.
+A pixel beside something nearer holds some of its colour (antialiasing), though its depth is one or the other: such edges
+would stay behind as sharp ghosts of a blurred wire, and a lamp's as a bright dot. Mixed edges are split. The lens looks past
+an edge by half the difference of the two circles of confusion; no farther is anything filled in. Highlights are no source
+for it, or a single lamp beside an edge would shine twice. `layer_from_view` moves another view of the scene into this camera,
+so that what lies behind the edges need not be guessed.
 """
 
 from concurrent.futures import Executor
@@ -36,7 +35,7 @@ def layer_from_view(
 
     shown_depth_m: depth of the picture that `camera` took; then only what lies behind that is kept, 2 % at least.
     Every pixel goes to the one pixel that its point falls on, and the nearest point wins; holes of single pixels, as
-    enlarging leaves them, take the mean of neighbours at their depth. To be listed behind the picture of `camera`.
+    enlarging leaves them, take the mean of neighbours at their depth. List it behind the picture of `camera`.
     """
     if depth_m.shape != (view.height_px, view.width_px):
         raise InputError(
@@ -58,14 +57,14 @@ def layer_from_view(
 
 
 def _nearest(target: Int[np.ndarray, " points"], z_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each target pixel once, and which of its points is the nearest."""
+    """Return each target pixel once, and which of its points is the nearest."""
     order = np.lexsort((z_m, target))
     first = np.concatenate([[True], np.diff(target[order]) != 0])[: len(order)]
     return target[order][first], order[first]
 
 
 def _closed(rgb: Float32[np.ndarray, "height width 3"], depth_m: Float32[np.ndarray, "height width"]) -> Layer:
-    """Holes with at least 5 of 8 neighbours, all about as deep as the nearest of them, become their mean."""
+    """Fill holes that have at least 5 of 8 neighbours about as deep as the nearest of them with the mean of these."""
     around = np.stack([np.roll(depth_m, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)])
     colours = np.stack([np.roll(rgb, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)])
     alike = around <= around.min(axis=0) * (1.0 + _SAME_DEPTH)
@@ -91,7 +90,7 @@ Places = Int32[np.ndarray, " _"]
 
 @dataclass(frozen=True)
 class _Edges:
-    """The circles of confusion with none floating in the air, the pixels beside something nearer, and lights."""
+    """Circles of confusion with none between two surfaces, the pixels beside something nearer, the pixels of one surface, and highlights."""
 
     coc_px: Float32[np.ndarray, "height width"]
     rims: Places
@@ -99,23 +98,23 @@ class _Edges:
     lit: Mask
 
 
-def split_edges(sheet: PaddedLayer, pool: Executor) -> tuple[Pixels, Pixels]:
-    """An opaque sheet as what is in front, with soft rims, and what lies behind its edges. The front takes over the sheet's memory."""
-    edges = _edges(sheet, pool)
+def split_edges(layer: PaddedLayer, pool: Executor) -> tuple[Pixels, Pixels]:
+    """Return an opaque layer as what is in front, with soft edges, and what lies behind them. The front takes over the layer's memory."""
+    edges = _edges(layer, pool)
     rims, places, seeds = _sources(edges)
-    behind = _filled(sheet.values, edges, places, seeds, pool)
-    _unmix(sheet.values, edges, rims, behind)
-    return Pixels.of(PaddedLayer(sheet.values, edges.coc_px, False)), behind
+    behind = _filled(layer.values, edges, places, seeds, pool)
+    _unmix(layer.values, edges, rims, behind)
+    return Pixels.of(PaddedLayer(layer.values, edges.coc_px, False)), behind
 
 
-def _edges(sheet: PaddedLayer, pool: Executor) -> _Edges:
+def _edges(layer: PaddedLayer, pool: Executor) -> _Edges:
     from mrbokeh.layering._hidden_background_numba import find_rims, snap
 
-    coc_px, lit, rim = np.empty_like(sheet.coc_px), np.empty(sheet.coc_px.shape, np.bool_), np.empty(sheet.coc_px.shape, np.bool_)
+    coc_px, lit, rim = np.empty_like(layer.coc_px), np.empty(layer.coc_px.shape, np.bool_), np.empty(layer.coc_px.shape, np.bool_)
 
     def look(top: int, bottom: int) -> None:
-        mark_highlights(lit, sheet.values, top, bottom)
-        snap(coc_px, sheet.coc_px, lit, _STEP_PX, top, bottom)
+        mark_highlights(lit, layer.values, top, bottom)
+        snap(coc_px, layer.coc_px, lit, _STEP_PX, top, bottom)
 
     in_bands(pool, len(rim), _BAND_ROWS, look)
     in_bands(pool, len(rim), _BAND_ROWS, lambda top, bottom: find_rims(rim, coc_px, _STEP_PX, top, bottom))
@@ -123,7 +122,9 @@ def _edges(sheet: PaddedLayer, pool: Executor) -> _Edges:
 
 
 def _sources(edges: _Edges) -> tuple[Places, Places, Places]:
-    """Rim pixels beside pure ones; where the lens sees behind an edge, those included, and the nearest pure pixel of what it sees there."""
+    """Return edge pixels beside pure ones, the places at which the lens sees behind an edge (edges included), and for each of these
+    the nearest pure pixel of what it sees there.
+    """
     from mrbokeh.layering._hidden_background_numba import nearest_behind, pure_neighbours
 
     pure = pure_neighbours(edges.rims, edges.coc_px, edges.pure, _STEP_PX, _RIM_PX)
@@ -137,7 +138,7 @@ def _sources(edges: _Edges) -> tuple[Places, Places, Places]:
 
 
 def _filled(values: Values, edges: _Edges, places: Places, seeds: Places, pool: Executor) -> Pixels:
-    """What lies behind at these places, interpolated from what is around on the surface of each one's seed."""
+    """Return the background at these places, interpolated from the pixels around on the surface of each one's seed."""
     from mrbokeh.layering._hidden_background_numba import interpolate
 
     filled = Pixels(places, np.empty((len(places), values.shape[2]), np.float32), np.empty(len(places), np.float32))
@@ -152,7 +153,7 @@ def _filled(values: Values, edges: _Edges, places: Places, seeds: Places, pool: 
 
 
 def _paths(places: Places, seeds: Places, width: int) -> Int32[np.ndarray, "8 _ 2"]:
-    """Rows down and columns to the right in 8 directions, at every distance that is looked at."""
+    """Return rows down and columns to the right in 8 directions, at every distance that is looked at."""
     farthest_px = np.hypot(seeds // width - places // width, seeds % width - places % width).max(initial=0.0)
     angles_rad = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
     distances_px = np.arange(int(3.0 * farthest_px) + 6)
@@ -161,7 +162,7 @@ def _paths(places: Places, seeds: Places, width: int) -> Int32[np.ndarray, "8 _ 
 
 
 def _unmix(values: Values, edges: _Edges, rims: Places, behind: Pixels) -> None:
-    """Part the pixels of rims in place: the front's share stays, the rest goes behind."""
+    """Split edge pixels in place: the front's share stays, the rest goes behind."""
     from mrbokeh.layering._hidden_background_numba import unmix_rims
 
     flat_values, flat_coc_px = values.reshape(-1, values.shape[2]), edges.coc_px.reshape(-1)

@@ -1,4 +1,4 @@
-"""Lights in a picture: pixels far brighter than what is around them."""
+"""Highlights of a picture: pixels far brighter than those around them."""
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -10,21 +10,21 @@ Mask = Bool[np.ndarray, "height width"]
 
 
 def find_highlights(values: Values) -> Mask:
-    """Pixels several times brighter than the median of the 5x5 pixels around them. values: R, G, B and any others."""
+    """Return a mask of the pixels several times brighter than the median of the 5x5 pixels around them. values: R, G, B and any others."""
     lit = np.empty(values.shape[:2], np.bool_)
     mark_highlights(lit, np.ascontiguousarray(values), 0, len(lit))
     return lit
 
 
 def mark_highlights(lit: Mask, values: Values, top: int, bottom: int) -> None:
-    """Set rows top to bottom of lit."""
+    """Set rows top to bottom of a mask, as `find_highlights` does for all."""
     from mrbokeh.layering._pixels_numba import mark_rows
 
     mark_rows(lit, values, _LIGHT_OVER_SURROUNDINGS, top, bottom)
 
 
 def without_highlights(values: Values) -> Values:
-    """The picture with the median of the surroundings in place of lights; the same array if there are none."""
+    """Return the picture with the median of the surroundings in place of highlights; the same array if there are none."""
     from cv2 import medianBlur
 
     lit = find_highlights(values)

@@ -1,6 +1,6 @@
 """Layering: layers with depth become slices of the circle of confusion, and slices, spread one by one, become a picture again.
 
-Shared by all renderers that spread light; they differ in the `KernelSum` alone.
+Shared by all renderers that sum kernels; they differ in the `KernelSum` alone (mrbokeh.layering.psf_over_field).
 
 Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.drawn_diameters) from here on.
 1. Every layer is continued beyond the frame by the largest blur: the border of an opaque one outwards, one with holes not at all.
@@ -44,7 +44,7 @@ _KEPT = ZeroedMemory(most_bytes=64 << 20)
 
 @dataclass(frozen=True)
 class Layering:
-    """How layers are cut and put together.
+    """Settings of how layers are cut and put together.
 
     slices: how many at most over the whole range of circles of confusion. fill: whether an opaque layer is continued
     behind what is near. field_cells: columns and rows in which the aperture is taken as the same (cat-eyes).
@@ -58,7 +58,7 @@ class Layering:
 def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | PsfField, layering: Layering) -> Layer:
     """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first.
 
-    kernel_sum: how kernels of the lens's aperture are summed, or an PsfField that takes the aperture's place.
+    kernel_sum: how kernels of the lens's aperture are summed, or a PsfField that takes the aperture's place.
     """
     _check(layers)
     psf = kernel_sum if isinstance(kernel_sum, PsfField) else AperturePsf.of(layers, lens.aperture, kernel_sum, layering.field_cells)
@@ -85,47 +85,47 @@ def _check(layers: Sequence[Layer]) -> None:
         raise InputError(f"layers must have the same extra channels in the same order, but came with {sorted(names)}")
 
 
-def _groups(sheets: Sequence[PaddedLayer]) -> list[list[PaddedLayer]]:
-    """Sheets that must be rendered together, front first."""
-    groups = [[sheets[0]]]
-    for sheet in sheets[1:]:
-        if any(front.is_opaque or _interleave(front, sheet) for front in groups[-1]):
-            groups[-1].append(sheet)
+def _groups(layers: Sequence[PaddedLayer]) -> list[list[PaddedLayer]]:
+    """Return the layers that must be rendered together, front first."""
+    groups = [[layers[0]]]
+    for layer in layers[1:]:
+        if any(front.is_opaque or _interleave(front, layer) for front in groups[-1]):
+            groups[-1].append(layer)
         else:
-            groups.append([sheet])
+            groups.append([layer])
     return groups
 
 
 def _interleave(front: PaddedLayer, behind: PaddedLayer) -> bool:
-    """Whether a sheet listed before another lies behind it anywhere."""
+    """Return whether a layer listed before another lies behind it anywhere."""
     both = (front.values[..., 3] > 0) & (behind.values[..., 3] > 0)
     return bool((both & (front.coc_px > behind.coc_px + _ONE_SURFACE_PX)).any())
 
 
 def _rendered(group: Sequence[PaddedLayer], layering: Layering, slicing: Slicing) -> tuple[Channels, Channels]:
-    """Colour and how much of the pupil is taken of one group, within the frame."""
+    """Return colour of one group and how much of the pupil it takes, within the frame."""
     is_filled = layering.fill and group[0].is_opaque
-    sheets = _with_hidden(group, slicing.pool) if is_filled else [Pixels.covered(sheet) for sheet in group]
-    colour, taken = composited(sheets, slicing, by_depth=not group[0].is_opaque)
-    return _shared_out(colour, taken) if any(sheet.is_opaque for sheet in group) else (colour, taken)
+    layers = _with_hidden(group, slicing.pool) if is_filled else [Pixels.covered(layer) for layer in group]
+    colour, taken = composited(layers, slicing, by_depth=not group[0].is_opaque)
+    return _shared_out(colour, taken) if any(layer.is_opaque for layer in group) else (colour, taken)
 
 
 def _with_hidden(group: Sequence[PaddedLayer], pool: Executor) -> list[Pixels]:
-    """An opaque sheet taken apart, what is known to lie behind it, and last what was filled in where nothing is known."""
-    known = [Pixels.covered(sheet, sheet.coc_px > group[0].coc_px + _ONE_SURFACE_PX) for sheet in group[1:]]
+    """Return an opaque layer with its edges split, what is known to lie behind it, and last the fill where nothing is known."""
+    known = [Pixels.covered(layer, layer.coc_px > group[0].coc_px + _ONE_SURFACE_PX) for layer in group[1:]]
     front, behind = split_edges(group[0], pool)
     if not known:
         return [front, behind]
     of_rim = front.values[behind.places, 3] < 1.0
     rest, filled = behind.only(of_rim), behind.only(~of_rim)
     free = np.ones(front.coc_px.size, np.float32)
-    for sheet in known:
-        free[sheet.places] *= 1.0 - sheet.values[:, 3]
+    for layer in known:
+        free[layer.places] *= 1.0 - layer.values[:, 3]
     return [front, rest, *known, replace(filled, values=filled.values * free[filled.places, None])]
 
 
 def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
-    """Colour of a scene without holes: what nobody claimed belongs to those who did."""
+    """Return the colour of a scene without holes: the unclaimed pupil belongs to those who claimed."""
     from mrbokeh.layering._slices_numba import share_out
 
     share_out(colour, taken, _NOTHING_TAKEN)
@@ -138,7 +138,7 @@ def _over(front: Channels, front_taken: Channels, behind: Channels, behind_taken
 
 
 def _kinds(colour: Channels, taken: Channels) -> list[int]:
-    """Which channel of `taken` goes with each channel of colour: its own, or green's for extra channels."""
+    """Return the channel of `taken` that goes with each channel of colour: its own, or green's for extra channels."""
     kinds = taken.shape[2]
     return [min(c, kinds - 1) if c < 3 else kinds // 2 for c in range(colour.shape[2])]
 

@@ -61,11 +61,13 @@ class LightFieldSamples:
 
     @property
     def per_pixel(self) -> float:
-        """How many samples a pixel has on average (spp)."""
+        """Mean number of samples of a pixel (spp)."""
         return self.count / (self.width_px * self.height_px)
 
     def coc_px(self, lens: Lens) -> Float32[np.ndarray, " samples"]:
-        """Signed circle of confusion of what each sample met; where the focus is tilted or curved, that of the sample's pixel."""
+        """Return the signed circle of confusion of what each sample met; if the focus is tilted or curved, by the focus at the sample's
+        pixel.
+        """
         if lens.has_flat_focus:
             return lens.coc_px(self.depth_m, self.width_px).astype(np.float32)
         x, y = self.pixels()
@@ -73,12 +75,12 @@ class LightFieldSamples:
         return (lens.coc_px_per_dioptre(self.width_px) * (in_focus - 1.0 / self.depth_m)).astype(np.float32)
 
     def pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Column and row of the pixel of each sample; the far border belongs to the last."""
+        """Return column and row of the pixel of each sample; the far border belongs to the last."""
         x, y = np.floor(self.xy_px).astype(np.int64).T
         return np.minimum(x, self.width_px - 1), np.minimum(y, self.height_px - 1)
 
     def positions_at_lens_centre_px(self, lens: Lens) -> Float32[np.ndarray, "samples 2"]:
-        """Where the middle of the pupil sees, at half time, what each sample met: reprojection to (u, v, t) = (0, 0, 1/2)."""
+        """Reproject to (u, v, t) = (0, 0, 1/2): return where the middle of the pupil sees, at half time, what each sample met."""
         moved = self.motion_px * (self.time - 0.5)[:, None]
         return self.xy_px - 0.5 * self.coc_px(lens)[:, None] * self.lens_uv - moved
 
@@ -93,7 +95,7 @@ class LightFieldSamples:
 
 
 def joined(parts: "list[LightFieldSamples]") -> LightFieldSamples:
-    """All samples of several sets of one picture."""
+    """Join several sets of samples of one picture."""
     if not parts:
         raise InputError("nothing to join: expected at least one set of light field samples, got none")
     sizes = {(part.width_px, part.height_px) for part in parts}

@@ -34,7 +34,7 @@ def with_motion(layer: Layer, motion_px: Float32[np.ndarray, "height width 2"], 
 
 
 def motion_channels(extra: Mapping[str, np.ndarray]) -> slice | None:
-    """Where motion is among R, G, B, coverage and extra channels; None if it is not."""
+    """Return the slice of motion among R, G, B, coverage and extra channels; None if there is none."""
     start = 4
     for name, values in extra.items():
         if name == MOTION:
@@ -44,14 +44,14 @@ def motion_channels(extra: Mapping[str, np.ndarray]) -> slice | None:
 
 
 def farthest_px(layers: Sequence[Layer]) -> int:
-    """How many whole pixels light of any of the layers may move away from its place at most; 0 if nothing moves."""
+    """Return how many whole pixels light of any of the layers moves away from its place at most; 0 if nothing moves."""
     return max((motion_reach_px(motion_of(layer.extra[MOTION], layer.alpha)) for layer in layers if MOTION in layer.extra), default=0)
 
 
 def moved(
     values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], channels: slice
 ) -> tuple[Float32[np.ndarray, "height width channels"], Float32[np.ndarray, "height width"]]:
-    """`drawn_out` along the motion that is among the channels, as much of it as there is coverage."""
+    """Draw light out (`drawn_out`) along the motion that its own channels hold, times coverage."""
     return drawn_out(values, coc_px, motion_of(values[..., channels], values[..., 3]))
 
 
@@ -61,7 +61,7 @@ def motion_of(motion_px: Float32[np.ndarray, "*batch 2"], coverage: Float32[np.n
 
 
 def motion_reach_px(motion_px: Float32[np.ndarray, "height width 2"]) -> int:
-    """How many whole pixels light may move away from its place at most, that is during half the shutter."""
+    """Return how many whole pixels light moves away from its place at most, that is during half the shutter."""
     farthest = float(np.abs(motion_px).max(initial=0.0))
     return 0 if farthest == 0.0 else int(np.ceil(0.5 * farthest))
 
@@ -71,7 +71,7 @@ def drawn_out(
     coc_px: Float32[np.ndarray, "height width"],
     motion_px: Float32[np.ndarray, "height width 2"],
 ) -> tuple[Float32[np.ndarray, "height width channels"], Float32[np.ndarray, "height width"]]:
-    """The light on its way from -motion / 2 to +motion / 2, and its mean circle of confusion at every pixel.
+    """Draw light out from -motion / 2 to +motion / 2; return it and its mean circle of confusion at every pixel.
 
     values: premultiplied, coverage in channel 3 (it weights the mean); what leaves the array is lost. coc_px: signed diameters.
     All light is kept, its centre stays in place, and what does not move stays bit for bit where nothing moves onto it.

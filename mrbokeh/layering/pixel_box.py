@@ -1,4 +1,4 @@
-"""Box: an upright rectangle of a picture's pixels, what is cut out there and put back, and the camera and the lens that see it alone."""
+"""Box: an upright rectangle of pixels, cut out of pictures and layers and pasted back, and the camera and lens that see it alone."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,25 +25,25 @@ class Box:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """(height, width)"""
+        """Height and width."""
         return self.bottom - self.top, self.right - self.left
 
     @property
     def origin_px(self) -> tuple[int, int]:
-        """(row, column) of its first pixel."""
+        """Row and column of its first pixel."""
         return self.top, self.left
 
     @property
     def where(self) -> tuple[slice, slice]:
-        """The index of its pixels; for a box within the frame."""
+        """Index of its pixels, for a box within the frame."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def grown(self, margin_px: int) -> "Box":
-        """To all sides, also beyond the frame."""
+        """Return the box, larger by so many pixels on all sides, also beyond the frame."""
         return Box(self.top - margin_px, self.bottom + margin_px, self.left - margin_px, self.right + margin_px)
 
     def within(self, frame_px: tuple[int, ...]) -> "Box":
-        """What of it lies in a frame of (height, width)."""
+        """Return the part of the box in a frame of (height, width)."""
         height, width = frame_px[:2]
         return Box(max(self.top, 0), min(self.bottom, height), max(self.left, 0), min(self.right, width))
 
@@ -62,7 +62,7 @@ class Box:
         return np.pad(part, beyond + rest, mode="edge") if mode == "edge" else np.pad(part, beyond + rest, constant_values=value)
 
     def paste(self, part: np.ndarray, whole: np.ndarray) -> None:
-        """What of the box lies in the frame goes back to its place."""
+        """Put the part of the box that lies in the frame back to its place."""
         inside = self.within(whole.shape)
         rows = slice(inside.top - self.top, inside.bottom - self.top)
         inside.of(whole)[...] = part[rows, inside.left - self.left : inside.right - self.left]
@@ -108,5 +108,5 @@ def lit_box(layer: Layer) -> Box:
 
 
 def is_same_everywhere(lens: Lens) -> bool:
-    """Whether a point's blur depends on its depth alone, so that a part of the picture can be blurred by itself."""
+    """Return whether a point's blur depends on its depth alone, so that a part of the picture can be blurred by itself."""
     return lens.has_flat_focus and not lens.aperture.varies_over_field

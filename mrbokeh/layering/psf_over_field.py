@@ -1,14 +1,10 @@
-"""PsfField: what the light of a slice goes through on its way to the picture, and how far it travels there.
+"""The PSF over the field (`PsfField`) and the sum of kernels (`KernelSum`): how far a slice's light travels, and where it arrives.
 
-Renderers that differ in how they sum the kernels of an opening give a `KernelSum` alone; `AperturePsf` does the rest for all
-of them. Kernels that come from elsewhere may be wide where the opening's are points, hold motion themselves, or lose light:
-a renderer that has such kernels brings an PsfField of its own.
-
-Spreading: every pixel throws its light over its own PSF, the one step in which the classical renderers differ.
-
-A `KernelSum` knows plain apertures only, weighted polygons that hold for every pixel and colour. What varies with the side
-of the focus, with the place in the frame or with the colour is resolved here, once for all of them: the pixels are
-sorted by side and by field cell, and each group goes through the plain aperture that it sees.
+A `KernelSum` is what classical renderers differ in. It knows plain apertures only, weighted polygons that hold for every pixel and
+colour. What varies with the side of the focus, the place in the frame or the colour is resolved once for all of them by `AperturePsf`:
+pixels are sorted by side and by field cell, and each group goes through the plain aperture that it sees. Kernels that come from
+elsewhere may be wide where an opening's are points, hold motion themselves, or lose light: they bring a PsfField of their own
+(mrbokeh.renderers.bank.bank_psf).
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,8 +30,8 @@ FIELD_CELLS = (16, 9)
 class KernelSum(Protocol):
     """The sum over all pixels of value times PSF, same size out; light that leaves the frame is lost.
 
-    values: (H, W, C), HDR; a pixel whose values are all 0 has no say, whatever its circle of confusion.
-    coc_px: (H, W) signed diameters. aperture: plain. Same bits for any number of threads.
+    values: (H, W, C), HDR; a pixel whose values are all 0 adds nothing, whatever its circle of confusion.
+    coc_px: (H, W) signed diameters. aperture: plain. The result is the same to the bit for any number of threads.
     """
 
     def __call__(
@@ -45,7 +41,7 @@ class KernelSum(Protocol):
 
 @dataclass(frozen=True)
 class Frame:
-    """Where an array of pixels lies in the picture that the lens sees: its top left corner and the picture's size."""
+    """Placement of an array of pixels in the picture that the lens sees: its top left corner and the picture's size."""
 
     width_px: int
     height_px: int
@@ -53,18 +49,18 @@ class Frame:
     top_px: int = 0
 
     def moved(self, right_px: int, down_px: int) -> "Frame":
-        """The frame of a part of the array that begins so much farther right and down."""
+        """Return the frame of a part of the array that begins so much farther right and down."""
         return Frame(self.width_px, self.height_px, self.left_px + right_px, self.top_px + down_px)
 
     def field_at(self, x_px: float, y_px: float) -> tuple[float, float]:
-        """Field position of a place in the array: 0 in the middle of the picture, 1 half a diagonal away; x right, y down."""
+        """Return the field position of a place in the array: 0 in the middle of the picture, 1 half a diagonal away; x right, y down."""
         half_diagonal_px = 0.5 * float(np.hypot(self.width_px, self.height_px))
         right_px, down_px = x_px + self.left_px - 0.5 * self.width_px, y_px + self.top_px - 0.5 * self.height_px
         return right_px / half_diagonal_px, down_px / half_diagonal_px
 
 
 def reach_px(aperture: Aperture, largest_coc_px: float) -> int:
-    """How many whole pixels light may travel at this diameter, whatever the colour and the place."""
+    """Return how many whole pixels light travels at most at this diameter, whatever the colour and the place."""
     if largest_coc_px == 0.0:
         return 0
     drift = max(map(abs, aperture.lateral_chromatic))
@@ -82,8 +78,8 @@ def blur_colours(
 ) -> Float32[np.ndarray, "height width channels_out"]:
     """Premultiplied R, G, B, then coverage, then any other channels, through the aperture with all that varies.
 
-    For a chromatic aperture the coverage differs by colour: three channels of coverage come back in place of one, so
-    that the result has R, G, B, three coverages and the others (which spread as green does).
+    For a chromatic aperture the coverage differs by colour: three channels of coverage come back in place of one, so that the result has
+    R, G, B, three coverages and the others (which go with green).
     """
     if aperture.is_plain:
         return kernel_sum(values, coc_px, aperture)
@@ -108,7 +104,7 @@ def _blur_field_cells(
     field_cells: tuple[int, int],
     channel: int | None,
 ) -> Float32[np.ndarray, "height width channels"]:
-    """Both sides of the focus and every field cell by themselves, each within the window that its light reaches."""
+    """Blur each side of the focus and each field cell by the plain aperture that it sees, within the window that its light reaches."""
     total = np.zeros_like(values)
     live = np.any(values != 0, axis=-1)
     for side, on_side in ((1, live & (coc_px > 0)), (-1, live & ~(coc_px > 0))):
@@ -127,7 +123,7 @@ def _blur_field_cells(
 
 
 def _cells(shape: tuple[int, ...], frame: Frame, field_cells: tuple[int, int]) -> Iterator[tuple[tuple[slice, slice], tuple[float, float]]]:
-    """Slices of the array and the field position of each cell's centre; pixels beyond the picture belong to its outermost cells."""
+    """Yield slices of the array and the field position of each cell's centre; pixels beyond the picture belong to its outermost cells."""
     columns = _cuts(shape[1], frame.left_px, frame.width_px, field_cells[0])
     rows = _cuts(shape[0], frame.top_px, frame.height_px, field_cells[1])
     for row, y_px in rows:
@@ -136,7 +132,7 @@ def _cells(shape: tuple[int, ...], frame: Frame, field_cells: tuple[int, int]) -
 
 
 def _cuts(length: int, offset_px: int, size_px: int, cells: int) -> list[tuple[slice, float]]:
-    """Parts of one axis and, in the array's own pixels, the middle of the cell that each belongs to."""
+    """Return parts of one axis and, in the array's own pixels, the middle of the cell that each belongs to."""
     borders = np.rint(np.linspace(0, size_px, cells + 1)).astype(int) - offset_px
     middles = 0.5 * (borders[:-1] + borders[1:])
     borders[0], borders[-1] = min(borders[0], 0), max(borders[-1], length)
@@ -150,7 +146,7 @@ Channels = Float32[np.ndarray, "height width _"]
 
 @runtime_checkable
 class PsfField(Protocol):
-    """How light travels from the sharp picture to the blurred one.
+    """Point spread function over the field: how light travels from the sharp picture to the blurred one.
 
     coverages: 1, or 3 where red, green and blue each cover their own share of the pupil.
     """
@@ -159,19 +155,19 @@ class PsfField(Protocol):
     def coverages(self) -> int: ...
 
     def drawn_px(self, coc_px: Plane) -> Plane:
-        """The signed diameters by which kernels are chosen for circles of confusion, in the same order."""
+        """Return the signed diameters by which kernels are chosen for circles of confusion, in the same order."""
         ...
 
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:
-        """How many whole pixels the light of any pixel of the layers, with these signed diameters, travels at most."""
+        """Return how many whole pixels the light of any pixel of the layers, with these signed diameters, travels at most."""
         ...
 
     def reach_px(self, parts: Sequence[Part], largest_coc_px: float, frame: Frame) -> int:
-        """The same of the pixels of a slice, none of whose diameters is larger. Nothing beyond it is kept."""
+        """Return the same for the pixels of a slice, none of whose diameters is larger. Light beyond it is dropped."""
         ...
 
     def blur(self, values: Channels, coc_px: Plane, frame: Frame) -> Channels:
-        """The light (R, G, B, coverage, others, premultiplied) where it arrives, of the same height and width.
+        """Return the light (R, G, B, coverage, others, premultiplied) where it arrives, of the same height and width.
 
         R, G, B, then `coverages` of coverage, then others. Coverage counts shares of the pupil as this place sees it: where
         something opaque fills all of it, it is 1, however much light is lost on the way. Other channels go with coverage.
@@ -181,7 +177,7 @@ class PsfField(Protocol):
 
 @dataclass(frozen=True)
 class AperturePsf:
-    """An PsfField of an opening, by a renderer's KernelSum; motion is drawn out along its path before (mrbokeh.layering.motion).
+    """PsfField of an opening, by a renderer's KernelSum; motion is drawn out along its path before (mrbokeh.layering.motion).
 
     motion: the channels that hold it, if anything moves, and farthest_px: by how many whole pixels at most.
     """
@@ -194,7 +190,7 @@ class AperturePsf:
 
     @classmethod
     def of(cls, layers: Sequence[Layer], aperture: Aperture, kernel_sum: KernelSum, field_cells: tuple[int, int]) -> "AperturePsf":
-        """With the motion that these layers have."""
+        """Make one that knows the motion of these layers."""
         farthest = farthest_px(layers)
         return cls(aperture, kernel_sum, field_cells, motion_channels(layers[0].extra) if farthest else None, farthest)
 

@@ -1,11 +1,8 @@
-"""Slices: layers of light sorted by the circle of confusion, spread one by one and put together front to back.
+"""Slices: pixels of layers sorted by the circle of confusion, blurred one slice at a time and composited front to back.
 
-Which pixels of which layers make up a slice, and which part of the frame they reach.
-
-Connected components: the pixels of a slice that lie so far apart that their lights do not meet, each spread in a window of its own.
-
-A slice of a slanted or rolling surface is a ring or a few patches in a window that is mostly empty, and spreading costs by the
-window. Connected components' lights do not overlap, so it makes no difference which of them claims its share of the pupil first.
+A slice of a slanted or rolling surface is a ring or a few patches in a window that is mostly empty, and blurring costs by the window.
+So the pixels of a slice are divided into connected components so far apart that their light does not meet, each blurred in a window of
+its own. Components' lights do not overlap, so it makes no difference which of them claims its share of the pupil first.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,7 +26,8 @@ Window = tuple[slice, slice]
 def sorted_slices(
     layers: Sequence[Pixels], shares: Sequence[Shares], step_px: float, width: int, pool: Executor
 ) -> list[tuple[int, list[Part]]]:
-    """Numbers and parts of the slices that are not empty, front first; circles of confusion nearest to that multiple of the step.
+    """Return number and parts of each slice that is not empty, front first; a slice holds circles of confusion nearest to its number times
+    the step.
 
     width: of the frame that places are counted in.
     """
@@ -44,7 +42,7 @@ def sorted_slices(
 def _runs(
     layer: Pixels, shares: Shares, step_px: np.float32, width: int, pool: Executor
 ) -> tuple[Int32[np.ndarray, " runs"], Int32[np.ndarray, "runs 2"]]:
-    """The slices of a layer's runs, ascending, and the runs, in order within each slice."""
+    """Return the slices of a layer's runs, ascending, and the runs, in order within each slice."""
     from mrbokeh.layering._slices_numba import runs_of_slices
 
     pixels = layer.places, layer.coc_px, shares, width, step_px
@@ -55,7 +53,7 @@ def _runs(
 
 
 def window_of(parts: Sequence[Part], reach: int, frame: Frame) -> Window | None:
-    """The smallest window that holds what is seen of these pixels and the pixels that it comes from; None if nothing is seen.
+    """Return the smallest window that holds these pixels, as far as they are seen, and where they are seen; None if nothing is.
 
     reach: how many pixels their light travels at most. Rows and columns are those of an array that lies as the frame says.
     """
@@ -69,7 +67,9 @@ def window_of(parts: Sequence[Part], reach: int, frame: Frame) -> Window | None:
 
 
 def _span(first: int, end: int, reach: int, inside: int, length: int) -> slice | None:
-    """Of pixels first to end those that reach the inside, together with what of it they reach."""
+    """Return the range of pixels first to end that reach the inside, together with the part of the inside that they reach; None if none
+    does.
+    """
     first, end = max(first, inside - reach), min(end, inside + length + reach)
     return slice(min(first, max(first - reach, inside)), max(end, min(end + reach, inside + length))) if first < end else None
 
@@ -81,7 +81,9 @@ _PIXELS_PER_SPREAD = 1 << 14
 
 
 def connected_components(parts: Sequence[Part], reach: int, size: tuple[int, int]) -> Iterator[list[Part]]:
-    """The parts of a slice whose light travels so far at most, component by component; size: height and width of the frame with its margin."""
+    """Yield the parts of a slice, component by component. reach: pixels that light travels at most. size: height and width of the frame
+    with its margin.
+    """
     from mrbokeh.layering._slices_numba import components_of_runs, join_components, label_components, mark_cells
 
     cell_px = max(_LEAST_CELL_PX, 2 * reach, -(-max(size) // _MOST_CELLS))
@@ -115,7 +117,7 @@ Channels = Float32[np.ndarray, "height width _"]
 class Slicing:
     """What the light goes through, how many slices at most, and the place in the frame.
 
-    frame: where arrays of pixels with a margin all around lie. pool: threads for slices and pieces of them.
+    frame: placement of arrays with their margin. pool: threads for slices and components.
     """
 
     psf: PsfField
@@ -131,19 +133,20 @@ class Slicing:
 
     @property
     def at_once(self) -> int:
-        """Pieces under way or waiting to be claimed: many where memory does not count, so that nobody waits for a large one whose turn
-        it is; few where each keeps all cores busy by itself; else one."""
+        """Components under way or waiting to be claimed: many for small frames, so that nobody waits for a large one whose turn it is; few
+        for frames of which each component keeps all cores busy; else one.
+        """
         pixels = self.size[0] * self.size[1]
         if pixels <= _FEWEST_PIXELS:
             return 5 * cores()
         return cores() + 2 if pixels <= _FEW_PIXELS else 2 if pixels <= _MANY_PIXELS else 1
 
-    def blur_component(self, piece: tuple[Sequence[Part], int]) -> list[tuple[Channels, Window]]:
+    def blur_component(self, component: tuple[Sequence[Part], int]) -> list[tuple[Channels, Window]]:
         """The light of parts of a slice, which travels so far at most, and the window where it lies.
 
-        Where pixels of two layers share a place there are two rounds of that or more.
+        If pixels of two layers share a place there are two rounds or more.
         """
-        parts, reach = piece
+        parts, reach = component
         rounds: list[tuple[Channels, Window]] = []
         while parts and (window := window_of(parts, reach, self.frame)) is not None:
             light, parts = self._blur_round(parts, window)
@@ -151,7 +154,7 @@ class Slicing:
         return rounds
 
     def _blur_round(self, parts: Sequence[Part], window: Window) -> tuple[Channels, list[Part]]:
-        """Light spread within a window of the frame, and what finds its place taken."""
+        """Return light blurred within a window of the frame, and the parts that found their place taken."""
         from mrbokeh.layering._slices_numba import place_light, remove_light
 
         memory = self.memory.take(self.size[0] * self.size[1] * (parts[0].pixels.values.shape[1] + 1), np.float32)
@@ -170,16 +173,17 @@ class Slicing:
 
 
 def _laid_out(memory: Float32[np.ndarray, " elements"], window: Window, channels: int) -> tuple[Channels, Plane]:
-    """The beginning of the memory as light and circles of confusion of a window."""
+    """Return the beginning of the memory as light and circles of confusion of a window."""
     rows, columns = window[0].stop - window[0].start, window[1].stop - window[1].start
     elements = rows * columns * channels
     return memory[:elements].reshape(rows, columns, channels), memory[elements : elements + rows * columns].reshape(rows, columns)
 
 
 def composited(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tuple[Channels, Channels]:
-    """All layers as the lens sees them, put together front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or 3).
+    """All layers as the lens sees them, put together front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or
+    3).
 
-    by_depth: which layer the pinhole picture shows at a pixel is a matter of depth, else of their order (slices are always by depth).
+    by_depth: the layer that the pinhole picture shows at a pixel is the nearest, else the first in order (slices are always by depth).
     The pupil is counted per colour where the optics are chromatic.
     """
     from mrbokeh.layering._slices_numba import claim
@@ -187,28 +191,29 @@ def composited(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tu
     frame, channels = slicing.frame, layers[0].values.shape[1]
     colour = np.zeros((frame.height_px, frame.width_px, channels - 1), np.float32)
     taken = np.zeros((frame.height_px, frame.width_px, slicing.psf.coverages), np.float32)
-    for rounds in ahead(slicing.pool, slicing.blur_component, _pieces(layers, slicing, by_depth), slicing.at_once):
+    for rounds in ahead(slicing.pool, slicing.blur_component, _components_in_turn(layers, slicing, by_depth), slicing.at_once):
         for light, (rows, columns) in rounds:
             claim(colour, taken, light, rows.start + frame.top_px, columns.start + frame.left_px)
     return colour, taken
 
 
-def _pieces(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[tuple[list[Part], int]]:
-    """Parts of slices that can be spread by themselves, and how far their light travels at most, in the order in which they claim."""
+def _components_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[tuple[list[Part], int]]:
+    """Yield components of slices and how far their light travels at most, in the order in which they claim the pupil."""
     nearest, farthest = _range_px(layers, slicing.size[0] * slicing.size[1])
     step_px = max((farthest - nearest) / slicing.slices, _LEAST_STEP_PX)
-    for k, parts in _in_turn(layers, slicing, by_depth, step_px):
+    for k, parts in _slices_in_turn(layers, slicing, by_depth, step_px):
         largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
         reach = slicing.psf.reach_px(parts, largest_px, slicing.frame)
         for component in connected_components(parts, reach, slicing.size):
             yield component, reach
 
 
-def _in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px: float) -> Iterator[tuple[int, list[Part]]]:
-    """Numbers and parts of the slices in the order in which they claim the pupil.
+def _slices_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px: float) -> Iterator[tuple[int, list[Part]]]:
+    """Yield number and parts of the slices in the order in which they claim the pupil.
 
-    Front to back, what the pinhole picture shows; last what hides. But what hides behind something on the other side of the focus
-    goes right before its slice: kernels are mirrored at the focus, so there the pupil that an edge leaves free looks behind it.
+    First, front to back, the pixels that the pinhole picture shows; last the hidden ones. But pixels hidden behind something on the other
+    side of the focus go right before their slice: kernels are mirrored at the focus, so the pupil that an edge leaves free looks behind
+    it.
     """
 
     def cut(shares: list[Shares]) -> list[tuple[int, list[Part]]]:
@@ -223,14 +228,16 @@ def _in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px
 
 
 def _range_px(layers: Sequence[Pixels], pixels: int) -> tuple[float, float]:
-    """The least and the greatest circle of confusion; what a layer leaves uncovered counts as in focus."""
+    """Return the least and the greatest circle of confusion; uncovered pixels of a layer count as in focus."""
     in_focus = [0.0] if any(len(layer.places) < pixels for layer in layers) else []
     used = [layer.coc_px for layer in layers if len(layer.places) > 0]
     return float(min([*in_focus, *(coc_px.min() for coc_px in used)])), float(max([*in_focus, *(coc_px.max() for coc_px in used)]))
 
 
 def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> tuple[list[Shares], list[Shares]]:
-    """How much of each pixel the layers listed before leave uncovered, and how much hides behind one on the other side of the focus."""
+    """Return how much of each pixel the layers listed before leave uncovered, and how much hides behind one on the other side of the
+    focus.
+    """
     from mrbokeh.layering._slices_numba import cover
 
     pixels = slicing.size[0] * slicing.size[1]
@@ -246,7 +253,7 @@ def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> tuple[list[Sh
 
 
 def _shown_by_depth(layers: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
-    """The same of nearer layers, and of those at one depth the ones listed before."""
+    """Return the same as `_shown_in_order` for nearer layers; of layers at one depth those listed before count as nearer."""
     shown, crossing = ([np.full_like(layer.coc_px, value) for layer in layers] for value in (1.0, 0.0))
     for j, front in enumerate(layers):
         coverage, coc_px = np.zeros(size[0] * size[1], np.float32), np.zeros(size[0] * size[1], np.float32)

@@ -1,4 +1,4 @@
-"""What every renderer is: layers and a lens in, one blurred layer out.
+"""The renderer protocol: layers and a lens in, one blurred layer out.
 
 Every renderer conserves these (tests/renderers/test_renderers.py):
 - energy: the light of a layer of one depth, far from the border, is as much after as before, colour and coverage alike;
@@ -26,5 +26,5 @@ class Renderer(Protocol):
     """
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        """One layer with premultiplied alpha; its depth is that of the sharp layers, front first."""
+        """Return one layer with premultiplied alpha; its depth is that of the sharp layers, front first."""
         ...

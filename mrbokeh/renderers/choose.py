@@ -1,7 +1,4 @@
-"""A renderer by its name on the command line; the only module that knows them all.
-
-A renderer with a measured bank of kernels in place of the lens's opening, and what its method keeps in files beside the bank.
-"""
+"""Renderers by their names on the command line, with or without a measured bank of kernels; the only module that knows them all."""
 
 import logging
 from collections.abc import Mapping
@@ -45,7 +42,7 @@ def _laplacian(**settings: Any) -> Renderer:
 
 
 def _lrdm(**settings: Any) -> Renderer:
-    """It makes layers of its own."""
+    """Make the renderer that takes layers as they are, without slices."""
     from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction
 
     return LayeredReconstruction(threads=settings["threads"], device=settings.get("device", ""))
@@ -60,7 +57,7 @@ WITH_BANKS = ("polygon", "low-rank", "laplacian", "scatter")
 def make_renderer(
     name: str, *, threads: int = 0, layering: Layering | None = None, device: str = "", kernels: Mapping[str, Any] | None = None
 ) -> Renderer:
-    """The renderer of that name, or the network in that .onnx file (which takes every layer as it is, without slices).
+    """Return the renderer of that name, or the network in that .onnx file (which takes every layer as it is, without slices).
 
     kernels: `bank`, and what is known of it already, as the renderer's constructor takes them (those of WITH_BANKS).
     device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there, where the renderer has such a twin.
@@ -78,7 +75,7 @@ def make_renderer(
 
 
 def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | None, Renderer]:
-    """What `--lens` and `--renderer` mean together: a network brings its lens, a lens file is rendered by the default."""
+    """Return lens and renderer of `--lens` and `--renderer`: a network brings its lens, a lens file is rendered by the default."""
     if lens is not None and lens.suffix.lower() == ".onnx":
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
@@ -93,7 +90,7 @@ def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | N
 
 
 def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:
-    """The renderer of that name; psf: a bank of kernels in place of the lens's opening."""
+    """Return the renderer of that name; psf: the folder of a bank of kernels in place of the lens's opening."""
     if psf is None:
         return make_renderer(method, threads=threads, layering=layering, device=device)
     if method not in WITH_BANKS:
@@ -107,7 +104,7 @@ def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering
 
 
 def _beside(method: str, psf: Path, bank: PsfBank) -> dict[str, Any]:
-    """What the method keeps in files beside a bank."""
+    """Return the files that the method keeps beside a bank, as arguments of its constructor."""
     from mrbokeh.renderers.bank.kernel_files import apertures_beside, terms_beside
     from mrbokeh.renderers.bank.lattice import BankLattice
 

@@ -1,16 +1,13 @@
-"""What an exported network says about itself, as JSON in the metadata of its file (contract 2).
-
-What a network must see of a layer: depth beyond its silhouette, and the window around what it can reach.
-
-A trained network (.onnx) as a Renderer, and what such a file says about itself (contract 2).
+"""A trained network (.onnx) as a Renderer, and the facts that its file states about itself (JSON in its metadata, contract 2).
 
 The graph takes `rgb` (B, 3, H, W) linear radiance and `coc_px` (B, 1, H, W) signed diameters and gives `blurred` (B, 3, H, W);
-tiles, the sign of the circle of confusion and the range of the network are the graph's own business. Where its facts say so it also
+tiles, the sign of the circle of confusion and the range of the network are handled in the graph. If its facts say so it also
 takes `place` (B, 2, H, W), field positions in the whole frame, and `lens` (B, 2), f-number and focal length in mm.
 Widths: a circle of confusion means the same number of pixels whatever the picture's width, so a network without tiles takes
-any width at which the blur stays within what it was trained for. Tiles belong to one size of picture.
+any width at which the blur stays within its training range. Tiles belong to one size of picture.
 Highlights above the radiance scale: a network that is linear in radiance takes them as they are. For any other the part above
 the scale goes through the network as an exposure of its own, darkened into range and brightened again, and is added.
+A layer's depth is continued beyond its silhouette, and only the window that it can reach goes through the network.
 """
 
 import json
@@ -36,16 +33,16 @@ METADATA_KEY = "mrbokeh"
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """What an exported network holds for.
+    """Facts of an exported network: its lens, and the range that it was trained for.
 
-    lens: its focus may change, and where they are inputs f-number and focal length, but nothing else.
+    lens: its focus may change, and f-number and focal length if they are inputs, but nothing else.
     width_px, height_px: the pictures it was trained on; the only size when tiled.
     largest_coc_px: the largest diameter it was trained for. radiance_scale: the largest radiance it was trained for.
     reach_px: how far from a pixel the network looks. commit: of the training code, or None.
-    trained_on: names of the stacks. held_out_slices: those of the only one that were not.
-    field_position: the place in the frame is an input. f_numbers, focal_lengths_mm: (lowest, highest) trained on, where the lens is an
+    trained_on: names of the stacks. held_out_slices: slices of the only stack that were not trained on.
+    field_position: the place in the frame is an input. f_numbers, focal_lengths_mm: (lowest, highest) trained on if the lens is an
     input, else None. These, held_out_slices and lens_guessed are missing in older files.
-    lens_guessed: it was trained on blur in pixels, in metres that nobody knows: the lens stands for no length.
+    lens_guessed: it was trained on blur in pixels, at distances in unknown units: the lens stands for no length.
     """
 
     lens: Lens
@@ -75,7 +72,7 @@ class NetworkFacts:
 
 
 def facts_from_json(text: str, where: str) -> NetworkFacts:
-    """Raises InputError where the text is of another format or version."""
+    """Read facts; InputError if the text is of another format or version."""
     document: dict[str, Any] = json.loads(text)
     if document.pop("format", None) != FORMAT or document.pop("version", None) != VERSION:
         raise InputError(f"{where}: expected a network of format {FORMAT!r} version {VERSION}: export it again with `mrbokeh train export`")
@@ -87,7 +84,7 @@ def facts_from_json(text: str, where: str) -> NetworkFacts:
 def depth_around(
     depth_m: Float32[np.ndarray, "height width"], covered: Bool[np.ndarray, "height width"]
 ) -> Float32[np.ndarray, "height width"]:
-    """Depth with every uncovered pixel given that of the nearest covered one, so that blur can spread beyond the silhouette."""
+    """Return depth in which every uncovered pixel has that of the nearest covered one, so that blur can spread beyond the silhouette."""
     from scipy.ndimage import distance_transform_edt
 
     if covered.all():
@@ -97,14 +94,14 @@ def depth_around(
 
 
 def grown(covered: Bool[np.ndarray, "height width"], radius_px: int) -> Bool[np.ndarray, "height width"]:
-    """Everything within radius_px of what is covered."""
+    """Return a mask of all pixels within radius_px of a covered one."""
     from scipy.ndimage import distance_transform_edt
 
     return covered if covered.all() else distance_transform_edt(~covered) <= radius_px + 0.5
 
 
 def window_around(reached: Bool[np.ndarray, "height width"], margin_px: int) -> tuple[slice, slice]:
-    """The rectangle around everything reached, with what the network must see around it."""
+    """Return the rectangle around all pixels reached, with the margin that the network must see."""
     rows, columns = np.flatnonzero(reached.any(axis=1)), np.flatnonzero(reached.any(axis=0))
     return tuple(slice(max(0, int(each[0]) - margin_px), int(each[-1]) + 1 + margin_px) for each in (rows, columns))  # type: ignore[return-value]
 
@@ -117,7 +114,7 @@ _SENSOR_BLUR_PX = 1  # a photograph is never sharper than its sensor, so light l
 
 
 class OnnxNetwork:
-    """A Renderer that blurs as the lens it learned from; it refuses what it was not trained for.
+    """Renderer that blurs as the lens it learned from; it refuses lenses, sizes and blur that it was not trained for.
 
     threads: of ONNX Runtime, 0 takes all cores. providers: see `open_session`; `provider` says which one runs.
     """
@@ -147,7 +144,7 @@ class OnnxNetwork:
         place: Float32[np.ndarray, "height width 2"] | None = None,
         lens: tuple[float, float] | Float32[np.ndarray, "2"] | None = None,
     ) -> Float32[np.ndarray, "height width 3"]:
-        """An opaque picture with a signed circle of confusion (diameter) per pixel, blurred; linear radiance of any height.
+        """Blur an opaque picture by a signed circle of confusion (diameter) per pixel; linear radiance of any height.
 
         place: field positions (see optics.field_position); None: the picture is a whole frame. lens: (f-number, focal length in mm);
         None: those of `self.lens`. Both are left out where the network does not use them.
@@ -166,7 +163,7 @@ class OnnxNetwork:
     def _further_inputs(
         self, size_px: tuple[int, ...], place: np.ndarray | None, lens: tuple[float, float] | np.ndarray | None
     ) -> dict[str, np.ndarray]:
-        """Place and lens as the graph takes them, where it does."""
+        """Return place and lens as the graph takes them, if it does."""
         inputs: dict[str, np.ndarray] = {}
         if self.facts.field_position:
             place = field_positions((size_px[0], size_px[1])) if place is None else place
@@ -185,7 +182,7 @@ class OnnxNetwork:
         return np.ascontiguousarray(self._session.run(["blurred"], picture | feed)[0][0].transpose(1, 2, 0))
 
     def _blurred_layer(self, layer: Layer, lens: Lens) -> Layer:
-        """Colour and coverage through the same network, cropped to where the layer can reach; outside that it stays empty."""
+        """Blur colour and coverage by the same network, cropped to where the layer can reach; outside that it stays empty."""
         covered = layer.alpha > 0
         if not covered.any():
             return clear(layer.height_px, layer.width_px)
@@ -211,7 +208,7 @@ class OnnxNetwork:
         self._require_trained("sensor_width_mm", lens.sensor_height_mm if upright and lens.sensor_height_mm else lens.sensor_width_mm)
 
     def _require_trained(self, name: str, got: float) -> None:
-        """One value of a lens: within the range of the data where it is an input, else that of the lens it was trained for."""
+        """Refuse a value of the lens that is out of the trained range, or, if it is no input, not that of the trained lens."""
         ranges = {"f_number": self.facts.f_numbers, "focal_length_mm": self.facts.focal_lengths_mm}
         lowest, highest = ranges.get(name) or (getattr(self.lens, name),) * 2
         if not lowest * (1.0 - _SAME_LENS) <= got <= highest * (1.0 + _SAME_LENS):

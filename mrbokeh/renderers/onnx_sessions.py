@@ -1,4 +1,4 @@
-"""An ONNX file opened on the best processor there is.
+"""ONNX files opened on the best processor there is.
 
 Spinning is off: threads that wait in a busy loop take the cores that rendering, or another network, needs.
 """
@@ -22,7 +22,7 @@ _NEWER_OPSET = re.compile(r"Opset (\d+) is under development.*till opset (\d+)",
 
 
 def open_session(path: Path, threads: int = 0, providers: Sequence[str] | None = None) -> "onnxruntime.InferenceSession":
-    """The network at `path`, ready to run.
+    """Open the network at `path`, ready to run.
 
     threads: of the CPU, 0 takes all cores. providers: names out of "tensorrt", "cuda", "openvino", "cpu", best first, all of which must
     be there; None takes those that are there. What none of them can compute is left to the CPU.
@@ -40,7 +40,7 @@ def open_session(path: Path, threads: int = 0, providers: Sequence[str] | None =
 
 
 def provider_of(session: "onnxruntime.InferenceSession") -> str:
-    """The short name of the provider that comes first in an open session: "cpu", "cuda", "tensorrt" or "openvino".
+    """Return the short name of the provider that comes first in an open session: "cpu", "cuda", "tensorrt" or "openvino".
 
     A provider that is installed but finds no device is dropped by ONNX Runtime while the session opens, and is not named here.
     """
@@ -49,7 +49,7 @@ def provider_of(session: "onnxruntime.InferenceSession") -> str:
 
 
 def _unopened(path: Path, reason: str) -> str:
-    """In ONNX Runtime's words, but where the file is newer than it."""
+    """Return why a file was not opened: in ONNX Runtime's words, unless the file is newer than that."""
     import onnxruntime
 
     for newer, what in ((_NEWER_IR, "IR version"), (_NEWER_OPSET, "opset")):

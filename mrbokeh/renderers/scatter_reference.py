@@ -1,4 +1,4 @@
-"""The truth that the fast renderers are tested against: every pixel throws its light over its own exact PSF.
+"""Exact reference that the fast renderers are tested against: every pixel throws its light over its own exact PSF.
 
 Slow and obvious: no kernel is rounded, cached or shared; everything is summed in float64.
 """
@@ -28,8 +28,8 @@ _BAND_PX = 64  # rows that are summed by themselves; fixed, so that the sum does
 class ScatterReference:
     """A Renderer that spreads by exact kernels; layers, slices and hidden background as in mrbokeh.layering.layering.
 
-    threads: 0 takes all cores. bank: kernels to use instead of the lens's aperture, each pixel's blended from those of the bank
-    around it (bilinearly over the frame, linearly over the diameter).
+    threads: 0 takes all cores. bank: kernels to use instead of the lens's aperture, each pixel's blended from the bank's kernels around it
+    (bilinearly over the frame, linearly over the diameter).
     """
 
     layering: Layering = field(default_factory=Layering)
@@ -55,7 +55,7 @@ class ScatterReference:
 def blur_layer(layer: Layer, coc_px: Float[np.ndarray, "height width"], aperture: Aperture) -> Layer:
     """One layer through one PSF per pixel and nothing else: the light of all pixels adds up, whatever their depth.
 
-    Where coverage sums to more than 1 it is divided by that sum; light that leaves the frame is lost.
+    Coverage that sums to more than 1 is divided by that sum, and colour with it; light that leaves the frame is lost.
     """
     spread = scatter(np.dstack([layer.rgb, layer.alpha]).astype(np.float64), coc_px, aperture)
     spread /= np.maximum(spread[..., 3:], 1.0)
@@ -68,7 +68,7 @@ def scatter(
     aperture: Aperture,
     threads: int = 0,
 ) -> Float64[np.ndarray, "height width channels"]:
-    """Sum over all pixels of value times PSF; a pixel without any value has no say, whatever its circle of confusion."""
+    """Return the sum over all pixels of value times PSF; a pixel whose values are all 0 adds nothing, whatever its circle of confusion."""
     diameters_px = np.where(np.any(values != 0, axis=-1), coc_px, 0.0).astype(np.float64)
     if not np.isfinite(diameters_px).all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
@@ -84,7 +84,7 @@ def scatter(
 
 
 def _band(values: np.ndarray, diameters_px: np.ndarray, top: int, aperture: Aperture) -> tuple[np.ndarray, int]:
-    """The light of a band of rows with the margin it reaches, and that margin."""
+    """Return the light of a band of rows with the margin it reaches, and that margin."""
     from mrbokeh.renderers.bank._scatter_numba import scatter_rows
 
     rows = slice(top, top + _BAND_PX)

@@ -8,8 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from datasets_scripts.bank_pairs import PairsPlan, main, make_bank_pairs
-from datasets_scripts.bank_pairs_scenes import FARTHEST_M, NEAREST_M, random_layers
+from datasets_scripts.bank_pairs import FARTHEST_M, NEAREST_M, PairsPlan, main, make_bank_pairs, random_layers
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens_file import read_lens

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -107,7 +108,7 @@ def test_it_is_a_renderer(renderer: Renderer) -> None:
     assert isinstance(renderer, Renderer)
 
 
-@pytest.mark.parametrize("coc_px", [-11.0, -2.3, 0.0, 0.7, 3.1, 14.6])
+@pytest.mark.parametrize("coc_px", [-11.0, 0.7, 3.1, 14.6])
 def test_energy_of_a_point_is_conserved(renderer: Renderer, coc_px: float) -> None:
     result = renderer.render([point(coc_px)], LENS)
     np.testing.assert_allclose(result.rgb.sum((0, 1)), (4.0, 2.0, 1.0), rtol=1e-5)
@@ -227,7 +228,7 @@ def test_changing_the_focus_changes_the_picture(renderer: Renderer) -> None:
     assert np.abs(sharp.rgb - blurred.rgb).max() > 0.1
 
 
-@pytest.mark.parametrize("coc_px", [-13.7, -2.0, 1.6, 4.0, 7.5, 18.3, 40.0])
+@pytest.mark.parametrize("coc_px", [-13.7, 1.6, 7.5, 40.0])
 def test_a_point_stays_where_it_is(renderer: Renderer, coc_px: float) -> None:
     """The centroid of its light; half a pixel of drift is the classic mistake."""
     alpha = renderer.render([point(coc_px)], LENS).alpha.astype(np.float64)
@@ -310,8 +311,16 @@ def test_alpha_stays_a_share(renderer: Renderer) -> None:
     ],
 )
 def test_every_parameter_of_the_lens_changes_the_picture(renderer: Renderer, changed: Lens) -> None:
-    layer = flat_layer(texture(10), np.ones((SIZE_PX, SIZE_PX)), 11.0)
-    assert np.abs(renderer.render([layer], changed).rgb - renderer.render([layer], LENS).rgb).max() > 1e-3
+    layer, plain = through_the_plain_lens(name_of(renderer))
+    assert np.abs(renderer.render([layer], changed).rgb - plain).max() > 1e-3
+
+
+@cache
+def through_the_plain_lens(name: str) -> tuple[Layer, np.ndarray]:
+    """A small textured layer, 11 px (of SIZE_PX) out of focus, and the picture that LENS makes of it."""
+    small = np.s_[:33, :33]
+    layer = flat_layer(texture(10)[small], np.ones((33, 33)), 11.0)
+    return layer, RENDERERS[name].render([layer], LENS).rgb
 
 
 def test_neutral_parameters_change_nothing(renderer: Renderer) -> None:

@@ -1,7 +1,4 @@
-"""The loop over pixels of a bank's plain twin, compiled; same words, nothing cleverer.
-
-The loop over pixels of scatter_reference, compiled; same words, nothing cleverer.
-"""
+"""Compiled loops of exact scattering, by apertures or by blended kernels of a bank: the plain formulas, nothing cleverer."""
 
 import math
 
@@ -22,7 +19,7 @@ def scatter_rows(
     starts: np.ndarray,
     weights: np.ndarray,
 ) -> None:
-    """Add values (H, W, C), each spread by its pixel's PSF, to padded, which has a margin of the largest kernel's radius."""
+    """Add values (H, W, C), each blurred by its pixel's PSF, to padded, which has a margin of the largest kernel's radius."""
     height, width, channels = values.shape
     for y in range(height):
         for x in range(width):
@@ -54,7 +51,7 @@ def scatter_blended(
     radii_px: np.ndarray,
     margin_px: int,
 ) -> None:
-    """Add values (H, W, C), each spread by the weighted kernels with its pixel's numbers (H, W, N), to padded, which has a margin."""
+    """Add values (H, W, C), each blurred by the weighted kernels with its pixel's numbers (H, W, N), to padded, which has a margin."""
     height, width, channels = values.shape
     for y in range(height):
         for x in range(width):

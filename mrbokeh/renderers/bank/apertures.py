@@ -1,8 +1,6 @@
-"""The kernels of a bank as apertures, so that renderers which spread by polygons can spread by a bank.
+"""Kernels of a bank as apertures, so that renderers which sum polygons can use a bank: fitting, and turning to where they are used.
 
-A measured kernel as weighted polygons: its iso-contours in the unit pupil, weighted so that they add up to it.
-
-A side of the focus of a bank through any Spread: shares of light by place and diameter, each with an opening of its own.
+A measured kernel becomes weighted polygons: its iso-contours in the unit pupil, weighted so that they add up to it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +30,7 @@ _FEWER_LEVELS, _NO_ISLANDS = 1.1, 4.0 / 3.0
 
 
 class PolygonFit(NamedTuple):
-    """aperture: as seen behind the focus. relative_error: what it misses of the kernel, norm over norm."""
+    """Aperture that stands for a kernel, as seen behind the focus. relative_error: what it misses of the kernel, norm over norm."""
 
     aperture: Aperture
     relative_error: float
@@ -44,7 +42,7 @@ def fit_polygons(kernel: Float[np.ndarray, "size size"], diameter_px: float, lev
     The candidates are the kernel's contours at `levels` heights; their weights are those, none negative, that come nearest to it
     in the sense of squares when drawn at this diameter, and give its sum. Renderers pay for every outline, so half as many levels are
     taken where they miss at most 10 % more, and small islands, which are the noise of a measurement, are left out where that misses
-    at most a third more. Raises InputError where a kernel has no inside.
+    at most a third more. Raises InputError if the kernel has no inside.
     """
     if not diameter_px > 2.0 or levels < 1:
         raise InputError(f"polygons are fitted to kernels of more than 2 px in 1 or more levels, got {diameter_px} px and {levels}")
@@ -60,12 +58,12 @@ def fit_polygons(kernel: Float[np.ndarray, "size size"], diameter_px: float, lev
 
 
 def _counts(levels: int) -> list[int]:
-    """As many as there may be, and halves of that."""
+    """Return the numbers of levels to try: `levels` and halves of it, ascending."""
     return sorted({max(1, levels >> i) for i in range(levels.bit_length())})
 
 
 def _fit(wanted: Float64[np.ndarray, "size size"], diameter_px: float, levels: int, least_px2: float) -> PolygonFit | None:
-    """With contours around areas larger than this; None where there are none."""
+    """Fit contours around areas larger than this; None if there are none."""
     heights = (np.arange(levels) + 0.5) / levels
     candidates = [each for height in heights if (each := _contour(wanted, float(height), 0.5 * diameter_px, least_px2)) is not None]
     if not candidates:
@@ -78,18 +76,18 @@ def _fit(wanted: Float64[np.ndarray, "size size"], diameter_px: float, levels: i
 
 
 def relative_error(found: Float[np.ndarray, "rows rows"], wanted: Float[np.ndarray, "size size"]) -> float:
-    """Norm of the difference of two centred kernels over that of the one wanted."""
+    """Return the norm of the difference of two centred kernels over that of the one wanted."""
     size = max(len(found), len(wanted))
     return float(np.linalg.norm(grown(found, size) - grown(wanted, size)) / np.linalg.norm(wanted))
 
 
 def grown(kernel: Float64[np.ndarray, "rows rows"], size: int) -> Float64[np.ndarray, "size size"]:
-    """A kernel with a border of zeros, so that it is `size` wide; both odd."""
+    """Return a kernel with a border of zeros, so that it is `size` wide; both odd."""
     return np.pad(kernel, (size - len(kernel)) // 2)
 
 
 def _contour(kernel: Float64[np.ndarray, "size size"], height: float, radius_px: float, least_px2: float) -> WeightedOutlines | None:
-    """Where a kernel is brighter than this share of its brightest pixel, in the unit pupil; None where that is nothing."""
+    """Return the area where a kernel is brighter than this share of its brightest pixel, in the unit pupil; None if that is nothing."""
     from contourpy import FillType, contour_generator
     from shapely import MultiPolygon, Polygon, make_valid
 
@@ -110,7 +108,7 @@ def _drawn(opening: WeightedOutlines, diameter_px: float) -> Float64[np.ndarray,
 
 
 def _weights(drawn: Sequence[np.ndarray], wanted: Float64[np.ndarray, "size size"]) -> Float64[np.ndarray, " candidates"]:
-    """Of candidates that sum to 1 each; they sum to 1."""
+    """Return weights, sum 1, of candidates that sum to 1 each."""
     from scipy.optimize import nnls
 
     size = max(len(each) for each in (*drawn, wanted))
@@ -143,22 +141,22 @@ class BankApertures:
 
     @property
     def unit_radius(self) -> float:
-        """How far the farthest vertex of any lies from the centre of the pupil."""
+        """Distance of the farthest vertex of any aperture from the centre of the pupil."""
         return max(each.unit_radius for side in self.apertures for node in side for place in node for each in place)
 
     def is_one(self, side: int, channel: int) -> bool:
-        """Whether a single aperture stands for all kernels on a side of the focus."""
+        """Return whether a single aperture stands for all kernels on a side of the focus."""
         of_side = self.apertures[SIDES.index(side)]
         return len({id(place[channel]) for node in of_side for place in node}) == 1
 
     def shares(
         self, side: int, diameters_px: Float[np.ndarray, "*batch"]
     ) -> tuple[Int64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch"]]:
-        """The fitted diameter below each unsigned diameter and the share of the next one: in proportion to the logarithm."""
+        """Return the fitted diameter below each unsigned diameter and the share of the next one: in proportion to the logarithm."""
         return between(np.log(self.diameters_px[SIDES.index(side)]), np.asarray(np.log(np.maximum(diameters_px, 1e-6))))
 
     def kernel(self, side: int, diameter_px: float, place: int, channel: int) -> Float64[np.ndarray, "size size"]:
-        """What they show at an unsigned diameter, as behind the focus."""
+        """Draw the kernel that the apertures give at an unsigned diameter, as behind the focus."""
         lower, share = (each.item() for each in self.shares(side, np.array(diameter_px)))
         fitted = [each[place][channel] for each in self.apertures[SIDES.index(side)]]
         parts = ((fitted[lower], 1.0 - share), (fitted[min(lower + 1, len(fitted) - 1)], share))
@@ -167,7 +165,7 @@ class BankApertures:
         return np.sum([weight * grown(kernel, size) for kernel, weight in drawn], axis=0)
 
     def relative_errors(self, lattice: BankLattice, side: int) -> Float64[np.ndarray, "nodes places channels"]:
-        """What they miss of every kernel of a bank on one side of the focus, norm over norm, blended where they are."""
+        """Return what the apertures miss of every kernel of a bank on one side of the focus, norm over norm, blended as in use."""
         diameters_px = lattice.diameters_px[side]
         errors = np.zeros((len(diameters_px), lattice.places, lattice.bank.channels))
         for node, place in np.ndindex(*errors.shape[:2]):
@@ -179,7 +177,7 @@ class BankApertures:
 
 
 def fit_apertures(lattice: BankLattice, levels: int = LEVELS) -> BankApertures:
-    """Polygons for the kernels of a bank at a few diameters on each side; one of kernels below 8 px only is an InputError.
+    """Fit polygons to the kernels of a bank at a few diameters on each side; a bank of kernels below 8 px only is an InputError.
 
     A kernel takes the aperture of a neighbour (see `_neighbours`) that misses at most a fifth more of it than its own polygons do.
     """
@@ -207,14 +205,16 @@ def fit_apertures(lattice: BankLattice, levels: int = LEVELS) -> BankApertures:
 
 
 def _neighbours(key: _Key) -> list[_Key]:
-    """Those whose aperture may serve: at the next larger diameter, on the other side of the focus, one place or one colour before."""
+    """Return the keys whose aperture may serve: at the next larger diameter, on the other side of the focus, one place or one colour
+    before.
+    """
     side, step, place, channel = key
     first = [(SIDES[0], step, place, channel)] if side != SIDES[0] else []
     return [(side, step + 1, place, channel), *first, (side, step, place - 1, channel), (side, step, place, channel - 1)]
 
 
 def _best_fit(wanted: Float64[np.ndarray, "size size"], diameter_px: float, near: Sequence[Aperture], levels: int) -> PolygonFit:
-    """The first of the apertures near by that is hardly worse than a kernel's own, else that."""
+    """Return the first of the apertures near by that is hardly worse than the kernel's own, else its own."""
     own = fit_polygons(wanted, diameter_px, levels)
     for aperture in near:
         error = relative_error(aperture.rasterize(diameter_px).kernel, wanted)
@@ -224,7 +224,7 @@ def _best_fit(wanted: Float64[np.ndarray, "size size"], diameter_px: float, near
 
 
 def _fitted_nodes(diameters_px: Float64[np.ndarray, " nodes"]) -> list[int]:
-    """From the largest diameter downwards."""
+    """Return the nodes to fit, ascending; they are chosen from the largest diameter downwards."""
     if diameters_px[-1] < LEAST_FITTED_PX:
         raise InputError(
             f"polygons need kernels of at least {LEAST_FITTED_PX:g} px, but this bank ends at {diameters_px[-1]:.1f} px: "
@@ -250,7 +250,7 @@ class TurnedApertures:
     _preparing: Lock = field(default_factory=Lock, repr=False)
 
     def shares(self, coc_px: Plane, side: int, channel: int, around: Around) -> Shares:
-        """One for each opening that some pixel takes: places and diameters that share an aperture are one."""
+        """Yield a share for each opening that some pixel takes; places and diameters that share an aperture are one."""
         if self.apertures.is_one(side, channel) and self.lattice.directions == 1:
             yield None, self._aperture(side, 0, 0, channel)
             return
@@ -266,7 +266,7 @@ class TurnedApertures:
         yield from taken.values()
 
     def _by_node(self, coc_px: Plane, side: int) -> Iterator[tuple[int, Plane]]:
-        """The fitted diameters in use, and each pixel's share of them; sharp pixels have none."""
+        """Yield the fitted diameters in use, and each pixel's share of them; sharp pixels have none."""
         lower, upper = self.apertures.shares(side, np.abs(coc_px))
         live = np.abs(coc_px) > SHARP_PX
         for node in range(len(self.apertures.diameters_px[SIDES.index(side)])):

@@ -1,10 +1,10 @@
-"""Optics of a bank of kernels: which kernel each pixel of a layer takes, how far its light travels, and what becomes of the light.
+"""The PSF over the field of a bank: the kernel that each pixel of a layer takes, how far its light travels, and how much gets through.
 
 The bank's coordinates come from what a slice holds anyway: depth from the circle of confusion, the place in the frame from
 that of the pixel, motion from the extra channels that carry it. Pixels with which a layer is continued beyond the frame see
 the lens as it is there, outside (at most as far out as the bank goes).
 
-Slices are still sorted by the circle of confusion: what differs in depth but not in it shares a slice and hides nothing of it.
+Slices are still sorted by the circle of confusion: pixels that differ in depth but not in it share a slice and hide nothing of it.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ _BEYOND_PX, _BEYOND = 1.0, 1.05  # how far the largest kernel stands for larger 
 
 @dataclass(frozen=True)
 class BankPsf:
-    """See mrbokeh.layering.psf_over_field.PsfField.
+    """PsfField of a bank of kernels (mrbokeh.layering.psf_over_field).
 
     sum_bank_kernels: the sum of kernels (LaplacianSpreadlets). motion: the channels that hold it, if there are any, and farthest_px:
     how far light moves at most. A bank without motion gets its light drawn out along its path before, as an aperture does.
@@ -49,7 +49,7 @@ class BankPsf:
     def of(
         cls, layers: Sequence[Layer], lens: Lens, tables: BankTables, sum_bank_kernels: Callable[[Channels, Plane, Place], Channels]
     ) -> "BankPsf":
-        """For these layers and what they need."""
+        """Make one for these layers."""
         return cls(tables, sum_bank_kernels, lens, layers[0].alpha.shape, motion_channels(layers[0].extra), farthest_px(layers))
 
     @property
@@ -57,11 +57,11 @@ class BankPsf:
         return self.tables.bank.channels
 
     def drawn_px(self, coc_px: Plane) -> Plane:
-        """Kernels of banks hold the pixel's area as those of openings do."""
+        """Return drawn diameters: kernels of banks hold the pixel's area as those of openings do."""
         return drawn_diameters_px(coc_px, _DISC)
 
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:
-        """Raises InputError where blur or motion is clearly larger than the bank's largest."""
+        """Return the margin; InputError if blur or motion is clearly larger than the bank's largest."""
         reach, frame = 0, Frame(self.size[1], self.size[0])
         for layer, circles in zip(layers, coc_px, strict=True):
             rows, columns = np.nonzero(layer.alpha > 0)
@@ -72,7 +72,7 @@ class BankPsf:
         return reach
 
     def reach_px(self, parts: Sequence[Part], largest_coc_px: float, frame: Frame) -> int:  # noqa: ARG002
-        """That of the farthest reaching kernel among those of the pixels."""
+        """Return the reach of the farthest reaching kernel among those of the pixels."""
         width = frame.width_px - 2 * frame.left_px
         reach = 0
         for part in parts:
@@ -115,7 +115,7 @@ class BankPsf:
         columns: Int64[np.ndarray, "*batch"],
         frame: Frame,
     ) -> Place:
-        """What does not move has motion 0."""
+        """Return the bank's coordinates of pixels; motion is 0 for pixels that do not move."""
         needed, (height, width) = self.tables.needed, self.size
         still = np.zeros((*coc_px.shape, 2), np.float32) if motion_px is None else motion_px
         down, right = rows + frame.top_px, columns + frame.left_px
@@ -129,7 +129,7 @@ class BankPsf:
     def _depth_m(
         self, coc_px: Float32[np.ndarray, "*batch"], down: Int64[np.ndarray, "*batch"], right: Int64[np.ndarray, "*batch"]
     ) -> Float64[np.ndarray, "*batch"]:
-        """Of what has this circle of confusion there: `Lens.coc_px` solved for depth."""
+        """Return the depth at which a pixel has this circle of confusion: `Lens.coc_px` solved for depth."""
         focus = self._focus_dioptres
         in_focus = focus if focus.ndim == 0 else focus[np.clip(down, 0, self.size[0] - 1), np.clip(right, 0, self.size[1] - 1)]
         dioptres = in_focus - coc_px.astype(np.float64) / self.lens.coc_px_per_dioptre(self.size[1])
@@ -157,6 +157,6 @@ def _too_small(model: str, axis: Axis, largest: float) -> str:
 
 
 def _members(part: Part) -> Int64[np.ndarray, " members"]:
-    """The numbers of the pixels in a part's runs."""
+    """Return the numbers of the pixels in a part's runs."""
     first, lengths = part.runs[:, 0].astype(np.int64), (part.runs[:, 1] - part.runs[:, 0]).astype(np.int64)
     return np.arange(lengths.sum()) + np.repeat(first - np.cumsum(lengths) + lengths, lengths)

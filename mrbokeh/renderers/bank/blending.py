@@ -1,9 +1,8 @@
-"""Light through a bank of kernels: every pixel's light is divided among the kernels around it, and each share is spread by its own.
+"""Blending of a bank's kernels: every pixel's light is divided among the kernels around it, and each share is summed by its own.
 
 Places in the frame share in proportion (bilinearly), so that nothing jumps where one cell of the bank ends; the shares of a
-pixel sum to 1, so no light is lost or doubled. Renderers differ in how a side of the focus is spread (`SideSum`).
-
-The plain twin of all that spread by a bank: every pixel throws its light over the exact kernels around it, blended.
+pixel sum to 1, so no light is lost or doubled. Renderers differ in how a side of the focus is summed (`SideSum`); `scatter_side` is
+the plain way, by the exact kernels, blended.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,7 +32,7 @@ Shares = Iterator[tuple[Plane | None, Any]]
 class SideSum(Protocol):
     """The sum over pixels on one side of the focus (signed diameters coc_px) of value times kernel of a channel of the bank.
 
-    Kernels sum to 1 here. A pixel without any value has no say. Same size out; light that leaves the frame is lost.
+    Kernels sum to 1 here. A pixel whose values are all 0 adds nothing. Same size out; light that leaves the frame is lost.
     """
 
     def __call__(self, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels: ...
@@ -41,7 +40,7 @@ class SideSum(Protocol):
 
 @dataclass
 class BlendedTables(BankTables):
-    """What mrbokeh.renderers.bank.bank_psf.BankPsf asks of a bank whose kernels are blended with those of the cells beside.
+    """Tables for mrbokeh.renderers.bank.bank_psf.BankPsf of a bank whose kernels are blended with those of the cells beside.
 
     unit_radius: how far apertures that stand for the kernels reach, 0 if none do.
     """
@@ -58,7 +57,7 @@ class BlendedTables(BankTables):
 
     @cached_property
     def reaches_px(self) -> Int64[np.ndarray, " cells"]:
-        """Of each cell's kernel, those of the cells beside it, and the apertures that stand for them."""
+        """Reach of each cell's kernel, the kernels of the cells beside it, and the apertures that stand for them."""
         own, axes = super().reaches_px, range(len(self.bank.axes))
         reaches, steps = own.copy(), list(product((-1, 0, 1), repeat=len(axes)))
         for cell, box in enumerate(self.bank.boxes):
@@ -81,7 +80,7 @@ class AnchorKernels:
     _kept: dict[tuple[int, int, int], Float64[np.ndarray, "_ _ channels"]] = field(default_factory=dict, repr=False)
 
     def kernel(self, side: int, node: int, anchor: int) -> Float64[np.ndarray, "size size channels"]:
-        """As behind the focus, each channel with sum 1."""
+        """Return the kernel as behind the focus, each channel with sum 1."""
         key = side, node, anchor
         if key not in self._kept:
             place, angle_rad = self.lattice.place_and_angle(anchor)
@@ -92,7 +91,7 @@ class AnchorKernels:
 
     @cached_property
     def unit_radius(self) -> float:
-        """How far kernels of 8 px or more reach, in radii of their circles of confusion; at least 1."""
+        """Reach of kernels of 8 px or more, in radii of their circles of confusion; at least 1."""
         tables = BlendedTables(self.lattice.bank, None)
         reaches = 2.0 * BankTables(self.lattice.bank, None).reaches_px + 1.0
         diameters_px = np.abs(self.lattice.bank.centres[:, tables.diameter_axis])
@@ -101,14 +100,14 @@ class AnchorKernels:
 
 
 def _without_border(kernel: Float64[np.ndarray, "_ _ channels"]) -> Float64[np.ndarray, "_ _ channels"]:
-    """Without rows and columns of zeros all around."""
+    """Return a kernel without rows and columns of zeros all around."""
     middle = len(kernel) // 2
     reach = int(np.abs(np.argwhere(kernel.any(axis=2)) - middle).max())
     return np.ascontiguousarray(kernel[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1])
 
 
 def blend_colours(tables: BlendedTables, sum_side: SideSum, values: Channels, coc_px: Plane, place: Place) -> Channels:
-    """R, G, B, coverage (for a bank of three colours three times), others; as LaplacianSpreadlets.sum_bank_kernels has it."""
+    """Return R, G, B, coverage (three times for a bank of three colours) and others, as LaplacianSpreadlets.sum_bank_kernels does."""
     lit = not_black(values)
     if not np.isfinite(coc_px[lit]).all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
@@ -118,7 +117,7 @@ def blend_colours(tables: BlendedTables, sum_side: SideSum, values: Channels, co
     sides = {side: here for side, here in ((1, behind), (-1, lit & ~behind)) if here.any()}
 
     def summed(picked: Channels, colours: int, channel: int) -> Channels:
-        """picked: channels of the picture, the first of which are colours."""
+        """Sum both sides of the focus. picked: channels of the picture, the first of which are colours."""
         total = np.zeros_like(picked) if len(sides) != 1 else None
         for side, here in sides.items():
             passed = _passed(tables.lattice, coc_px, side, channel, around)
@@ -138,7 +137,7 @@ def blend_colours(tables: BlendedTables, sum_side: SideSum, values: Channels, co
 
 
 def sum_openings(values: Channels, coc_px: Plane, shares: Shares, kernel_sum: Callable[..., Channels]) -> Channels:
-    """What is sharp, and every share spread within the window that its light reaches."""
+    """Return sharp pixels as they are, and add every opening's share of light, blurred within the window that it reaches."""
     blurred = not_black(values) & (np.abs(coc_px) > SHARP_PX)
     total = np.where(blurred[..., None], np.float32(0.0), values)
     for share, opening in shares:
@@ -157,12 +156,12 @@ def sum_openings(values: Channels, coc_px: Plane, shares: Shares, kernel_sum: Ca
 
 
 def not_black(values: Channels) -> Bool[np.ndarray, "height width"]:
-    """Which hold anything, faster than `any` along a short axis."""
+    """Return the pixels that hold any light, faster than `any` along a short axis."""
     return np.asarray(reduce(np.logical_or, np.moveaxis(values[..., 1:], -1, 0), values[..., 0] != 0.0))
 
 
 def _passed(lattice: BankLattice, coc_px: Plane, side: int, channel: int, around: Around) -> Plane | None:
-    """What the lens lets through of each pixel's light; None is all."""
+    """Return the share of each pixel's light that the lens lets through; None is all."""
     known = lattice.light(side)[..., channel]
     if np.abs(known - 1.0).max() < _ALL_LIGHT:
         return None
@@ -173,7 +172,9 @@ def _passed(lattice: BankLattice, coc_px: Plane, side: int, channel: int, around
 
 
 def scatter_side(kernels: AnchorKernels, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels:
-    """See SideSum; kernels are blended over place (bilinearly) and diameter (linearly), summed in float64."""
+    """Sum a side of the focus plainly (`SideSum`); kernels are blended over place (bilinearly) and diameter (linearly), summed in
+    float64.
+    """
     from mrbokeh.renderers.bank._scatter_numba import scatter_blended
 
     lattice = kernels.lattice

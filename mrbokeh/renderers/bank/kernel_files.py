@@ -1,10 +1,8 @@
-"""Spreadlets in a file: what takes minutes to compute for a bank of kernels is kept beside it (`spreadlets.npz`).
+"""Files beside a bank of what methods make of its kernels: BANK/spreadlets.npz, BANK/polygons.npz (apertures), BANK/low_rank.npz (terms).
 
-What renderers make of a bank's kernels, in files beside it: BANK/polygons.npz (fitted apertures) and BANK/low_rank.npz (terms).
-
-A file is used only where it is of the same kernels, over the same coordinates, made in the same way; else it is made anew.
-
-The spreadlets of a whole bank, cell by cell, kept beside it; an interrupted build goes on where it stopped.
+A file is used only if it is of the same kernels, over the same coordinates, made in the same way. Polygons and terms are made anew
+otherwise; spreadlets take minutes and are built by `mrbokeh lens spreadlets`, cell by cell, so that an interrupted build goes on
+where it stopped.
 """
 
 import json
@@ -36,7 +34,7 @@ _SPREADLETS_VERSION = 1
 
 
 def write_spreadlets(path: Path | str, spreadlets: Spreadlets, made_by: Sparsification, of: str) -> None:
-    """One .npz: points (N, 2) int16, values (N, C) float64, starts (cells + 1,), and what they were made of and how.
+    """Write one .npz: points (N, 2) int16, values (N, C) float64, starts (cells + 1,), and what they were made of and how.
 
     of: a fingerprint of the kernels (`fingerprint`).
     """
@@ -52,7 +50,7 @@ def read_spreadlets(path: Path | str, made_by: Sparsification, of: str) -> Sprea
 
 
 def spreadlets_beside(folder: Path | str, kernels: tuple[np.ndarray, ...]) -> Spreadlets | None:
-    """The spreadlets that `mrbokeh lens spreadlets` has put beside a bank, however they were made; None if there are none.
+    """Return the spreadlets that `mrbokeh lens spreadlets` has put beside a bank, however they were made; None if there are none.
 
     InputError if they are not of these kernels: the bank was changed after.
     """
@@ -64,7 +62,7 @@ def spreadlets_beside(folder: Path | str, kernels: tuple[np.ndarray, ...]) -> Sp
 
 
 def _read_spreadlets(path: Path | str) -> tuple[Spreadlets, dict, str] | None:
-    """What is in a file, how it was made and of what; None if there is no such file or it is of another version."""
+    """Read spreadlets, their settings and the fingerprint of their kernels; None if there is no such file or it is of another version."""
     if not Path(path).exists():
         return None
     try:
@@ -78,7 +76,7 @@ def _read_spreadlets(path: Path | str) -> tuple[Spreadlets, dict, str] | None:
 
 
 def fingerprint(kernels: tuple[np.ndarray, ...]) -> str:
-    """The same for the same kernels."""
+    """Return a hash, the same for the same kernels."""
     from hashlib import sha256
 
     digest = sha256()
@@ -110,7 +108,8 @@ def terms_beside(
     decomposed: Callable[[Float64[np.ndarray, "size size"]], LowRankKernel],
     made_by: Sequence[float | int],
 ) -> BankTerms:
-    """The low-rank terms beside a bank, the same way. made_by: the settings on which `decomposed` depends.
+    """Return the low-rank terms beside a bank, found and written there if they are not there yet. made_by: the settings on which
+    `decomposed` depends.
 
     A bank that turns with the field has none: its kernels are turned first, and decomposed when they are used.
     """
@@ -132,7 +131,7 @@ def _key(lattice: BankLattice, made_by: Sequence[float | int | str]) -> str:
 
 
 def _read(path: Path, key: str) -> Arrays | None:
-    """None where there is no such file, it is of something else, or damaged."""
+    """Read arrays; None if there is no such file, or its key is another, or it is damaged."""
     try:
         with np.load(path) as file:
             return dict(file) if str(file["key"]) == key else None
@@ -141,14 +140,14 @@ def _read(path: Path, key: str) -> Arrays | None:
 
 
 def _write(path: Path, arrays: Arrays, key: str) -> None:
-    """Not where the bank's folder is read-only."""
+    """Write arrays, unless the bank's folder is read-only."""
     with suppress(PermissionError), atomic_path(path) as temporary:
         np.savez(temporary, allow_pickle=False, key=np.array(key), **arrays)
 
 
 def _apertures_to_arrays(made: BankApertures) -> Arrays:
-    """vertices of all outlines, where each outline and the outlines of each aperture end; which aperture stands for each kernel, sides
-    one after the other.
+    """Return vertices of all outlines, the ends of each outline and of each aperture's outlines, and the number of each kernel's
+    aperture, one side after the other.
     """
     of_kernels = [aperture for side in made.apertures for node in side for place in node for aperture in place]
     each = list({id(aperture): aperture for aperture in of_kernels}.values())
@@ -181,7 +180,7 @@ def _apertures_from(found: Arrays, lattice: BankLattice) -> BankApertures:
 
 
 def _terms_to_arrays(made: BankTerms) -> Arrays:
-    """keys (kernels, 4); terms of all kernels one after the other, those of a symmetric kernel without rows."""
+    """Return keys (kernels, 4) and the terms of all kernels one after the other; those of a symmetric kernel have no rows."""
     kernels = list(made.values())
     return {
         "keys": np.array(list(made)),
@@ -243,7 +242,7 @@ def _part(folder: Path, cell: int) -> Path:
 
 
 def _of_cell(path: Path, kernel: np.ndarray, settings: Sparsification) -> Spreadlet:
-    """The spreadlet of one kernel, from its file where that is of this kernel and these settings."""
+    """The spreadlet of one kernel, from its file if that is of this kernel and these settings."""
     of = fingerprint((kernel,))
     kept = read_spreadlets(path, settings, of)
     if kept is not None:

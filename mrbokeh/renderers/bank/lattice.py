@@ -1,7 +1,4 @@
-"""The kernels of a bank over signed diameter and place in the frame, and which of them a pixel lies between.
-
-Which places of a bank each pixel of a picture lies between, and what share of its light each of them takes.
-"""
+"""Lattice of a bank: its kernels over signed diameter and place in the frame, and those that each pixel lies between."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -46,7 +43,7 @@ class BankLattice:
 
     @cached_property
     def diameters_px(self) -> dict[int, Float64[np.ndarray, " nodes"]]:
-        """Of each side: the unsigned middles of the bank's cells, ascending."""
+        """Unsigned middles of the bank's cells on each side, ascending."""
         middles = self._middles("diameter_px")
         if middles[0] >= 0.0:
             return dict.fromkeys(SIDES, middles)
@@ -103,7 +100,7 @@ class BankLattice:
         return np.stack(ends, axis=-1), _bilinear(ring_share, turn - first)
 
     def cell(self, side: int, node: int, place: int) -> int:
-        """The cell of the bank."""
+        """Return the number of the bank's cell."""
         column, row = place % len(self._field[0]), place // len(self._field[0])
         diameter_px = self.diameters_px[side][node]
         where = {"diameter_px": side * diameter_px, "eccentricity": self._field[0][column]}
@@ -111,13 +108,13 @@ class BankLattice:
         return int(self.bank.nearest(np.array([where[axis.name] for axis in self.bank.axes], np.float64)))
 
     def kernel(self, side: int, node: int, place: int) -> Float64[np.ndarray, "size size channels"]:
-        """As behind the focus, each channel with sum 1."""
+        """Return the kernel as behind the focus, each channel with sum 1."""
         kernel = self.bank.kernels[self.cell(side, node, place)].astype(np.float64)
         turned = kernel[::-1, ::-1] if side < 0 and not self.bank.near_side_turned else kernel
         return np.ascontiguousarray(turned / turned.sum(axis=(0, 1)))
 
     def light(self, side: int) -> Float64[np.ndarray, "nodes places channels"]:
-        """What the kernels let through."""
+        """Return how much light the kernels let through."""
         return self._light[side]
 
     @cached_property
@@ -129,7 +126,7 @@ class BankLattice:
         return {side: of_side(side) for side in SIDES}
 
     def _middles(self, name: str) -> Float64[np.ndarray, " middles"]:
-        """Of the bank's cells along one axis, ascending; 0 where it has no such axis."""
+        """Return the middles of the bank's cells along one axis, ascending; 0 if it has no such axis."""
         at = [index for index, axis in enumerate(self.bank.axes) if axis.name == name]
         return np.unique(self.bank.centres[:, at[0]].round(9)) if at else np.zeros(1)
 
@@ -158,7 +155,7 @@ class Around:
 
     @classmethod
     def of(cls, lattice: BankLattice, place: Place, size: tuple[int, ...]) -> "Around":
-        """For a picture of this height and width."""
+        """Find the anchors for a picture of this height and width."""
         if lattice.anchors == 1:
             first = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
             return cls(np.broadcast_to(np.int64(0), (*size, 4)), np.broadcast_to(first, (*size, 4)), one=True)
@@ -166,7 +163,7 @@ class Around:
         return cls(*lattice.field_shares(field_xy))
 
     def by_anchor(self) -> Iterator[tuple[int, Plane | None]]:
-        """The anchors in use, and each pixel's share of them; None is all."""
+        """Yield the anchors in use, and each pixel's share of them; None is all."""
         if self.one:
             yield 0, None
             return

@@ -1,8 +1,7 @@
-"""A bank of kernels behind the renderers that spread one side of the focus, or one opening, at a time.
+"""Renderers by a bank of kernels: for a method that sums one side of the focus, or one opening, at a time.
 
-The kernels of a bank as sums of few separable ones.
-
-A place of a bank in the role of an Aperture: its kernels at any diameter, blended between those that the bank has.
+A place of a bank takes the role of an Aperture (`KernelOpening`): its kernels at any diameter, blended between those of the bank,
+and as sums of few separable ones for low-rank filters.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +32,7 @@ BankTerms = Mapping[tuple[int, int, int, int], LowRankKernel]
 
 
 def decompose_bank(lattice: BankLattice, decomposed: Callable[[Float64[np.ndarray, "size size"]], LowRankKernel]) -> BankTerms:
-    """All kernels, as behind the focus. decomposed: how, see LowRankFilter."""
+    """Decompose all kernels, as behind the focus. decomposed: one kernel's terms, see LowRankFilter."""
     nodes = [(side, node, place) for side in SIDES for node in range(len(lattice.diameters_px[side])) for place in range(lattice.places)]
     terms = {}
     for key in track(nodes, "low-rank terms of the bank"):
@@ -48,7 +47,7 @@ Decompose = Callable[[Float64[np.ndarray, "size size"]], LowRankKernel]
 
 @dataclass(frozen=True, eq=False)
 class KernelOpening:
-    """Of one side of the focus, seen as behind it, one channel of the kernels.
+    """Opening of one side of the focus, seen as behind it, by one channel of the kernels.
 
     terms: low-rank terms that are known already; kept: those that were found since, for all openings of a bank.
     """
@@ -65,7 +64,7 @@ class KernelOpening:
         return self.kernels.unit_radius
 
     def rasterize(self, diameter_px: float) -> Psf:
-        """Behind the focus where positive, turned by half a turn where negative."""
+        """Draw the kernel: as behind the focus if the diameter is positive, turned by half a turn if it is negative."""
         lower, upper = (each.item() for each in self.kernels.lattice.diameter_shares(self.side, np.array(abs(diameter_px))))
         parts = [(lower, 1.0 - upper), (lower + 1, upper)]
         found = [(self._at(node), share) for node, share in parts if share > 0.0]
@@ -74,7 +73,7 @@ class KernelOpening:
         return Psf(np.ascontiguousarray(kernel if diameter_px > 0 else kernel[::-1, ::-1]))
 
     def levels(self, diameters_px: Float32[np.ndarray, "height width"], exact: Float32[np.ndarray, "height width"]) -> Levels:
-        """The bank's own diameters as levels; `diameters_px` is 0 for pixels that take no part."""
+        """Sort pixels into the bank's own diameters as levels; `diameters_px` is 0 for pixels that take no part."""
         from mrbokeh.renderers.kernels._low_rank_numba import NOT_A_LEVEL
 
         nodes_px = self.kernels.lattice.diameters_px[self.side]
@@ -108,7 +107,7 @@ Inner = Callable[[Channels, Plane, Any], Channels]
 
 @dataclass(frozen=True, eq=False)
 class BankRenderer:
-    """What a renderer does in place of spreading by the lens's aperture."""
+    """Rendering by a bank in place of the lens's aperture."""
 
     tables: BlendedTables
     sum_side: SideSum
@@ -121,19 +120,19 @@ class BankRenderer:
 
 
 def by_scatter(bank: PsfBank) -> BankRenderer:
-    """With the exact kernels, blended."""
+    """Make a renderer by the exact kernels, blended."""
     tables = BlendedTables(bank, None)
     return BankRenderer(tables, partial(scatter_side, AnchorKernels(tables.lattice)))
 
 
 def by_polygons(bank: PsfBank, apertures: BankApertures, inner: Inner, prepare: Callable[[Aperture], object]) -> BankRenderer:
-    """With the polygons fitted to them. inner: the spread of one aperture; prepare: what it needs for each."""
+    """Make a renderer by polygons fitted to the kernels. inner: the kernel sum of one aperture; prepare: makes its tables."""
     tables = BlendedTables(bank, None, unit_radius=apertures.unit_radius)
     return BankRenderer(tables, _ByPolygons(TurnedApertures(tables.lattice, apertures, prepare), inner))
 
 
 def by_low_rank(bank: PsfBank, terms: BankTerms | None, inner: Inner) -> BankRenderer:
-    """With their low-rank terms; those that are not given are found when they are needed."""
+    """Make a renderer by low-rank terms of the kernels; terms that are not given are found when they are needed."""
     tables = BlendedTables(bank, None)
     return BankRenderer(tables, _ByLowRank(AnchorKernels(tables.lattice), terms or {}, inner))
 

@@ -1,4 +1,4 @@
-"""Kernels of a bank for every pixel: the nearest sample, turned to where it is used (Leimkuehler et al. 2018, Section 6.2)."""
+"""Tables of a bank: the kernel of every pixel, the nearest sample turned to where it is used (Leimkuehler et al. 2018, Section 6.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ _MOST_KERNELS = 1 << 15  # that are kept between calls
 
 @dataclass(frozen=True)
 class Place:
-    """What a pixel's PSF depends on besides its circle of confusion; what the bank does not ask for may be None.
+    """Coordinates of pixels in a bank besides the circle of confusion; those that the bank does not need may be None.
 
     motion_px (..., 2): right and down per shutter. field_xy (..., 2): position in half diagonals. depth_m (...).
     """
@@ -47,14 +47,14 @@ class BankTables:
 
     @cached_property
     def angles(self) -> int:
-        """How many directions are told apart: an even number, so that half a turn is one of them."""
+        """Number of directions that are told apart, even so that half a turn is one of them."""
         if self.bank.turns == "none":
             return 2
         return int(np.clip(4 * self.bank.radius_px, _LEAST_ANGLES, _MOST_ANGLES)) // 2 * 2
 
     @cached_property
     def needed(self) -> frozenset[str]:
-        """What a `Place` must hold: "motion", "field", "depth"."""
+        """Names of what a `Place` must hold: "motion", "field", "depth"."""
         of_axes = {"motion_px": "motion", "eccentricity": "field", "field_x": "field", "field_y": "field", "depth_m": "depth"}
         names = {self.bank.turns, *(of_axes.get(axis.name, "none") for axis in self.bank.axes)}
         return frozenset(names - {"none"})
@@ -65,7 +65,7 @@ class BankTables:
 
     @cached_property
     def reaches_px(self) -> Int64[np.ndarray, " cells"]:
-        """How many whole pixels the light of each cell's kernel travels at most along rows or columns, however it is turned."""
+        """Whole pixels that the light of each cell's kernel travels at most along rows or columns, however it is turned."""
         return np.array([_reach_px(kernel, self.bank.turns != "none") for kernel in self.bank.kernels], np.int64)
 
     def cells(self, coc_px: Float32[np.ndarray, "*batch"], place: Place) -> Int64[np.ndarray, "*batch"]:
@@ -74,7 +74,7 @@ class BankTables:
         return self.bank.nearest(np.stack(planes, axis=-1).astype(np.float64))
 
     def farthest_px(self, coc_px: Float32[np.ndarray, " pixels"]) -> int:
-        """How far light travels at most between the least and the greatest of these, of a bank over diameters alone."""
+        """Return how far light of these diameters travels at most, by a bank over diameters alone."""
         if coc_px.size == 0:
             return 0
         first, last = self.cells(np.array([coc_px.min(), coc_px.max()], np.float32), Place())
@@ -83,7 +83,7 @@ class BankTables:
     def codes(
         self, coc_px: Float32[np.ndarray, "height width"], bright: Bool[np.ndarray, "height width"], place: Place
     ) -> Int64[np.ndarray, "height width"]:
-        """The kernel of every pixel."""
+        """Return the code of every pixel's kernel."""
         turn = np.zeros(coc_px.shape, np.int64)
         if self.bank.turns != "none":
             way = self._needed(place.motion_px if self.bank.turns == "motion" else place.field_xy, self.bank.turns)
@@ -93,11 +93,13 @@ class BankTables:
         return 2 * (self.cells(coc_px, place) * self.angles + turn % self.angles) + bright
 
     def light(self, codes: Int64[np.ndarray, "*batch"]) -> Float32[np.ndarray, "*batch channels"]:
-        """What the kernel of each code sums to."""
+        """Return the sum of each code's kernel."""
         return self.bank.throughput.astype(np.float32)[codes // 2 // self.angles]
 
     def is_dense(self, code: int) -> bool:
-        """Whether a kernel is splatted tap by tap (Section 6.4): it has few of them, or most are rim, so that points were no fewer."""
+        """Return whether a kernel is splatted tap by tap (Section 6.4): it has few taps, or most are rim, so that points would be no
+        fewer.
+        """
         return bool(self._dense[code // 2 // self.angles])
 
     @cached_property
@@ -106,7 +108,7 @@ class BankTables:
         return np.array([seen.sum() <= max(_DENSE_TAPS, _DENSE_RIM * (seen & ~binary_erosion(seen)).sum()) for seen in supports])
 
     def points(self, codes: Sequence[int], dense: bool, channel: int) -> Points:
-        """The points of these codes, in their order; what is new is computed and kept. dense: all taps."""
+        """Return the points of these codes, in their order; what is new is computed and kept. dense: all taps."""
         if len(self._kept) > _MOST_KERNELS:
             self._kept.clear()
         found = {code: self._kept.get((code, dense)) for code in codes}
@@ -116,7 +118,7 @@ class BankTables:
         return joined_points([found[code] for code in codes], channel)
 
     def _made(self, code: int, dense: bool) -> Spreadlet:
-        """Sorted by row, and kept."""
+        """Return the points of a code, sorted by row, and keep them."""
         if (code, dense) not in self._kept:
             self._kept[code, dense] = by_rows(self._computed(code, dense))
         return self._kept[code, dense]
@@ -151,7 +153,9 @@ class BankTables:
 
 
 def _reach_px(kernel: Float32[np.ndarray, "size size channels"], turns: bool) -> int:
-    """To the farthest tap along rows or columns; of one that is turned as the crow flies, and what interpolation adds."""
+    """Return the distance to the farthest tap along rows or columns; as the crow flies, and with what interpolation adds, for a kernel
+    that turns.
+    """
     down, right = np.abs(np.argwhere(kernel.any(axis=2)) - kernel.shape[0] // 2).T
     return int(np.ceil(np.hypot(down, right).max() + np.sqrt(2.0))) if turns else int(max(down.max(), right.max()))
 

@@ -1,7 +1,4 @@
-"""Which kernel every pixel takes, compiled.
-
-Tridiagonal sweeps of mrbokeh.renderers.kernels.laplacian_integration, compiled: one system per sine mode, modes side by side.
-"""
+"""Compiled loops of Laplacian spreadlets: the kernel that every pixel takes, and the tridiagonal sweeps of integration."""
 
 import numpy as np
 
@@ -26,7 +23,8 @@ def choose_cells(
     borders_px: np.ndarray,
     blocks: int,
 ) -> bool:
-    """Code of every pixel's kernel; what is sharp is copied to out and has none. False if a circle of confusion is not finite.
+    """Set the code of every pixel's kernel; sharp pixels are copied to out and have none. Returns False if a circle of confusion is not
+    finite.
 
     A code is a level + blocks * kind + 3 * blocks * (in front of the focus); kinds: 0 dense, 1 sparse, 2 whole Laplacian.
     borders_px: where each level of those beyond dense_up_to_px begins, the last 2 NEAR infinitely large.
@@ -71,7 +69,7 @@ def mark_used(used: np.ndarray, codes: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def _mirrored(place: int, length: int) -> int:
-    """A place beyond the border as in a mirror that stands on the last pixel."""
+    """Return the place inside that a place beyond the border shows, as in a mirror that stands on the last pixel."""
     while (place < 0 or place >= length) and length > 1:
         place = -place if place < 0 else 2 * (length - 1) - place
     return place if length > 1 else 0
@@ -106,7 +104,7 @@ def find_outshining(found: np.ndarray, values: np.ndarray, radius_px: int, times
 
 @njit(cache=True, nogil=True)
 def _mark_row(found: np.ndarray, values: np.ndarray, box: np.ndarray, limit: float, channels: int) -> None:
-    """Mark what exceeds its limit; stretches without any are passed in vectors."""
+    """Mark pixels that exceed their limit; stretches without any are passed in vectors."""
     stretch = _STRETCH_PX * channels
     for first in range(0, len(values), stretch):
         here, around, count = values[first : first + stretch], box[first : first + stretch], 0
@@ -129,7 +127,7 @@ def _mirror_ends(columns: np.ndarray, width: int, channels: int, radius_px: int)
 
 @njit(cache=True, nogil=True)
 def pivots(diagonal: np.ndarray, height: int) -> np.ndarray:
-    """(height, modes) reciprocal pivots of Thomas's elimination for rows -u[y-1] + diagonal u[y] - u[y+1]; diagonal (modes,) >= 2."""
+    """Return (height, modes) reciprocal pivots of Thomas's elimination for rows -u[y-1] + diagonal u[y] - u[y+1]; diagonal (modes,) >= 2."""
     modes = diagonal.shape[0]
     out = np.empty((height, modes))
     for k in range(modes):

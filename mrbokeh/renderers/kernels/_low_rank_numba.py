@@ -1,4 +1,4 @@
-"""One-pass loops over pixels that prepare a low-rank scatter: what is blurred, on which side, by which level, and how bright."""
+"""Compiled loops over pixels that prepare a low-rank scatter: which pixels are blurred, on which side, by which level, and how bright."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ NOT_A_LEVEL = -2  # neither a level nor one below a level
 def prepare(
     out: np.ndarray, diameters_px: np.ndarray, values: np.ndarray, coc_px: np.ndarray, sharp_up_to_px: float, signed: np.ndarray
 ) -> int:
-    """Split rows into what is sharp (copied to out, which else becomes 0) and what is blurred (its signed diameter, else 0).
+    """Split rows into sharp pixels (copied to out, which else becomes 0) and blurred ones (their signed diameters, else 0).
 
     A pixel without any value counts as sharp. signed (C,) is set where a channel has a negative value. Returns the flags.
     """
@@ -40,7 +40,7 @@ def prepare(
 
 @njit(cache=True, nogil=True)
 def one_side(diameters_px: np.ndarray, sign: int) -> np.ndarray:
-    """Unsigned diameters of the pixels on one side of the focus, 0 elsewhere."""
+    """Return unsigned diameters of the pixels on one side of the focus, 0 elsewhere."""
     out = np.empty_like(diameters_px)
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
@@ -58,7 +58,7 @@ def sort_into_levels(
     begins_px: np.ndarray,
     per_px: np.ndarray,
 ) -> None:
-    """Level and share of the next level for every pixel with a diameter that is not spread exactly; NOT_A_LEVEL elsewhere.
+    """Set level and share of the next level for every pixel with a diameter that is not summed exactly; NOT_A_LEVEL elsewhere.
 
     begins_px, per_px (S,): stretches of diameters and how many levels a pixel of diameter has in each. used: (levels,) is
     set where a level takes part.
@@ -84,7 +84,7 @@ def sort_into_levels(
 
 @njit(cache=True, nogil=True)
 def level_spans(levels: np.ndarray, uppers: np.ndarray, tile_px: int) -> np.ndarray:
-    """(H, tiles, 2) lowest and highest level that any pixel of a tile's row takes part in; (1, 0) where none does."""
+    """Return (H, tiles, 2): lowest and highest level that any pixel of a tile's row takes part in; (1, 0) if none does."""
     height, width = levels.shape
     spans = np.empty((height, (width + tile_px - 1) // tile_px, 2), np.int16)
     spans[..., 0], spans[..., 1] = 1, 0
@@ -104,7 +104,7 @@ def level_spans(levels: np.ndarray, uppers: np.ndarray, tile_px: int) -> np.ndar
 
 @njit(cache=True, nogil=True)
 def brightness(values: np.ndarray, channel: int, diameters_px: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Magnitudes of one channel where there is a diameter, 0 elsewhere; with the largest and the smallest of the whole."""
+    """Return magnitudes of one channel where there is a diameter, 0 elsewhere, and the largest and the smallest of the whole."""
     height, width = diameters_px.shape
     out = np.empty((height, width), np.float32)
     largest, smallest = np.float32(0), np.float32(np.inf)
@@ -135,7 +135,7 @@ def raise_shares(
     alone: float,
     contrast: float,
 ) -> None:
-    """Where the diameter lies in (above_px, up_to_px]: raise the share to how far the larger ratio is past its threshold, 0 to 1."""
+    """Raise the share, if the diameter lies in (above_px, up_to_px], to how far the larger ratio is past its threshold, 0 to 1."""
     for y in range(bright.shape[0]):
         for x in range(bright.shape[1]):
             if above_px < diameters_px[y, x] <= up_to_px and bright[y, x] > 0:

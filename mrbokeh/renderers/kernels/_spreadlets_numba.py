@@ -1,4 +1,4 @@
-"""The loops of mrbokeh.renderers.kernels.spreadlets, compiled: darts, Lloyd's relaxation, sums over Voronoi cells, annealing.
+"""Compiled loops of mrbokeh.renderers.kernels.spreadlets: darts, Lloyd's relaxation, sums over Voronoi cells, annealing.
 
 Pixels of a Laplacian come as xy (M, 2) whole pixels with charges (M, C) and importance (M,); points as (N, 2).
 """
@@ -12,7 +12,7 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True)
 def _uniform(state: np.ndarray) -> float:
-    """A number in [0, 1) from a state (1,) uint64: SplitMix64 (Steele, Lea and Flood 2014)."""
+    """Return a number in [0, 1) from a state (1,) uint64: SplitMix64 (Steele, Lea and Flood 2014)."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
     z = state[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -22,7 +22,7 @@ def _uniform(state: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True)
 def throw_darts(xy: np.ndarray, importance: np.ndarray, radius_px: np.ndarray, failures: int, seed: int) -> np.ndarray:
-    """Indices of pixels, drawn by importance and kept where none kept before is within the smaller radius of both.
+    """Return indices of pixels drawn by importance, each kept if no earlier one is within the smaller radius of both.
 
     Ends after so many failures in a row.
     """
@@ -50,7 +50,7 @@ def throw_darts(xy: np.ndarray, importance: np.ndarray, radius_px: np.ndarray, f
 
 @njit(cache=True, nogil=True)
 def nearest(points: np.ndarray, xy: np.ndarray, owner: np.ndarray) -> None:
-    """The point whose Voronoi cell holds each pixel; of two as near, the first."""
+    """Set the point whose Voronoi cell holds each pixel; of two as near, the first."""
     for m in range(xy.shape[0]):
         best = np.inf
         for n in range(points.shape[0]):
@@ -61,7 +61,7 @@ def nearest(points: np.ndarray, xy: np.ndarray, owner: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def relax(points: np.ndarray, xy: np.ndarray, importance: np.ndarray, steps: int) -> None:
-    """Lloyd: move points (floating) to the centroids of their cells, weighted by importance, so many times."""
+    """Move points (floating) to the centroids of their cells, weighted by importance, so many times (Lloyd)."""
     owner = np.empty(xy.shape[0], np.int64)
     sums = np.empty((points.shape[0], 3))
     for _ in range(steps):
@@ -78,7 +78,7 @@ def relax(points: np.ndarray, xy: np.ndarray, importance: np.ndarray, steps: int
 
 @njit(cache=True, nogil=True)
 def cell_sums(points: np.ndarray, xy: np.ndarray, charges: np.ndarray) -> np.ndarray:
-    """(N, C) sums of the charges in the Voronoi cell of every point."""
+    """Return (N, C) sums of the charges in the Voronoi cell of every point."""
     owner = np.empty(xy.shape[0], np.int64)
     nearest(points, xy, owner)
     values = np.zeros((points.shape[0], charges.shape[1]))
@@ -90,7 +90,7 @@ def cell_sums(points: np.ndarray, xy: np.ndarray, charges: np.ndarray) -> np.nda
 
 @njit(cache=True, nogil=True)
 def cost(points: np.ndarray, values: np.ndarray, potential: np.ndarray, table: np.ndarray, radius_px: int) -> float:
-    """Squared error of the integrated sum of points, less a constant: v K v - 2 v (K L).
+    """Return the squared error of the integrated sum of points, less a constant: v K v - 2 v (K L).
 
     potential (S, S, C): K L around the middle pixel (radius_px, radius_px). table: K by whole distances |x|, |y|.
     """
@@ -106,7 +106,7 @@ def cost(points: np.ndarray, values: np.ndarray, potential: np.ndarray, table: n
 
 @njit(cache=True, nogil=True)
 def _merged(points: np.ndarray) -> np.ndarray:
-    """Without points that lie on an earlier one."""
+    """Return the points without those that lie on an earlier one."""
     kept = np.empty_like(points)
     count = 0
     for i in range(points.shape[0]):

@@ -1,6 +1,6 @@
-"""Four channels of one or two cells at once, in vectors: loops over them were compiled to single steps or to tests for overlap.
+"""Vector intrinsics of splatting, in LLVM: four channels of one or two cells at once, and the aim of eight pixels at a polygon's corner.
 
-Where the impulses of a corner fall and how strong they are, for eight pixels at once.
+Plain loops over them were compiled to single steps or to tests for overlap.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ def data_of(context: Any, builder: ir.IRBuilder, kind: Any, array: Any) -> Any:
 
 
 def load_vector(builder: ir.IRBuilder, data: Any, at: Any, element: Any, lanes: int, size: int) -> Any:
-    """lanes elements of `size` bytes from data[at] on, which need not be aligned."""
+    """Load `lanes` elements of `size` bytes from data[at] on, which need not be aligned."""
     loaded = builder.load(builder.bitcast(builder.gep(data, [at]), ir.VectorType(element, lanes).as_pointer()))
     loaded.align = size
     return loaded
@@ -31,19 +31,19 @@ def store_vector(builder: ir.IRBuilder, vector: Any, data: Any, at: Any, size: i
 
 
 def shuffled(builder: ir.IRBuilder, first: Any, lanes: Sequence[int], second: Any = None) -> Any:
-    """Lanes of one vector, or of two behind one another."""
+    """Return lanes of one vector, or of two behind one another."""
     other = ir.Constant(first.type, ir.Undefined) if second is None else second
     return builder.shuffle_vector(first, other, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes)))
 
 
 def filled(builder: ir.IRBuilder, value: Any, lanes: int) -> Any:
-    """A vector of one value."""
+    """Return a vector of one value."""
     one = builder.insert_element(ir.Constant(ir.VectorType(value.type, 1), ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
     return shuffled(builder, one, [0] * lanes)
 
 
 def _add_weighted(builder: ir.IRBuilder, data: Any, at: Any, weights: Any, value: Any, size: int) -> None:
-    """data[at + 4 k : at + 4 k + 4] += weights[k] * value, a tuple of four."""
+    """Add to data[at + 4 k : at + 4 k + 4] weights[k] times value, a tuple of four."""
     real, cells = weights.type.element, weights.type.count
     four = ir.Constant(ir.VectorType(real, 4), ir.Undefined)
     for lane in range(4):
@@ -55,7 +55,7 @@ def _add_weighted(builder: ir.IRBuilder, data: Any, at: Any, weights: Any, value
 
 
 def _adding_to(cells: int) -> Any:
-    """Neighbouring cells: array[at + 4 k : at + 4 k + 4] += weights[first + k] * value for k = 0 .. cells - 1.
+    """Make the intrinsic array[at + 4 k : at + 4 k + 4] += weights[first + k] * value for k = 0 .. cells - 1, neighbouring cells.
 
     array and weights are flat and of one type, value is a tuple of four of it; places are not checked.
     """
@@ -79,7 +79,7 @@ def _adding_to(cells: int) -> Any:
 
 @intrinsic
 def _scaled(typing_context: Any, values: Any, at: Any, gain: Any) -> Lowering:
-    """values[at : at + 4] * gain, in the type of gain; values is flat, `at` is not checked."""
+    """Return values[at : at + 4] * gain, in the type of gain; values is flat, `at` is not checked."""
     signature = types.UniTuple(gain, 4)(values, types.intp, gain)
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
@@ -102,7 +102,7 @@ BLENDED_CELLS = 4
 
 @intrinsic
 def _blend_onto_cells(typing_context: Any, array: Any, at: Any, lower: Any, rise: Any, first: Any, upper: Any, value: Any) -> Lowering:
-    """BLENDED_CELLS neighbouring cells: array[at + 4 k : at + 4 k + 4] += (lower[first + k] + upper * rise[first + k]) * value.
+    """Add to array[at + 4 k : at + 4 k + 4] (lower[first + k] + upper * rise[first + k]) * value, for BLENDED_CELLS neighbouring cells.
 
     lower, rise: flat, single precision, as `upper` is; for the rest see `_adding_to`.
     """
@@ -124,7 +124,7 @@ def _blend_onto_cells(typing_context: Any, array: Any, at: Any, lower: Any, rise
 
 @intrinsic
 def _fetch(typing_context: Any, array: Any, at: Any) -> Lowering:
-    """Have the cache line of array[at] ready for writing soon."""
+    """Prefetch the cache line of array[at] for writing."""
     signature = types.void(array, types.intp)
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
@@ -139,7 +139,7 @@ def _fetch(typing_context: Any, array: Any, at: Any) -> Lowering:
 
 @intrinsic
 def _one_by_one(typing_context: Any) -> Lowering:
-    """Nothing, but in a loop it keeps the compiler from making vectors across its steps: tuned for 512 bits it is five times slower."""
+    """Do nothing, but keep the compiler from making vectors across the steps of a loop: tuned for 512 bits that is five times slower."""
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
         builder.asm(ir.FunctionType(ir.VoidType(), []), "", "", [], side_effect=True)
@@ -166,13 +166,15 @@ AIM_PX = 8
 
 
 def _aiming(pairs: tuple[tuple[int, int], tuple[int, int]]) -> Any:
-    """Of the crossings 0 (neither edge's line moved), 1 (that of the edge before), 2 (after), 3 (both) those that are stored together."""
+    """Make `aim` for pairs of crossings that are stored together: 0 (neither edge's line moved), 1 (that of the edge before), 2 (after), 3
+    (both).
+    """
 
     @intrinsic
     def aim(
         typing_context: Any, targets: Any, weights: Any, columns: Any, lines: Any, shares: Any, places: Any, steps: Any, signs: Any
     ) -> Lowering:
-        """Crossing 0 as an element of the ring, and the weights of all four, two by two.
+        """Store crossing 0 as an element of the ring, and the weights of all four, two by two.
 
         targets, columns, lines: int32; weights, shares: of the ring's type; all flat. places: (pixel, first target,
         first weight, first line before, first line after); the pairs of weights lie 2 CHUNK_PX apart. steps: int32 (of the

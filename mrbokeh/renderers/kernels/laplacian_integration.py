@@ -1,8 +1,8 @@
-"""From the Laplacian of a picture back to the picture (Leimkuehler et al. 2018, Sections 4 and 6.3).
+"""Integration: a picture from its Laplacian (Leimkuehler et al. 2018, Sections 4 and 6.3).
 
-The Laplacian is the isotropic 3x3 one, ((1, 4, 1), (4, -20, 4), (1, 4, 1)) / 6. Its error term is the squared Laplacian / 12,
-so that polynomials up to degree 3 and harmonic ones up to degree 7 have their true Laplacian; `mrbokeh.renderers.kernels.spreadlets` counts
-on both. Pictures are zero on a border and beyond, which makes the answer unique.
+The Laplacian is the isotropic 3x3 one, ((1, 4, 1), (4, -20, 4), (1, 4, 1)) / 6. Its error term is the squared Laplacian / 12, so that
+polynomials up to degree 3 and harmonic ones up to degree 7 have their true Laplacian; `mrbokeh.renderers.kernels.spreadlets` counts on
+both. Pictures are zero on a border and beyond, which makes the answer unique.
 
 `integrate` inverts just this operator: a sine transform along rows decouples the columns, and every column is a
 tridiagonal system with two sweeps. Nothing is approximated; a picture that is zero within one pixel of the border comes
@@ -92,7 +92,7 @@ def _in_place(transform: Callable[..., Channels], rows: Channels) -> None:
 
 @lru_cache(maxsize=4)
 def _system(height: int, width: int) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, "height modes"]]:
-    """Of every sine mode what the neighbours in a column weigh, and the reciprocal pivots of its elimination."""
+    """Return for every sine mode the weight of the neighbours in a column, and the reciprocal pivots of its elimination."""
     from mrbokeh.renderers.kernels._laplacian_numba import pivots
 
     cosine = np.cos(np.pi * np.arange(1, width + 1) / width)
@@ -116,7 +116,7 @@ def integrate_plainly(source: Channels) -> Float64[np.ndarray, "height width cha
 
 
 def integrate_by_pyramid(source: Channels) -> Channels:
-    """Nearly the same by a convolution pyramid (Farbman et al. 2011): a few small filters per level, no transform."""
+    """Return nearly the same as `integrate` by a convolution pyramid (Farbman et al. 2011): a few small filters per level, no transform."""
     import cv2
 
     _check(source)
@@ -136,7 +136,7 @@ def integrate_by_pyramid(source: Channels) -> Channels:
 
 
 def _bordered(values: Channels) -> Float[np.ndarray, "height_out width_out channels"]:
-    """Zeros all around, at every level, so that nothing is reflected."""
+    """Pad with zeros all around, at every level, so that nothing is reflected."""
     border = (_PYRAMID_BORDER_PX, _PYRAMID_BORDER_PX)
     return np.pad(values, (border, border, (0, 0)))
 

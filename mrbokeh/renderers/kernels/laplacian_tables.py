@@ -1,4 +1,6 @@
-"""Which kernel a pixel takes, and the points of all kernels that a picture needs, kept from call to call."""
+"""Tables of kernels as points: the kernel that a pixel takes, and the points of all kernels that a picture needs, kept from call to
+call.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -58,7 +60,7 @@ class KernelTables:
         coc_px: Float32[np.ndarray, "height width"],
         aperture: Aperture,
     ) -> Int32[np.ndarray, "height width"]:
-        """Codes of the kernels, -1 for what is sharp or dark; sharp pixels are copied to out."""
+        """Return codes of the kernels, -1 for sharp and dark pixels; sharp ones are copied to out."""
         from mrbokeh.renderers.kernels._laplacian_numba import choose_cells
 
         codes = np.empty(coc_px.shape, np.int32)
@@ -77,7 +79,7 @@ class KernelTables:
         return codes
 
     def points(self, codes: Sequence[int], aperture: Aperture, threads: int, dense: bool = False) -> Points:
-        """The points of these codes, in their order; what is new is computed and kept. dense: all taps, whatever the code says."""
+        """Return the points of these codes, in their order; new ones are computed and kept. dense: all taps, whatever the code says."""
         vertices, starts, weights = aperture.packed()
         key = vertices.tobytes() + starts.tobytes() + weights.tobytes()
         if len(self.kept) > _MOST_KERNELS:
@@ -113,7 +115,7 @@ def taps_of(kernel: Float[np.ndarray, "size size *channels"]) -> Spreadlet:
 
 
 def kind_of(code: int) -> int:
-    """DENSE, SPARSE or WHOLE."""
+    """Return DENSE, SPARSE or WHOLE."""
     return code // _BLOCK % 3
 
 
@@ -124,7 +126,7 @@ def by_rows(cell: Spreadlet) -> Spreadlet:
 
 
 def joined_points(cells: Sequence[Spreadlet | None], channel: int = 0) -> Points:
-    """Cells that are sorted by row, one after the other, but None; weights of one channel."""
+    """Join cells that are sorted by row, leaving out None; weights of one channel."""
     some = [cell for cell in cells if cell is not None]
     xy = np.concatenate([each.points for each in some]).astype(np.int32)
     weights = np.concatenate([each.values[:, channel] for each in some])
@@ -133,7 +135,9 @@ def joined_points(cells: Sequence[Spreadlet | None], channel: int = 0) -> Points
 
 
 def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.ndarray, "height width"]:
-    """Pixels that outshine the mean of their surroundings in any channel: lamps and lone pixels, whose PSF can be seen."""
+    """Return a mask of pixels that outshine the mean of their surroundings in any channel: highlights and lone pixels, whose PSF can be
+    seen.
+    """
     from mrbokeh.renderers.kernels._laplacian_numba import find_outshining
 
     light = np.ascontiguousarray(values, np.float32)
@@ -153,7 +157,7 @@ def stands_out_plainly(values: Float32[np.ndarray, "height width channels"]) -> 
 
 
 def used_codes(codes: Int[np.ndarray, "height width"]) -> Int[np.ndarray, " codes"]:
-    """The codes that occur, but -1, ascending; without sorting all pixels."""
+    """Return the codes that occur, but -1, ascending; without sorting all pixels."""
     from mrbokeh.renderers.kernels._laplacian_numba import mark_used
 
     used = np.zeros(int(codes.max(initial=-1)) + 1, np.bool_)

@@ -2,8 +2,7 @@
 
 The singular values say how much of a kernel the first r terms leave out (McGraw, Eq. 2 to 4). Eq. 3 as printed lacks a
 square root: here both norms of the relative error are Frobenius norms, sqrt(s_{r+1}^2 + ... + s_m^2) / sqrt(s_1^2 + ... + s_m^2).
-
-Levels: the diameters at which low-rank kernels are tabulated, and how the pixels of a picture share them.
+Kernels are tabulated at fixed diameters (levels), and every pixel shares its light between the two levels next to its own.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,12 +48,12 @@ class LowRankKernel:
 
     @property
     def scaled_columns(self) -> Float64[np.ndarray, "rank size"]:
-        """u' = sqrt(|s|) u of McGraw's Section 3."""
+        """Columns u' = sqrt(|s|) u of McGraw's Section 3."""
         return np.sqrt(np.abs(self.weights))[:, None] * self.columns
 
     @property
     def scaled_rows(self) -> Float64[np.ndarray, "rank size"]:
-        """v' = sqrt(|s|) v; these carry the sign of a negative weight."""
+        """Rows v' = sqrt(|s|) v; they carry the sign of a negative weight."""
         return (np.sign(self.weights) * np.sqrt(np.abs(self.weights)))[:, None] * (self.columns if self.rows is None else self.rows)
 
     def dense(self) -> Float64[np.ndarray, "size size"]:
@@ -63,19 +62,21 @@ class LowRankKernel:
 
 
 def relative_errors(kernel: Float[np.ndarray, "rows columns"]) -> Float64[np.ndarray, " size"]:
-    """What the best approximation of rank 1, 2, ... size misses of a kernel, norm over norm; it falls from below 1 to 0."""
+    """Return the relative errors of the best approximations of rank 1, 2, ... size of a kernel, norm over norm; they fall from below 1 to
+    0.
+    """
     return _errors(np.linalg.svd(_square(kernel), compute_uv=False))
 
 
 def aperture_errors(aperture: Aperture, diameter_px: float) -> Float64[np.ndarray, " size"]:
-    """`relative_errors` of the PSF at this diameter: one curve of McGraw's Fig. 3."""
+    """Return `relative_errors` of the PSF at this diameter: one curve of McGraw's Fig. 3."""
     return relative_errors(aperture.rasterize(diameter_px).kernel)
 
 
 def decompose(
     kernel: Float[np.ndarray, "rows columns"], relative_error: float = 0.0, max_rank: int | None = None, min_rank: int = 1
 ) -> LowRankKernel:
-    """The first terms of a kernel, as few as meet `relative_error`, at least `min_rank` (if it has as many), at most `max_rank`.
+    """Return the first terms of a kernel, as few as meet `relative_error`, at least `min_rank` (if it has as many), at most `max_rank`.
 
     Cutting the sum short loses energy. The weights are therefore changed by the least amount (in the sense of squares,
     which is the Frobenius norm of the change, as the terms are orthonormal) that gives the sum of the terms the sum of
@@ -99,7 +100,7 @@ def _square(kernel: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "size size"
 
 
 def _terms(kernel: Float64[np.ndarray, "size size"]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Weights, largest first, columns and rows; no rows where the kernel is its own transpose."""
+    """Return weights, largest first, columns and rows; no rows where the kernel is its own transpose."""
     if np.abs(kernel - kernel.T).max() <= _SYMMETRY * np.abs(kernel).max():
         values, vectors = np.linalg.eigh(0.5 * (kernel + kernel.T))
         order = np.argsort(-np.abs(values), kind="stable")
@@ -119,7 +120,7 @@ def _rank(errors: Float64[np.ndarray, " size"], relative_error: float, max_rank:
 
 
 def _balanced(weights: np.ndarray, columns: np.ndarray, rows: np.ndarray, kernel: Float64[np.ndarray, "size size"]) -> np.ndarray:
-    """Weights nearest to the given ones whose terms have the sum (and the centroid) of the kernel."""
+    """Return the weights nearest to the given ones whose terms have the sum (and the centroid) of the kernel."""
     away = np.linspace(-1.0, 1.0, kernel.shape[0]) if kernel.shape[0] > 1 else np.zeros(1)
     ones = np.ones_like(away)
     moments = ((ones, ones), (ones, away), (away, ones))
@@ -185,13 +186,13 @@ def levels_of(diameters_px: Float32[np.ndarray, "height width"], exact: Float32[
 
 
 def _grid_px(largest_px: float) -> np.ndarray:
-    """Diameters of the levels up to the first beyond the largest."""
+    """Return the diameters of the levels up to the first beyond the largest."""
     ends_px = [*_BEGINS_PX[1:], max(_BEGINS_PX[-1], np.ceil(largest_px)) + 2.0]
     return np.concatenate([np.arange(begin, end, 1.0 / per) for begin, end, per in zip(_BEGINS_PX, ends_px, _LEVELS_PER_PX, strict=True)])
 
 
 def taps_of(levels: Levels, kernel_at: Callable[[float], LowRankKernel], mirrored: bool) -> Taps:
-    """The kernels of all levels as taps; mirrored: for pixels in front of the focus."""
+    """Return the kernels of all levels as taps; mirrored: for pixels in front of the focus."""
     kernels = [None if np.isnan(diameter_px) else kernel_at(diameter_px) for diameter_px in levels.diameters_px]
     known = [kernel for kernel in kernels if kernel is not None]
     terms, size = max(kernel.rank for kernel in known), 2 * max(kernel.radius_px for kernel in known) + 1

@@ -2,19 +2,18 @@
 
 The 3x3 Laplacian of a kernel is gathered into points: darts thrown by importance, Lloyd's relaxation, sums over Voronoi
 cells, annealing with merging. What the paper stores are the sums; they keep the charge and nothing else, so the light would
-drift and shine far beyond its circle. Here the values are fitted in a last step (mrbokeh.renderers.kernels.spreadlets): the light and
-the centroid are exact, and the error is the least for these points. Without `fit` the sums stay as in the paper.
+drift and shine far beyond its circle. Here the values are fitted in a last step: the light and the centroid are exact, and the error
+is the least for these points. Without `fit` the sums stay as in the paper.
 
 Where the paper is silent: the radius around a dart is that of a disc which holds the charge of a point, sum |L| / points;
 the number of points is `points_per_px` times the length of the kernel's outline, sum |grad f| / sum f^2, which is the
 circumference for a disc; the cost is the squared error instead of the absolute one, which makes one step a matter of
 points squared; the temperature begins at 1 % of the cost and falls linearly.
 
-The best values for given points of a spreadlet: least squares over the whole plane, with the moments of light kept.
-
-A kernel f with Laplacian L = D f is replaced by the sum of v_j at points p_j; what is seen is G v, with G the inverse of D.
-The squared error is |G (L - v)|^2 = (L - v) K (L - v), K = G G: the Green's function of the squared Laplacian, r^2 log r / (8 pi)
-far away. K grows, so the error is finite only if L - v has neither charge nor dipole: thin-plate splines in other clothes.
+The fit is a least-squares one over the whole plane. A kernel f with Laplacian L = D f is replaced by the sum of v_j at points p_j;
+what is seen is G v, with G the inverse of D. The squared error is |G (L - v)|^2 = (L - v) K (L - v), K = G G: the Green's function of
+the squared Laplacian, r^2 log r / (8 pi) far away. K grows, so the error is finite only if L - v has neither charge nor dipole:
+thin-plate splines in other clothes.
 
 What the moments of L mean, by Green's second identity, sum(L p) = sum(f D p) for every polynomial p:
 - D 1 = D x = D y = 0: charge and dipole of L are 0, else a spreadlet would shine to infinity as log r or 1 / r;
@@ -43,7 +42,7 @@ _LEAST_MOMENT = 1e-9
 
 @lru_cache(maxsize=8)
 def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
-    """K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
+    """Return K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
     half = fast_width(_DOMAIN // 2 * reach_px + 2)
     source = np.zeros((2 * half + 1, 2 * half + 1, 1))
     source[half, half] = 1.0
@@ -52,7 +51,7 @@ def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
 
 
 def potential_of(charges: Float64[np.ndarray, "size size channels"], table: Float64[np.ndarray, "side side"]) -> np.ndarray:
-    """K L on the pixels of L; the table must reach across."""
+    """Return K L on the pixels of L; the table must reach across."""
     reach = charges.shape[0] - 1
     quarter = table[: reach + 1, : reach + 1]
     half = np.concatenate([quarter[:0:-1], quarter])
@@ -69,7 +68,7 @@ def table_for(size: int) -> Float64[np.ndarray, "side side"]:
 
 
 def moments(xy: np.ndarray, scale_px: float | np.ndarray, degree: int) -> Float64[np.ndarray, "points moments"]:
-    """Monomials up to a degree at every point, in units of scale_px, one for both axes or one for each."""
+    """Return monomials up to a degree at every point, in units of scale_px, one for both axes or one for each."""
     x, y = (xy / scale_px).T
     return np.stack([x ** (total - j) * y**j for total in range(degree + 1) for j in range(total + 1)], axis=1)
 
@@ -81,7 +80,7 @@ def fitted_values(
     potential: Float64[np.ndarray, "size size channels"],
     table: Float64[np.ndarray, "side side"],
 ) -> Float64[np.ndarray, "points channels"]:
-    """Values at the points with the least squared error among those that keep the moments of the charges."""
+    """Return the values at the points with the least squared error that keep the moments of the charges."""
     radius_px = potential.shape[0] // 2
     return _solved(points, xy, charges, potential[points[:, 1] + radius_px, points[:, 0] + radius_px], table)
 
@@ -89,7 +88,7 @@ def fitted_values(
 def turned(
     points: Int16[np.ndarray, "points 2"], values: Float64[np.ndarray, "points channels"], angle_rad: float
 ) -> tuple[Int16[np.ndarray, "places 2"], Float64[np.ndarray, "places channels"]]:
-    """A spreadlet turned from x towards y: points at the nearest whole pixels with values fitted to where they should be.
+    """Turn a spreadlet from x towards y: points at the nearest whole pixels with values fitted to where they should be.
 
     Rounding alone would give every point a dipole; as the moments are fitted, light and centroid stay exact here, too.
     """
@@ -107,7 +106,7 @@ def turned(
 
 @lru_cache(maxsize=8)
 def _spline(side: int) -> Float64[np.ndarray, "side side"]:
-    """Coefficients that make a table of this size smooth between whole distances."""
+    """Return coefficients that make a table of this size smooth between whole distances."""
     return spline_filter(biharmonic_table(side - 1), order=3, mode="mirror")
 
 
@@ -118,7 +117,7 @@ def _solved(
     potential: Float64[np.ndarray, "points channels"],
     table: Float64[np.ndarray, "side side"],
 ) -> Float64[np.ndarray, "points channels"]:
-    """Values at points (N, 2) for charges at xy (M, 2), whose potential at the points is known.
+    """Return values at points (N, 2) for charges at xy (M, 2), whose potential at the points is known.
 
     Moments up to degree 3 are kept with at least 30 points; fewer points keep fewer moments, at least the charge. Points in few
     rows, as those of a line, cannot have all of them on their own (y^3 = y in rows -1, 0 and 1): `_independent`.
@@ -144,7 +143,7 @@ def _independent(
 ) -> tuple[Float64[np.ndarray, "points kept"], Float64[np.ndarray, "kept channels"]]:
     """Combinations of moments that the points can have independently, and what the charges have of them.
 
-    A lower degree where the charges have a moment that the points cannot have.
+    The degree is lowered if the charges have a moment that the points cannot have.
     """
     scale_px = np.maximum(np.abs(xy).max(axis=0), 1.0)
     held, wanted = moments(points, scale_px, degree), moments(xy, scale_px, degree).T @ charges
@@ -163,7 +162,7 @@ _MOVED_SHARE, _HEAT = 0.01, 0.01
 
 @dataclass(frozen=True)
 class Sparsification:
-    """How a kernel becomes few points.
+    """Settings of how a kernel becomes few points.
 
     points_per_px: points per pixel of outline, and at least `least_points`: a bright core in a wide veil has a short outline,
     and fewer than 30 points cannot hold all moments. failures, lloyd_steps, annealing_steps: as in the paper. fit: least squares at
@@ -221,13 +220,13 @@ class Spreadlets:
 
 
 def whole_laplacian(kernel: Float[np.ndarray, "height width *channels"]) -> Spreadlet:
-    """Every pixel of a kernel's Laplacian that is not 0: the exact spreadlet, the twin of `sparsify`."""
+    """Return every pixel of a kernel's Laplacian that is not 0: the exact spreadlet, the twin of `sparsify`."""
     xy, charges, _ = _charges(kernel)
     return Spreadlet(xy.astype(np.int16), charges)
 
 
 def sparsify(kernel: Float[np.ndarray, "height width *channels"], settings: Sparsification | None = None) -> Spreadlet:
-    """A kernel (K, K) or (K, K, C), K odd, as few points. A kernel that has few pixels anyway comes back whole."""
+    """Return a kernel (K, K) or (K, K, C), K odd, as few points. A kernel that has few pixels anyway comes back whole."""
     from mrbokeh.renderers.kernels._spreadlets_numba import anneal, cell_sums, cost, relax, throw_darts
 
     settings = settings or Sparsification()
@@ -252,14 +251,14 @@ def sparsify(kernel: Float[np.ndarray, "height width *channels"], settings: Spar
 
 
 def outline_px(kernel: Float[np.ndarray, "height width *channels"]) -> float:
-    """Length of a kernel's outline: its total variation over its sum of squares; the circumference of a disc."""
+    """Return the length of a kernel's outline: its total variation over its sum of squares; the circumference of a disc."""
     values = np.pad(kernel.reshape(*kernel.shape[:2], -1).astype(np.float64), ((1, 1), (1, 1), (0, 0)))
     down, right = np.diff(values, axis=0)[:, :-1], np.diff(values, axis=1)[:-1]
     return float(np.sqrt(down**2 + right**2).sum() / (values**2).sum())
 
 
 def _charges(kernel: np.ndarray) -> tuple[Int64[np.ndarray, "pixels 2"], Float64[np.ndarray, "pixels channels"], np.ndarray]:
-    """Places and values of what is not 0 of the Laplacian, and all of it."""
+    """Return places and values of the Laplacian's pixels that are not 0, and all of it."""
     if kernel.ndim not in (2, 3) or kernel.shape[0] != kernel.shape[1] or kernel.shape[0] % 2 == 0:
         raise InputError(f"a kernel must be square with an odd size, (K, K) or (K, K, C), but came with shape {kernel.shape}")
     dense = laplacian(kernel.reshape(*kernel.shape[:2], -1))

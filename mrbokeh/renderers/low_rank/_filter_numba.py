@@ -1,11 +1,9 @@
-"""Low-rank scatter of a picture whose blur changes from pixel to pixel: per tile of the result, level by level, term by term.
+"""Compiled low-rank scatter of a picture whose blur changes from pixel to pixel: levels, exact splats, McGraw's two passes.
 
-A tile is TILE_FLOATS numbers wide, so that one row of it is a fixed count that the compiler turns into vector code.
-Its work (rows of one level's share of the picture, and one term's rows filtered across) stays in the processor's cache.
-
-Exact scatter of single pixels with tabulated 2D kernels; what the low-rank sum must not touch goes this way.
-
-McGraw's passes, compiled: across with the kernel of the source, down with the kernel of the pixel that was reached.
+Levels are summed per tile of the result, level by level, term by term. A tile is TILE_FLOATS numbers wide, so that one row of it is a
+fixed count that the compiler turns into vector code. Its work (rows of one level's share of the picture, and one term's rows filtered
+across) stays in the processor's cache. Exact splats take single pixels by tabulated 2D kernels. McGraw's passes go across with the
+kernel of the source, and down with the kernel of the pixel that was reached.
 """
 
 import numpy as np
@@ -78,7 +76,7 @@ def splat_pixels(
 
 @njit(cache=True, nogil=True)
 def _blended(taps: np.ndarray, table: np.ndarray, position: float) -> None:
-    """taps (K,) between two neighbouring rows of a table (levels, K)."""
+    """Set taps (K,) between two neighbouring rows of a table (levels, K)."""
     level = min(int(position), table.shape[0] - 2)
     upper = np.float32(position - level)
     for j in range(taps.shape[0]):
@@ -140,7 +138,7 @@ _ROWS_AT_ONCE = 4
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _across(row: np.ndarray, line: np.ndarray, taps: np.ndarray, channels: int) -> None:
-    """row[x] = sum of taps[j] * line[x + j * channels]; four taps at once, or storing the row would cost more than adding."""
+    """Set row[x] to the sum of taps[j] * line[x + j * channels]; four taps at once, or storing the row would cost more than adding."""
     row[:] = np.float32(0)
     count = taps.shape[0]
     whole = count - count % 4
@@ -161,7 +159,7 @@ def _across(row: np.ndarray, line: np.ndarray, taps: np.ndarray, channels: int) 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _four_by_four(out: np.ndarray, across: np.ndarray, taps: np.ndarray) -> None:
-    """Four rows of the result from four filtered rows; taps: the seven that lie between them, the middle one for row = row."""
+    """Add to four rows of the result from four filtered rows; taps: the seven that lie between them, the middle one for row = row."""
     out0, out1, out2, out3 = out[0], out[1], out[2], out[3]
     in0, in1, in2, in3 = across[0], across[1], across[2], across[3]
     t0, t1, t2, t3, t4, t5, t6 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5], taps[6]
@@ -175,7 +173,7 @@ def _four_by_four(out: np.ndarray, across: np.ndarray, taps: np.ndarray) -> None
 
 @njit(cache=True, nogil=True)
 def _down(out: np.ndarray, across: np.ndarray, lit: np.ndarray, padded_taps: np.ndarray, count: int) -> None:
-    """out[y] += sum of tap[j] * across[y + j]; padded_taps has 3 zeros before and 6 behind, so that no four need a case."""
+    """Add to out[y] the sum of tap[j] * across[y + j]; padded_taps has 3 zeros before and 6 behind, so that no four need a case."""
     for y in range(0, out.shape[0], _ROWS_AT_ONCE):
         for at in range(y, y + count + 3, _ROWS_AT_ONCE):
             if lit[at] or lit[at + 1] or lit[at + 2] or lit[at + 3]:
@@ -186,7 +184,7 @@ def _down(out: np.ndarray, across: np.ndarray, lit: np.ndarray, padded_taps: np.
 def _stage(
     line: np.ndarray, values: np.ndarray, shares: np.ndarray, levels: np.ndarray, uppers: np.ndarray, left: int, pixels: int, level: int
 ) -> bool:
-    """One level's share of a row of the picture from column `left` on, 0 beyond the frame; False where that is nothing."""
+    """Set one level's share of a row of the picture from column `left` on, 0 beyond the frame; False if that is nothing."""
     line[:] = np.float32(0)
     channels = values.shape[1]
     lit = False
@@ -209,7 +207,7 @@ def _stage(
 def _level_on_tile(
     sums: np.ndarray, lines: np.ndarray, lit: np.ndarray, across: np.ndarray, columns: np.ndarray, rows: np.ndarray, channels: int
 ) -> None:
-    """All terms of one level: every lit line across, then down into the sums; columns with their zeros around them."""
+    """Add all terms of one level: every lit line across, then down into the sums; columns with their zeros around them."""
     count = rows.shape[1]
     for term in range(rows.shape[0]):
         for y in range(lines.shape[0]):
@@ -233,7 +231,7 @@ def _any_in_reach(spans: np.ndarray, top: int, bottom: int, left: int, right: in
 def _stage_level(
     lines: np.ndarray, lit: np.ndarray, source: tuple, top: int, bottom: int, tile: int, tile_px: int, radius_px: int, level: int
 ) -> bool:
-    """One level's share of all rows of the picture that reach rows top:bottom of a tile; False where that is nothing.
+    """Set one level's share of all rows of the picture that reach rows top:bottom of a tile; False if that is nothing.
 
     source: values, shares, levels, uppers and spans of `scatter_piece`.
     """

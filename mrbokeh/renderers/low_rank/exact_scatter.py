@@ -1,6 +1,6 @@
-"""Exact scatter of the pixels that a low-rank sum must not touch, each with its own 2D kernel.
+"""Exact scatter of the pixels that a low-rank sum must not touch: which they are (highlights), and each by its own 2D kernel.
 
-Highlights: pixels so much brighter than what surrounds them that the ripples of a short low-rank sum would show.
+Highlights are pixels so much brighter than those around them that the ripples of a short low-rank sum would show.
 """
 
 from collections.abc import Callable, Iterable
@@ -28,7 +28,9 @@ _BAND_PX = 32  # rows summed by themselves; fixed, so that the sum does not depe
 
 @dataclass(frozen=True)
 class _Tables:
-    """taps: those of all kernels one after the other, each from its entry in `starts`; lowers (N,), uppers (N,): of every pixel."""
+    """Kernels as taps: those of all kernels one after the other, each from its entry in `starts`; lowers (N,), uppers (N,): of every
+    pixel.
+    """
 
     taps: Float32[np.ndarray, " taps"]
     starts: Int[np.ndarray, " kernels"]
@@ -58,7 +60,7 @@ def scatter_exactly(
 
 
 def _tables(diameters_px: Float32[np.ndarray, " pixels"], aperture: Aperture | KernelOpening, sign: int) -> _Tables:
-    """The kernel of every diameter in use if they are few, as lights are; else kernels at fixed steps."""
+    """Return the kernel of every diameter in use if they are few, as for highlights; else kernels at fixed steps."""
     own_px, lowers = np.unique(diameters_px, return_inverse=True)
     taps_each = (2 * kernel_radius_px(float(own_px[-1]), aperture.unit_radius) + 1) ** 2
     if len(own_px) <= _MOST_OWN_KERNELS and len(own_px) * taps_each <= _MOST_OWN_TAPS:
@@ -87,7 +89,7 @@ def _band(
     tables: _Tables,
     part: slice,
 ) -> tuple[Float32[np.ndarray, "rows columns channels"], int, int]:
-    """Light of a band of pixels on the smallest rectangle that holds it, and the row and column where that begins."""
+    """Return the light of a band of pixels on the smallest rectangle that holds it, and the row and column where that begins."""
     from mrbokeh.renderers.low_rank._filter_numba import splat_pixels
 
     lowers, uppers = tables.lowers[part], tables.uppers[part]
@@ -127,11 +129,10 @@ def exact_share(
 ) -> Float32[np.ndarray, "height width"]:
     """How much of each pixel's light has to be spread by its exact kernel: 0 for most, 1 for highlights.
 
-    diameters_px: unsigned, 0 for pixels that take no part. unit_radius: of the aperture.
-    A pixel's window is the square its light may reach (its radius rounded up to a power of two). In every channel two
-    ratios are taken: value over mean of the window, and mean over the window of value over what a patch there has, where
-    anything is lit at all. The share rises from 0 at ALONE (CONTRAST) to 1 at twice that. It depends on ratios only, so
-    that light scaled as a whole is treated alike.
+    diameters_px: unsigned, 0 for pixels that take no part. unit_radius: of the aperture. A pixel's window is the square its light may
+    reach (its radius rounded up to a power of two). In every channel two ratios are taken: value over mean of the window, and mean over
+    the window of value over what a patch there has, where anything is lit at all. The share rises from 0 at ALONE (CONTRAST) to 1 at
+    twice that. It depends on ratios only, so that light scaled as a whole is treated alike.
     """
     if diameters_px.max() * unit_radius <= 2.0 * LEAST_RADIUS_PX - 1.0:
         return np.zeros(diameters_px.shape, np.float32)
@@ -146,7 +147,7 @@ def _share(
     diameters_px: Float32[np.ndarray, "height width"],
     unit_radius: float,
 ) -> Float32[np.ndarray, "height width"] | None:
-    """The share that one channel asks for; None where it is too even to ask for any."""
+    """Return the share that one channel asks for; None if it is too even to ask for any."""
     import cv2
 
     from mrbokeh.renderers.kernels._low_rank_numba import brightness, darkness, raise_shares

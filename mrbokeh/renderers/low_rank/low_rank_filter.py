@@ -1,20 +1,19 @@
 """Low-rank filters: every pixel's PSF as a sum of few separable kernels (McGraw, Fast Bokeh Effects Using Low-Rank Linear Filters).
 
 The blur of a picture changes from pixel to pixel, and a separable filter whose width changes between its two passes is
-not the blur that was asked for (McGraw therefore goes back to 2D filtering near depth edges; see _low_rank_per_pixel).
+not the blur that was asked for (McGraw therefore goes back to 2D filtering near depth edges; see mrbokeh.renderers.low_rank.per_pixel).
 Here the pixels are sorted by diameter instead: each gives its light to the two tabulated kernels next to its own, and all
 light of one kernel is an even, truly separable scatter. Edges of depth need no mask then, and no light is lost or doubled.
 
 What it costs: the light of a pixel is not exactly its PSF. The low-rank sum ripples within the square around the kernel
 (in the corners too, where the kernel has ended) with a norm of `relative_error` of the kernel's, and blending two kernels
 adds up to 3 % to that. Ripples average out over an even field (exactly), a texture and even an edge: an edge from 0 to 1 is
-within 0.003 of its exact blur at the default. They do not average out for lights: those are spread by their exact kernels,
-see _low_rank_highlights. Beside a bright area that just fails to count as one, the dark is off by a tenth of its own light.
+within 0.003 of its exact blur at the default. They do not average out for highlights: those are summed by their exact kernels,
+see mrbokeh.renderers.low_rank.exact_scatter. Beside a bright area that just fails to count as one, the dark is off by a tenth of its
+own light.
 
-Tilt-shift: a photograph blurred by a map that somebody drew, without any depth (McGraw, Section 4 and Fig. 14).
-
-A tilted lens keeps a wedge of space sharp; a gradient of blur drawn over a photograph looks alike and makes the subject
-seem small. The map is one of diameters in pixels: 0 along the band to keep, growing smoothly away from it.
+`tilt_shift` blurs a photograph by a map that somebody drew, without any depth (McGraw, Section 4 and Fig. 14): a tilted lens keeps a
+wedge of space sharp, and a gradient of blur drawn over a photograph looks alike and makes the subject seem small.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -51,7 +50,7 @@ class LowRankFilter:
     relative_error: the rank of every kernel is the least from 4 on with this error (McGraw, Eq. 4), at most max_rank.
     per_pixel: McGraw's two passes of varying width with a mask near edges of depth, in place of levels (slower, less exact).
     threads: 0 takes all cores.
-    bank: kernels to use instead of the lens's aperture (what is blurred by up to 1 px stays sharp, other kernels are blended between
+    bank: kernels to use instead of the lens's aperture (blur of up to 1 px stays sharp, other kernels are blended between
       those of the bank around a pixel); terms: its own, if they have been computed before.
 
     It is linear but for two steps. Which pixels count as highlights depends on ratios to their surroundings: light scaled as
@@ -91,7 +90,7 @@ class LowRankFilter:
         coc_px: Float32[np.ndarray, "height width"],
         aperture: Aperture | KernelOpening,
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.KernelSum."""
+        """Sum kernels as mrbokeh.layering.psf_over_field.KernelSum says."""
         if values.shape[2] > _MOST_CHANNELS:
             parts = [values[..., at : at + _MOST_CHANNELS] for at in range(0, values.shape[2], _MOST_CHANNELS)]
             return np.concatenate([self.sum_kernels(np.ascontiguousarray(part), coc_px, aperture) for part in parts], axis=2)
@@ -131,12 +130,12 @@ class LowRankFilter:
         _scatter_levels(out, values, shares, levels, taps_of(levels, kernel_at, sign < 0), each)
 
     def decomposed(self, kernel: Float64[np.ndarray, "size size"]) -> LowRankKernel:
-        """As few terms of a kernel as the settings allow; small ones at full rank."""
+        """Decompose a kernel into as few terms as the settings allow; small ones at full rank."""
         small = len(kernel) // 2 < LEAST_RADIUS_PX
         return decompose(kernel) if small else decompose(kernel, self.relative_error, self.max_rank, _LEAST_RANK)
 
     def _kernel(self, aperture: Aperture | KernelOpening, diameter_px: float) -> LowRankKernel:
-        """The decomposed PSF, kept for the next call."""
+        """Return the decomposed PSF, kept for the next call."""
         if isinstance(aperture, KernelOpening):
             return aperture.low_rank(diameter_px, self.decomposed)
         vertices, starts, weights = aperture.packed()
@@ -154,7 +153,9 @@ def _split(
     sharp_up_to_px: float,
     each: Callable[[Callable, Iterable], Iterable],
 ) -> tuple[Float32[np.ndarray, "height width channels"], Float32[np.ndarray, "height width"], list[int], Bool[np.ndarray, " channels"]]:
-    """What is sharp, the signed diameters of what is not (else 0), the signs among them, and which channels have negative values."""
+    """Return the sharp pixels, the signed diameters of the others (else 0), the signs among them, and the channels with negative
+    values.
+    """
     from mrbokeh.renderers.kernels._low_rank_numba import BEHIND, IN_FRONT, NOT_FINITE, prepare
 
     height, width, channels = values.shape
@@ -182,7 +183,7 @@ def _scatter_levels(
     taps: Taps,
     each: Callable[[Callable, Iterable], Iterable],
 ) -> None:
-    """Add share * value of every pixel that has a level, spread by its low-rank kernels, to out."""
+    """Add share * value of every pixel that has a level, blurred by its low-rank kernels, to out."""
     from mrbokeh.renderers.kernels._low_rank_numba import level_spans
     from mrbokeh.renderers.low_rank._filter_numba import TILE_FLOATS, scatter_piece
 
@@ -208,7 +209,8 @@ def tilt_shift(
     rank: int = 3,
     threads: int = 0,
 ) -> Float32[np.ndarray, "height width 3"]:
-    """A scene-linear picture with every pixel spread by its own diameter, and the sum divided by how much arrived.
+    """Return a scene-linear picture with every pixel blurred by its own diameter (0 along the band to keep, growing smoothly away from
+    it), and the sum divided by how much arrived.
 
     coc_px: from 0 (kept; anything below 1 px is) to any size; negative diameters mirror the aperture. Steps in the map are
     allowed and give what no depth can order: light of both sides mixes across them. aperture: plain.

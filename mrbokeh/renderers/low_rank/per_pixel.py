@@ -1,4 +1,4 @@
-"""McGraw's own way with a blur that varies: two passes whose width changes from pixel to pixel, and a mask where that fails.
+"""Two passes whose width changes from pixel to pixel, and a mask where that fails: McGraw's own way with a blur that varies.
 
 The second pass knows the pixels that the first one reached, not where their light came from: it filters by the diameter
 found there. Where the diameter changes slowly that is nearly the right one; near an edge of depth it is not. As in the
@@ -21,7 +21,7 @@ _PIECE_PX = 64
 def depth_edge_mask(
     coc_px: Float32[np.ndarray, "height width"], lit: Bool[np.ndarray, "height width"], unit_radius: float
 ) -> Bool[np.ndarray, "height width"]:
-    """Pixels within whose reach there is an edge: an abrupt change of the (signed) diameter, or a pixel without light.
+    """Return a mask of the pixels within whose reach there is an edge: an abrupt change of the (signed) diameter, or a pixel without light.
 
     The reach of a pixel is the square around it that its kernel takes, rounded up to a power of two.
     """
@@ -77,7 +77,7 @@ def scatter_per_pixel(
 def _tables(
     largest_px: float, kernel_at: Callable[[float], LowRankKernel], mirrored: bool
 ) -> tuple[Float32[np.ndarray, "terms levels size"], Float32[np.ndarray, "terms levels size"], Int[np.ndarray, " levels"]]:
-    """Scaled columns and rows of the kernels at all steps up to the largest diameter, term by term in step with one another."""
+    """Return scaled columns and rows of the kernels at all steps up to the largest diameter, term by term in step with one another."""
     kernels = [kernel_at(_STEP_PX * i) for i in range(int(np.ceil(largest_px / _STEP_PX)) + 2)]
     terms, size = max(kernel.rank for kernel in kernels), 2 * max(kernel.radius_px for kernel in kernels) + 1
     columns, rows = np.zeros((len(kernels), terms, size)), np.zeros((len(kernels), terms, size))

@@ -1,4 +1,4 @@
-"""All points of a kernel for one pixel or for two neighbours, as one compiled loop: one weight and one place serve both pixels.
+"""Compiled loop over all points of a kernel, for one pixel or for two neighbours: one weight and one place serve both pixels.
 
 Into reals every point adds its weight times the light. Into whole numbers `weights` are sums: of the weights before each point, and
 at last of all. A point adds by how much that sum times the light, rounded, has grown. What a pixel adds is thus 0 in the end where
@@ -25,7 +25,7 @@ Vectors = list[Any]
 
 
 class _Points(NamedTuple):
-    """What the loop over points is built from: where sums, offsets and weights begin, the light in vectors and where each goes."""
+    """Parts that the loop over points is built from: where sums, offsets and weights begin, the light in vectors, and its place."""
 
     builder: ir.IRBuilder
     sums: Any
@@ -36,7 +36,7 @@ class _Points(NamedTuple):
     size: int
 
     def each(self, first: Any, end: Any, carried: Vectors, step: Callable[[Any, Vectors], Vectors]) -> None:
-        """Carried vectors become step(n, carried) for n from first to end."""
+        """Replace carried vectors by step(n, carried) for n from first to end."""
         builder = self.builder
         before, loop, after = builder.block, builder.append_basic_block("points"), builder.append_basic_block("done")
         builder.cbranch(builder.icmp_signed("<", first, end), loop, after)
@@ -51,14 +51,14 @@ class _Points(NamedTuple):
         builder.position_at_end(after)
 
     def products(self, n: Any, to: Vectors) -> Vectors:
-        """weights[n] times the light, added to vectors."""
+        """Return weights[n] times the light, added to vectors."""
         builder = self.builder
         weight = filled(builder, builder.load(builder.gep(self.weights, [n])), self.light[0].type.count)
         each = [builder.fmul(vector, weight, flags=("contract",)) for vector in self.light]
         return [builder.fadd(base, product, flags=("contract",)) for base, product in zip(to, each, strict=True)]
 
     def change(self, n: Any, changed: Callable[[Vectors], Vectors], kind: Any) -> None:
-        """Sums of point n become what changed() makes of them."""
+        """Replace the sums of point n by what changed() makes of them."""
         builder, lanes = self.builder, kind.count
         place = builder.add(self.here, builder.sext(builder.load(builder.gep(self.offsets, [n])), self.here.type))
         places = [builder.add(place, ir.Constant(place.type, part * lanes)) for part in range(len(self.light))]
@@ -71,7 +71,8 @@ class _Points(NamedTuple):
 
 
 def _adding_points(pixels: int) -> Any:
-    """Add points low:high of a kernel to sums[here + offsets[n] : .. + 4 pixels] for the light values[at : at + 4 pixels].
+    """Make the intrinsic that adds points low:high of a kernel to sums[here + offsets[n] : .. + 4 pixels] for the light values[at : at +
+    4 pixels].
 
     All arrays are flat, places are not checked. sums and weights are of one type, gains and dithers without meaning; or sums are
     int32, weights float32 and one more than points, light is multiplied by gains (4,) first and rounded by the dither of each of two
@@ -151,7 +152,7 @@ def _add_rounded(points: _Points, first: Any, end: Any, gains: Any, dithers: Any
 
 
 def _rounded(builder: ir.IRBuilder, vector: Any) -> Any:
-    """To the nearest whole numbers."""
+    """Round to the nearest whole numbers."""
     lanes = vector.type.count
     nearest = get_or_insert_function(builder.module, ir.FunctionType(vector.type, [vector.type]), f"llvm.nearbyint.v{lanes}f32")
     return builder.fptosi(builder.call(nearest, [vector]), ir.VectorType(ir.IntType(32), lanes))

@@ -1,8 +1,6 @@
-"""Splatting of points, compiled: every pixel adds its value times the points of its cell to an accumulator.
+"""Compiled loops of Laplacian spreadlets: points splatted, sums in whole numbers and back, highlights among the pixels.
 
-Sums in whole numbers, compiled: how large they can be, and back to reals.
-
-Lamps among the pixels whose kernels are sparse, compiled.
+Every pixel adds its value times the points of its cell to an accumulator.
 """
 
 import numpy as np
@@ -13,7 +11,7 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True)
 def largest_sum(points: np.ndarray, weights: np.ndarray, reach_px: int) -> float:
-    """What no sum of points (N, 2) times light of at most 1 exceeds, whichever cell every pixel around takes."""
+    """Return a bound on the sum of points (N, 2) times light of at most 1, whichever cell every pixel around takes."""
     side = 2 * reach_px + 1
     most = np.zeros((side, side))
     for n in range(len(weights)):
@@ -24,7 +22,7 @@ def largest_sum(points: np.ndarray, weights: np.ndarray, reach_px: int) -> float
 
 @njit(cache=True, nogil=True)
 def to_reals(whole: np.ndarray, reals: np.ndarray, gains: np.ndarray) -> None:
-    """reals (h, w, LANES) = whole (h, w, LANES) over gains (LANES,), powers of two; they may lie in the same memory."""
+    """Set reals (h, w, LANES) to whole (h, w, LANES) over gains (LANES,), powers of two; they may lie in the same memory."""
     height, width, lanes = whole.shape
     row, unit = np.empty(width * lanes, np.float32), np.empty(width * lanes, np.float32)
     for i in range(len(unit)):
@@ -43,7 +41,7 @@ _STRETCH_PX = 64
 
 @njit(cache=True, nogil=True)
 def add_up(sums: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.ndarray) -> int:
-    """How many pixels of values (H, W, C) have a code (H, W) that is sparse; their light, without sign, goes onto sums (C,)."""
+    """Add the light, without sign, of pixels of values (H, W, C) whose code (H, W) is sparse to sums (C,), and return their number."""
     height, width, channels = values.shape
     count = 0
     for y in range(height):
@@ -106,7 +104,7 @@ _ALONG, _DOWN = 0.7548776662466927, 0.5698402909980532  # a lattice whose points
 
 @njit(cache=True, nogil=True)
 def rows_of(points: np.ndarray, starts: np.ndarray, reach_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where each row of a cell's points begins, and whether its points lie apart.
+    """Return where each row of a cell's points begins, and whether its points lie apart.
 
     points (N, 2), cell i at starts[i]:starts[i + 1] sorted by y. Returns (cells, 2 reach + 2): the first point with y >= k - reach;
     (cells,): False where many points have one right beside them, so that two neighbouring pixels at once would write onto what
@@ -128,7 +126,7 @@ def rows_of(points: np.ndarray, starts: np.ndarray, reach_px: int) -> tuple[np.n
 
 @njit(cache=True, nogil=True)
 def dither_of(x: int, y: int) -> np.float32:
-    """How a pixel rounds, within +-0.5: neighbours differ, and any area has about as much of each."""
+    """Return how a pixel rounds, within +-0.5: neighbours differ, and any area has about as much of each."""
     phase = _ALONG * x + _DOWN * y
     return np.float32(phase - np.rint(phase))
 

@@ -51,14 +51,14 @@ Values = Float32[np.ndarray, "height width channels"]
 
 
 class Highlights(NamedTuple):
-    """Which pixels are lamps, and how large light of the other pixels with sparse kernels is at most in each channel, without sign."""
+    """Mask of highlights, and the largest light, without sign, of the other pixels with sparse kernels in each channel."""
 
     found: Bool[np.ndarray, "height width"]
     largest: Float32[np.ndarray, " channels"]
 
 
 def highlights_among(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Highlights:
-    """The lamps among pixels whose code (-1 for none) is sparse."""
+    """Return the highlights among pixels whose code (-1 for none) is sparse."""
     from mrbokeh.renderers.spreadlets._splat_numba import mark_highlights
 
     limits = (OUTSHINES_MEAN * _mean(values, codes, sparse)).astype(np.float32)
@@ -75,7 +75,7 @@ def highlights_among(values: Values, codes: Codes, sparse: Bool[np.ndarray, " ki
 
 
 def _mean(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Float64[np.ndarray, " channels"]:
-    """Of light without sign of the sparse pixels, in some rows or, if there are none in these, in all."""
+    """Return the mean light, without sign, of the sparse pixels, in some rows or, if these have none, in all."""
     from mrbokeh.renderers.spreadlets._splat_numba import add_up
 
     sums = np.zeros(values.shape[2])
@@ -100,7 +100,7 @@ _MOST_KEPT_BYTES = 1 << 27
 
 @dataclass(frozen=True)
 class LaplacianSpreadlets:
-    """A Renderer that spreads light by spreadlets; layers, slices and hidden background as in mrbokeh.layering.layering.
+    """Renderer that sums spreadlets; layers, slices and hidden background as in mrbokeh.layering.layering.
 
     sparsification: how kernels become points; None takes the whole Laplacian (exact, in double precision throughout).
     dense_up_to_px: the fast track: kernels of apertures up to this diameter are splatted as they are; those of a bank with
@@ -132,7 +132,7 @@ class LaplacianSpreadlets:
         object.__setattr__(self, "_add_light", _adder_on(self.device))
 
     def __reduce__(self) -> tuple[Callable[[], "LaplacianSpreadlets"], tuple[()]]:
-        """Made anew where it is unpickled: memory and tables stay where they are."""
+        """Make it anew where it is unpickled: memory and tables stay here."""
         return partial(type(self), **{each.name: getattr(self, each.name) for each in fields(self) if each.init}), ()
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
@@ -141,19 +141,21 @@ class LaplacianSpreadlets:
         return render_layers(layers, lens, BankPsf.of(layers, lens, self._bank_tables, self.sum_bank_kernels), self.layering)
 
     def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
-        """A picture from noisy samples: each gives its light to the whole PSF of the point that it saw (Section 6.2, Fig. 7)."""
+        """Reconstruct a picture from noisy samples: each gives its light to the whole PSF of the point that it saw (Section 6.2, Fig.
+        7).
+        """
         return reconstructed(samples, lens, self)
 
     def sum_kernels(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.KernelSum."""
+        """Sum kernels as mrbokeh.layering.psf_over_field.KernelSum says."""
         return self._sum(values, coc_px, aperture, densely=False)
 
     def sum_kernels_densely(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """The same with all taps of the same kernels and no Laplacian: what is fast in `spread` is measured against this."""
+        """Sum all taps of the same kernels without a Laplacian; `sum_kernels` is measured against this."""
         return self._sum(values, coc_px, aperture, densely=True)
 
     def sum_bank_kernels(
@@ -163,7 +165,8 @@ class LaplacianSpreadlets:
         place: Place,
         densely: bool = False,
     ) -> Float32[np.ndarray, "height width channels_out"]:
-        """The sum over all pixels of value times the bank's kernel: R, G, B, coverage, then others, as in layering.psf_over_field.PsfField.
+        """Return the sum over all pixels of value times the bank's kernel: R, G, B, coverage, then others, as in
+        layering.psf_over_field.PsfField.
 
         Coverage, three times for a bank of three colours, and others take kernels scaled to sum to 1: light that is absorbed
         darkens what is seen, but is no hole in it. Others go with green. What a bank of one colour is given may also be colour
@@ -233,7 +236,7 @@ class LaplacianSpreadlets:
 
     @property
     def _sums_whole_numbers(self) -> bool:
-        """Of 32 bits, for which lamps are set apart; sums in double precision and those on a device hold any light."""
+        """Whether sums are whole numbers of 32 bits, for which highlights are set apart; other sums hold any light."""
         return not self.device and self.sparsification is not None and self.integration == "exact"
 
 

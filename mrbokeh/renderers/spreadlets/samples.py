@@ -1,4 +1,4 @@
-"""Reconstruction from light field samples: each sample's PSF around the point that it saw (Leimkuehler et al. 2018, Section 6.2).
+"""Reconstruction from light field samples: each sample's PSF is put around the point that it saw (Leimkuehler et al. 2018, Section 6.2).
 
 A sample at y is one ray of a point whose light is spread all over its circle of confusion and its path. Splatting the PSF at y
 would apply it twice; around y' = y - coc/2 uv - motion (t - 1/2) it is put where it belongs (Fig. 7). Samples are taken in
@@ -38,7 +38,7 @@ class _Renderer(Protocol):
 
 
 def reconstructed(samples: LightFieldSamples, lens: Lens, renderer: _Renderer) -> Layer:
-    """An opaque picture; its depth is that of the nearest sample in each pixel."""
+    """Return an opaque picture; its depth is that of the nearest sample in each pixel."""
     coc_px, at_px = samples.coc_px(lens), samples.positions_at_lens_centre_px(lens)
     step_px = max(float(np.ptp(coc_px)) / renderer.layering.slices, _LEAST_STEP_PX)
     index = np.floor(coc_px / step_px + 0.5).astype(np.int64)
@@ -61,7 +61,7 @@ def reconstructed(samples: LightFieldSamples, lens: Lens, renderer: _Renderer) -
 def _rounds(
     samples: LightFieldSamples, coc_px: Float32[np.ndarray, " samples"], at_px: np.ndarray, mine: Bool[np.ndarray, " samples"], margin: int
 ) -> Iterator[tuple[Channels, Plane, np.ndarray]]:
-    """R, G, B and weight, circles and motion of the samples, the first of every pixel, then the second, and so on."""
+    """Yield R, G, B and weight, circles of confusion and motion of the first sample of every pixel, then the second, and so on."""
     chosen = np.flatnonzero(mine)
     x, y = np.floor(at_px[chosen]).astype(np.int64).T + margin
     size = samples.height_px + 2 * margin, samples.width_px + 2 * margin
@@ -80,7 +80,7 @@ def _rounds(
 def _blur_round(
     values: Channels, coc_px: Plane, motion_px: np.ndarray, samples: LightFieldSamples, lens: Lens, renderer: _Renderer, margin: int
 ) -> np.ndarray:
-    """Light through the aperture, drawn out along its path before, or through the kernels of the bank."""
+    """Blur light by the aperture, drawn out along its path before, or by the kernels of the bank."""
     if renderer.bank is None:
         moving, circles = drawn_out(values, coc_px, motion_px) if motion_px.any() else (values, coc_px)
         frame = Frame(samples.width_px, samples.height_px, -margin, -margin)

@@ -1,11 +1,8 @@
-"""Points of all pixels summed up: taps into the picture itself, points of Laplacians into one that is then integrated.
+"""Sums of points over all pixels: taps into the picture itself, points of Laplacians into one that is then integrated.
 
 Four channels at a time, in strips that stay in a core's cache from one step to the next, in memory that is kept from call to call.
-
-Where sums of points lie in the plane, and points laid out for them: in reals, or in whole numbers of 32 bits.
-
-Whole numbers take half the memory of double precision, and what a pixel adds sums to 0 to the last bit, so that no error grows with
-the picture. Their unit is as small as the brightest light and the points allow.
+Sums are reals, or whole numbers of 32 bits. Whole numbers take half the memory of double precision, and every pixel's additions sum to 0
+to the last bit, so that no error grows with the picture. Their unit is as small as the brightest light and the points allow.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -37,13 +34,13 @@ class Window(NamedTuple):
     width: int
 
     def holds(self, other: "Window") -> bool:
-        """Whether the other lies within."""
+        """Return whether the other lies within."""
         begins = self.top <= other.top and self.left <= other.left
         return begins and other.top + other.height <= self.top + self.height and other.left + other.width <= self.left + self.width
 
 
 def window_of(cells: Cells, reach_px: int, is_integrated: bool) -> Window:
-    """What points of the pixels that have a cell (>= 0) reach, and for Laplacians the border on which light is 0."""
+    """Return the window that points of the pixels with a cell (>= 0) reach; for Laplacians with the border on which light is 0."""
     rows, columns = (np.flatnonzero((cells >= 0).any(axis=axis)) for axis in (1, 0))
     margin = reach_px + (1 + FAR_FIELD_PX if is_integrated else 0)
     top, left = int(rows[0]) - margin, int(columns[0]) - margin
@@ -66,7 +63,7 @@ class Laid(NamedTuple):
 
     @classmethod
     def out(cls, points: Points, width: int, precision: type) -> "Laid":
-        """precision: of the sums, numpy.int32 for whole numbers; their points must be of Laplacians, whose weights sum to 0."""
+        """Lay points out. precision: of the sums, numpy.int32 for whole numbers, whose points must be of Laplacians (weights sum to 0)."""
         from mrbokeh.renderers.spreadlets._splat_numba import rows_of
 
         offsets = (FOUR * (points.xy[:, 1] * width + points.xy[:, 0])).astype(np.int32)
@@ -75,7 +72,7 @@ class Laid(NamedTuple):
 
 
 def gains_for(largest: Float32[np.ndarray, " channels"], points: Points) -> Float32[np.ndarray, " lanes"]:
-    """Powers of two that make light, at most `largest` in each channel, as large as whole numbers can hold its sums."""
+    """Return powers of two that make light, at most `largest` in each channel, as large as whole numbers can hold its sums."""
     from mrbokeh.renderers.spreadlets._splat_numba import largest_sum
 
     bound = np.zeros(FOUR)
@@ -109,7 +106,7 @@ def add_light(
 ) -> None:
     """Add the light of all pixels that have a cell (>= 0) to out; integration None: the points are taps of kernels.
 
-    What points reach beyond the picture is summed, too: a Laplacian that is cut off is that of another picture. memory: kept
+    Sums go on beyond the picture as far as points reach: a Laplacian that is cut off is that of another picture. memory: kept
     from call to call; to get it anew takes as long as to integrate. Points of Laplacians are
     summed in double precision; if it is known that no light of a channel is larger than `largest`, without sign, in whole numbers,
     which become single precision. taps: cells and points of other pixels to splat as they are.
@@ -135,7 +132,7 @@ def _add_four(
     pool: ThreadPoolExecutor,
     memory: ZeroedMemory,
 ) -> None:
-    """Splat, integrate, splat taps onto what that gave, and add to out."""
+    """Splat, integrate, splat taps onto the result, and add to out."""
     from mrbokeh.renderers.spreadlets._splat_numba import add_and_clear
 
     window = splatting.window
@@ -168,7 +165,7 @@ def _add_four(
 
 
 class _Splatting(NamedTuple):
-    """What is splatted, and where the sums lie in the picture. gains: of light in whole numbers, None for sums in reals."""
+    """Light and points to splat, and where the sums lie in the picture. gains: of light in whole numbers, None for sums in reals."""
 
     values: Float32[np.ndarray, "height width lanes"]
     cells: Cells
@@ -186,7 +183,7 @@ class _Splatting(NamedTuple):
         precision: type,
         gains: Float32[np.ndarray, " lanes"] | None = None,
     ) -> "_Splatting":
-        """precision: of the sums without gains."""
+        """Lay points out for splatting. precision: of the sums without gains."""
         return cls(values, cells, Laid.out(points, window.width, precision if gains is None else np.int32), window, gains)
 
     def fill(self, sums: Sums, first: int, end: int) -> None:
@@ -218,7 +215,7 @@ def splat_plainly(sums: Sums, values: Values, cells: Cells, points: Points, orig
 
 
 def _fours(values: Values) -> Iterator[tuple[int, Values]]:
-    """Groups of four channels, the last filled up with zeros, each in memory of its own, and the first channel of each."""
+    """Yield groups of four channels, the last filled up with zeros, each in memory of its own, and the first channel of each."""
     channels = values.shape[2]
     if channels == FOUR:
         yield 0, np.ascontiguousarray(values)
@@ -229,6 +226,6 @@ def _fours(values: Values) -> Iterator[tuple[int, Values]]:
 
 
 def _strips(height: int, reach_px: int) -> list[tuple[int, int]]:
-    """First and end row of pieces for the cores."""
+    """Return first and end row of pieces for the cores."""
     rows = max(_LEAST_ROWS, reach_px, -(-height // (_STRIPS_PER_CORE * cores())))
     return [(first, min(first + rows, height)) for first in range(0, height, rows)]

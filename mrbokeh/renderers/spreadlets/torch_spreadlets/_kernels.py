@@ -1,6 +1,6 @@
-"""Which kernel of a bank a pixel takes, asked on the device: `BankTables.codes` and `stands_out` by torch.
+"""Kernels of a bank on a device: the one that each pixel takes (`BankTables.codes` and `stands_out` by torch), and their points.
 
-Points of kernels on a device: those of one call, or those of a bank, which are kept and grow with what pictures ask for.
+Points are those of one call, or those of a bank, which are kept and grow with what pictures ask for.
 """
 
 from dataclasses import dataclass, field
@@ -48,7 +48,7 @@ class BankCells:
     def codes(
         self, bright: Bool[Tensor, "height width"], coc_px: Plane, motion_px: Way | None, field_xy: Way | None, depth_m: Plane | None
     ) -> Int64[Tensor, "height width"]:
-        """See `BankTables.codes`."""
+        """Return codes as `BankTables.codes` does."""
         bank, angles = self.tables.bank, self.tables.angles
         right, down = (None, None) if field_xy is None else (field_xy[..., 0], field_xy[..., 1])
         planes = {"diameter_px": coc_px, "motion_px": _length(motion_px), "depth_m": depth_m}
@@ -67,11 +67,11 @@ class BankCells:
         return 2 * (self._cell_at[place] * angles + turn % angles) + bright
 
     def light(self, codes: Int64[Tensor, "height width"]) -> Float32[Tensor, "height width channels"]:
-        """What the kernel of each code sums to."""
+        """Return the sum of each code's kernel."""
         return self._light[codes // 2 // self.tables.angles]
 
     def is_dense(self, codes: Int64[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-        """See `BankTables.is_dense`."""
+        """Return what `BankTables.is_dense` does, for every pixel."""
         return self._dense[codes // 2 // self.tables.angles]
 
     def _needed(self, plane: Tensor | None, what: str) -> Tensor:
@@ -83,7 +83,7 @@ class BankCells:
 
 
 def stands_out(values: Float32[Tensor, "height width channels"]) -> Bool[Tensor, "height width"]:
-    """See `mrbokeh.renderers.kernels.laplacian_tables.stands_out`."""
+    """Return the mask of `mrbokeh.renderers.kernels.laplacian_tables.stands_out`."""
     light = values.abs().permute(2, 0, 1).double()
     rows, columns = (_mirrored(size, values.device) for size in values.shape[:2])
     side = 2 * AROUND_PX + 1
@@ -94,7 +94,7 @@ def stands_out(values: Float32[Tensor, "height width channels"]) -> Bool[Tensor,
 
 @lru_cache(maxsize=8)
 def _mirrored(size: int, device: torch.device) -> Int64[Tensor, " around"]:
-    """Numbers of the pixels along an axis that goes on as in a mirror."""
+    """Return numbers of the pixels along an axis that goes on as in a mirror."""
     return torch.from_numpy(np.pad(np.arange(size), AROUND_PX, mode="reflect")).to(device)
 
 
@@ -103,7 +103,9 @@ def _length(way: Way | None) -> Plane | None:
 
 
 def _intervals(bank: PsfBank) -> tuple[list[Float64[np.ndarray, " borders"]], Int64[np.ndarray, " intervals"]]:
-    """Inner borders on each axis, in physical coordinates, and the cell of every combination of intervals, the last axis fastest."""
+    """Return inner borders on each axis, in physical coordinates, and the cell of every combination of intervals, the last axis
+    fastest.
+    """
     ends = [np.unique(bank.grid.boxes[:, axis]) for axis in range(len(bank.axes))]
     middles = np.meshgrid(*(0.5 * (each[:-1] + each[1:]) for each in ends), indexing="ij")
     cell_at = bank.grid.index_of(np.stack(middles, axis=-1)).reshape(-1)
@@ -116,7 +118,8 @@ _LARGEST_SUM = 64.0  # far above the 8 that banks were seen to have, so that uni
 
 @dataclass(frozen=True)
 class PointTable:
-    """xy (N, 2) right and down of the source; weights (N, K), one column for each colour; cell i has count[i] points from first[i].
+    """Points of kernels: xy (N, 2) right and down of the source; weights (N, K), one column for each colour; cell i has count[i] points
+    from first[i].
 
     most: the largest count. reach_px: no point lies farther away. largest_sum: no sum of points times light, one of them from
     every pixel around, exceeds this times the brightest light.
@@ -186,7 +189,7 @@ class BankPoints:
 def _largest_at(
     largest: Float64[np.ndarray, "side side"], xy: Int32[np.ndarray, "points 2"], weights: Float64[np.ndarray, "points columns"]
 ) -> Float64[np.ndarray, "side side"]:
-    """For every offset the largest weight, without sign, of any kernel there; added to what is known."""
+    """Raise the known largest weights, by offset and without sign, to those of these kernels."""
     middle = len(largest) // 2
     np.maximum.at(largest, (xy[:, 1] + middle, xy[:, 0] + middle), np.abs(weights).max(axis=1))
     return largest

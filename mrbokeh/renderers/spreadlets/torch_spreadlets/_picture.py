@@ -1,4 +1,4 @@
-"""Layers on a device become a picture on the device."""
+"""Pictures on a device from layers on the device."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ Channels = Float32[Tensor, "height width channels"]
 
 @dataclass(frozen=True)
 class DeviceLayer:
-    """One picture with holes, all of it on one device.
+    """Picture with holes, all of it on one device.
 
     rgba (H, W, 4): linear, premultiplied, HDR. coc_px (H, W): signed diameters of the circle of confusion. What else the bank
     asks for: motion_px (H, W, 2) right and down per shutter, field_xy (H, W, 2) in half diagonals, depth_m (H, W).
@@ -36,7 +36,7 @@ class DeviceLayer:
     depth_m: Float32[Tensor, "height width"] | None = None
 
     def continued(self, by_px: int) -> "DeviceLayer":
-        """Larger by so many pixels on each side, as the border pixels are."""
+        """Return the layer, continued by so many border pixels on each side."""
         return replace(self, **{name: _continued(plane, by_px) for name, plane in vars(self).items() if plane is not None})
 
 
@@ -62,7 +62,7 @@ class TorchSpreadlets:
         self._dense, self._sparse = BankPoints(tables, True, self.device), BankPoints(tables, False, self.device)
 
     def picture(self, layers: Sequence[DeviceLayer], continued_px: int = 0) -> Float32[Tensor, "height width 4"]:
-        """The layers, front first, each spread and laid over those behind it; premultiplied colour and coverage.
+        """Return the layers, front first, each blurred and laid over those behind it; premultiplied colour and coverage.
 
         continued_px: layers go on beyond the frame as their border pixels do, so that light comes in from there.
         """
@@ -103,7 +103,7 @@ class TorchSpreadlets:
         return out
 
     def _light(self, rgba: Channels, codes: Int64[Tensor, "height width"]) -> tuple[Float32[Tensor, "height width sums"], list[int]]:
-        """What is spread, and the colour of the kernel that each channel takes; coverage goes through kernels that sum to 1."""
+        """Return the channels to sum, and the colour of the kernel that each takes; coverage goes through kernels that sum to 1."""
         coverage = rgba[..., 3:] / self._cells.light(codes)
         return torch.cat([rgba[..., :3], coverage], dim=2), [0] * 4 if self.bank.channels == 1 else [0, 1, 2, 0, 1, 2]
 
@@ -120,7 +120,7 @@ class TorchSpreadlets:
 
 
 def over(front: Channels, behind: Channels) -> Channels:
-    """Light in front and what is seen of that behind it, by one coverage or by one for each colour; they come last."""
+    """Lay light in front over that behind it, by one coverage or by one for each colour; coverages come last."""
     free = 1.0 - front[..., 3:].clamp(0.0, 1.0)
     return front + (free if free.shape[2] == 1 else torch.cat([free, free], dim=2)) * behind
 
@@ -138,7 +138,7 @@ def _finite(layer: DeviceLayer, lit: Bool[Tensor, "height width"]) -> tuple[Devi
 
 
 def _continued(plane: Tensor, by_px: int) -> Tensor:
-    """Planes (H, W) or (H, W, C) with their border pixels repeated."""
+    """Return planes (H, W) or (H, W, C) with their border pixels repeated."""
     planes = plane.reshape(*plane.shape[:2], -1).permute(2, 0, 1)
     wider = pad(planes, (by_px,) * 4, mode="replicate").permute(1, 2, 0)
     return wider.reshape(*wider.shape[:2], *plane.shape[2:]).contiguous()

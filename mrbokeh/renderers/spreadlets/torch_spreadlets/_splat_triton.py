@@ -1,4 +1,4 @@
-"""The splat as one kernel with atomic additions, for NVIDIA GPUs; imported only where triton is there."""
+"""Splatting as one kernel with atomic additions, for NVIDIA GPUs; imported only if triton is installed."""
 
 from collections.abc import Sequence
 from typing import no_type_check
@@ -25,7 +25,7 @@ def splat_by_kernel(
     scale: float,
     colours: Sequence[int],
 ) -> None:
-    """See `splat_in_chunks`, its twin: the same bits."""
+    """Splat as `splat_in_chunks` does, to the same bits."""
     channels, columns = values.shape[2], table.weights.shape[1]
     shift = table.xy[:, 1] * window.width + table.xy[:, 0]
     corner = -window.top * window.width - window.left
@@ -59,8 +59,9 @@ def _splat(
     PIXELS: tl.constexpr,
     SEGMENT: tl.constexpr,
 ):
-    """One program: PIXELS pixels, SEGMENT points of each. Neighbours mostly share a cell, so that they read the same points and
-    write side by side."""
+    """Splat PIXELS pixels, SEGMENT points of each, in one program. Neighbours mostly share a cell, so that they read the same points and
+    write side by side.
+    """
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     begin = tl.program_id(1) * SEGMENT
     cell = tl.load(cells + pixel, mask=pixel < pixels, other=-1)

@@ -1,11 +1,8 @@
-"""`mrbokeh.renderers.spreadlets.sums.add_light` on a device: the CPU's tables and pictures go over, the sums come back.
+"""Sums of points on a device, in whole numbers, and their integration; `add_light_on` stands in for `sums.add_light`.
 
-`mrbokeh.renderers.kernels.laplacian_integration.integrate` by transforms alone: no sweeps along columns, which a GPU has no use for.
-
-The same operator with the same borders is diagonal under a sine transform of the second kind along rows (continued
-antisymmetrically about the border) and of the first kind along columns (zeros one pixel beyond).
-
-Splatting on a device: every pixel adds its light times the points of its cell, in whole numbers.
+Integration is by transforms alone: no sweeps along columns, which a GPU has no use for. The operator of
+`mrbokeh.renderers.kernels.laplacian_integration.integrate`, with the same borders, is diagonal under a sine transform of the second kind
+along rows (continued antisymmetrically about the border) and of the first kind along columns (zeros one pixel beyond).
 """
 
 import math
@@ -38,7 +35,7 @@ def integrate(source: Planes) -> Planes:
 
 @lru_cache(maxsize=8)
 def _inverse(height: int, width: int, precision: torch.dtype, device: torch.device) -> Float[Tensor, "height width"]:
-    """One over the Laplacian of every mode, with what the transforms there and back multiply by."""
+    """Return one over the Laplacian of every mode, with the factor of the transforms there and back."""
     down = torch.cos(torch.pi * torch.arange(1, height + 1, dtype=torch.float64) / (height + 1))[:, None]
     right = torch.cos(torch.pi * torch.arange(1, width + 1, dtype=torch.float64) / width)
     eigenvalues = (-20.0 + 8.0 * (right + down) + 4.0 * right * down) / 6.0
@@ -92,7 +89,7 @@ Cells = Int32[Tensor, "height width"]
 def splat(
     values: Light, cells: Cells, table: PointTable, window: Window, largest: float, colours: Sequence[int] = ()
 ) -> Float64[Tensor, "channels rows columns"]:
-    """The sums over all pixels with a cell (>= 0) within a window that all points fall into. Same bits on every device.
+    """Return the sums over all pixels with a cell (>= 0) within a window that all points fall into, the same bits on every device.
 
     largest: no value is larger, without its sign. colours: the column of weights that each channel takes; () is the first.
     """
@@ -121,7 +118,7 @@ def splat_in_chunks(
     colours: Sequence[int],
     at_once: int = 0,
 ) -> None:
-    """Add round(scale * weight * light) to sums: all points of some pixels at a time, wherever torch runs."""
+    """Add round(scale * weight * light) to sums: all points of some pixels at a time, on any device of torch."""
     channels = torch.arange(values.shape[2], device=values.device)
     pixels = torch.nonzero(cells.reshape(-1) >= 0)[:, 0]
     cell = cells.reshape(-1)[pixels].long()
@@ -139,12 +136,12 @@ def splat_in_chunks(
 
 
 def rounded(number: Float64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
-    """The nearest whole number, halves upwards; the kernel does the same."""
+    """Round to the nearest whole number, halves upwards; the Triton kernel does the same."""
     return torch.floor(number + 0.5).to(torch.int64)
 
 
 def _chunks(ends: Int64[Tensor, " pixels"], at_once: int) -> list[tuple[int, int]]:
-    """First and end of runs of pixels with at most so many points together, or of single pixels."""
+    """Return first and end of runs of pixels with at most so many points together, or of single pixels."""
     chunks, begin, before = [], 0, 0
     while begin < len(ends):
         end = max(int(torch.searchsorted(ends, before + at_once, right=True)), begin + 1)
@@ -154,7 +151,7 @@ def _chunks(ends: Int64[Tensor, " pixels"], at_once: int) -> list[tuple[int, int
 
 
 def add_light_on(device: str) -> Callable[..., None]:
-    """What stands in for `add_light`: same arguments, same windows, and the same result to rounding."""
+    """Return the stand-in for `add_light` on a device: same arguments, same windows, and the same result to rounding."""
     return partial(_add_light, device_named(device))
 
 
