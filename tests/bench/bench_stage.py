@@ -27,7 +27,7 @@ from mrbokeh.scene.staging.staged_scene import Assets, StagedObject, StagedScene
 from mrbokeh.tracking.world_axes import upright_camera
 from tests.bench.machine import machine_line, memory_line
 from tests.scenes.stage_scenes import looking
-from viewfinder.stage.drawing import RenderSetup, Drawing, DrawRequest, draw
+from viewfinder.stage.drawing import Drawing, DrawRequest, RenderSetup, draw
 from viewfinder.stage.drawing_thread import RESOLUTIONS
 from viewfinder.stage.reprojection import LayerDepth
 from viewfinder.stage.stage import Stage

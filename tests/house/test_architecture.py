@@ -130,7 +130,7 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
     asking = {
         "mrbokeh.commands.doctor",
         "mrbokeh.compositing.plate_look.vignetting",
-        "datasets_scripts.dng_writer",
+        "datasets_scripts.made_sets.simulated_camera",
         "mrbokeh.system.gphoto2_library",
     }
     users = {

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from datasets_scripts.gallery.headless_chromium import CHROMIUM, Page, chromium_page
 
-from datasets_scripts.headless_chromium import CHROMIUM, Page, chromium_page
 from tests.scenes.made_viewfinder import LENS_RGB, VIEW_RGB, Made, in_time, made_viewfinder
 from viewfinder.server.access import Access
 from viewfinder.server.sessions import Role, Sessions
@@ -328,10 +328,10 @@ def test_what_stopped_is_told_and_forgotten_when_it_comes_back(tmp_path: Path) -
                 port = int(made.url.rsplit(":", 1)[1].strip("/"))
                 page = await browser.enter_async_context(chromium_page(made.url, tmp_path / "profile"))
                 await opened(page)
-                made.pictures.resting.set()
+                made.pictures.rest()
                 made.jpeg.fail("the camera was unplugged")
                 await page.comes_true(f"{message} === 'the camera was unplugged'")
-                made.pictures.resting.clear()
+                made.pictures.go_on()
                 await page.comes_true(f"{message} === ''")
             await page.comes_true(f"{message} === 'connection lost, trying again'")
             async with made_viewfinder(Access(sessions=Sessions()), port=port):

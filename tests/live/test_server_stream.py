@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from threading import Event
 from typing import Any
 
 import aiohttp
@@ -117,6 +118,37 @@ def test_a_failure_reaches_those_who_are_here_and_those_who_come_until_pictures_
                     assert (await later.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY
             async with session.ws_connect(made.url + "stream") as stream:
                 assert (await stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY
+
+    in_time(work)
+
+
+def test_a_picture_from_before_a_failure_never_follows_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would say that all is well again; here it is being encoded when the camera fails. The next picture is one of those that do."""
+    encoding, failed = Event(), Event()
+    original = jpeg_stream.jpeg_message
+
+    def slow(frame: Any, quality: int) -> bytes:
+        encoding.set()
+        assert failed.wait(5.0)
+        return original(frame, quality)
+
+    monkeypatch.setattr(jpeg_stream, "jpeg_message", slow)
+
+    async def work() -> None:
+        jpeg = JpegStream()
+        jpeg.broadcaster.open()
+        viewer = asyncio.create_task(jpeg.broadcaster.next_message())
+        await asyncio.sleep(0)
+        jpeg.show(made_frame(MadeControls(), 3))
+        assert await asyncio.to_thread(encoding.wait, 5.0)
+        jpeg.fail("the camera was unplugged")
+        failed.set()
+        while not jpeg.wants_frame:
+            await asyncio.sleep(0.01)
+        assert not viewer.done() and jpeg.broadcaster.failure == "the camera was unplugged"
+        jpeg.show(made_frame(MadeControls(), 9))
+        assert unpacked(await viewer)[0]["sequence"] == 9 and jpeg.broadcaster.failure is None
+        jpeg.close()
 
     in_time(work)
 

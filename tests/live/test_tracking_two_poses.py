@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datasets_scripts.charuco_clip import BoardClip
-from datasets_scripts.hand_held import HandHeld
-from datasets_scripts.sheet_tracer import Sheet
+from datasets_scripts.charuco_clip import BoardClip, HandHeld
+from datasets_scripts.tracers.sheet import Sheet
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.camera_track.board_track import poses_of

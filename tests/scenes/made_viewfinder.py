@@ -5,7 +5,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
 import cv2
@@ -128,12 +128,12 @@ def made_frame(controls: MadeControls, sequence: int) -> OutputFrame:
 class Pictures:
     """A thread that shows sinks a new picture every 1/fps seconds while they want one, as the compositing thread does.
 
-    resting: set while the camera gives nothing.
+    Between `rest` and `go_on` the camera gives nothing.
     """
 
     def __init__(self, controls: MadeControls, sinks: Sequence[Any], fps: float = 50.0) -> None:
         self._controls, self._sinks, self._period_s = controls, sinks, 1 / fps
-        self._stopping, self.resting = Event(), Event()
+        self._stopping, self._resting, self._showing = Event(), Event(), Lock()
         self.shown = 0
         self._thread = Thread(target=self._work, name="made pictures", daemon=True)
 
@@ -148,13 +148,22 @@ class Pictures:
     def _work(self) -> None:
         sequence = 0
         while not self._stopping.wait(self._period_s):
-            wanting = [sink for sink in self._sinks if sink.wants_frame]
-            if wanting and not self.resting.is_set():
-                frame = made_frame(self._controls, sequence)
-                for sink in wanting:
-                    sink.show(frame)
-                self.shown += 1
+            with self._showing:
+                wanting = [sink for sink in self._sinks if sink.wants_frame]
+                if wanting and not self._resting.is_set():
+                    frame = made_frame(self._controls, sequence)
+                    for sink in wanting:
+                        sink.show(frame)
+                    self.shown += 1
             sequence += 1
+
+    def rest(self) -> None:
+        """Give nothing more; a picture that is under way is shown before this returns."""
+        with self._showing:
+            self._resting.set()
+
+    def go_on(self) -> None:
+        self._resting.clear()
 
 
 @dataclass

@@ -6,9 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from datasets_scripts.charuco_clip import BoardClip
-from datasets_scripts.hand_held import HandHeld
-from datasets_scripts.sheet_tracer import Sheet
+from datasets_scripts.charuco_clip import BoardClip, HandHeld
+from datasets_scripts.tracers.sheet import Sheet
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import MM_PER_M, Lens

@@ -24,8 +24,7 @@ from capture.tether.focus_motor import FocusAxis
 from capture.tether.gphoto2_camera import CANON_STEPS_HOME, Gphoto2Camera
 from capture.tether.gphoto2_config import CameraConfig, is_fixed_white_balance, is_manual, is_off, is_raw_only, number_in
 from capture.tether.simulated_camera import SimulatedMotor
-from datasets_scripts.dng_writer import ShotMetadata, write_dng
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 

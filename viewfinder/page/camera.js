@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 630d4fa69bf41fc469c95f62cd0bd85be67f3eaf837e0e85fc77ac686d2241b8
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e3d9d0a77dcd3f7d8ed94b39a853adf0e4399830f2558e781c4e27d941b4a396
 "use strict";
 (() => {
   // src/model.ts
@@ -60,8 +60,6 @@
   function posted(message) {
     return { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) };
   }
-
-  // src/sdp_exchange.ts
   var GATHERING_MS = 1e3;
   async function offerTo(path, peer) {
     await peer.setLocalDescription();

@@ -1,67 +1,6 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 630d4fa69bf41fc469c95f62cd0bd85be67f3eaf837e0e85fc77ac686d2241b8
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e3d9d0a77dcd3f7d8ed94b39a853adf0e4399830f2558e781c4e27d941b4a396
 "use strict";
 (() => {
-  // src/aids.ts
-  var AIDS = {
-    peakReal: "peaking: real",
-    peakVirtual: "peaking: virtual",
-    zebra: "zebra",
-    histogram: "histogram",
-    grid: "grid",
-    level: "level of this phone",
-    times: "times",
-    leftHand: "left hand"
-  };
-  var KEPT = "mrbokeh-aids";
-  var Aids = class extends EventTarget {
-    on = new Set(load());
-    has(aid) {
-      return this.on.has(aid);
-    }
-    set(aid, on) {
-      if (on) this.on.add(aid);
-      else this.on.delete(aid);
-      try {
-        localStorage.setItem(KEPT, JSON.stringify([...this.on]));
-      } catch {
-      }
-      this.dispatchEvent(new Event("change"));
-    }
-  };
-  function load() {
-    try {
-      const kept = JSON.parse(localStorage.getItem(KEPT) ?? "[]");
-      return Array.isArray(kept) ? kept.filter((each) => each in AIDS) : [];
-    } catch {
-      return [];
-    }
-  }
-  var aids = new Aids();
-
-  // src/level.ts
-  var levelAllowed = window.isSecureContext && "DeviceOrientationEvent" in window;
-  async function askForLevel() {
-    const kind = DeviceOrientationEvent;
-    return !kind.requestPermission || await kind.requestPermission().catch(() => "denied") === "granted";
-  }
-  function upOnScreen(beta, gamma, screen2) {
-    const [b, g, s] = [beta, gamma, screen2].map((angle) => angle * Math.PI / 180);
-    const [x, y, z] = [-Math.cos(b) * Math.sin(g), Math.sin(b), Math.cos(b) * Math.cos(g)];
-    return [x * Math.cos(s) - y * Math.sin(s), x * Math.sin(s) + y * Math.cos(s), z];
-  }
-  function showLevel(line, active) {
-    if (!levelAllowed) return;
-    window.addEventListener("deviceorientation", (event) => {
-      line.hidden = !active() || event.beta === null || event.gamma === null;
-      if (line.hidden) return;
-      const [right, up, towards] = upOnScreen(event.beta, event.gamma, screen.orientation?.angle ?? 0);
-      const roll = Math.atan2(right, up) * 180 / Math.PI;
-      const down = Math.asin(Math.max(-1, Math.min(1, towards))) / (Math.PI / 2);
-      line.style.transform = `translateY(${-100 * down}%) rotate(${roll}deg)`;
-      line.classList.toggle("even", Math.abs(roll) < 0.7);
-    });
-  }
-
   // src/model.ts
   var Model = class extends EventTarget {
     state = null;
@@ -106,7 +45,64 @@
     return metres < 1 ? `${(100 * metres).toFixed(0)} cm` : `${metres.toFixed(2)} m`;
   }
 
-  // src/aid_switches.ts
+  // src/aids.ts
+  var AIDS = {
+    peakReal: "peaking: real",
+    peakVirtual: "peaking: virtual",
+    zebra: "zebra",
+    histogram: "histogram",
+    grid: "grid",
+    level: "level of this phone",
+    times: "times",
+    leftHand: "left hand"
+  };
+  var KEPT = "mrbokeh-aids";
+  var Aids = class extends EventTarget {
+    on = new Set(load());
+    has(aid) {
+      return this.on.has(aid);
+    }
+    set(aid, on) {
+      if (on) this.on.add(aid);
+      else this.on.delete(aid);
+      try {
+        localStorage.setItem(KEPT, JSON.stringify([...this.on]));
+      } catch {
+      }
+      this.dispatchEvent(new Event("change"));
+    }
+  };
+  function load() {
+    try {
+      const kept = JSON.parse(localStorage.getItem(KEPT) ?? "[]");
+      return Array.isArray(kept) ? kept.filter((each) => each in AIDS) : [];
+    } catch {
+      return [];
+    }
+  }
+  var aids = new Aids();
+  var levelAllowed = window.isSecureContext && "DeviceOrientationEvent" in window;
+  async function askForLevel() {
+    const kind = DeviceOrientationEvent;
+    return !kind.requestPermission || await kind.requestPermission().catch(() => "denied") === "granted";
+  }
+  function upOnScreen(beta, gamma, screen2) {
+    const [b, g, s] = [beta, gamma, screen2].map((angle) => angle * Math.PI / 180);
+    const [x, y, z] = [-Math.cos(b) * Math.sin(g), Math.sin(b), Math.cos(b) * Math.cos(g)];
+    return [x * Math.cos(s) - y * Math.sin(s), x * Math.sin(s) + y * Math.cos(s), z];
+  }
+  function showLevel(line, active) {
+    if (!levelAllowed) return;
+    window.addEventListener("deviceorientation", (event) => {
+      line.hidden = !active() || event.beta === null || event.gamma === null;
+      if (line.hidden) return;
+      const [right, up, towards] = upOnScreen(event.beta, event.gamma, screen.orientation?.angle ?? 0);
+      const roll = Math.atan2(right, up) * 180 / Math.PI;
+      const down = Math.asin(Math.max(-1, Math.min(1, towards))) / (Math.PI / 2);
+      line.style.transform = `translateY(${-100 * down}%) rotate(${roll}deg)`;
+      line.classList.toggle("even", Math.abs(roll) < 0.7);
+    });
+  }
   var AidSwitches = class extends HTMLElement {
     connectedCallback() {
       this.innerHTML = "<details><summary>Aids</summary><div></div></details>";
@@ -188,8 +184,94 @@
   function posted(message) {
     return { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) };
   }
+  var GATHERING_MS = 1e3;
+  async function offerTo(path, peer) {
+    await peer.setLocalDescription();
+    await gathered(peer);
+    const body = peer.localDescription.sdp;
+    const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
+    if (!answer.ok) throw new Error(await sentenceOf(answer));
+    await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });
+    return answer.headers.get("Location");
+  }
+  function release(resource) {
+    if (resource !== null) void fetch(resource, { method: "DELETE", keepalive: true }).catch(() => void 0);
+  }
+  function gathered(peer) {
+    return new Promise((done) => {
+      if (peer.iceGatheringState === "complete") return done();
+      setTimeout(done, GATHERING_MS);
+      peer.addEventListener("icegatheringstatechange", () => peer.iceGatheringState === "complete" && done());
+    });
+  }
 
-  // src/choices.ts
+  // src/timing.ts
+  var ServerClock = class {
+    offset_ms = 0;
+    roundTrip_ms = Infinity;
+    asked = 0;
+    timer = 0;
+    /** Ask through a channel, often at first; `answer` takes what comes back. */
+    start(send) {
+      this.stop();
+      this.roundTrip_ms = Infinity;
+      this.asked = 0;
+      const ask = () => {
+        send(JSON.stringify({ clock: performance.now() }));
+        this.asked += 1;
+        this.timer = window.setTimeout(ask, this.asked < 8 ? 150 : 5e3);
+      };
+      ask();
+    }
+    answer(message) {
+      const now = performance.now();
+      const roundTrip_ms = now - message.clock;
+      this.roundTrip_ms += 0.01;
+      if (roundTrip_ms <= this.roundTrip_ms) {
+        this.roundTrip_ms = roundTrip_ms;
+        this.offset_ms = message.server_ms - (message.clock + now) / 2;
+      }
+    }
+    stop() {
+      clearTimeout(this.timer);
+    }
+    get known() {
+      return this.roundTrip_ms < Infinity;
+    }
+  };
+  var clock = new ServerClock();
+  var SPAN_MS = 2e3;
+  var Counts = class {
+    shown = 0;
+    dropped = 0;
+    age_ms = null;
+    last = null;
+    times = [];
+    /** A new connection: the gap to the last picture is nobody's drop. */
+    restart() {
+      this.last = null;
+      this.times.length = 0;
+    }
+    /** A picture is on the screen since shown_ms of the page's time. */
+    count(shown_ms) {
+      this.shown += 1;
+      this.times.push(shown_ms);
+      while (this.times.length > 1 && this.times[0] < shown_ms - SPAN_MS) this.times.shift();
+    }
+    /** What is known of a picture that was shown at shown_ms. */
+    know(header, shown_ms) {
+      if (this.last !== null) this.dropped += Math.max(0, header.sequence - this.last - 1);
+      this.last = header.sequence;
+      this.age_ms = shown_ms + clock.offset_ms - header.captured_ms;
+    }
+    get fps() {
+      const span = this.times[this.times.length - 1] - this.times[0];
+      return span > 0 ? 1e3 * (this.times.length - 1) / span : null;
+    }
+  };
+  var counts = new Counts();
+
+  // src/panel.ts
   var CHOICES = [
     { id: "view", label: "View", names: (s) => s.views ?? [], now: (s) => s.view, message: (view) => ({ view }) },
     { id: "lens", label: "Lens", names: (s) => s.lenses ?? [], now: (s) => s.lens, message: (lens) => ({ lens }) },
@@ -248,76 +330,48 @@
       button.disabled = !model.mayControl || !state.views?.includes(this.lastView);
     }
   };
-
-  // src/clock.ts
-  var ServerClock = class {
-    offset_ms = 0;
-    roundTrip_ms = Infinity;
-    asked = 0;
-    timer = 0;
-    /** Ask through a channel, often at first; `answer` takes what comes back. */
-    start(send) {
-      this.stop();
-      this.roundTrip_ms = Infinity;
-      this.asked = 0;
-      const ask = () => {
-        send(JSON.stringify({ clock: performance.now() }));
-        this.asked += 1;
-        this.timer = window.setTimeout(ask, this.asked < 8 ? 150 : 5e3);
-      };
-      ask();
+  var selection = { name: "" };
+  var ObjectPicker = class extends HTMLElement {
+    connectedCallback() {
+      this.innerHTML = `<label>Object<select id="object"></select></label>
+      <label class="switch"><input id="visible" type="checkbox"> shown</label>
+      <label class="switch" id="smooth_label"><input id="smoothing" type="checkbox"> smooth tracking</label>`;
+      this.find("object").addEventListener("change", () => this.onPick());
+      this.find("visible").addEventListener("change", () => void this.send({ object: { name: selection.name, visible: this.find("visible").checked } }));
+      this.find("smoothing").addEventListener("change", () => void this.send({ smoothing: this.find("smoothing").checked }));
+      model.addEventListener("state", () => this.onState());
     }
-    answer(message) {
-      const now = performance.now();
-      const roundTrip_ms = now - message.clock;
-      this.roundTrip_ms += 0.01;
-      if (roundTrip_ms <= this.roundTrip_ms) {
-        this.roundTrip_ms = roundTrip_ms;
-        this.offset_ms = message.server_ms - (message.clock + now) / 2;
+    find(id) {
+      return this.querySelector(`#${id}`);
+    }
+    onPick() {
+      selection.name = this.find("object").value;
+      if (selection.name) model.say(`drag ${selection.name} on the picture`, 3);
+      this.onState();
+    }
+    async send(message) {
+      await control(message);
+      await refreshState().catch(() => void 0);
+    }
+    onState() {
+      const { objects = [], smoothing } = model.state;
+      const select = this.find("object");
+      const names = objects.map((each) => each.name);
+      if (!names.includes(selection.name)) selection.name = "";
+      if (select.dataset["names"] !== names.join("\n")) {
+        select.replaceChildren(new Option("none", ""), ...names.map((name) => new Option(name, name)));
+        select.dataset["names"] = names.join("\n");
       }
-    }
-    stop() {
-      clearTimeout(this.timer);
-    }
-    get known() {
-      return this.roundTrip_ms < Infinity;
-    }
-  };
-  var clock = new ServerClock();
-
-  // src/counting.ts
-  var SPAN_MS = 2e3;
-  var Counts = class {
-    shown = 0;
-    dropped = 0;
-    age_ms = null;
-    last = null;
-    times = [];
-    /** A new connection: the gap to the last picture is nobody's drop. */
-    restart() {
-      this.last = null;
-      this.times.length = 0;
-    }
-    /** A picture is on the screen since shown_ms of the page's time. */
-    count(shown_ms) {
-      this.shown += 1;
-      this.times.push(shown_ms);
-      while (this.times.length > 1 && this.times[0] < shown_ms - SPAN_MS) this.times.shift();
-    }
-    /** What is known of a picture that was shown at shown_ms. */
-    know(header, shown_ms) {
-      if (this.last !== null) this.dropped += Math.max(0, header.sequence - this.last - 1);
-      this.last = header.sequence;
-      this.age_ms = shown_ms + clock.offset_ms - header.captured_ms;
-    }
-    get fps() {
-      const span = this.times[this.times.length - 1] - this.times[0];
-      return span > 0 ? 1e3 * (this.times.length - 1) / span : null;
+      select.value = selection.name;
+      select.parentElement.hidden = names.length === 0;
+      const picked = objects.find((each) => each.name === selection.name);
+      this.find("visible").parentElement.hidden = !picked;
+      this.find("visible").checked = picked?.visible ?? false;
+      this.find("smooth_label").hidden = typeof smoothing !== "boolean";
+      this.find("smoothing").checked = smoothing === true;
+      for (const id of ["object", "visible", "smoothing"]) this.find(id).disabled = !model.mayControl;
     }
   };
-  var counts = new Counts();
-
-  // src/focus_control.ts
   var INFINITY_BELOW = 0.01;
   var QUIET_MS = 1500;
   var FocusControl = class extends HTMLElement {
@@ -368,94 +422,60 @@
     if (name === void 0) return "";
     return name === null ? "from the file of the lens" : name.startsWith("by ") ? name : `from ${name}`;
   }
-
-  // src/objects.ts
-  var selection = { name: "" };
-  var ObjectPicker = class extends HTMLElement {
+  var Shutter = class extends HTMLElement {
     connectedCallback() {
-      this.innerHTML = `<label>Object<select id="object"></select></label>
-      <label class="switch"><input id="visible" type="checkbox"> shown</label>
-      <label class="switch" id="smooth_label"><input id="smoothing" type="checkbox"> smooth tracking</label>`;
-      this.find("object").addEventListener("change", () => this.onPick());
-      this.find("visible").addEventListener("change", () => void this.send({ object: { name: selection.name, visible: this.find("visible").checked } }));
-      this.find("smoothing").addEventListener("change", () => void this.send({ smoothing: this.find("smoothing").checked }));
+      this.innerHTML = `<button id="record" aria-label="record" aria-pressed="false"></button>
+      <button id="capture" aria-label="capture"></button>`;
+      this.button("capture").addEventListener("click", () => void this.capture());
+      this.button("record").addEventListener("click", () => void this.record());
       model.addEventListener("state", () => this.onState());
     }
-    find(id) {
+    button(id) {
       return this.querySelector(`#${id}`);
     }
-    onPick() {
-      selection.name = this.find("object").value;
-      if (selection.name) model.say(`drag ${selection.name} on the picture`, 3);
+    async capture() {
+      this.button("capture").disabled = true;
+      model.say("capturing");
+      const answer = await control({ capture: {} });
+      if (answer) model.say(`saved ${String(answer["bundle"])}`, 5);
       this.onState();
     }
-    async send(message) {
-      await control(message);
+    async record() {
+      await control({ record: !model.state?.recording });
       await refreshState().catch(() => void 0);
     }
     onState() {
-      const { objects = [], smoothing } = model.state;
-      const select = this.find("object");
-      const names = objects.map((each) => each.name);
-      if (!names.includes(selection.name)) selection.name = "";
-      if (select.dataset["names"] !== names.join("\n")) {
-        select.replaceChildren(new Option("none", ""), ...names.map((name) => new Option(name, name)));
-        select.dataset["names"] = names.join("\n");
-      }
-      select.value = selection.name;
-      select.parentElement.hidden = names.length === 0;
-      const picked = objects.find((each) => each.name === selection.name);
-      this.find("visible").parentElement.hidden = !picked;
-      this.find("visible").checked = picked?.visible ?? false;
-      this.find("smooth_label").hidden = typeof smoothing !== "boolean";
-      this.find("smoothing").checked = smoothing === true;
-      for (const id of ["object", "visible", "smoothing"]) this.find(id).disabled = !model.mayControl;
+      const { can_capture, can_record, recording } = model.state;
+      this.button("capture").hidden = !can_capture;
+      this.button("record").hidden = !can_record;
+      this.button("capture").disabled = this.button("record").disabled = !model.mayControl;
+      this.button("record").setAttribute("aria-pressed", String(recording === true));
+      this.hidden = !can_capture && !can_record;
     }
   };
-
-  // src/drag.ts
-  function onGround([m0, m1, m2], [x, y]) {
-    const of = ([a, b, c]) => a * x + b * y + c;
-    const w = of(m2);
-    return Math.abs(w) < 1e-9 ? null : [of(m0) / w, of(m1) / w];
-  }
-  var ObjectDrag = class {
-    constructor(name, from) {
-      this.name = name;
-      this.from = from;
-      void this.begin();
+  var WAYS = { whep: "video", jpeg: "pictures" };
+  var Readout = class extends HTMLElement {
+    connectedCallback() {
+      this.innerHTML = `<div><b id="age">-</b><span>ms old</span></div>
+      <div><b id="fps">-</b><span>frames/s</span></div>
+      <div><b id="dropped">0</b><span>dropped</span></div>
+      <div><b id="way">-</b><span>sent as</span></div>
+      <p id="times" hidden></p>`;
+      setInterval(() => this.refresh(), 250);
     }
-    name;
-    from;
-    ground = null;
-    sent = null;
-    wanted = null;
-    busy = false;
-    moveTo(point) {
-      this.wanted = point;
-      void this.send();
-    }
-    /** The plane as it lies now: the camera may have moved since the last state. */
-    async begin() {
-      const state = await refreshState().catch(() => null);
-      this.ground = state?.ground_from_picture ?? null;
-      this.sent = this.ground && onGround(this.ground, this.from);
-      if (!this.sent) model.say("an object can be moved while the camera is tracked and sees the ground", 6);
-      void this.send();
-    }
-    async send() {
-      if (this.busy || !this.ground) return;
-      this.busy = true;
-      while (this.wanted && this.sent) {
-        const to = onGround(this.ground, this.wanted);
-        this.wanted = null;
-        if (!to) continue;
-        const answer = await control({ object: { name: this.name, move_m: [to[0] - this.sent[0], to[1] - this.sent[1]] } });
-        if (!answer) break;
-        this.sent = to;
-        await pace();
-      }
-      this.busy = false;
+    refresh() {
+      const set = (id, text) => {
+        this.querySelector(`#${id}`).textContent = text;
+      };
+      if (counts.age_ms !== null && clock.known) set("age", Math.max(0, counts.age_ms).toFixed(0));
+      set("fps", counts.fps?.toFixed(1) ?? "-");
+      set("dropped", String(counts.dropped));
+      set("way", WAYS[model.way] ?? "-");
+      const header = model.shown?.header;
+      const stages = Object.entries(header?.stages_ms ?? {}).map(([name, took_ms]) => `${name} ${took_ms.toFixed(1)}`);
+      if (header?.layer_age_ms) stages.push(`layer ${header.layer_age_ms.toFixed(0)} old`);
+      set("times", stages.length ? `${stages.join(" · ")} ms` : "");
+      this.querySelector("#times").hidden = !aids.has("times");
     }
   };
 
@@ -510,26 +530,84 @@
       gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0);
     }, { passive: false });
   }
-
-  // src/histogram.ts
-  var EVERY_MS = 200;
-  var Histogram = class {
-    constructor(canvas) {
-      this.canvas = canvas;
+  var MOST = 8;
+  var Zoom = class {
+    constructor(frame, stage) {
+      this.frame = frame;
+      this.stage = stage;
     }
-    canvas;
-    last_ms = 0;
-    draw(marks) {
-      const now = performance.now();
-      if (now - this.last_ms < EVERY_MS) return;
-      this.last_ms = now;
-      const { width, height } = this.canvas;
-      const context = this.canvas.getContext("2d");
-      const bins = marks.histogram();
-      context.clearRect(0, 0, width, height);
-      context.fillStyle = "#e8e6e1";
-      const step = width / bins.length;
-      bins.forEach((share, i) => context.fillRect(i * step, height * (1 - Math.sqrt(share)), step, height));
+    frame;
+    stage;
+    scale = 1;
+    left_px = 0;
+    top_px = 0;
+    by(factor, x_px, y_px, dx_px, dy_px) {
+      const scale = Math.min(MOST, Math.max(1, this.scale * factor));
+      const box = this.frame.getBoundingClientRect();
+      const [x, y] = [x_px - box.left, y_px - box.top];
+      this.left_px = x - (x - this.left_px) * scale / this.scale + dx_px;
+      this.top_px = y - (y - this.top_px) * scale / this.scale + dy_px;
+      this.scale = scale;
+      this.apply();
+    }
+    pan(dx_px, dy_px) {
+      this.left_px += dx_px;
+      this.top_px += dy_px;
+      this.apply();
+    }
+    reset() {
+      [this.scale, this.left_px, this.top_px] = [1, 0, 0];
+      this.apply();
+    }
+    apply() {
+      const { clientWidth, clientHeight } = this.stage;
+      this.left_px = Math.min(0, Math.max(clientWidth * (1 - this.scale), this.left_px));
+      this.top_px = Math.min(0, Math.max(clientHeight * (1 - this.scale), this.top_px));
+      this.stage.style.transform = `translate(${this.left_px}px, ${this.top_px}px) scale(${this.scale})`;
+    }
+  };
+  function onGround([m0, m1, m2], [x, y]) {
+    const of = ([a, b, c]) => a * x + b * y + c;
+    const w = of(m2);
+    return Math.abs(w) < 1e-9 ? null : [of(m0) / w, of(m1) / w];
+  }
+  var ObjectDrag = class {
+    constructor(name, from) {
+      this.name = name;
+      this.from = from;
+      void this.begin();
+    }
+    name;
+    from;
+    ground = null;
+    sent = null;
+    wanted = null;
+    busy = false;
+    moveTo(point) {
+      this.wanted = point;
+      void this.send();
+    }
+    /** The plane as it lies now: the camera may have moved since the last state. */
+    async begin() {
+      const state = await refreshState().catch(() => null);
+      this.ground = state?.ground_from_picture ?? null;
+      this.sent = this.ground && onGround(this.ground, this.from);
+      if (!this.sent) model.say("an object can be moved while the camera is tracked and sees the ground", 6);
+      void this.send();
+    }
+    async send() {
+      if (this.busy || !this.ground) return;
+      this.busy = true;
+      while (this.wanted && this.sent) {
+        const to = onGround(this.ground, this.wanted);
+        this.wanted = null;
+        if (!to) continue;
+        const answer = await control({ object: { name: this.name, move_m: [to[0] - this.sent[0], to[1] - this.sent[1]] } });
+        if (!answer) break;
+        this.sent = to;
+        await pace();
+      }
+      this.busy = false;
     }
   };
 
@@ -666,9 +744,27 @@ void main() {
     for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
     return made;
   }
-
-  // src/matte_feed.ts
-  var EVERY_MS2 = 200;
+  var HISTOGRAM_EVERY_MS = 200;
+  var Histogram = class {
+    constructor(canvas) {
+      this.canvas = canvas;
+    }
+    canvas;
+    last_ms = 0;
+    draw(marks) {
+      const now = performance.now();
+      if (now - this.last_ms < HISTOGRAM_EVERY_MS) return;
+      this.last_ms = now;
+      const { width, height } = this.canvas;
+      const context = this.canvas.getContext("2d");
+      const bins = marks.histogram();
+      context.clearRect(0, 0, width, height);
+      context.fillStyle = "#e8e6e1";
+      const step = width / bins.length;
+      bins.forEach((share, i) => context.fillRect(i * step, height * (1 - Math.sqrt(share)), step, height));
+    }
+  };
+  var MATTE_EVERY_MS = 200;
   var MatteFeed = class {
     constructor(take) {
       this.take = take;
@@ -683,7 +779,7 @@ void main() {
       await Promise.resolve();
       while (this.running) {
         if (model.state?.matte) await this.fetchOne().catch(() => void 0);
-        await new Promise((done) => setTimeout(done, EVERY_MS2));
+        await new Promise((done) => setTimeout(done, MATTE_EVERY_MS));
       }
     }
     async fetchOne() {
@@ -692,44 +788,6 @@ void main() {
       const bitmap = await createImageBitmap(await answer.blob());
       this.take(bitmap);
       bitmap.close();
-    }
-  };
-
-  // src/zoom.ts
-  var MOST = 8;
-  var Zoom = class {
-    constructor(frame, stage) {
-      this.frame = frame;
-      this.stage = stage;
-    }
-    frame;
-    stage;
-    scale = 1;
-    left_px = 0;
-    top_px = 0;
-    by(factor, x_px, y_px, dx_px, dy_px) {
-      const scale = Math.min(MOST, Math.max(1, this.scale * factor));
-      const box = this.frame.getBoundingClientRect();
-      const [x, y] = [x_px - box.left, y_px - box.top];
-      this.left_px = x - (x - this.left_px) * scale / this.scale + dx_px;
-      this.top_px = y - (y - this.top_px) * scale / this.scale + dy_px;
-      this.scale = scale;
-      this.apply();
-    }
-    pan(dx_px, dy_px) {
-      this.left_px += dx_px;
-      this.top_px += dy_px;
-      this.apply();
-    }
-    reset() {
-      [this.scale, this.left_px, this.top_px] = [1, 0, 0];
-      this.apply();
-    }
-    apply() {
-      const { clientWidth, clientHeight } = this.stage;
-      this.left_px = Math.min(0, Math.max(clientWidth * (1 - this.scale), this.left_px));
-      this.top_px = Math.min(0, Math.max(clientHeight * (1 - this.scale), this.top_px));
-      this.stage.style.transform = `translate(${this.left_px}px, ${this.top_px}px) scale(${this.scale})`;
     }
   };
 
@@ -825,67 +883,43 @@ void main() {
     }
   };
 
-  // src/readout.ts
-  var WAYS = { whep: "video", jpeg: "pictures" };
-  var Readout = class extends HTMLElement {
-    connectedCallback() {
-      this.innerHTML = `<div><b id="age">-</b><span>ms old</span></div>
-      <div><b id="fps">-</b><span>frames/s</span></div>
-      <div><b id="dropped">0</b><span>dropped</span></div>
-      <div><b id="way">-</b><span>sent as</span></div>
-      <p id="times" hidden></p>`;
-      setInterval(() => this.refresh(), 250);
+  // src/transports.ts
+  var AGAIN_MS = 1e3;
+  function offered(canvas, video, names) {
+    const wanted = new URLSearchParams(location.search).get("transport");
+    const all = { whep: () => new WhepTransport(video), jpeg: () => new JpegTransport(canvas) };
+    const usable = names.filter((name) => (name !== "whep" || "RTCPeerConnection" in window) && (wanted ?? name) === name);
+    return usable.flatMap((name) => all[name] ? [all[name]()] : []);
+  }
+  async function watch(canvas, video) {
+    for (; ; ) {
+      for (const transport of offered(canvas, video, model.state?.transports ?? [])) {
+        counts.restart();
+        let shown = false;
+        const why = await transport.run(() => {
+          shown = true;
+          video.hidden = transport.name !== "whep";
+          canvas.hidden = !video.hidden;
+          model.setWay(transport.name);
+          if (!model.state?.failure) model.say("");
+        });
+        model.say(why);
+        if (shown) break;
+      }
+      do {
+        await new Promise((done) => setTimeout(done, AGAIN_MS));
+      } while (!await letIn());
     }
-    refresh() {
-      const set = (id, text) => {
-        this.querySelector(`#${id}`).textContent = text;
-      };
-      if (counts.age_ms !== null && clock.known) set("age", Math.max(0, counts.age_ms).toFixed(0));
-      set("fps", counts.fps?.toFixed(1) ?? "-");
-      set("dropped", String(counts.dropped));
-      set("way", WAYS[model.way] ?? "-");
-      const header = model.shown?.header;
-      const stages = Object.entries(header?.stages_ms ?? {}).map(([name, took_ms]) => `${name} ${took_ms.toFixed(1)}`);
-      if (header?.layer_age_ms) stages.push(`layer ${header.layer_age_ms.toFixed(0)} old`);
-      set("times", stages.length ? `${stages.join(" · ")} ms` : "");
-      this.querySelector("#times").hidden = !aids.has("times");
+  }
+  async function letIn() {
+    try {
+      await refreshState();
+      return true;
+    } catch (problem) {
+      model.say(problem instanceof Error && !(problem instanceof TypeError) ? problem.message : "connection lost, trying again");
+      return false;
     }
-  };
-
-  // src/shutter.ts
-  var Shutter = class extends HTMLElement {
-    connectedCallback() {
-      this.innerHTML = `<button id="record" aria-label="record" aria-pressed="false"></button>
-      <button id="capture" aria-label="capture"></button>`;
-      this.button("capture").addEventListener("click", () => void this.capture());
-      this.button("record").addEventListener("click", () => void this.record());
-      model.addEventListener("state", () => this.onState());
-    }
-    button(id) {
-      return this.querySelector(`#${id}`);
-    }
-    async capture() {
-      this.button("capture").disabled = true;
-      model.say("capturing");
-      const answer = await control({ capture: {} });
-      if (answer) model.say(`saved ${String(answer["bundle"])}`, 5);
-      this.onState();
-    }
-    async record() {
-      await control({ record: !model.state?.recording });
-      await refreshState().catch(() => void 0);
-    }
-    onState() {
-      const { can_capture, can_record, recording } = model.state;
-      this.button("capture").hidden = !can_capture;
-      this.button("record").hidden = !can_record;
-      this.button("capture").disabled = this.button("record").disabled = !model.mayControl;
-      this.button("record").setAttribute("aria-pressed", String(recording === true));
-      this.hidden = !can_capture && !can_record;
-    }
-  };
-
-  // src/jpeg_transport.ts
+  }
   var JpegTransport = class {
     constructor(canvas) {
       this.canvas = canvas;
@@ -900,17 +934,21 @@ void main() {
         const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/stream`);
         socket.binaryType = "arraybuffer";
         let first = true;
-        socket.onopen = () => {
-          model.say("waiting for the camera");
-          clock.start((text) => socket.readyState === WebSocket.OPEN && socket.send(text));
-        };
-        socket.onmessage = async (event) => {
-          if (typeof event.data === "string") return this.hear(JSON.parse(event.data));
-          const header = await this.draw(event.data);
+        let drawn = Promise.resolve();
+        const take = async (data) => {
+          const header = await this.draw(data);
           if (first) showing();
           first = false;
           model.show({ pixels: this.canvas, header });
           if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ ack: header.sequence }));
+        };
+        socket.onopen = () => {
+          model.say("waiting for the camera");
+          clock.start((text) => socket.readyState === WebSocket.OPEN && socket.send(text));
+        };
+        socket.onmessage = (event) => {
+          if (typeof event.data === "string") this.hear(JSON.parse(event.data), drawn);
+          else drawn = take(event.data);
         };
         socket.onclose = () => {
           clock.stop();
@@ -918,9 +956,10 @@ void main() {
         };
       });
     }
-    hear(message) {
+    hear(message, drawn) {
+      const { failure } = message;
       if (message.server_ms !== void 0) clock.answer(message);
-      else if (message.failure !== void 0) model.fail(message.failure);
+      else if (failure !== void 0) void drawn.then(() => model.fail(failure));
       else if (message.error !== void 0) model.say(message.error, 6);
     }
     async draw(data) {
@@ -942,30 +981,6 @@ void main() {
       return header;
     }
   };
-
-  // src/sdp_exchange.ts
-  var GATHERING_MS = 1e3;
-  async function offerTo(path, peer) {
-    await peer.setLocalDescription();
-    await gathered(peer);
-    const body = peer.localDescription.sdp;
-    const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
-    if (!answer.ok) throw new Error(await sentenceOf(answer));
-    await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });
-    return answer.headers.get("Location");
-  }
-  function release(resource) {
-    if (resource !== null) void fetch(resource, { method: "DELETE", keepalive: true }).catch(() => void 0);
-  }
-  function gathered(peer) {
-    return new Promise((done) => {
-      if (peer.iceGatheringState === "complete") return done();
-      setTimeout(done, GATHERING_MS);
-      peer.addEventListener("icegatheringstatechange", () => peer.iceGatheringState === "complete" && done());
-    });
-  }
-
-  // src/whep_transport.ts
   var FIRST_PICTURE_MS = 6e3;
   var STILL_MS = 5e3;
   var MOST_REMEMBERED = 300;
@@ -1065,34 +1080,6 @@ void main() {
       });
     }
   };
-
-  // src/transport.ts
-  var AGAIN_MS = 1e3;
-  function offered(canvas, video, names) {
-    const wanted = new URLSearchParams(location.search).get("transport");
-    const all = { whep: () => new WhepTransport(video), jpeg: () => new JpegTransport(canvas) };
-    const usable = names.filter((name) => (name !== "whep" || "RTCPeerConnection" in window) && (wanted ?? name) === name);
-    return usable.flatMap((name) => all[name] ? [all[name]()] : []);
-  }
-  async function watch(canvas, video) {
-    for (; ; ) {
-      for (const transport of offered(canvas, video, model.state?.transports ?? [])) {
-        counts.restart();
-        let shown = false;
-        const why = await transport.run(() => {
-          shown = true;
-          video.hidden = transport.name !== "whep";
-          canvas.hidden = !video.hidden;
-          model.setWay(transport.name);
-          if (!model.state?.failure) model.say("");
-        });
-        model.say(why);
-        if (shown) break;
-      }
-      await new Promise((done) => setTimeout(done, AGAIN_MS));
-      await refreshState().catch((problem) => model.say(problem instanceof TypeError ? "connection lost, trying again" : problem.message));
-    }
-  }
 
   // src/main.ts
   var STATE_EVERY_MS = 2e3;

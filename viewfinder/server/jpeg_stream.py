@@ -18,7 +18,7 @@ import struct
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
 from aiohttp import WSMsgType, web
@@ -105,7 +105,9 @@ class JpegStream:
     def __init__(self, jpeg_quality: int = 85) -> None:
         self.broadcaster = Broadcaster()
         self._jpeg_quality = jpeg_quality
-        self._newest: Newest[OutputFrame] = Newest()
+        self._newest: Newest[tuple[OutputFrame, int]] = Newest()
+        # A picture that was shown before a failure must not be published after it: it would say that all is well again.
+        self._failures, self._telling = 0, Lock()
         self._encoding, self._stopping = Event(), Event()
         self._thread = Thread(target=self._work, name="jpeg", daemon=True)
         self._thread.start()
@@ -116,10 +118,12 @@ class JpegStream:
         return self.broadcaster.waited_for and not self._encoding.is_set() and not self._newest.waiting
 
     def show(self, frame: OutputFrame) -> None:
-        self._newest.put(frame)
+        self._newest.put((frame, self._failures))
 
     def fail(self, sentence: str) -> None:
-        self.broadcaster.fail(sentence)
+        with self._telling:
+            self._failures += 1
+            self.broadcaster.fail(sentence)
 
     def __enter__(self) -> "JpegStream":
         return self
@@ -134,16 +138,23 @@ class JpegStream:
 
     def _work(self) -> None:
         while not self._stopping.is_set():
-            frame = self._newest.take(_POLL_S)
-            if frame is None or not self.broadcaster.waited_for:
+            shown = self._newest.take(_POLL_S)
+            if shown is None or not self.broadcaster.waited_for:
                 continue
             self._encoding.set()
             try:
-                self.broadcaster.publish(jpeg_message(frame, self._jpeg_quality))
+                self._publish(*shown)
             except Exception:
                 log.exception("a picture could not be encoded")
             finally:
                 self._encoding.clear()
+
+    def _publish(self, frame: OutputFrame, failures: int) -> None:
+        """Encode a picture, and hand it out unless the source failed since it was shown. failures: how many there were then."""
+        message = jpeg_message(frame, self._jpeg_quality)
+        with self._telling:
+            if failures == self._failures:
+                self.broadcaster.publish(message)
 
 
 def jpeg_message(frame: OutputFrame, jpeg_quality: int) -> bytes:

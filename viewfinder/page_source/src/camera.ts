@@ -1,6 +1,5 @@
 // The page that sends this device's camera (WHIP) to the viewfinder.
-import { offerTo, release } from "./sdp_exchange";
-import { enter } from "./server";
+import { enter, offerTo, release } from "./server";
 
 const FOCUS_EVERY_MS = 200;
 const MOST_BITS_PER_S = 4_000_000;

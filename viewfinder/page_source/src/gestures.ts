@@ -1,5 +1,8 @@
-// Fingers on the picture: a tap, a drag with one, a pinch with two.
+// Fingers on the picture: taps, drags and pinches, and what they zoom and move.
+import { type Matrix3, model } from "./model";
+import { control, pace, refreshState } from "./server";
 
+// Fingers on the picture: a tap, a drag with one, a pinch with two.
 export interface Gestures {
   tap(x_px: number, y_px: number): void;
   dragStart(x_px: number, y_px: number): void;
@@ -69,4 +72,95 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
     event.preventDefault();
     gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0);
   }, { passive: false });
+}
+
+// Enlarges what is displayed, about the fingers; nothing of it reaches the server.
+const MOST = 8;
+
+export class Zoom {
+  scale = 1;
+  private left_px = 0;
+  private top_px = 0;
+
+  constructor(private readonly frame: HTMLElement, private readonly stage: HTMLElement) {}
+
+  by(factor: number, x_px: number, y_px: number, dx_px: number, dy_px: number): void {
+    const scale = Math.min(MOST, Math.max(1, this.scale * factor));
+    const box = this.frame.getBoundingClientRect();
+    const [x, y] = [x_px - box.left, y_px - box.top];
+    // What lies under the fingers stays there.
+    this.left_px = x - ((x - this.left_px) * scale) / this.scale + dx_px;
+    this.top_px = y - ((y - this.top_px) * scale) / this.scale + dy_px;
+    this.scale = scale;
+    this.apply();
+  }
+
+  pan(dx_px: number, dy_px: number): void {
+    this.left_px += dx_px;
+    this.top_px += dy_px;
+    this.apply();
+  }
+
+  reset(): void {
+    [this.scale, this.left_px, this.top_px] = [1, 0, 0];
+    this.apply();
+  }
+
+  private apply(): void {
+    const { clientWidth, clientHeight } = this.stage;
+    this.left_px = Math.min(0, Math.max(clientWidth * (1 - this.scale), this.left_px));
+    this.top_px = Math.min(0, Math.max(clientHeight * (1 - this.scale), this.top_px));
+    this.stage.style.transform = `translate(${this.left_px}px, ${this.top_px}px) scale(${this.scale})`;
+  }
+}
+
+// Dragging an object on the plane on which it stands: from the finger to metres through the homography of the state.
+type Point = [number, number];
+
+/** A point of the picture (0 to 1, right and down) on the ground, metres; null beyond the horizon. */
+export function onGround([m0, m1, m2]: Matrix3, [x, y]: Point): Point | null {
+  const of = ([a, b, c]: [number, number, number]): number => a * x + b * y + c;
+  const w = of(m2);
+  return Math.abs(w) < 1e-9 ? null : [of(m0) / w, of(m1) / w];
+}
+
+/** One finger on one object. */
+export class ObjectDrag {
+  private ground: Matrix3 | null = null;
+  private sent: Point | null = null;
+  private wanted: Point | null = null;
+  private busy = false;
+
+  constructor(private readonly name: string, private readonly from: Point) {
+    void this.begin();
+  }
+
+  moveTo(point: Point): void {
+    this.wanted = point;
+    void this.send();
+  }
+
+  /** The plane as it lies now: the camera may have moved since the last state. */
+  private async begin(): Promise<void> {
+    const state = await refreshState().catch(() => null);
+    this.ground = state?.ground_from_picture ?? null;
+    this.sent = this.ground && onGround(this.ground, this.from);
+    if (!this.sent) model.say("an object can be moved while the camera is tracked and sees the ground", 6);
+    void this.send();
+  }
+
+  private async send(): Promise<void> {
+    if (this.busy || !this.ground) return;
+    this.busy = true;
+    while (this.wanted && this.sent) {
+      const to = onGround(this.ground, this.wanted);
+      this.wanted = null;
+      if (!to) continue;
+      const answer = await control({ object: { name: this.name, move_m: [to[0] - this.sent[0], to[1] - this.sent[1]] } });
+      if (!answer) break;
+      this.sent = to;
+      await pace();
+    }
+    this.busy = false;
+  }
 }

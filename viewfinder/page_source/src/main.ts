@@ -1,16 +1,11 @@
 // The viewfinder's page: lets itself in, then keeps showing the stream and the state.
-import { AidSwitches } from "./aid_switches";
-import { Choices } from "./choices";
-import { clock } from "./clock";
-import { counts } from "./counting";
-import { FocusControl } from "./focus_control";
+import { AidSwitches } from "./aids";
 import { model } from "./model";
-import { ObjectPicker } from "./objects";
+import { Choices, FocusControl, ObjectPicker, Readout, Shutter } from "./panel";
 import { PictureView } from "./picture";
-import { Readout } from "./readout";
 import { enter, refreshState } from "./server";
-import { Shutter } from "./shutter";
-import { watch } from "./transport";
+import { clock, counts } from "./timing";
+import { watch } from "./transports";
 
 const STATE_EVERY_MS = 2000;
 

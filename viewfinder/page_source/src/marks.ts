@@ -1,4 +1,5 @@
 // Focus peaking, zebra and histogram, measured in the browser on the picture as it arrived (compressed), in one WebGL2 pass.
+import { model } from "./model";
 
 export interface Marking {
   peakReal: boolean;
@@ -154,4 +155,58 @@ function texture(gl: WebGL2RenderingContext, filter: number): WebGLTexture {
   for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, filter);
   for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
   return made;
+}
+
+// The histogram of luma, drawn a few times a second: counting costs more than drawing.
+const HISTOGRAM_EVERY_MS = 200;
+
+export class Histogram {
+  private last_ms = 0;
+
+  constructor(private readonly canvas: HTMLCanvasElement) {}
+
+  draw(marks: Marks): void {
+    const now = performance.now();
+    if (now - this.last_ms < HISTOGRAM_EVERY_MS) return;
+    this.last_ms = now;
+    const { width, height } = this.canvas;
+    const context = this.canvas.getContext("2d")!;
+    const bins = marks.histogram();
+    context.clearRect(0, 0, width, height);
+    context.fillStyle = "#e8e6e1";
+    const step = width / bins.length;
+    // Roots show the few pixels of lights and shadows beside the many between.
+    bins.forEach((share, i) => context.fillRect(i * step, height * (1 - Math.sqrt(share)), step, height));
+  }
+}
+
+// The coverage of the virtual layer, fetched a few times a second while peaking needs to tell real from virtual.
+const MATTE_EVERY_MS = 200;
+
+export class MatteFeed {
+  private running = false;
+
+  constructor(private readonly take: (matte: ImageBitmap) => void) {}
+
+  run(on: boolean): void {
+    if (on && !this.running) void this.loop();
+    this.running = on;
+  }
+
+  private async loop(): Promise<void> {
+    // Begun before `running` is set.
+    await Promise.resolve();
+    while (this.running) {
+      if (model.state?.matte) await this.fetchOne().catch(() => undefined);
+      await new Promise((done) => setTimeout(done, MATTE_EVERY_MS));
+    }
+  }
+
+  private async fetchOne(): Promise<void> {
+    const answer = await fetch("/matte");
+    if (!answer.ok) return;
+    const bitmap = await createImageBitmap(await answer.blob());
+    this.take(bitmap);
+    bitmap.close();
+  }
 }

@@ -1,15 +1,10 @@
 // <vf-picture>: the picture, what is drawn over it, and what fingers do on it.
-import { aids } from "./aids";
-import { ObjectDrag } from "./drag";
-import { listen } from "./gestures";
-import { Histogram } from "./histogram";
-import { askForLevel, showLevel } from "./level";
-import { Marks, sizeOf } from "./marks";
-import { MatteFeed } from "./matte_feed";
+import { aids, askForLevel, showLevel } from "./aids";
+import { listen, ObjectDrag, Zoom } from "./gestures";
+import { Histogram, Marks, MatteFeed, sizeOf } from "./marks";
 import { distanceText, model } from "./model";
-import { selection } from "./objects";
+import { selection } from "./panel";
 import { control } from "./server";
-import { Zoom } from "./zoom";
 
 const THIRDS = [1, 2].flatMap((i) => [`M${i} 0V3`, `M0 ${i}H3`]).join("");
 
