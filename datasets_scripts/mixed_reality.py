@@ -148,7 +148,7 @@ class MixedView(ViewFiles):
 
     def _tracer(self, scene: TruthScene, part: Literal["all", "thin"] = "all") -> TruthTracer:
         camera = self._plan.camera(self._number)
-        return make_tracer(without_shadows(pack(scene, camera)), camera, part, self._plan.seed, self._variant)
+        return make_tracer(without_shadows(pack(scene, camera)), camera, part, self._plan.seed)
 
     def document(self) -> dict[str, object]:
         """meta.json: that of the scene's own truth, and what is added."""
@@ -197,11 +197,11 @@ class MixedView(ViewFiles):
 DEFAULT_SHAPES = ("disc", "blades7", "cat_eye")
 
 
-def mixed_reality(out: Path, plan: TruthPlan, *, overwrite: bool = False, variant: str | None = None) -> int:
+def mixed_reality(out: Path, plan: TruthPlan, *, overwrite: bool = False) -> int:
     """`truth_set.make_missing` of MixedView; raises InputError for scenes without an object too."""
     if set(plan.scenes) - set(OBJECT_DISTANCES_M):
         raise InputError(f"expected scenes out of {','.join(OBJECT_DISTANCES_M)}, got {','.join(plan.scenes)}")
-    return make_missing(MixedView, out, plan, overwrite=overwrite, variant=variant)
+    return make_missing(MixedView, out, plan, overwrite=overwrite)
 
 
 main = truth_command(mixed_reality, tuple(OBJECT_DISTANCES_M), DEFAULT_SHAPES)

@@ -14,12 +14,21 @@ from typing import Annotated
 
 import typer
 
-from datasets_scripts.public_blb import BLB_LENS, blb_stacks
-from datasets_scripts.public_conversion import Conversion, convert
-from datasets_scripts.public_depth import DepthMaps
-from datasets_scripts.public_photo_pairs import APERTURE_LENS, DPDD_LENS, EBB_LENS, aperture_stacks, dpdd_stacks, ebb_stacks
-from datasets_scripts.public_realbokeh import REALBOKEH_LENS, realbokeh_stacks
-from datasets_scripts.public_stack import PublicLens, PublicStack
+from datasets_scripts.public_sets.adapters import (
+    APERTURE_LENS,
+    BLB_LENS,
+    DPDD_LENS,
+    EBB_LENS,
+    REALBOKEH_LENS,
+    PublicLens,
+    PublicStack,
+    aperture_stacks,
+    blb_stacks,
+    dpdd_stacks,
+    ebb_stacks,
+    realbokeh_stacks,
+)
+from datasets_scripts.public_sets.conversion import Conversion, DepthMaps, convert
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME
 from mrbokeh.system.errors import InputError
 

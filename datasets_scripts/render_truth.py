@@ -4,18 +4,16 @@
 
 OUT/SCENE_SEED/view_NN/ holds meta.json (lens, camera, openings, conventions), all_in_focus.exr, depth.exr, layers/NN.exr where a
 thin foreground hides what is behind it, truth/OPENING_FOCUS.exr and sheet.png. Finished files are kept, so an interrupted run goes
-on where it stopped. It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and is fast where LLVM's library is installed
-(Debian: libllvm19).
+on where it stopped. It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and LLVM's library (Debian: libllvm19).
 """
 
 from functools import partial
 
 import typer
 
-from datasets_scripts.truth_scenes import SCENES
-from datasets_scripts.truth_set import make_missing, truth_command
-from datasets_scripts.truth_shapes import SHAPE_NAMES
-from datasets_scripts.truth_views import View
+from datasets_scripts.made_sets.truth_plan import SHAPE_NAMES
+from datasets_scripts.made_sets.truth_set import View, make_missing, truth_command
+from datasets_scripts.scenes.truth_scenes import SCENES
 
 render_truth = partial(make_missing, View)
 

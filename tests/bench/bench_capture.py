@@ -17,10 +17,9 @@ import numpy as np
 from capture.poses.sparse_model import read_sparse_model
 from capture.scale.answer import read_scale
 from capture.scale.board import umeyama
-from datasets_scripts.lab_scene import BOARD_MARKER_M, BOARD_SQUARE_M, BOARD_SQUARES
-from datasets_scripts.make_raw_stack import make_raw_stack
-from datasets_scripts.raw_stack_truth import StackPlan
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel
+from datasets_scripts.make_raw_stack import StackPlan, make_raw_stack
+from datasets_scripts.scenes.stack_scenes import BOARD_MARKER_M, BOARD_SQUARE_M, BOARD_SQUARES
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from tests.bench.machine import machine_line
 from tests.bench.process_cost import mrbokeh

@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from capture.merging.second_pass import SliceOptics, second_pass
-from datasets_scripts.make_raw_stack import make_raw_stack
-from datasets_scripts.raw_stack_truth import StackPlan
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel
+from datasets_scripts.make_raw_stack import StackPlan, make_raw_stack
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
 from tests.bench.machine import machine_line

@@ -15,8 +15,8 @@ import numpy as np
 from capture.dense.dense_depth import DenseSettings, dense_depth
 from capture.dense.plane_sweep import Matching, dioptre_planes, window_statistics
 from capture.dense.sweep_view import SweepView, neighbour_from_reference, packed_view, rays_of, structure_of
-from datasets_scripts.lab_scene import LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera, lab_scene
-from datasets_scripts.thin_lens_tracer import trace_pinhole
+from datasets_scripts.scenes.stack_scenes import LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera, lab_scene
+from datasets_scripts.tracers.thin_lens import trace_pinhole
 from mrbokeh.optics.lens import Lens
 from tests.bench.machine import machine_line, memory_line
 

@@ -1,6 +1,6 @@
 """Objects between the blurred layers of a photograph against ray-traced truth: object alone, scene alone, both traced together.
 
-The cards are traced by datasets_scripts/card_tracer.py, which runs everywhere; what the sets of datasets_scripts/mixed_reality.py give
+The cards are traced by tests/scenes/card_tracer.py, which runs everywhere; what the sets of datasets_scripts/mixed_reality.py give
 is in docs/compositing_results.md. The bounds are those of the project: 3 dB over the better of two simple ways on every picture,
 40 dB on average.
 """

@@ -8,14 +8,22 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from datasets_scripts.mixed_reality import main, mixed_reality
-from datasets_scripts.mixed_reality_cards import FOCUS_CARD, mixed_cards
-from datasets_scripts.mixed_reality_objects import OBJECT_DISTANCES_M, scene_around, virtual_object, with_object, without_shadows
-from datasets_scripts.truth_plan import TruthPlan
-from datasets_scripts.truth_scene import pack
-from datasets_scripts.truth_scenes import make_scene
+from datasets_scripts.made_sets.truth_plan import TruthPlan
+from datasets_scripts.mixed_reality import (
+    OBJECT_DISTANCES_M,
+    main,
+    mixed_reality,
+    scene_around,
+    virtual_object,
+    with_object,
+    without_shadows,
+)
+from datasets_scripts.scenes.truth_scenes import make_scene
+from datasets_scripts.tracers.truth_scene import pack
 from mrbokeh.system.errors import InputError
+from tests.scenes.card_scene import FOCUS_CARD, mixed_cards
 from tests.scenes.mixed_reality_cases import traced_cases
+from tests.scenes.scalar_truth_tracer import require_mitsuba
 
 PLAN = TruthPlan(width_px=64, height_px=36, samples=4, scenes=("fence",), shapes=("disc",))
 
@@ -56,7 +64,7 @@ def test_cards_with_and_without_the_virtual_one() -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A written set of one opening."""
-    pytest.importorskip("mitsuba", reason="the truth is traced by Mitsuba: pip install 'mrbokeh[datasets]'")
+    require_mitsuba()
     out = tmp_path_factory.mktemp("mixed")
     assert mixed_reality(out, PLAN) == 2 + 2 * 3
     return out
@@ -86,7 +94,7 @@ def test_where_the_object_does_not_reach_both_pictures_are_one(folder: Path) -> 
 
 
 def test_the_command_says_what_it_cannot_do() -> None:
-    pytest.importorskip("mitsuba", reason="the truth is traced by Mitsuba: pip install 'mrbokeh[datasets]'")
+    require_mitsuba()
     app = typer.Typer()
     app.command()(main)
     found = CliRunner().invoke(app, ["nowhere", "--scenes", "checkers"])

@@ -10,17 +10,13 @@ import typer
 from typer.testing import CliRunner
 
 from datasets_scripts.bokeh_stacks import main, make_bokeh_stacks, make_pull
-from datasets_scripts.bokeh_stacks_plan import SIZES, StackSize, StacksPlan
-from datasets_scripts.bokeh_stacks_scenes import KINDS, bokeh_scene
-from datasets_scripts.bokeh_stacks_shapes import SHAPES, bokeh_shape
-from datasets_scripts.bokeh_stacks_view import StackView
-from datasets_scripts.traced_scene import plain_texture
-from datasets_scripts.truth_bodies import quad
-from datasets_scripts.truth_field_stop import FieldStop, OpenShares, polygon_share
-from datasets_scripts.truth_mitsuba import LLVM, SCALAR, best_variant
-from datasets_scripts.truth_scene import Lamp, PackedScene, TruthScene, pack
-from datasets_scripts.truth_tracer import Opening
-from datasets_scripts.truth_tracer_choice import make_tracer
+from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StackSize, StacksPlan, bokeh_shape
+from datasets_scripts.made_sets.bokeh_view import StackView
+from datasets_scripts.scenes.bokeh_scenes import KINDS, bokeh_scene
+from datasets_scripts.tracers.pupil import FieldStop, OpenShares, polygon_share
+from datasets_scripts.tracers.traced_scene import plain_texture
+from datasets_scripts.tracers.truth import Opening, make_tracer
+from datasets_scripts.tracers.truth_scene import Lamp, PackedScene, TruthScene, pack, quad
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
@@ -28,6 +24,7 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
+from tests.scenes.scalar_truth_tracer import ScalarTracer, require_mitsuba
 from training.data.dataset import PairSet, read_pair
 from training.data.training_data import training_data
 
@@ -39,7 +36,7 @@ TINY = StackSize(("garlands_1", "checkers_1"), 2, 2, 32, 20, 1.1, 4, 512)
 
 @pytest.fixture(autouse=True)
 def _mitsuba() -> None:
-    pytest.importorskip("mitsuba", reason="Mitsuba is not installed (pip install 'mrbokeh[datasets]')")
+    require_mitsuba()
 
 
 def one_light(camera: Camera, at_px: tuple[float, float], depth_m: float) -> PackedScene:
@@ -141,14 +138,12 @@ def test_a_stop_needs_sense_and_a_round_opening() -> None:
 
 def test_both_ways_of_tracing_agree_about_the_stop() -> None:
     """The same scrambled numbers: they differ by float32 alone, which lets single rays of 32 pass on another side of an edge."""
-    if best_variant() != LLVM:
-        pytest.skip("LLVM's library is not installed")
     plan = StacksPlan("ring", replace(TINY, width_px=24, height_px=16))
     camera = plan.camera("checkers_1", 1)
     packed = pack(bokeh_scene("checkers_1"), camera)
     packed = replace(packed, lamps=packed.lamps[:6], lamp_centres_m=packed.lamp_centres_m[:6])
     opening = plan.traced_opening(NEAR_FOCUS_M)
-    fast, slow = (make_tracer(packed, camera, variant=variant) for variant in (LLVM, SCALAR))
+    fast, slow = make_tracer(packed, camera), ScalarTracer(packed, camera)
     one, other = fast.traced(opening, 8), slow.traced(opening, 8)
     assert np.median(np.abs(one.rgb - other.rgb)) < 1e-5
     assert one.open_share.mean() == pytest.approx(other.open_share.mean(), abs=0.003)

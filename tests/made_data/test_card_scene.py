@@ -7,16 +7,15 @@ import pytest
 from scipy.ndimage import uniform_filter
 from scipy.signal import fftconvolve
 
-from datasets_scripts import card_scene as cards
-from datasets_scripts.card_content import Card, Lamp
-from datasets_scripts.card_shapes import TexelGrid, disc, everywhere, mirrored_beyond, rectangle, wire
-from datasets_scripts.card_tracer import lens_samples
-from datasets_scripts.procedural_textures import fractal_noise
+from datasets_scripts.scenes.textures import fractal_noise
 from mrbokeh.images.image_metrics import energy_ratio, psnr
 from mrbokeh.images.layer import flatten
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
+from tests.scenes import card_scene as cards
+from tests.scenes.card_tracer import lens_samples
+from tests.scenes.cards import Card, Lamp, TexelGrid, disc, everywhere, mirrored_beyond, rectangle, wire
 
 SIZE_PX, MARGIN_PX, DENSITY = 48, 16, 8
 GRID = TexelGrid(SIZE_PX, SIZE_PX, MARGIN_PX, DENSITY)
@@ -82,7 +81,7 @@ def test_past_a_straight_edge_shows_the_open_share_of_the_aperture(coc_px: float
 def test_a_slanted_card_is_met_where_the_ray_in_space_meets_it() -> None:
     # The thin lens in millimetres: the ray leaves lens point u, passes the point in focus that the pixel images, and cuts
     # the plane in space; the pinhole picture of that point is where the tracer must look.
-    from datasets_scripts._card_tracer_numba import sharp_from_film
+    from tests.scenes._card_tracer_numba import sharp_from_film
 
     lens, size_px = LENS, 200
     dioptres = np.array([0.42, 0.0006, -0.0011])

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_scripts.gallery import build
-from datasets_scripts.gallery_entries import Entry, read_entries
-from datasets_scripts.gallery_pictures import WIDEST_PX, result_jpeg
+from datasets_scripts.gallery.__main__ import Entry, build, read_entries
+from datasets_scripts.gallery.pictures import WIDEST_PX, result_jpeg
 from mrbokeh.cli import SUB_COMMANDS
 from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer

@@ -12,16 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from datasets_scripts import render_samples as command
-from datasets_scripts import thin_lens_tracer
-from datasets_scripts.render_samples import render_samples
-from datasets_scripts.samples_packing import gathered_lamps, pack
-from datasets_scripts.samples_plan import SamplesPlan, SamplesSet, in_a_row
-from datasets_scripts.samples_pupil import lens_table, light_through
-from datasets_scripts.samples_scene import Mover, MovingScene, Stage
-from datasets_scripts.samples_scenes import LENS, SCENES, checkerboard, make_scene
-from datasets_scripts.samples_tracer import SampleArrays, SampleTracer, mirrored_sobol
-from datasets_scripts.traced_scene import Quad, plain_texture
-from datasets_scripts.truth_sampling import owen_scrambled, reversed_bits, scramble_seed
+from datasets_scripts.render_samples import SamplesPlan, SamplesSet, in_a_row, render_samples
+from datasets_scripts.scenes.moving_scenes import LENS, SCENES, Mover, MovingScene, Stage, checkerboard, make_scene
+from datasets_scripts.tracers import thin_lens
+from datasets_scripts.tracers.samples import SampleArrays, SampleTracer, gathered_lamps, lens_table, light_through, mirrored_sobol, pack
+from datasets_scripts.tracers.sobol import owen_scrambled, reversed_bits, scramble_seed
+from datasets_scripts.tracers.traced_scene import Quad, plain_texture
 from mrbokeh.images.image_io import read_image, read_layer
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import over
@@ -170,8 +166,8 @@ def test_still_scenes_look_as_the_tracer_of_still_scenes_renders_them() -> None:
         STAGE.backdrop(0.12, checkerboard(6, (0.1, 0.1, 0.1), (0.9, 0.9, 0.9))),
     )
     lens, turned = (replace(LENS, aperture=Aperture.blades(3, rotation_rad=0.2 + turn)) for turn in (0.0, np.pi))
-    camera = thin_lens_tracer.camera_for_lens(Camera(W, H, (1.0, 1.0), (0.5 * W, 0.5 * H)), lens)
-    still = thin_lens_tracer.trace(MovingScene(movers).at(0.5), camera, lens, 1024)
+    camera = thin_lens.camera_for_lens(Camera(W, H, (1.0, 1.0), (0.5 * W, 0.5 * H)), lens)
+    still = thin_lens.trace(MovingScene(movers).at(0.5), camera, lens, 1024)
     # Random rays would leave about 0.4 / sqrt(1024) in two such pictures: 35 dB.
     assert psnr(tracer(*movers, lens=lens).mean(1024), still) > 45.0
     assert psnr(tracer(*movers, lens=turned).mean(1024), still) < 35.0
@@ -209,7 +205,7 @@ def test_random_numbers_are_those_of_their_plain_twin() -> None:
 @pytest.mark.parametrize("name", list(SCENES))
 def test_bodies_left_out_of_a_tile_are_not_to_be_seen_there(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fast path skips bodies whose bounds do not touch a tile; its slow twin tries every body everywhere."""
-    from datasets_scripts import samples_tracer
+    from datasets_scripts.tracers import samples
 
     both = SampleTracer(make_scene(name, 5, LENS, H / W), LENS, W, H)
     fast, fast_mean = both.samples(4), both.mean(16)
@@ -218,7 +214,7 @@ def test_bodies_left_out_of_a_tile_are_not_to_be_seen_there(name: str, monkeypat
         packed = pack(*args)  # type: ignore[arg-type]
         return packed._replace(bounds_px=np.broadcast_to((-1e9, -1e9, 1e9, 1e9), packed.bounds_px.shape).copy())
 
-    monkeypatch.setattr(samples_tracer, "pack", everywhere)
+    monkeypatch.setattr(samples, "pack", everywhere)
     slow = both.samples(4)
     for field in ("xy_px", "rgb", "depth_m", "motion_px"):
         np.testing.assert_array_equal(getattr(fast, field), getattr(slow, field))
@@ -244,7 +240,7 @@ def test_scenes_look_alike_at_all_sizes() -> None:
 
 
 def open_share(aperture: Aperture, points: np.ndarray) -> np.ndarray:
-    from datasets_scripts.card_tracer import transmission
+    from tests.scenes.card_tracer import transmission
 
     return transmission(aperture, points.astype(np.float64))
 

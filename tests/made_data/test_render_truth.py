@@ -8,19 +8,14 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from datasets_scripts.made_sets.truth_plan import SHAPE_NAMES, TruthPlan, lens_shape
 from datasets_scripts.render_truth import main, render_truth
-from datasets_scripts.traced_scene import Vector, plain_texture
-from datasets_scripts.truth_bodies import Body, quad
-from datasets_scripts.truth_mitsuba import LLVM, SCALAR, best_variant
-from datasets_scripts.truth_plan import TruthPlan
-from datasets_scripts.truth_pupil import pupil_table, two_disc_overlap
-from datasets_scripts.truth_sampling import owen_scrambled, reversed_bits, scramble_seed, sobol_table
-from datasets_scripts.truth_scene import Lamp, TruthScene, pack
-from datasets_scripts.truth_scenes import SCENES, make_scene
-from datasets_scripts.truth_shapes import SHAPE_NAMES, lens_shape
-from datasets_scripts.truth_sharp import sharp_layer
-from datasets_scripts.truth_tracer import Opening, Part, TruthTracer, lamp_flux
-from datasets_scripts.truth_tracer_choice import make_tracer
+from datasets_scripts.scenes.truth_scenes import SCENES, make_scene
+from datasets_scripts.tracers.pupil import pupil_table, two_disc_overlap
+from datasets_scripts.tracers.sobol import owen_scrambled, reversed_bits, scramble_seed, sobol_table
+from datasets_scripts.tracers.traced_scene import Vector, plain_texture
+from datasets_scripts.tracers.truth import Opening, Part, TruthTracer, lamp_flux, make_tracer, sharp_layer
+from datasets_scripts.tracers.truth_scene import Body, Lamp, TruthScene, pack, quad
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image, read_layer
 from mrbokeh.images.image_metrics import psnr
@@ -30,6 +25,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
+from tests.scenes.scalar_truth_tracer import ScalarTracer, require_mitsuba
 
 SIZE_PX = 96
 FOCAL_PX = 900.0
@@ -50,13 +46,11 @@ def opening(focus_m: float, aperture: Aperture | None = None) -> Opening:
     return Opening(aperture or Aperture.disc(), PUPIL_M, focus_m)
 
 
-def tracer(
-    bodies: tuple[Body, ...] = (), lamps: tuple[Lamp, ...] = (), part: Part = "all", variant: str | None = None, size_px: int = SIZE_PX
-) -> TruthTracer:
+def tracer(bodies: tuple[Body, ...] = (), lamps: tuple[Lamp, ...] = (), part: Part = "all", size_px: int = SIZE_PX) -> TruthTracer:
     """Bodies that shine as their texture says: with sky light alone, of the same strength from everywhere (quads face the camera)."""
-    pytest.importorskip("mitsuba", reason="Mitsuba is not installed (pip install 'mrbokeh[datasets]')")
+    require_mitsuba()
     scene = TruthScene("open", bodies or (wall(500.0, (0.0, 0.0, 0.0)),), lamps, sun=0.0, sky_light=1.0 / 0.75)
-    return make_tracer(pack(scene, camera(size_px)), camera(size_px), part, 0, variant)
+    return make_tracer(pack(scene, camera(size_px)), camera(size_px), part)
 
 
 def wall(z_m: float, rgb: Vector, left_m: float = -100.0, texture: np.ndarray | None = None) -> Body:
@@ -299,12 +293,10 @@ def small_leaves() -> tuple[TruthPlan, TruthScene]:
 
 @pytest.mark.parametrize("part", ["all", "thin", "rest"])
 def test_the_fast_tracer_agrees_with_its_slow_twin(part: Part, small_leaves: tuple[TruthPlan, TruthScene]) -> None:
-    pytest.importorskip("mitsuba", reason="Mitsuba is not installed (pip install 'mrbokeh[datasets]')")
-    if best_variant() != LLVM:
-        pytest.skip("LLVM's library is not installed (Debian: libllvm19)")
+    require_mitsuba()
     plan, scene = small_leaves
     packed, view = pack(scene, plan.camera(1)), plan.camera(1)
-    fast, slow = (make_tracer(packed, view, part, 5, variant) for variant in (LLVM, SCALAR))
+    fast, slow = make_tracer(packed, view, part, 5), ScalarTracer(packed, view, part, 5)
     for chosen in (None, plan.opening("cat_eye", 0.95), plan.opening("ring", 7.0)):
         one, other = fast.traced(chosen, 8), slow.traced(chosen, 8)
         assert one.rgb == pytest.approx(other.rgb, abs=1e-4)
@@ -317,7 +309,7 @@ def test_the_fast_tracer_agrees_with_its_slow_twin(part: Part, small_leaves: tup
 
 def test_parts_make_the_whole(small_leaves: tuple[TruthPlan, TruthScene]) -> None:
     """The foreground over the rest is the whole picture, but for what coverage cannot say about the inside of a pixel."""
-    pytest.importorskip("mitsuba", reason="Mitsuba is not installed (pip install 'mrbokeh[datasets]')")
+    require_mitsuba()
     plan, scene = small_leaves
     packed = pack(scene, plan.camera(0))
     parts: tuple[Part, ...] = ("all", "thin", "rest")
@@ -330,7 +322,7 @@ def test_parts_make_the_whole(small_leaves: tuple[TruthPlan, TruthScene]) -> Non
 
 
 def test_the_script_makes_a_set_goes_on_and_refuses_another(tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba", reason="Mitsuba is not installed (pip install 'mrbokeh[datasets]')")
+    require_mitsuba()
     plan = TruthPlan(32, 18, 2, 1, 1, ("fence",), ("disc",))
     assert render_truth(tmp_path, plan) == 6
     folder = tmp_path / "fence_1" / "view_00"

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
-from datasets_scripts.traced_scene import DiscLight, Scene, Sphere, emissive_quad, plain_texture
+from datasets_scripts.tracers.thin_lens import camera_for_lens, trace, trace_pinhole
+from datasets_scripts.tracers.traced_scene import DiscLight, Scene, Sphere, emissive_quad, plain_texture
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens

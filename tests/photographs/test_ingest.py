@@ -13,7 +13,7 @@ from capture.cli import app
 from capture.commands.ingest import parse_white_balance
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import write_image
 from mrbokeh.stacks.focal_stack import read_focal_stack

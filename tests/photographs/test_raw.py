@@ -9,8 +9,7 @@ from jaxtyping import Float
 import capture
 from capture.photos.developing import develop
 from capture.photos.raw import DecodedPhoto, camera_white_balance, decode_raw, read_raw_metadata
-from datasets_scripts.dng_writer import ShotMetadata, write_dng
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.images.color import convert, rec709_from_XYZ
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError

@@ -10,14 +10,19 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from datasets_scripts.desk_scene import desk_camera, desk_scene
-from datasets_scripts.dng_writer import ShotMetadata, film_plane_distance_m, focus_distance_from_film_plane_m, write_dng
-from datasets_scripts.lab_scene import BOARD, BOARD_DICTIONARY, BOARD_MARKER_M, BOARD_SQUARE_M, BOARD_SQUARES, board_texture
-from datasets_scripts.make_raw_stack import _jobs, make_raw_stack
-from datasets_scripts.raw_stack_truth import StackPlan, truth_document
-from datasets_scripts.sensor_model import CFA_PATTERNS, SensorModel
-from datasets_scripts.thin_lens_tracer import trace, trace_pinhole
-from datasets_scripts.traced_scene import Scene, emissive_quad
+from datasets_scripts.made_sets.simulated_camera import (
+    CFA_PATTERNS,
+    SensorModel,
+    ShotMetadata,
+    film_plane_distance_m,
+    focus_distance_from_film_plane_m,
+    write_dng,
+)
+from datasets_scripts.make_raw_stack import StackPlan, _jobs, make_raw_stack, truth_document
+from datasets_scripts.scenes.desk import desk_camera, desk_scene
+from datasets_scripts.scenes.stack_scenes import BOARD, BOARD_DICTIONARY, BOARD_MARKER_M, BOARD_SQUARE_M, BOARD_SQUARES, board_texture
+from datasets_scripts.tracers.thin_lens import trace, trace_pinhole
+from datasets_scripts.tracers.traced_scene import Scene, emissive_quad
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import camera_from_json
@@ -174,7 +179,7 @@ def test_a_traced_slice_survives_the_camera(tmp_path: Path, desk: Scene) -> None
 def test_a_stack_is_resumed_and_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a plain wall instead of the still life, since what is in the picture does not matter here."""
     wall = emissive_quad((-1.0, -1.0, 1.0), (2.0, 0.0, 0.0), (0.0, 2.0, 0.0), random_rgb())
-    monkeypatch.setattr("datasets_scripts.stack_scenes.desk_scene", lambda _seed: Scene((wall,)))
+    monkeypatch.setattr("datasets_scripts.scenes.stack_scenes.desk_scene", lambda _seed: Scene((wall,)))
     plan = StackPlan(viewpoints=1, slices=2, width_px=48, height_px=32, samples=8)
     assert make_raw_stack(tmp_path, plan) == 3
     path = tmp_path / "view_0" / "slice_01.dng"

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, grey_dilation
 
-from datasets_scripts import card_scene as cards
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image
@@ -17,6 +16,7 @@ from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.atomic_files import read_json
+from tests.scenes import card_scene as cards
 
 CARD_RADII_PX = (12, 32)
 _EDGE_REACH_PX = 4

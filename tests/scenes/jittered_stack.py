@@ -13,8 +13,8 @@ from capture.merging.registration.plane_transforms import (
     inverse,
     moved,
 )
-from datasets_scripts.desk_scene import desk_camera
-from datasets_scripts.thin_lens_tracer import trace
+from datasets_scripts.scenes.desk import desk_camera
+from datasets_scripts.tracers.thin_lens import trace
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from tests.scenes.traced_focal_stack import still_life

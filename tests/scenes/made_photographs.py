@@ -11,8 +11,7 @@ from jaxtyping import Float32
 from scipy.ndimage import gaussian_filter
 
 from capture.stacks.ingest import IngestReport
-from datasets_scripts.dng_writer import ShotMetadata, write_dng
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack
 

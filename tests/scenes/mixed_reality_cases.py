@@ -8,9 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from datasets_scripts.card_scene import lens_of_radius, truth
-from datasets_scripts.mixed_reality_cards import mixed_cards
-from datasets_scripts.truth_shapes import lens_shape
+from datasets_scripts.made_sets.truth_plan import lens_shape
 from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.near_and_far import continued
 from mrbokeh.compositing.over import OverPhotograph
@@ -22,6 +20,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
+from tests.scenes.card_scene import lens_of_radius, mixed_cards, truth
 
 BASELINES = ("sharp mask", "plain over")
 _LEAST = 1e-3
@@ -46,7 +45,7 @@ class MixedCase:
 
     def union(self, renderer: Renderer) -> np.ndarray:
         """The blurred region of the object and of what is nearer than it."""
-        scene = Between(true_rims=False).cut(self.plate, [self.virtual], renderer)
+        scene = Between(refine_edges=False).cut(self.plate, [self.virtual], renderer)
         blurred = [renderer.render([layer], self.plate.lens).alpha > _LEAST for layer in (scene.near, self.virtual)]
         return blurred[0] | blurred[1]
 

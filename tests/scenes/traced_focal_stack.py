@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets_scripts.desk_scene import desk_camera
-from datasets_scripts.procedural_textures import bricks, checks, mottled, page_of_text
-from datasets_scripts.thin_lens_tracer import trace, trace_pinhole
-from datasets_scripts.traced_scene import Quad, Scene, emissive_quad
+from datasets_scripts.scenes.desk import desk_camera
+from datasets_scripts.scenes.textures import bricks, checks, mottled, page_of_text
+from datasets_scripts.tracers.thin_lens import trace, trace_pinhole
+from datasets_scripts.tracers.traced_scene import Quad, Scene, emissive_quad
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from datasets_scripts.procedural_textures import mottled, page_of_text, spots
-from datasets_scripts.thin_lens_tracer import camera_for_lens, trace, trace_pinhole
-from datasets_scripts.traced_scene import Quad, Scene, Vector, emissive_quad
+from datasets_scripts.scenes.textures import mottled, page_of_text, spots
+from datasets_scripts.tracers.thin_lens import camera_for_lens, trace, trace_pinhole
+from datasets_scripts.tracers.traced_scene import Quad, Scene, Vector, emissive_quad
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera

@@ -12,8 +12,7 @@ from capture.tether.camera_driver import CameraError, CameraSettings, Stop
 from capture.tether.focus_plan import FocusRange, plan_focus
 from capture.tether.shoot import ShootOptions, Surroundings, shoot
 from capture.tether.watched_folder import WatchedFolder, is_whole
-from datasets_scripts.dng_writer import ShotMetadata, write_dng
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 

@@ -22,8 +22,7 @@ from capture.tether.saved_shot import save_shot
 from capture.tether.shoot import ShootOptions, Surroundings, shoot
 from capture.tether.shoot_log import read_log
 from capture.tether.simulated_camera import SimulatedCamera, unstated
-from datasets_scripts.dng_writer import ShotMetadata, write_dng
-from datasets_scripts.sensor_model import SensorModel
+from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from datasets_scripts.hand_held import HandHeld
+from datasets_scripts.charuco_clip import HandHeld
 from mrbokeh.commands.track import app
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera, camera_to_json

@@ -14,8 +14,7 @@ import pycolmap
 
 from capture.poses.colmap_worker import adjusted
 from capture.scale.board import umeyama
-from datasets_scripts.lab_scene import LAB_NEAR_M, LAB_VIEWPOINTS, lab_camera
-from datasets_scripts.stack_scenes import STACK_SCENES
+from datasets_scripts.scenes.stack_scenes import LAB_NEAR_M, LAB_VIEWPOINTS, STACK_SCENES, lab_camera
 from mrbokeh.optics.camera import Camera
 
 WIDTH_PX, HEIGHT_PX = 960, 640

@@ -17,6 +17,18 @@ from training.data.training_data import TrainingData, training_data
 from training.fitting.settings import PRESETS, TrainSettings
 
 TableName = Literal["1", "3", "improvements"]
+_NO_TILES = {"tile_px": 0, "overlap_px": 0}
+TITLES: dict[TableName, str] = {
+    "1": "Variants of the design (the paper's Table 1)",
+    "3": "Against other networks, by data set (the paper's Table 3)",
+    "improvements": "Improvements, one at a time",
+}
+FILE_NAMES: dict[TableName, str] = {"1": "table_1", "3": "table_3", "improvements": "improvements"}
+_OUR_NAMES = {"ring": "circle"}
+"""Shapes of datasets_scripts.bokeh_stacks that are called otherwise in the paper."""
+PAPER_WIDTH_PX = 1920
+SPLIT_SEED = 0
+TEST_FRACTION = 0.2
 
 
 @dataclass(frozen=True)
@@ -39,8 +51,6 @@ class Row:
     paper: PaperNumbers | None = None
     note: str = ""
 
-
-_NO_TILES = {"tile_px": 0, "overlap_px": 0}
 
 PUBLISHED = Row("published", "Neural Bokeh as published", paper=PaperNumbers(42.0, 0.981, 0.017))
 GATED = Row("gated", "gated form (this project)", start="demo", note="with its own learning rate, crops and loss, as in the preset `demo`")
@@ -99,12 +109,6 @@ _IMPROVEMENTS = (
 )
 
 TABLES: dict[TableName, tuple[Row, ...]] = {"1": _VARIANTS, "3": _OTHERS, "improvements": _IMPROVEMENTS}
-TITLES: dict[TableName, str] = {
-    "1": "Variants of the design (the paper's Table 1)",
-    "3": "Against other networks, by data set (the paper's Table 3)",
-    "improvements": "Improvements, one at a time",
-}
-FILE_NAMES: dict[TableName, str] = {"1": "table_1", "3": "table_3", "improvements": "improvements"}
 
 PAPER_TABLE_3: dict[str, dict[str, PaperNumbers]] = {
     bokeh: {
@@ -123,9 +127,6 @@ PAPER_TABLE_3: dict[str, dict[str, PaperNumbers]] = {
 }
 """The paper's numbers by bokeh and row. It calls its two lenses Nikkor 35mm (Nikon Z6) and Nikkor 28mm (Nikon D3300)."""
 
-_OUR_NAMES = {"ring": "circle"}
-"""Shapes of datasets_scripts.bokeh_stacks that are called otherwise in the paper."""
-
 
 def rows_of(tables: tuple[TableName, ...]) -> list[Row]:
     """Every row once, in the order of the tables."""
@@ -139,11 +140,6 @@ def paper_numbers(row: Row, table: TableName, set_names: tuple[str, ...]) -> Pap
         bokeh = next((names[name] for name in names if len(set_names) == 1 and name in set_names[0].lower()), None)
         return None if bokeh is None else PAPER_TABLE_3[bokeh].get(row.name)
     return row.paper
-
-
-PAPER_WIDTH_PX = 1920
-SPLIT_SEED = 0
-TEST_FRACTION = 0.2
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,153 @@
+"""One viewpoint of a set as a FocalStack folder: slices through the lens, the same view through a pinhole, depth; each made once.
+
+The manifest of a set of traced stacks: hashes, split, radiance and noise, measured on the files as they were written.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import asdict
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datasets_scripts.made_sets.bokeh_plan import StacksPlan
+from datasets_scripts.made_sets.file_job import Job
+from datasets_scripts.scenes.bokeh_scenes import bokeh_scene
+from datasets_scripts.tracers.truth import Opening, Picture, TruthTracer, make_tracer, sharp_layer
+from datasets_scripts.tracers.truth_scene import pack
+from mrbokeh.images.camera_rgb import write_camera_rgb
+from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.image_metrics import psnr
+from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
+from mrbokeh.stacks.focal_stack_dataset import FileRecord, FocalStackDataset, Part, RadianceRange, StackRecord
+from mrbokeh.system.errors import InputError
+
+NOISE_FLOOR = "noiseFloorDb"
+# Two halves differ by twice the variance of one, their mean has half of it: a quarter, 6.02 dB.
+_MEAN_OVER_DIFFERENCE_DB = 20.0 * np.log10(2.0)
+
+
+class StackView:
+    """One viewpoint in OUT/SCENE/VIEW. focus_distances_m: those of the plan, or others for a focus pull."""
+
+    def __init__(
+        self,
+        folder: Path,
+        plan: StacksPlan,
+        scene: str,
+        view: int,
+        focus_distances_m: tuple[float, ...] | None = None,
+    ) -> None:
+        self.folder, self._plan, self._scene, self._view = folder, plan, scene, view
+        self.focus_distances_m = focus_distances_m or plan.focus_distances_m
+
+    def jobs(self) -> Iterator[Job]:
+        """stack.json comes last, when the pictures are there."""
+        yield Job((self.folder / "all_in_focus.exr", self.folder / "depth.exr"), self._make_sharp)
+        for index in range(len(self.focus_distances_m)):
+            yield Job((self.folder / slice_name(index),), partial(self._make_slice, index))
+        yield Job((self.folder / FILE_NAME,), self._make_stack)
+
+    @cached_property
+    def _tracers(self) -> tuple[TruthTracer, TruthTracer]:
+        """Equal but for their random numbers, so that their difference shows the noise."""
+        camera = self._plan.camera(self._scene, self._view)
+        packed = pack(bokeh_scene(self._scene), camera)
+        first, second = (make_tracer(packed, camera, "all", 2 * self._plan.seed + half) for half in (0, 1))
+        return first, second
+
+    def defocused(self, opening: Opening) -> tuple[Picture, float]:
+        """(picture, its noise floor in dB: the PSNR that a perfect method would reach)."""
+        size = self._plan.size
+        first, second = (
+            tracer.traced(opening, self._plan.samples // 2).rgb + tracer.lamp_light(opening, size.lamp_rays // 2)
+            for tracer in self._tracers
+        )
+        return 0.5 * (first + second), float(psnr(first, second) + _MEAN_OVER_DIFFERENCE_DB)
+
+    def _make_slice(self, index: int) -> None:
+        rgb, noise_floor_db = self.defocused(self._plan.traced_opening(self.focus_distances_m[index]))
+        write_camera_rgb(self.folder / slice_name(index), rgb, None, attributes={NOISE_FLOOR: noise_floor_db})
+
+    def _make_sharp(self) -> None:
+        size = self._plan.size
+        first, second = (sharp_layer(tracer, self._plan.size.samples // 2, size.lamp_rays // 2) for tracer in self._tracers)
+        depth_m = first.depth_m
+        if not np.isfinite(depth_m).all():
+            raise InputError(f"{self._scene} is open somewhere: expected a scene in which every pixel has a depth")
+        confidence = np.ones_like(depth_m)
+        write_merged(self.folder, 0.5 * (first.rgb + second.rgb), self._focus_index(depth_m), confidence, depth_m)
+
+    def _focus_index(self, depth_m: np.ndarray) -> np.ndarray:
+        """The fractional index of the sharpest slice."""
+        dioptres = 1.0 / np.asarray(self.focus_distances_m)
+        order = np.argsort(dioptres)
+        return np.interp(1.0 / depth_m, dioptres[order], order.astype(np.float64)).astype(np.float32)
+
+    def _make_stack(self) -> None:
+        stack = FocalStack(
+            self.folder,
+            tuple(Slice(slice_name(index), distance_m) for index, distance_m in enumerate(self.focus_distances_m)),
+            lens=self._plan.lens(self.focus_distances_m[0]),
+            camera=self._plan.camera(self._scene, self._view),
+            registered=True,
+            merged=True,
+            metadata={"traced": True, "scene": self._scene, "shape": self._plan.shape, "opening": self._plan.opening.document()},
+        )
+        write_focal_stack(stack)
+
+
+def slice_name(index: int) -> str:
+    return f"slice_{index:02d}.exr"
+
+
+LICENCE = (
+    "These pictures are computed from scenes that a program of this project makes up; no photograph, model or texture of anybody is in "
+    "them. Use them as you like (CC0 1.0)."
+)
+_QUANTILES = ("0.5", "0.99", "0.999", "0.9999")
+
+
+def dataset_of(out: Path, plan: StacksPlan) -> FocalStackDataset:
+    """The data set of finished stacks. Its radiance scale is the largest radiance: nothing is cut off."""
+    records = tuple(stack_record(out, name, part) for name, part in plan.parts().items())
+    floors_db = {record.name: noise_floors_db(read_focal_stack(out / record.name)) for record in records}
+    every_db = [each for floors in floors_db.values() for each in floors]
+    metadata: dict[str, Any] = {
+        "made_by": "datasets_scripts.bokeh_stacks",
+        "plan": asdict(plan),
+        "opening": plan.opening.document(),
+        "noise_floor_db": {"lowest": min(every_db), "median": float(np.median(every_db)), "by_stack": floors_db},
+        "noise_floor_is": "PSNR of a slice against one without noise, linear radiance clipped to [0, 1], from two halves of the samples",
+        "split_by": "whole scenes, and the last viewpoints of the others",
+    }
+    return FocalStackDataset(out, LICENCE, max(each.radiance.largest for each in records), records, metadata)
+
+
+def stack_record(out: Path, name: str, part: Part) -> StackRecord:
+    """Reads every picture once."""
+    stack = read_focal_stack(out / name)
+    depth_m = stack.depth_m()
+    largest_px = max(float(np.abs(stack.coc_px(index, depth_m)).max()) for index in range(len(stack)))
+    paths = [STACK_FILE, *(each.path for each in stack.slices), stack.all_in_focus_path.name, stack.depth_path.name]
+    files = {path: file_record(stack.folder / path) for path in paths}
+    return StackRecord(name, part, len(stack), depth_m.shape[1], depth_m.shape[0], largest_px, radiance_range(stack), {"any": 0.0}, files)
+
+
+def radiance_range(stack: FocalStack) -> RadianceRange:
+    """The quantiles are those of the picture in which they are largest."""
+    peaks = [rgb.max(axis=2) for rgb in (stack.all_in_focus(), *stack.iter_rgb())]
+    quantiles = {each: max(float(np.quantile(peak, float(each))) for peak in peaks) for each in _QUANTILES}
+    return RadianceRange(max(float(peak.max()) for peak in peaks), quantiles)
+
+
+def noise_floors_db(stack: FocalStack) -> list[float]:
+    return [round(float(read_exr(stack.folder / each.path)[0].attributes[NOISE_FLOOR]), 2) for each in stack.slices]
+
+
+def file_record(path: Path) -> FileRecord:
+    with path.open("rb") as file:
+        return FileRecord(hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)
