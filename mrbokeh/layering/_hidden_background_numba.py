@@ -14,8 +14,8 @@ _BESIDE = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 @njit(cache=True, nogil=True)
 def snap(snapped: np.ndarray, coc_px: np.ndarray, lit: np.ndarray, step_px: float, top: int, bottom: int) -> None:
-    """Rows top to bottom of circles of confusion in which no pixel floats in the air between two surfaces, as antialiased or
-    resized depth makes them.
+    """Set rows top to bottom of `snapped`: circles of confusion in which no pixel floats between two surfaces, as antialiasing or
+    resizing of depth makes them.
 
     A pixel between two even surfaces, each at most 2 pixels away on opposite sides, takes the nearer value of the two; a highlight does
     not, for lamps do hang in the air.
@@ -264,7 +264,7 @@ def interpolate(
     first: int,
     end: int,
 ) -> None:
-    """Set filled (N, C) and its circles of confusion, first to end, to what is around each of the places on its seed's surface.
+    """Set filled (N, C) and its circles of confusion, first to end, from the pixels around each place that lie on its seed's surface.
 
     They are the first pure pixels (mixed ones have coc_px NaN) along 8 paths, up to twice as far as the seed, weighted by one over the
     squared distance; each path gives the mean of a quarter as many pixels as the first is far. So behind a thin wire this interpolates

@@ -11,7 +11,7 @@ _MOST = 13  # of 25
 
 @njit(cache=True, nogil=True)
 def mark_rows(lit: np.ndarray, values: np.ndarray, ratio: np.float32, top: int, bottom: int) -> None:
-    """Rows top to bottom of lit (H, W): pixels of values (H, W, 3 or more) more than `ratio` times as bright as most of the 5x5 around.
+    """Set rows top to bottom of lit (H, W): pixels of values (H, W, 3 or more) more than `ratio` times as bright as most of the 5x5 around.
 
     A pixel's brightness is its strongest channel. If most of the 25 are that much darker, so are most of at least one column: a pixel that
     is not `ratio` times the least of the columns' medians needs no count. That bound vectorises.

@@ -31,9 +31,9 @@ def layer_from_view(
     camera: Camera,
     shown_depth_m: Float32[np.ndarray, "rows columns"] | None = None,
 ) -> Layer:
-    """The opaque picture (scene-linear) with its depth (metres; inf is left out) that `view` took, as a layer of `camera`.
+    """Return the opaque picture (scene-linear) with its depth (metres; inf is left out) that `view` took, as a layer of `camera`.
 
-    shown_depth_m: depth of the picture that `camera` took; then only what lies behind that is kept, 2 % at least.
+    shown_depth_m: depth of the picture that `camera` took; then only what lies at least 2 % behind it is kept.
     Every pixel goes to the one pixel that its point falls on, and the nearest point wins; holes of single pixels, as
     enlarging leaves them, take the mean of neighbours at their depth. List it behind the picture of `camera`.
     """
@@ -90,7 +90,7 @@ Places = Int32[np.ndarray, " _"]
 
 @dataclass(frozen=True)
 class _Edges:
-    """Circles of confusion with none between two surfaces, the pixels beside something nearer, the pixels of one surface, and highlights."""
+    """Circles of confusion with none between two surfaces, pixels beside something nearer, pixels of one surface, and highlights."""
 
     coc_px: Float32[np.ndarray, "height width"]
     rims: Places

@@ -1,4 +1,4 @@
-"""Layering: layers with depth become slices of the circle of confusion, and slices, spread one by one, become a picture again.
+"""Layering: layers with depth become slices of the circle of confusion, and slices, blurred one by one, become a picture again.
 
 Shared by all renderers that sum kernels; they differ in the `KernelSum` alone (mrbokeh.layering.psf_over_field).
 
@@ -56,7 +56,7 @@ class Layering:
 
 
 def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | PsfField, layering: Layering) -> Layer:
-    """The layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first.
+    """Return the layers, front first, as the lens sees them; see Renderer. The depth returned is the sharp one, front first.
 
     kernel_sum: how kernels of the lens's aperture are summed, or a PsfField that takes the aperture's place.
     """

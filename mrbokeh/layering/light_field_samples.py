@@ -85,7 +85,7 @@ class LightFieldSamples:
         return self.xy_px - 0.5 * self.coc_px(lens)[:, None] * self.lens_uv - moved
 
     def raw_picture(self) -> Float32[np.ndarray, "height width 3"]:
-        """The mean of the samples of each pixel, noise and all; 0 where a pixel has none."""
+        """Return the mean of the samples of each pixel, noise and all; 0 where a pixel has none."""
         x, y = self.pixels()
         place = y * self.width_px + x
         size = self.width_px * self.height_px

@@ -22,7 +22,7 @@ MOTION = "motion_px"
 
 
 def with_motion(layer: Layer, motion_px: Float32[np.ndarray, "height width 2"], shutter: float = 1.0) -> Layer:
-    """The layer with motion, right and down, in pixels of what it shows; shutter: the part of that time for which it is open."""
+    """Return the layer with motion, right and down, in pixels of what it shows; shutter: the part of that time for which it is open."""
     if motion_px.shape != (*layer.alpha.shape, 2):
         raise InputError(f"motion must have the shape {(*layer.alpha.shape, 2)} of its layer, but came with {motion_px.shape}: resize it")
     if not shutter >= 0.0:
@@ -56,7 +56,7 @@ def moved(
 
 
 def motion_of(motion_px: Float32[np.ndarray, "*batch 2"], coverage: Float32[np.ndarray, "*batch"]) -> Float32[np.ndarray, "*batch 2"]:
-    """The motion of what is seen, from motion times coverage; 0 where nothing is."""
+    """Return the motion of what is seen, from motion times coverage; 0 where nothing is."""
     return np.divide(motion_px, coverage[..., None], out=np.zeros_like(motion_px), where=coverage[..., None] > 0)
 
 

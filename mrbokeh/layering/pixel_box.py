@@ -48,11 +48,11 @@ class Box:
         return Box(max(self.top, 0), min(self.bottom, height), max(self.left, 0), min(self.right, width))
 
     def of(self, picture: np.ndarray) -> Any:
-        """A view of the pixels (H, W, ...) of a box within the frame."""
+        """Return a view of the pixels (H, W, ...) of a box within the frame."""
         return picture[self.where]
 
     def cut(self, plane: np.ndarray, mode: str, value: float = 0.0) -> np.ndarray:
-        """The box of an array (H, W, ...); beyond the frame its border goes on (mode edge) or it is `value` (mode constant)."""
+        """Return the box of an array (H, W, ...); beyond the frame its border goes on (mode edge) or it is `value` (mode constant)."""
         inside = self.within(plane.shape)
         part = inside.of(plane)
         beyond = (inside.top - self.top, self.bottom - inside.bottom), (inside.left - self.left, self.right - inside.right)
@@ -68,13 +68,13 @@ class Box:
         inside.of(whole)[...] = part[rows, inside.left - self.left : inside.right - self.left]
 
     def cut_layer(self, layer: Layer) -> Layer:
-        """The layer's part in the box, clear beyond the frame."""
+        """Return the layer's part in the box, clear beyond the frame."""
         extra = {name: self.cut(values, "constant") for name, values in layer.extra.items()}
         depth_m = self.cut(layer.depth_m, "constant", np.inf)
         return Layer(self.cut(layer.rgb, "constant"), self.cut(layer.alpha, "constant"), depth_m, extra)
 
     def placed(self, part: Layer, frame_px: tuple[int, ...]) -> Layer:
-        """A layer of the box's size in a clear one of (height, width)."""
+        """Return a layer of the box's size in a clear one of (height, width)."""
         height, width = frame_px[:2]
         extra = {name: np.zeros((height, width, values.shape[2]), np.float32) for name, values in part.extra.items()}
         whole = replace(clear(height, width), extra=extra)
@@ -84,12 +84,12 @@ class Box:
         return whole
 
     def camera_of(self, camera: Camera) -> Camera:
-        """The camera that sees just this part."""
+        """Return the camera that sees just this part."""
         principal = (camera.principal_px[0] - self.left, camera.principal_px[1] - self.top)
         return replace(camera, width_px=self.right - self.left, height_px=self.bottom - self.top, principal_px=principal)
 
     def lens_of(self, lens: Lens, frame_width_px: int) -> Lens:
-        """The lens with so much of its sensor as sees this part, so that circles of confusion keep their size."""
+        """Return the lens with so much of its sensor as sees this part, so that circles of confusion keep their size."""
         return replace(lens, sensor_width_mm=lens.sensor_width_mm * (self.right - self.left) / frame_width_px)
 
 
@@ -97,7 +97,7 @@ NOWHERE = Box(0, 0, 0, 0)
 
 
 def lit_box(layer: Layer) -> Box:
-    """The smallest box with all pixels that cover or hold any light; NOWHERE where there are none."""
+    """Return the smallest box with all pixels that cover or hold any light; NOWHERE where there are none."""
     from mrbokeh.layering._pixels_numba import widen
 
     box = np.array([layer.height_px, 0, layer.width_px, 0])

@@ -76,7 +76,7 @@ def blur_colours(
     frame: Frame,
     field_cells: tuple[int, int] = FIELD_CELLS,
 ) -> Float32[np.ndarray, "height width channels_out"]:
-    """Premultiplied R, G, B, then coverage, then any other channels, through the aperture with all that varies.
+    """Blur premultiplied R, G, B, coverage and any other channels by an aperture with all that varies, colour by colour if it is chromatic.
 
     For a chromatic aperture the coverage differs by colour: three channels of coverage come back in place of one, so that the result has
     R, G, B, three coverages and the others (which go with green).

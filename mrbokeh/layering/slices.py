@@ -115,7 +115,7 @@ Channels = Float32[np.ndarray, "height width _"]
 
 @dataclass(frozen=True)
 class Slicing:
-    """What the light goes through, how many slices at most, and the place in the frame.
+    """What is the same for all slices: the PSF, their largest number, the frame, threads and memory.
 
     frame: placement of arrays with their margin. pool: threads for slices and components.
     """
@@ -142,7 +142,8 @@ class Slicing:
         return cores() + 2 if pixels <= _FEW_PIXELS else 2 if pixels <= _MANY_PIXELS else 1
 
     def blur_component(self, component: tuple[Sequence[Part], int]) -> list[tuple[Channels, Window]]:
-        """The light of parts of a slice, which travels so far at most, and the window where it lies.
+        """Return the blurred light of a component (its parts and how far light travels at most) and the window where it lies, round by
+        round.
 
         If pixels of two layers share a place there are two rounds or more.
         """
@@ -180,8 +181,8 @@ def _laid_out(memory: Float32[np.ndarray, " elements"], window: Window, channels
 
 
 def composited(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tuple[Channels, Channels]:
-    """All layers as the lens sees them, put together front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W, 1 or
-    3).
+    """Return all layers as the lens sees them, composited front to back: colour (H, W, 3 + E) and how much of the pupil is taken (H, W,
+    1 or 3).
 
     by_depth: the layer that the pinhole picture shows at a pixel is the nearest, else the first in order (slices are always by depth).
     The pupil is counted per colour where the optics are chromatic.

@@ -133,7 +133,7 @@ class OnnxNetwork:
         return self.facts.lens
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        """See Renderer. The aperture of `lens` has no say: the network learned its own. Extra channels are left out."""
+        """Render layers (see Renderer) by the trained lens: the aperture of `lens` has no effect, and extra channels are left out."""
         self._require_trained_lens(lens)
         return flatten([self._blurred_layer(layer, lens) for layer in layers])
 

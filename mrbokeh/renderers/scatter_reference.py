@@ -26,7 +26,7 @@ _BAND_PX = 64  # rows that are summed by themselves; fixed, so that the sum does
 
 @dataclass(frozen=True)
 class ScatterReference:
-    """A Renderer that spreads by exact kernels; layers, slices and hidden background as in mrbokeh.layering.layering.
+    """Renderer that sums exact kernels; layers, slices and hidden background as in mrbokeh.layering.layering.
 
     threads: 0 takes all cores. bank: kernels to use instead of the lens's aperture, each pixel's blended from the bank's kernels around it
     (bilinearly over the frame, linearly over the diameter).
@@ -48,12 +48,12 @@ class ScatterReference:
     def sum_kernels(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.KernelSum."""
+        """Sum kernels as mrbokeh.layering.psf_over_field.KernelSum says."""
         return scatter(values.astype(np.float64), coc_px, aperture, self.threads).astype(np.float32)
 
 
 def blur_layer(layer: Layer, coc_px: Float[np.ndarray, "height width"], aperture: Aperture) -> Layer:
-    """One layer through one PSF per pixel and nothing else: the light of all pixels adds up, whatever their depth.
+    """Blur one layer by one PSF per pixel and nothing else: the light of all pixels adds up, whatever their depth.
 
     Coverage that sums to more than 1 is divided by that sum, and colour with it; light that leaves the frame is lost.
     """

@@ -37,7 +37,7 @@ class PolygonFit(NamedTuple):
 
 
 def fit_polygons(kernel: Float[np.ndarray, "size size"], diameter_px: float, levels: int = LEVELS) -> PolygonFit:
-    """A kernel of a point behind the focus with this circle of confusion (above 0) as a sum of polygons.
+    """Return a kernel of a point behind the focus with this circle of confusion (above 0) as a sum of polygons.
 
     The candidates are the kernel's contours at `levels` heights; their weights are those, none negative, that come nearest to it
     in the sense of squares when drawn at this diameter, and give its sum. Renderers pay for every outline, so half as many levels are

@@ -44,7 +44,7 @@ def write_spreadlets(path: Path | str, spreadlets: Spreadlets, made_by: Sparsifi
 
 
 def read_spreadlets(path: Path | str, made_by: Sparsification, of: str) -> Spreadlets | None:
-    """The spreadlets in a file; None if there is no such file or they are of other kernels or made in another way."""
+    """Return the spreadlets in a file; None if there is no such file or they are of other kernels or made in another way."""
     found = _read_spreadlets(path)
     return found[0] if found is not None and found[1:] == (asdict(made_by), of) else None
 
@@ -92,7 +92,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def apertures_beside(folder: Path | str, lattice: BankLattice, levels: int = LEVELS) -> BankApertures:
-    """The polygons beside a bank, fitted and written there if they are not there yet (where the folder may be written to)."""
+    """Return the polygons beside a bank, fitted and written there if they are not there yet (where the folder may be written to)."""
     path, key = Path(folder) / POLYGONS, _key(lattice, ["polygons", levels])
     found = _read(path, key)
     if found is None:
@@ -242,7 +242,7 @@ def _part(folder: Path, cell: int) -> Path:
 
 
 def _of_cell(path: Path, kernel: np.ndarray, settings: Sparsification) -> Spreadlet:
-    """The spreadlet of one kernel, from its file if that is of this kernel and these settings."""
+    """Return the spreadlet of one kernel, from its file if that is of this kernel and these settings."""
     of = fingerprint((kernel,))
     kept = read_spreadlets(path, settings, of)
     if kept is not None:

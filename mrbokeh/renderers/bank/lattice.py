@@ -73,20 +73,20 @@ class BankLattice:
         return self.places * self.directions
 
     def place_and_angle(self, anchor: int) -> tuple[int, float]:
-        """The place of an anchor and the angle (radians, x towards y) by which its kernels are turned, in the picture."""
+        """Return the place of an anchor and the angle (radians, x towards y) by which its kernels are turned, in the picture."""
         place, direction = divmod(anchor, self.directions)
         return place, 2.0 * np.pi * direction / self.directions
 
     def diameter_shares(
         self, side: int, diameters_px: Float[np.ndarray, "*batch"]
     ) -> tuple[Int64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch"]]:
-        """The node below each unsigned diameter, and the share of the next one."""
+        """Return the node below each unsigned diameter, and the share of the next one."""
         return between(self.diameters_px[side], diameters_px)
 
     def field_shares(
         self, field_xy: Float[np.ndarray, "*batch 2"]
     ) -> tuple[Int64[np.ndarray, "*batch 4"], Float32[np.ndarray, "*batch 4"]]:
-        """The anchors around each position and their shares, which sum to 1; beyond the outermost places those count alone."""
+        """Return the anchors around each position and their shares, which sum to 1; beyond the outermost places those count alone."""
         if not self._is_polar:
             (x, x_share), (y, y_share) = (between(self._field[i], field_xy[..., i]) for i in (0, 1))
             columns, rows = (len(each) for each in self._field)
@@ -134,7 +134,7 @@ class BankLattice:
 def between(
     nodes: Float64[np.ndarray, " nodes"], values: Float[np.ndarray, "*batch"]
 ) -> tuple[Int64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch"]]:
-    """The node below each value, and how far towards the next one it lies (0 to 1); beyond the ends it lies at them."""
+    """Return the node below each value, and how far towards the next one it lies (0 to 1); beyond the ends it lies at them."""
     place = np.interp(values, nodes, np.arange(len(nodes)))
     lower = np.minimum(np.asarray(place).astype(np.int64), max(len(nodes) - 2, 0))
     return np.asarray(lower), np.asarray(place - lower)

@@ -89,7 +89,7 @@ class KernelOpening:
         return Levels(tuple(steps_px.tolist()), np.where(live, level, NOT_A_LEVEL).astype(np.int16), share)
 
     def low_rank(self, diameter_px: float, decomposed: Decompose) -> LowRankKernel:
-        """The terms of one of the bank's own diameters."""
+        """Return the terms of one of the bank's own diameters."""
         node = int(np.argmin(np.abs(self.kernels.lattice.diameters_px[self.side] - diameter_px)))
         place, angle_rad = self.kernels.lattice.place_and_angle(self.anchor)
         known = None if angle_rad else self.terms.get((self.side, node, place, self.channel))

@@ -69,7 +69,7 @@ class BankTables:
         return np.array([_reach_px(kernel, self.bank.turns != "none") for kernel in self.bank.kernels], np.int64)
 
     def cells(self, coc_px: Float32[np.ndarray, "*batch"], place: Place) -> Int64[np.ndarray, "*batch"]:
-        """The cell of the bank that holds each pixel."""
+        """Return the cell of the bank that holds each pixel."""
         planes = [self._coordinate(axis.name, coc_px, place) for axis in self.bank.axes]
         return self.bank.nearest(np.stack(planes, axis=-1).astype(np.float64))
 
@@ -108,7 +108,7 @@ class BankTables:
         return np.array([seen.sum() <= max(_DENSE_TAPS, _DENSE_RIM * (seen & ~binary_erosion(seen)).sum()) for seen in supports])
 
     def points(self, codes: Sequence[int], dense: bool, channel: int) -> Points:
-        """Return the points of these codes, in their order; what is new is computed and kept. dense: all taps."""
+        """Return the points of these codes, in their order; new ones are computed and kept. dense: all taps."""
         if len(self._kept) > _MOST_KERNELS:
             self._kept.clear()
         found = {code: self._kept.get((code, dense)) for code in codes}
@@ -161,7 +161,7 @@ def _reach_px(kernel: Float32[np.ndarray, "size size channels"], turns: bool) ->
 
 
 def turned_kernel(kernel: Float32[np.ndarray, "size size channels"], angle_rad: float) -> Float64[np.ndarray, "side side channels"]:
-    """A kernel turned about its middle pixel from x towards y, interpolated, with its light; half turns are exact."""
+    """Return a kernel turned about its middle pixel from x towards y, interpolated, with its light; half turns are exact."""
     quarters = angle_rad / (0.5 * np.pi)
     if abs(quarters - round(quarters)) < 1e-9:
         return np.ascontiguousarray(np.rot90(kernel, -round(quarters))).astype(np.float64)

@@ -127,7 +127,10 @@ def _mirror_ends(columns: np.ndarray, width: int, channels: int, radius_px: int)
 
 @njit(cache=True, nogil=True)
 def pivots(diagonal: np.ndarray, height: int) -> np.ndarray:
-    """Return (height, modes) reciprocal pivots of Thomas's elimination for rows -u[y-1] + diagonal u[y] - u[y+1]; diagonal (modes,) >= 2."""
+    """Return Return (height, modes) reciprocal pivots of Thomas's elimination for rows -u[y-1] + diagonal u[y] - u[y+1].
+
+    diagonal: (modes,), at least 2.
+    """
     modes = diagonal.shape[0]
     out = np.empty((height, modes))
     for k in range(modes):

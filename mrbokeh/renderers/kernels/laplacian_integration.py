@@ -39,19 +39,19 @@ Channels = Float[np.ndarray, "height width channels"]
 
 
 def laplacian(image: Float[np.ndarray, "height width *channels"]) -> Float64[np.ndarray, "height_out width_out *channels"]:
-    """The 3x3 Laplacian of a picture that is zero outside, one pixel larger on each side."""
+    """Return the 3x3 Laplacian of a picture that is zero outside, one pixel larger on each side."""
     padded = np.pad(image.astype(np.float64), ((2, 2), (2, 2), *((0, 0),) * (image.ndim - 2)))
     height, width = image.shape[0] + 2, image.shape[1] + 2
     return sum(STENCIL[j, i] * padded[j : j + height, i : i + width] for j in range(3) for i in range(3))
 
 
 def fast_width(width: int) -> int:
-    """The next width at which the sine transform is quick."""
+    """Return the next width at which the sine transform is quick."""
     return fft.next_fast_len(width, real=True)
 
 
 def integrate(source: Channels, threads: int = 0) -> Channels:
-    """The picture (H, W, C) whose 3x3 Laplacian is this, zero beyond the border; in the precision of the source.
+    """Return the picture (H, W, C) whose 3x3 Laplacian is this, zero beyond the border; in the precision of the source.
 
     To the left and right the picture is continued antisymmetrically about the border, above and below by zeros. Widths
     as from `fast_width` are quickest. threads: 0 takes all cores; the result does not depend on it.
@@ -101,7 +101,7 @@ def _system(height: int, width: int) -> tuple[Float64[np.ndarray, " modes"], Flo
 
 
 def integrate_plainly(source: Channels) -> Float64[np.ndarray, "height width channels"]:
-    """The same by a sparse linear solver: the slow and obvious twin of `integrate`."""
+    """Return the same by a sparse linear solver: the slow and obvious twin of `integrate`."""
     from scipy.sparse import diags, eye, kron
     from scipy.sparse.linalg import spsolve
 

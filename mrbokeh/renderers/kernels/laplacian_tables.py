@@ -94,7 +94,7 @@ class KernelTables:
         return joined_points([found[code] for code in codes])
 
     def diameter_px(self, code: int) -> float:
-        """The signed diameter that a code stands for."""
+        """Return the signed diameter that a code stands for."""
         level, sign = code % _BLOCK, -1.0 if code >= 3 * _BLOCK else 1.0
         size = level / DENSE_PER_PX if kind_of(code) == DENSE else self.dense_up_to_px * 2.0 ** (level / LEVELS_PER_OCTAVE)
         return sign * size
@@ -107,7 +107,7 @@ class KernelTables:
 
 
 def taps_of(kernel: Float[np.ndarray, "size size *channels"]) -> Spreadlet:
-    """All pixels of a kernel that are not 0, as points."""
+    """Return all pixels of a kernel that are not 0, as points."""
     colours = kernel.reshape(*kernel.shape[:2], -1).astype(np.float64)
     rows, columns = np.nonzero(np.any(colours != 0.0, axis=2))
     xy = np.stack([columns, rows], axis=1) - kernel.shape[0] // 2
@@ -115,12 +115,12 @@ def taps_of(kernel: Float[np.ndarray, "size size *channels"]) -> Spreadlet:
 
 
 def kind_of(code: int) -> int:
-    """Return DENSE, SPARSE or WHOLE."""
+    """Return Return DENSE, SPARSE or WHOLE."""
     return code // _BLOCK % 3
 
 
 def by_rows(cell: Spreadlet) -> Spreadlet:
-    """The same points sorted by row."""
+    """Return the same points sorted by row."""
     order = np.lexsort((cell.points[:, 0], cell.points[:, 1]))
     return Spreadlet(cell.points[order], cell.values[order])
 
@@ -148,7 +148,7 @@ def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.
 
 
 def stands_out_plainly(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.ndarray, "height width"]:
-    """The plain twin of `stands_out`."""
+    """Return the plain twin of `stands_out`."""
     import cv2
 
     window = (2 * AROUND_PX + 1, 2 * AROUND_PX + 1)

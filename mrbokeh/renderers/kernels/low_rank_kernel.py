@@ -48,7 +48,7 @@ class LowRankKernel:
 
     @property
     def scaled_columns(self) -> Float64[np.ndarray, "rank size"]:
-        """Columns u' = sqrt(|s|) u of McGraw's Section 3."""
+        """Columns Columns u' = sqrt(|s|) u of McGraw's Section 3."""
         return np.sqrt(np.abs(self.weights))[:, None] * self.columns
 
     @property
@@ -57,7 +57,7 @@ class LowRankKernel:
         return (np.sign(self.weights) * np.sqrt(np.abs(self.weights)))[:, None] * (self.columns if self.rows is None else self.rows)
 
     def dense(self) -> Float64[np.ndarray, "size size"]:
-        """The sum of all terms."""
+        """Return the sum of all terms."""
         return self.scaled_columns.T @ self.scaled_rows
 
 
@@ -69,7 +69,7 @@ def relative_errors(kernel: Float[np.ndarray, "rows columns"]) -> Float64[np.nda
 
 
 def aperture_errors(aperture: Aperture, diameter_px: float) -> Float64[np.ndarray, " size"]:
-    """Return `relative_errors` of the PSF at this diameter: one curve of McGraw's Fig. 3."""
+    """Return Return `relative_errors` of the PSF at this diameter: one curve of McGraw's Fig. 3."""
     return relative_errors(aperture.rasterize(diameter_px).kernel)
 
 
@@ -142,7 +142,7 @@ _ZEROS_BEFORE, _ZEROS_BEHIND = 3, 6  # around the taps of a column, see _low_ran
 
 @dataclass(frozen=True)
 class Levels:
-    """Which kernels every pixel takes: 1 - upper of its level's and upper of the next one's.
+    """Levels of a picture's pixels: each takes 1 - upper of its level's kernel and upper of the next one's.
 
     diameters_px: one per level in use, from the lowest; nan where no pixel needs it.
     level: (H, W) index into diameters_px, negative for pixels that take no part. upper: (H, W) in [0, 1).

@@ -42,7 +42,7 @@ _LEAST_MOMENT = 1e-9
 
 @lru_cache(maxsize=8)
 def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
-    """Return K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
+    """Return Return K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
     half = fast_width(_DOMAIN // 2 * reach_px + 2)
     source = np.zeros((2 * half + 1, 2 * half + 1, 1))
     source[half, half] = 1.0
@@ -51,7 +51,7 @@ def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
 
 
 def potential_of(charges: Float64[np.ndarray, "size size channels"], table: Float64[np.ndarray, "side side"]) -> np.ndarray:
-    """Return K L on the pixels of L; the table must reach across."""
+    """Return Return K L on the pixels of L; the table must reach across."""
     reach = charges.shape[0] - 1
     quarter = table[: reach + 1, : reach + 1]
     half = np.concatenate([quarter[:0:-1], quarter])
@@ -63,7 +63,7 @@ def potential_of(charges: Float64[np.ndarray, "size size channels"], table: Floa
 
 
 def table_for(size: int) -> Float64[np.ndarray, "side side"]:
-    """A table for Laplacians of this many pixels across; sizes share tables."""
+    """Return a table for Laplacians of this many pixels across; sizes share tables."""
     return biharmonic_table(1 << int(np.ceil(np.log2(max(size, 16)))))
 
 
@@ -141,7 +141,7 @@ def _solved(
 def _independent(
     points: Int64[np.ndarray, "points 2"], xy: np.ndarray, charges: Float64[np.ndarray, "pixels channels"], degree: int
 ) -> tuple[Float64[np.ndarray, "points kept"], Float64[np.ndarray, "kept channels"]]:
-    """Combinations of moments that the points can have independently, and what the charges have of them.
+    """Return combinations of moments that the points can have independently, and the charges' share of them.
 
     The degree is lowered if the charges have a moment that the points cannot have.
     """

@@ -45,7 +45,7 @@ class PartitionCounts:
 
 @dataclass(frozen=True)
 class LayeredReconstruction:
-    """Clean pictures from few samples, and a Renderer that takes samples of layers first.
+    """Reconstruction of clean pictures from few samples, and a Renderer that takes samples of layers first.
 
     per_pixel: how many samples of layers are taken a pixel. threads: 0 takes all cores. seed: of these samples and of the choice
     that the sparse statistics look at. device: "" for compiled loops; "cuda", "cuda:1" or "cpu" for torch there, without the
@@ -65,7 +65,7 @@ class LayeredReconstruction:
             TorchReconstruction(self.settings, self.device, self.seed)  # refuses what is not there
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
-        """See Renderer. Extra channels `motion_px` (mrbokeh.layering.motion) blur as well.
+        """Render layers (see Renderer). Extra channels `motion_px` (mrbokeh.layering.motion) blur as well.
 
         Takes openings that are the same over the frame and for all colours; InputError for cat-eyes and chromatic errors.
         """
@@ -88,18 +88,18 @@ class LayeredReconstruction:
         return Layer(inside[..., :3].copy(), np.clip(inside[..., 3], 0.0, 1.0), flat.depth_m, extra)
 
     def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
-        """The picture that more samples would converge to: opaque, with the depth of the nearest sample of each pixel."""
+        """Return the picture that more samples would converge to: opaque, with the depth of the nearest sample of each pixel."""
         rgb, _ = self.reconstruct_counted(samples, lens)
         return opaque(rgb, _nearest_depth_m(samples))
 
     def reconstruct_counted(self, samples: LightFieldSamples, lens: Lens) -> tuple[Float32[np.ndarray, "height width 3"], PartitionCounts]:
-        """The colour alone, and how many partitions it took."""
+        """Return the colour alone, and how many partitions it took."""
         return self.reconstruct_values(samples, samples.rgb, lens)
 
     def reconstruct_values(
         self, samples: LightFieldSamples, values: Float32[np.ndarray, "samples channels"], lens: Lens
     ) -> tuple[Float32[np.ndarray, "height width channels"], PartitionCounts]:
-        """Any values (N, C) in place of the samples' colour."""
+        """Reconstruct any values (N, C) in place of the samples' colour."""
         return self._reconstructed(samples, values, samples.coc_px(lens), lens.aperture)
 
     def _reconstructed(
@@ -143,7 +143,7 @@ class LayeredReconstruction:
         )  # fmt: skip
 
     def _each(self, run: Callable[[np.ndarray], None], tiles: int) -> None:
-        """Tiles in groups; none touches another's pixels, so that their order and the number of threads change nothing."""
+        """Run tiles in groups; none touches another's pixels, so that their order and the number of threads change nothing."""
         groups = [np.arange(first, min(first + _TILES_AT_ONCE, tiles)) for first in range(0, tiles, _TILES_AT_ONCE)]
         with ThreadPoolExecutor(self.threads or cores()) as pool:
             list(pool.map(run, groups))

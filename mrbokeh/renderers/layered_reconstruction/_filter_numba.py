@@ -1,8 +1,7 @@
-"""The sheared filter of a partition from the sums over its samples; docs/layered_reconstruction.md derives every line.
+"""Compiled reprojection and filter formulas of layered reconstruction; docs/layered_reconstruction.md derives every line.
 
-Samples in the order in which they are worked through: tile by tile, within a tile by pixels in Morton order.
-
-Reprojection of the samples around a tile along the slopes of one partition (Eq. 1).
+Samples go tile by tile, within a tile by pixels in Morton order. The sheared filter of a partition comes from the sums over its
+samples, and the samples around a tile are reprojected along the partition's slopes (Eq. 1).
 """
 
 import math
@@ -15,7 +14,7 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True)
 def morton(x: int, y: int) -> int:
-    """The bits of x and y interleaved, x first: neighbours in the plane stay neighbours on the line."""
+    """Return the bits of x and y interleaved, x first: neighbours in the plane stay neighbours on the line."""
     code = 0
     for bit in range(8):
         code |= ((x >> bit) & 1) << (2 * bit)
@@ -99,7 +98,7 @@ def reproject(
 
 @njit(cache=True, nogil=True)
 def block_range(from_px: int, size_px: int, reach_px: float, side_px: int, count: int) -> tuple[int, int]:
-    """The first and last block whose samples may land on the pixels from from_px on."""
+    """Return the first and last block whose samples may land on the pixels from from_px on."""
     first, last = int(math.floor((from_px - reach_px) / side_px)), int(math.floor((from_px + size_px + reach_px) / side_px))
     return max(0, first), min(count - 1, last)
 
@@ -108,7 +107,7 @@ def block_range(from_px: int, size_px: int, reach_px: float, side_px: int, count
 def add_block(
     planes: np.ndarray, left: int, top: int, first: int, end: int, sharp: bool, slope: Slope, j: int, partitions: Partitions, light: Light
 ) -> None:
-    """The samples from first to end. sharp: each counts for the pixel it is in; else it is shared out among the four nearest."""
+    """Add the samples from first to end. sharp: each counts for the pixel it is in; else it is shared out among the four nearest."""
     height, width, channels = planes.shape
     flat, across, step_x, zero = planes.reshape(-1), np.uint64(width * channels), np.uint64(channels), np.uint64(0)
     to_opacity, to_weight, to_count = np.uint64(channels - 3), np.uint64(channels - 2), np.uint64(channels - 1)
@@ -154,7 +153,7 @@ def add_block(
 
 @njit(cache=True, nogil=True)
 def evened_out(planes: np.ndarray, enough: float) -> np.ndarray:
-    """Planes (h, w, C + 2) without the count, in which no place weighs more than `enough` samples do, its colour and opacity in
+    """Return planes (h, w, C + 2) without the count, in which no place weighs more than `enough` samples do, its colour and opacity in
     proportion.
 
     Samples fall on places in uneven numbers by chance. Left so, that chance is noise in every mean over places.
@@ -183,7 +182,9 @@ PIXEL_VARIANCE = 1.0 / 12.0
 
 @njit(cache=True, nogil=True)
 def sheared_slopes(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: float) -> tuple[float, float, float, float, float]:
-    """(r, m_x, m_y, kappa_u, kappa_t): the mean slopes of a partition and the shares of them that the filter is sheared by."""
+    """Return Return (r, m_x, m_y, kappa_u, kappa_t): the mean slopes of a partition and the shares of them that the filter is sheared
+    by.
+    """
     n = sums[0]
     r, m_x, m_y = sums[1] / n, sums[3] / n, sums[4] / n
     var_r = max(sums[2] / n - r * r, 0.0)
@@ -207,7 +208,7 @@ def sheared_slopes(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, band
 def sheared_filter(
     sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: float
 ) -> tuple[float, float, float, float, float, float]:
-    """(a, b_x, b_y, V_xx, V_xy, V_yy): reprojection x' = x - a (u, v) - b (t - 1/2), then a Gaussian of covariance V."""
+    """Return Return (a, b_x, b_y, V_xx, V_xy, V_yy): reprojection x' = x - a (u, v) - b (t - 1/2), then a Gaussian of covariance V."""
     r, m_x, m_y, kappa_u, kappa_t = sheared_slopes(sums, window, sigma_x_px, bandwidth)
     lens, shutter = kappa_u * (2.0 - kappa_u) * r * r, kappa_t * (2.0 - kappa_t) * window[3]
     v_xx = sigma_x_px**2 + lens * window[0] + shutter * m_x * m_x
@@ -218,14 +219,14 @@ def sheared_filter(
 
 @njit(cache=True, nogil=True)
 def axes(v_xx: float, v_xy: float, v_yy: float) -> tuple[float, float, float]:
-    """(sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
+    """Return Return (sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
     middle, half = 0.5 * (v_xx + v_yy), math.hypot(0.5 * (v_xx - v_yy), v_xy)
     return math.sqrt(middle + half), math.sqrt(max(middle - half, 0.0)), 0.5 * math.atan2(2.0 * v_xy, v_xx - v_yy)
 
 
 @njit(cache=True, nogil=True)
 def sheared_axes(sigma_u: float, sigma_v: float, theta: float) -> tuple[float, float, float]:
-    """(s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
+    """Return Return (s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
     cosine, sine = math.cos(theta), math.sin(theta)
     rho = math.sqrt((sigma_v * cosine) ** 2 + (sigma_u * sine) ** 2)
     if rho == 0.0:
@@ -235,7 +236,7 @@ def sheared_axes(sigma_u: float, sigma_v: float, theta: float) -> tuple[float, f
 
 @njit(cache=True, nogil=True)
 def extents(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: float) -> tuple[float, float]:
-    """Standard deviations of the screen-space filter along its axes, the longer first."""
+    """Return standard deviations of the screen-space filter along its axes, the longer first."""
     _, _, _, v_xx, v_xy, v_yy = sheared_filter(sums, window, sigma_x_px, bandwidth)
     sigma_u, sigma_v, _ = axes(v_xx, v_xy, v_yy)
     return sigma_u, sigma_v
@@ -243,7 +244,7 @@ def extents(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: 
 
 @njit(cache=True, nogil=True)
 def blur_px(sums: np.ndarray, window: np.ndarray, sigma_x_px: float) -> tuple[float, float]:
-    """Standard deviations of the blur of the mean sample along its axes, the longer first."""
+    """Return standard deviations of the blur of the mean sample along its axes, the longer first."""
     r, m_x, m_y = sums[1] / sums[0], sums[3] / sums[0], sums[4] / sums[0]
     out_xx = sigma_x_px**2 + r * r * window[0] + window[3] * m_x * m_x
     out_xy = r * r * window[1] + window[3] * m_x * m_y
@@ -254,7 +255,9 @@ def blur_px(sums: np.ndarray, window: np.ndarray, sigma_x_px: float) -> tuple[fl
 
 @njit(cache=True, nogil=True)
 def slope_distance(one: np.ndarray, other: np.ndarray, window: np.ndarray, sigma_x_px: float) -> float:
-    """By how much reprojection along the mean slopes of the other goes wrong for the mean sample of one, in units of its own blur."""
+    """Return by how much reprojection along the mean slopes of the other goes wrong for the mean sample of one, in units of its own
+    blur.
+    """
     r, m_x, m_y = one[1] / one[0], one[3] / one[0], one[4] / one[0]
     off_r, off_x, off_y = other[1] / other[0] - r, other[3] / other[0] - m_x, other[4] / other[0] - m_y
     out_xx = sigma_x_px**2 + r * r * window[0] + window[3] * m_x * m_x

@@ -1,10 +1,8 @@
-"""The screen-space Gaussian in the open, every pixel from every other: the slow twin of the fast filters.
+"""Compiled Gaussians over the screen, as in the papers: directly, recursively along a sheared axis, or by look-ups in a mip map.
 
-The screen-space Gaussian as a recursive filter along x and a plain one along a sheared axis (Eq. 9 and 10).
-
-The screen-space Gaussian by anisotropic look-ups in a mip map, as texture units of graphics processors do (Eq. 2 to 4).
-
-One partition of a tile by Gaussians over the screen, as in the papers.
+`direct_gaussian` weighs every pixel for every other: the slow twin of the fast filters. `sheared_gaussian` is a recursive filter along
+x and a plain one along a sheared axis (Eq. 9 and 10). `texture_gaussian` takes anisotropic look-ups in a mip map, as texture units
+of graphics processors do (Eq. 2 to 4).
 """
 
 import math
@@ -46,7 +44,7 @@ _LEAST_VARIANCE = 1e-3
 
 @njit(cache=True, nogil=True)
 def feedback(variance_px2: float) -> float:
-    """gamma of Eq. 10, such that forward and backward together have exactly this variance.
+    """Return Return gamma of Eq. 10, such that forward and backward together have exactly this variance.
 
     The impulse response of both is (1 - gamma) / (1 + gamma) gamma^|n| with variance 2 gamma / (1 - gamma)^2. The paper's
     exp(-sqrt(2) / sigma) is the same for large sigma and 15 % too narrow at 1 px.
@@ -89,7 +87,7 @@ def recursive_rows(planes: np.ndarray, variance_px2: float, passes: int) -> None
 
 @njit(cache=True, nogil=True)
 def sheared_taps(s_v: float, beta: float, guard_y: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Weights along the sheared axis, the shift in x of each row, and the variance that linear interpolation adds along x."""
+    """Return weights along the sheared axis, the shift in x of each row, and the variance that linear interpolation adds along x."""
     weights, shifts = np.zeros(2 * guard_y + 1), np.zeros(2 * guard_y + 1)
     for j in range(-guard_y, guard_y + 1):
         weights[j + guard_y] = math.exp(-0.5 * (j / s_v) ** 2) if s_v > 1e-3 else (1.0 if j == 0 else 0.0)
@@ -106,7 +104,7 @@ def sheared_taps(s_v: float, beta: float, guard_y: int) -> tuple[np.ndarray, np.
 def sheared_gaussian(
     out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: int, v_xx: float, v_xy: float, v_yy: float, passes: int
 ) -> None:
-    """As direct_gaussian; uses planes up."""
+    """Fill out as direct_gaussian does; overwrites planes."""
     sigma_u, sigma_v, theta = axes(v_xx, v_xy, v_yy)
     s_u, s_v, beta = sheared_axes(sigma_u, sigma_v, theta)
     weights, shifts, added = sheared_taps(s_v, beta, guard_y)
@@ -138,7 +136,9 @@ _MOST_PROBES = 16
 
 @njit(cache=True, nogil=True)
 def mip_map(planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All levels, each the mean of 2x2 of the one below (nothing beyond the border), in one flat array, with (start, h, w) of each."""
+    """Return all levels, each the mean of 2x2 of the one below (nothing beyond the border), in one flat array, with (start, h, w) of
+    each.
+    """
     height, width, channels = planes.shape
     levels, total = 1, height * width
     h, w = height, width
@@ -188,7 +188,7 @@ def add_look_up(
     minor_px: float,
     weight: float,
 ) -> None:
-    """One anisotropic look-up at the place (x, y) in pixels: trilinear probes side by side along the major axis.
+    """Add one anisotropic look-up at the place (x, y) in pixels: trilinear probes side by side along the major axis.
 
     (major_x, major_y), minor_px: the footprint's axes as the derivatives ddx, ddy give them; at most 16 probes.
     One probe of a texel's width w has the variance w^2 / 4 (a box and the tent of the interpolation), so that a round footprint
@@ -229,7 +229,9 @@ def texture_gaussian(
     tap_distance: float,
     taps: int,
 ) -> None:
-    """As direct_gaussian. taps: 1, or 4 of a footprint smaller by tap_distance, that far from the centre along both axes (Fig. 4)."""
+    """Fill out as direct_gaussian does. taps: 1, or 4 of a footprint smaller by tap_distance, that far from the centre along both axes
+    (Fig. 4).
+    """
     flat, places = mip_map(planes)
     cosine, sine = math.cos(theta), math.sin(theta)
     u_px, v_px = alpha * sigma_u, alpha * sigma_v
@@ -279,7 +281,7 @@ def filter_layer(out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: int
 
 @njit(cache=True, nogil=True)
 def guard_px(variance: float, support: float) -> int:
-    """Pixels around a tile that its filter needs; a Gaussian that ends within its pixel needs none."""
+    """Return the pixels around a tile that its filter needs; a Gaussian that ends within its pixel needs none."""
     return int(math.ceil(support * math.sqrt(variance))) if variance > 0.04 else 0
 
 

@@ -1,4 +1,4 @@
-"""Rays through pupil and shutter into layers with depth: which pixel of which layer each of them meets."""
+"""Compiled rays through pupil and shutter into layers with depth: each meets one pixel of one layer, or nothing."""
 
 import math
 
@@ -13,7 +13,7 @@ _GOLDEN = 1.1673039782614187  # the root of g^6 = g + 1: the steps of an even se
 
 @njit(cache=True, nogil=True)
 def shifts(pixel: int, seed: int, out: np.ndarray) -> None:
-    """Chance in [0, 1) for each dimension of a pixel, by xor-shift from a mixed start."""
+    """Set chance in [0, 1) for each dimension of a pixel, by xor-shift from a mixed start."""
     state = (pixel * 2654435761 + seed * 2246822519 + 374761393) & 0xFFFFFFFF
     state = state if state else 1
     for k in range(-3, len(out)):
@@ -26,7 +26,7 @@ def shifts(pixel: int, seed: int, out: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def through_pupil(spans: np.ndarray, cumulative: np.ndarray, height: float, first: float, second: float) -> tuple[float, float]:
-    """A place in the pupil for two numbers in [0, 1): strips (S, 5) of one height, with the running sums of their weights."""
+    """Return a place in the pupil for two numbers in [0, 1): strips (S, 5) of one height, with the running sums of their weights."""
     k = 0
     while k < len(cumulative) - 1 and cumulative[k] <= first:
         k += 1
@@ -37,7 +37,7 @@ def through_pupil(spans: np.ndarray, cumulative: np.ndarray, height: float, firs
 
 @njit(cache=True, nogil=True)
 def carried_to(x: float, y: float, m_x: float, m_y: float, covered: np.ndarray, motion_px: np.ndarray, tau: float) -> tuple[int, int, bool]:
-    """Row and column of the pixel that lies at (x, y) at the time tau, beginning with a motion, and whether its own brings it there.
+    """Return row and column of the pixel that lies at (x, y) at the time tau, beginning with a motion, and whether its own brings it there.
 
     -1 outside the picture.
     """
@@ -59,10 +59,10 @@ def carried_to(x: float, y: float, m_x: float, m_y: float, covered: np.ndarray, 
 def pinhole_place(
     x: float, y: float, radius_px: np.ndarray, covered: np.ndarray, motion_px: np.ndarray, fastest_px: np.ndarray, tau: float
 ) -> tuple[int, int]:
-    """Row and column of the pixel of a layer that lies at (x, y) at the time tau, or -1.
+    """Return row and column of the pixel of a layer that lies at (x, y) at the time tau, or -1.
 
-    Begun with the motion at that place and with the fastest around it, fastest_px, for what moves covers places that it does not
-    cover at half time. Of two pixels that come there the nearer counts.
+    It begins with the motion at that place and with the fastest around it, fastest_px, since a moving pixel covers places that it does
+    not cover at half time. Of two pixels that come there the nearer counts.
     """
     at_row, at_column = min(max(int(math.floor(y)), 0), covered.shape[0] - 1), min(max(int(math.floor(x)), 0), covered.shape[1] - 1)
     own, fastest = motion_px[at_row, at_column], fastest_px[at_row, at_column]
@@ -80,7 +80,7 @@ def meet(
     x: float, y: float, pupils: np.ndarray, tau: float, radius_px: np.ndarray, covered: np.ndarray, motion_px: np.ndarray,
     fastest_px: np.ndarray, nearest_px: float, farthest_px: float, fill: bool,
 ) -> tuple[int, int, int]:  # fmt: skip
-    """Row, column and side (0 in front of the focus, 1 behind) of the pixel that a ray meets in one layer; -1 where it meets none.
+    """Return row, column and side (0 in front of the focus, 1 behind) of the pixel that a ray meets in one layer; -1 where it meets none.
 
     The ray is followed from what is nearest to what is farthest: a point of signed blur radius s on it lies at x - s u.
     It meets the surface where that falls to s; where it already lies a pixel before, the ray passes behind an edge.
@@ -160,5 +160,5 @@ def trace_rows(
 
 @njit(cache=True, nogil=True)
 def even(shift: float, n: int, dimension: int) -> float:
-    """The n-th number of an even sequence of five dimensions, shifted, in [0, 1)."""
+    """Return the n-th number of an even sequence of five dimensions, shifted, in [0, 1)."""
     return (shift + n * _GOLDEN ** (-dimension)) % 1.0

@@ -1,6 +1,7 @@
-"""How the buckets of a tile become partitions, and to which of them any sample belongs.
+"""Compiled partitions of a tile: sums over the samples of each bucket, and how buckets with like filters become partitions.
 
-Sums over the samples of a tile for each bucket it holds, from all samples or a sparse stratified choice.
+Sums are over all samples or a sparse stratified choice. Every bucket, also one that the tile does not hold, belongs to a partition or
+lies between two.
 """
 
 import math
@@ -14,7 +15,7 @@ from mrbokeh.system.kernels import njit
 
 
 class Rows(NamedTuple):
-    """What was found so far: buckets (R,) and sums (R, SUMS), used[0] of which are in use; place (B,) is the row of a bucket or -1."""
+    """Rows found so far: buckets (R,) and sums (R, SUMS), used[0] of which are in use; place (B,) is the row of a bucket or -1."""
 
     buckets: np.ndarray
     sums: np.ndarray
@@ -24,7 +25,7 @@ class Rows(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def xorshift(state: int) -> int:
-    """The next number of a 32 bit xor-shift generator with the triple (13, 17, 5) of Marsaglia 2003; the state is never 0."""
+    """Return the next number of a 32 bit xor-shift generator with the triple (13, 17, 5) of Marsaglia 2003; the state is never 0."""
     state ^= (state << 13) & 0xFFFFFFFF
     state ^= state >> 17
     state ^= (state << 5) & 0xFFFFFFFF
@@ -33,7 +34,7 @@ def xorshift(state: int) -> int:
 
 @njit(cache=True, nogil=True)
 def seeded(seed: int, tile: int) -> int:
-    """A state for a tile, far from that of its neighbours."""
+    """Return a state for a tile, far from that of its neighbours."""
     state = (seed * 2654435761 + tile * 2246822519 + 374761393) & 0xFFFFFFFF
     state = state if state else 1
     for _ in range(4):
@@ -43,11 +44,11 @@ def seeded(seed: int, tile: int) -> int:
 
 @njit(cache=True, nogil=True)
 def rows_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Buckets (R,), in rising order, and sums (R, SUMS) of all that the tile and the blocks around it hold; of the same samples, all of
-    them, the number, the light and its root (R, 3).
+    """Return buckets (R,), in rising order, and sums (R, SUMS) of all that the tile and the blocks around it hold; of the same samples,
+    all of them, the number, the light and its root (R, 3).
 
-    place: (B,) of -1; afterwards not, for these buckets. What none of the chosen samples saw is summed over all samples, and what
-    only the blocks around hold over those: a lamp must not vanish by chance, nor where its light leaves a tile's corner.
+    place: (B,) of -1; afterwards not, for these buckets. Buckets that none of the chosen samples is in are summed over all samples, and
+    buckets that only the blocks around hold over those: a lamp must not vanish by chance, nor where its light leaves a tile's corner.
     """
     first, end = light.starts[tile * BLOCKS], light.starts[(tile + 1) * BLOCKS]
     beside = blocks_around(tile, light)
@@ -95,7 +96,7 @@ def add_unknown(rows: Rows, known: int, first: int, end: int, light: Light) -> N
 
 @njit(cache=True, nogil=True)
 def add_sample(rows: Rows, bucket: int, slope: np.ndarray) -> None:
-    """slope: half the signed circle of confusion, motion x and y."""
+    """Add a sample to its bucket's row. Add a sample to its bucket's row. slope: half the signed circle of confusion, motion x and y."""
     if rows.place[bucket] < 0:
         new = rows.used[0]
         rows.place[bucket], rows.buckets[new] = new, bucket
@@ -128,7 +129,7 @@ def add_light(held: np.ndarray, rows: Rows, first: int, end: int, light: Light) 
 
 @njit(cache=True, nogil=True)
 def blocks_around(tile: int, light: Light) -> list[int]:
-    """The blocks of other tiles that touch this one."""
+    """Return the blocks of other tiles that touch this one."""
     rows, row, column = (len(light.starts) - 1) // BLOCKS // light.columns, tile // light.columns, tile % light.columns
     blocks = []
     for y in range(row * BLOCKS_ACROSS - 1, (row + 1) * BLOCKS_ACROSS + 1):
@@ -150,7 +151,7 @@ LOOK_BACK = 8
 
 @njit(cache=True, nogil=True)
 def fits(row: np.ndarray, first: np.ndarray, both: np.ndarray, widest: np.ndarray, light: Light, choice: Choice) -> bool:
-    """Whether a bucket may join a partition whose first bucket is `first` and whose widest filter is (u, v) `widest`; sums (SUMS,).
+    """Return whether a bucket may join a partition whose first bucket is `first` and whose widest filter is (u, v) `widest`; sums (SUMS,).
 
     The common filter may be by the tolerance narrower, along either axis, than that of any bucket in it, and its slopes may
     leave those of its first and its last bucket by that share of their blur. (The paper names the first rule only. By that alone
@@ -198,7 +199,7 @@ def merged_rows(rows: np.ndarray, faint: np.ndarray, light: Light, choice: Choic
 
 @njit(cache=True, nogil=True)
 def nearest(row: np.ndarray, partitions: np.ndarray, light: Light, choice: Choice) -> int:
-    """The partition by whose slopes the mean sample of a bucket goes least wrong; the first of several."""
+    """Return the partition by whose slopes the mean sample of a bucket goes least wrong; the first of several."""
     best, least = 0, np.inf
     for j in range(len(partitions)):
         distance = slope_distance(row, partitions[j], light.window, choice.sigma_x_px)
@@ -209,7 +210,7 @@ def nearest(row: np.ndarray, partitions: np.ndarray, light: Light, choice: Choic
 
 @njit(cache=True, nogil=True)
 def faint_rows(rows: np.ndarray, held: np.ndarray, light: Light, choice: Choice) -> np.ndarray:
-    """Which buckets (R,) can hardly be seen: spread over the area of their filter, their samples hide no more than the share
+    """Return which buckets (R,) can hardly be seen: spread over the area of their filter, their samples hide no more than the share
     choice.faint of what is there, nor are they brighter than that share of the mean of the tile and the blocks around it.
 
     The area is that of an even disc of the same second moments. Where all are faint none is.
@@ -226,7 +227,9 @@ def faint_rows(rows: np.ndarray, held: np.ndarray, light: Light, choice: Choice)
 
 @njit(cache=True, nogil=True)
 def partitions_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarray) -> tuple[Partitions, np.ndarray, int]:
-    """Also the buckets whose place (B,) is to be -1 again for the next tile, as it must come, and how many buckets are populated."""
+    """Return the partitions, the buckets whose place (B,) must be set to -1 again for the next tile, and how many buckets are
+    populated.
+    """
     buckets, rows, held = rows_of_tile(tile, light, choice, place)
     faint = faint_rows(rows, held, light, choice)
     own, merged = merged_rows(rows, faint, light, choice)
@@ -243,7 +246,7 @@ def partitions_of_tile(tile: int, light: Light, choice: Choice, place: np.ndarra
 
 @njit(cache=True, nogil=True)
 def widened(buckets: np.ndarray, place: np.ndarray, light: Light) -> np.ndarray:
-    """Free neighbours of each bucket, in depth and in motion, go with it: a surface goes on beyond the tile.
+    """Give free neighbours of each bucket, in depth and in motion, its place: a surface goes on beyond the tile.
 
     Returns all buckets that then have a place.
     """

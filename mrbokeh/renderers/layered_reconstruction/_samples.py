@@ -1,8 +1,7 @@
-"""Layers seen along rays: light field samples for a renderer that is given layers.
+"""Light field samples for layered reconstruction: taken of layers along rays, and sorted by tile as the compiled loops want them.
 
-Depth buckets: equal steps of the circle of confusion near the focus and equal steps of depth everywhere.
-
-Samples as the kernels want them: sorted by tile, centred, with their slopes, depth buckets and the window they fill.
+Sorted samples are centred and have slopes, depth buckets and cells of motion. Depth buckets are equal steps of the circle of confusion
+near the focus and equal steps of depth everywhere.
 """
 
 from collections.abc import Sequence
@@ -27,7 +26,7 @@ _BAND_ROWS = 16
 
 
 def motion_of(layer: Layer) -> Float32[np.ndarray, "height width 2"]:
-    """Motion in pixels, not premultiplied; 0 where the layer has none."""
+    """Return motion in pixels, not premultiplied; 0 if the layer has none."""
     if MOTION not in layer.extra:
         return np.zeros((*layer.alpha.shape, 2), np.float32)
     if layer.extra[MOTION].shape[2] != 2:
@@ -38,7 +37,9 @@ def motion_of(layer: Layer) -> Float32[np.ndarray, "height width 2"]:
 
 
 def coc_px_of(layer: Layer, lens: Lens) -> Float32[np.ndarray, "height width"]:
-    """Signed diameters to draw (optics.drawn_diameters); 0 where nothing is covered and up to one pixel, where light stays as it is."""
+    """Return signed diameters to draw (optics.drawn_diameters); 0 where nothing is covered and up to one pixel, where light stays as
+    it is.
+    """
     covered = layer.alpha > 0
     if not (layer.depth_m > 0)[covered].all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
@@ -49,14 +50,14 @@ def coc_px_of(layer: Layer, lens: Lens) -> Float32[np.ndarray, "height width"]:
 
 
 def all_sharp(layers: Sequence[Layer], lens: Lens) -> bool:
-    """Whether nothing moves and every circle of confusion is at most one pixel: then there is nothing to take samples of."""
+    """Return whether nothing moves and every circle of confusion is at most one pixel: then there is nothing to take samples of."""
     return not any(coc_px_of(layer, lens).any() or motion_of(layer).any() for layer in layers)
 
 
 def sample_layers(
     layers: Sequence[Layer], lens: Lens, per_pixel: int, seed: int, threads: int
 ) -> tuple[LightFieldSamples, Float32[np.ndarray, "samples channels"], Float32[np.ndarray, " samples"], int]:
-    """Samples of the layers continued beyond the frame, their values (N, 4 + E: R, G, B, coverage, others), their circles of
+    """Return samples of the layers continued beyond the frame, their values (N, 4 + E: R, G, B, coverage, others), their circles of
     confusion, and the margin in pixels.
 
     Opaque layers go on beyond the frame as their border pixels do, others do not. A ray that meets nothing is a black sample
@@ -92,7 +93,7 @@ def _continued(planes: Float32[np.ndarray, "height width channels"], margin: int
 
 
 class _Rays:
-    """xy_px, lens_uv, time of all rays and what they met: (N, 3) layer, row and column, or -1."""
+    """Rays of all samples: xy_px, lens_uv, time, and met (N, 3): layer, row and column, or -1."""
 
     def __init__(
         self, continued: Float32[np.ndarray, "layers height width _"], lens: Lens, per_pixel: int, seed: int, threads: int
@@ -126,7 +127,7 @@ class _Rays:
 
 
 def _fastest_around(motion_px: Float32[np.ndarray, "height width 2"]) -> Float32[np.ndarray, "height width 2"]:
-    """Of all motions that begin within reach of a pixel, the fastest."""
+    """Return for each pixel the fastest of all motions that begin within its reach."""
     from scipy.ndimage import maximum_filter
 
     reach = int(np.ceil(0.5 * np.abs(motion_px).max()))
@@ -144,7 +145,7 @@ def _range(radii_px: np.ndarray) -> tuple[float, float]:
 
 
 def _pupil(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Strips in front of the focus and behind it, running sums of their weights, where each side begins, heights of the strips."""
+    """Return strips in front of the focus and behind it, running sums of their weights, where each side begins, heights of the strips."""
     sides = [lens.aperture.seen(side) for side in (-1, 1)]
     tables = [pupil_spans(aperture, STRIPS[-1]) for aperture in sides]
     corners = [np.concatenate(aperture.outlines)[:, 1] for aperture in sides]
@@ -160,7 +161,7 @@ _ENOUGH = 65536  # samples for the percentiles of depth
 def bucket_of(
     coc_px: Float32[np.ndarray, " samples"], depth_m: Float32[np.ndarray, " samples"], settings: Settings
 ) -> tuple[Int32[np.ndarray, " samples"], int]:
-    """The bucket of each sample, front to back from 0, and how many there are; constant time per sample.
+    """Return the bucket of each sample, front to back from 0, and how many there are; constant time per sample.
 
     Steps of the circle of confusion, clipped at near_coc_px, plus steps of depth: both grow with depth, so their sum does,
     and it has the borders of both. Depth is cut between its 1st and 99th percentile; background at infinity goes last.
@@ -182,7 +183,7 @@ def bucket_of(
 
 
 def motion_cells(motion_px: Float32[np.ndarray, "samples 2"], settings: Settings) -> tuple[Int32[np.ndarray, " samples"], int, int]:
-    """The cell of motion of each sample, how many there are along x and in all."""
+    """Return the cell of motion of each sample, how many there are along x and in all."""
     if not settings.motion or not np.isfinite(settings.motion_step_px):
         return np.zeros(len(motion_px), np.int32), 1, 1
     most = np.float32(settings.motion_step_px * 32)
@@ -199,7 +200,9 @@ def prepared(
     coc_px: Float32[np.ndarray, " samples"],
     settings: Settings,
 ) -> Light:
-    """values: (N, C) what is reconstructed, the samples' rgb or more. coc_px: their circles of confusion."""
+    """Sort samples by tile. Sort samples by tile. values: (N, C) what is reconstructed, the samples' rgb or more. coc_px: their
+    circles of confusion.
+    """
     from mrbokeh.renderers.layered_reconstruction._filter_numba import gather, tile_order
 
     columns, rows = -(-samples.width_px // settings.tile_px), -(-samples.height_px // settings.tile_px)
@@ -220,7 +223,7 @@ def prepared(
 
 
 def _window(samples: LightFieldSamples) -> Float64[np.ndarray, "4"]:
-    """Of an even disc the second moment is 1/4 along each axis, of an even shutter 1/12."""
+    """Return the second moments of pupil and shutter: 1/4 along each axis for an even disc, 1/12 for an even shutter."""
     u, v = samples.lens_uv.T
     t = samples.time - np.float32(0.5)
     return np.array([np.mean(a * b, dtype=np.float64) for a, b in ((u, u), (u, v), (v, v), (t, t))])

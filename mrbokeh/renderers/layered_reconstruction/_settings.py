@@ -1,4 +1,4 @@
-"""What of layered reconstruction can be turned on, off and set."""
+"""Settings of layered reconstruction."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -15,7 +15,7 @@ _MOST_PARTS = 16
 
 @dataclass(frozen=True)
 class Settings:
-    """The defaults are the paper's where it names one, else what measured best (tests/bench/bench_layered_reconstruction.py).
+    """Settings, whose defaults are the paper's where it names one, else what measured best (tests/bench/bench_layered_reconstruction.py).
 
     tile_px: side of a tile, a power of two from 4 to 256.
     coc_step_px, near_coc_px: depth buckets take equal steps of the circle of confusion up to near_coc_px on both sides of the focus.
@@ -100,14 +100,14 @@ class Settings:
 
     @property
     def parts(self) -> tuple[int, int]:
-        """pupil_parts and shutter_parts as far as they mean anything: a Gaussian has no parts, and without motion time has none."""
+        """Parts of pupil and shutter as far as they mean anything: a Gaussian has no parts, and without motion time has none."""
         if self.screen_filter != "windows":
             return 1, 1
         return self.pupil_parts, self.shutter_parts if self.motion else 1
 
 
 def footprint_sigmas(energy: float) -> float:
-    """alpha of Eq. 3: half the side, in standard deviations, of the square that holds this share of a 2D Gaussian."""
+    """Return Return alpha of Eq. 3: half the side, in standard deviations, of the square that holds this share of a 2D Gaussian."""
     from scipy.special import erfinv
 
     return float(np.sqrt(2.0) * erfinv(np.sqrt(energy)))

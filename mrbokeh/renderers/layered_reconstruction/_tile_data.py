@@ -1,6 +1,6 @@
-"""What the kernels share: samples sorted by tile, and how they are to be filtered.
+"""Data that the compiled loops share: samples sorted by tile, how they are filtered, and the opening of the lens as strips along u.
 
-The opening of a lens as strips along u: what the window filter sums over, and where rays are sent through.
+The window filter sums over the strips, and rays are sent through them.
 """
 
 from itertools import pairwise
@@ -19,7 +19,7 @@ _LEAST_SHARE = 1e-4
 
 
 def pupil_spans(aperture: Aperture, strips: int) -> Float64[np.ndarray, "spans 5"]:
-    """All stretches that let light pass on `strips` lines across a plain aperture: v, from u, to u, weight, height in v.
+    """Return all stretches that let light pass on `strips` lines across a plain aperture: v, from u, to u, weight, height in v.
 
     The weights sum to 1.
     """
@@ -34,7 +34,7 @@ def pupil_spans(aperture: Aperture, strips: int) -> Float64[np.ndarray, "spans 5
 def packed_pupil(
     aperture: Aperture, across: int = 1
 ) -> tuple[Float64[np.ndarray, "spans 5"], Int64[np.ndarray, " starts"], Float64[np.ndarray, " cells"]]:
-    """All drawings of what is seen in front of the focus, then of what is seen behind it, each in its cells; where each begins; the
+    """Return all drawings of what is seen in front of the focus, then of what is seen behind it, each in its cells; where each begins; the
     share of the light that comes through each cell.
 
     across: cells along either side of the box around the opening; those that nothing comes through are left out. Weights of a
@@ -54,7 +54,7 @@ def packed_pupil(
 def _in_cells(
     spans: Float64[np.ndarray, "spans 5"], low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"], across: int
 ) -> list[Float64[np.ndarray, "_ 5"]]:
-    """What of the strips lies in each of across x across cells of the box from low to high, u first; weights by area."""
+    """Cut the strips by across x across cells of the box from low to high, u first; weights by area."""
     u, v = (np.linspace(low[axis], high[axis], across + 1) for axis in (0, 1))
     middle, from_u, to_u, weight, height = spans.T
     cells = []
@@ -68,7 +68,7 @@ def _in_cells(
 
 
 def _open_stretches(aperture: Aperture, v: float) -> list[tuple[float, float, float]]:
-    """From u, to u and length times weight along one line, where the weights of all outlines together are above 0."""
+    """Return (from u, to u, length times weight) along one line, where the weights of all outlines together are above 0."""
     steps = []
     for outline, weight in zip(aperture.outlines, aperture.weights, strict=True):
         steps += [(u, weight if k % 2 == 0 else -weight) for k, u in enumerate(_crossings(outline, v))]
@@ -82,7 +82,7 @@ def _open_stretches(aperture: Aperture, v: float) -> list[tuple[float, float, fl
 
 
 def _crossings(outline: Float64[np.ndarray, "points 2"], v: float) -> list[float]:
-    """Where a closed outline crosses the line of this v, from left to right."""
+    """Return where a closed outline crosses the line of this v, from left to right."""
     closed = np.concatenate([outline, outline[:1]])
     pairs = ((a, b) for a, b in pairwise(closed) if (a[1] <= v) != (b[1] <= v))
     return sorted(float(a[0] + (v - a[1]) / (b[1] - a[1]) * (b[0] - a[0])) for a, b in pairs)
@@ -118,7 +118,7 @@ class Light(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Numbers of Settings. every: one sample of so many makes the statistics. kind: of the screen filter. alpha: of Eq. 3.
+    """Settings as numbers. every: one sample of so many makes the statistics. kind: of the screen filter. alpha: of Eq. 3.
 
     times: stretches of the shutter that are composited on their own. part_tolerance: 0 where parts are never merged.
     """
@@ -142,7 +142,7 @@ class Choice(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """A sample is reprojected to x' = x - a (u, v) - (b_x, b_y) (t - 1/2)."""
+    """Slopes by which a sample is reprojected to x' = x - a (u, v) - (b_x, b_y) (t - 1/2)."""
 
     a: float
     b_x: float
@@ -161,7 +161,7 @@ class Pupil(NamedTuple):
 
 
 class Partitions(NamedTuple):
-    """Of one tile, front to back: sums (P, SUMS), first depth bucket (P,), and the place of every bucket among them.
+    """Partitions of one tile, front to back: sums (P, SUMS), first depth bucket (P,), and the place of every bucket among them.
 
     place: (B,) 2 j for buckets of the partition j; -1 for those that no partition knows, which lie where `gaps` (depths,) says:
     2 j - 1 in front of the partition j.

@@ -1,9 +1,8 @@
-"""One tile after the other: its partitions, front to back, filtered and laid behind one another.
+"""Compiled reconstruction of one tile after the other: its partitions, front to back, filtered and laid behind one another, in parts.
 
-Which parts of pupil and shutter are merged: those of pixels that look the same without them.
-
-Parts cost as much as the whole does, for each of them anew, and make a difference only where layers hide one another and the
-place in the pupil, or the time, decides what. A picture of a quarter of the resolution shows where, for next to nothing.
+Parts of pupil and shutter cost as much as the whole does, for each of them anew, and make a difference only where layers hide one
+another and the place in the pupil, or the time, decides what. A picture of a quarter of the resolution shows where, for next to nothing;
+elsewhere parts are merged.
 """
 
 import numpy as np
@@ -26,7 +25,7 @@ MOST_RATIO = 2.0
 
 @njit(cache=True, nogil=True)
 def coarse(one: WindowLayer, height: int, width: int) -> WindowLayer:
-    """The same layer of a tile of height x width in pixels COARSE_PX as large, each the mean of those it is made of."""
+    """Return the same layer of a tile of height x width in pixels COARSE_PX as large, each the mean of those it is made of."""
     scale, length_x, length_y = one.scale / COARSE_PX, one.length_x / COARSE_PX, one.length_y / COARSE_PX
     guard_x, guard_y, guard, _ = window_guards(scale, 1.0, length_x, length_y, 0.0)
     beyond_x, beyond_y = guard_x + guard, guard_y + guard
@@ -75,7 +74,7 @@ def mean_of_parts(picture: np.ndarray, pictures: np.ndarray, parts_past: np.ndar
 def coarse_ratio(
     layers: list[WindowLayer], shape: tuple, whole: Pupil, cells: Pupil, times: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parts over the whole, (h, w, C) in coarse pixels, and where such pixels cannot hold what parts add, (h, w) of bool.
+    """Return parts over the whole, (h, w, C) in coarse pixels, and where such pixels cannot hold what parts add, (h, w) of bool.
 
     shape: height, width and channels of the tile.
     """
@@ -90,7 +89,9 @@ def coarse_ratio(
 
 @njit(cache=True, nogil=True)
 def ratio_of(alike: np.ndarray, apart: np.ndarray) -> np.ndarray:
-    """From 0 to MOST_RATIO, 1 where the whole is 0. A factor, for it leaves alone where nothing is, and what channels have in common."""
+    """Return parts over the whole, from 0 to MOST_RATIO, 1 where the whole is 0. A factor leaves dark pixels alone, and what channels
+    have in common.
+    """
     ratio = np.ones_like(alike)
     for y in range(ratio.shape[0]):
         for x in range(ratio.shape[1]):
@@ -102,7 +103,7 @@ def ratio_of(alike: np.ndarray, apart: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def too_detailed(alike: np.ndarray, apart: np.ndarray, ratio: np.ndarray, tolerance: float) -> np.ndarray:
-    """Where what parts add has detail, which is what the mean of its 3 x 3 pixels does not have, or is no such factor."""
+    """Return where the light that parts add has detail (differs from the mean of its 3 x 3 pixels), or is no such factor."""
     height, width, channels = alike.shape
     found = np.zeros((height, width), np.bool_)
     for c in range(channels):
@@ -119,7 +120,7 @@ def too_detailed(alike: np.ndarray, apart: np.ndarray, ratio: np.ndarray, tolera
 
 @njit(cache=True, nogil=True)
 def box_of(found: np.ndarray, height: int, width: int) -> tuple[int, int, int, int]:
-    """Top, bottom, left and right of the pixels of a tile that hold all that was found; all 0 where nothing was."""
+    """Return top, bottom, left and right of the pixels of a tile that hold all that was found; all 0 where nothing was."""
     top, bottom, left, right = height, 0, width, 0
     for y in range(found.shape[0]):
         for x in range(found.shape[1]):
@@ -147,14 +148,14 @@ def scale_by_coarse(picture: np.ndarray, ratio: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def between(at: int, count: int) -> tuple[int, np.float32]:
-    """The coarse pixel before the middle of a fine one and the share of the next; at the border the first or the last alone."""
+    """Return the coarse pixel before the middle of a fine one and the share of the next; at the border the first or the last alone."""
     place = min(max((at + 0.5) / COARSE_PX - 0.5, 0.0), count - 1.0)
     return int(place), np.float32(place - int(place))
 
 
 @njit(cache=True, nogil=True)
 def cropped(one: WindowLayer, box: tuple[int, int, int, int]) -> WindowLayer:
-    """What the pixels from top to bottom and from left to right need of a layer."""
+    """Return the part of a layer that the pixels from top to bottom and from left to right need."""
     beyond_x, beyond_y = 2 * (one.guard_x + one.guard), 2 * (one.guard_y + one.guard)
     planes = np.ascontiguousarray(one.planes[box[0] : box[1] + beyond_y, box[2] : box[3] + beyond_x])
     return WindowLayer(planes, one.scale, one.length_x, one.length_y, one.guard_x, one.guard_y, one.guard)
@@ -220,7 +221,9 @@ def in_parts(
 def in_merged_parts(
     picture: np.ndarray, left: int, top: int, partitions: Partitions, light: Light, choice: Choice, whole: Pupil, cells: Pupil
 ) -> np.ndarray:
-    """As in_parts, but only for the pixels that need them; the others take the whole times, coarsely, parts over the whole."""
+    """Fill a tile as in_parts does, but in parts only for the pixels that need them; the others take the whole times, coarsely, parts
+    over the whole.
+    """
     height, width, _ = picture.shape
     layers = [window_layer(left, top, picture.shape, j, partitions, light, choice) for j in range(len(partitions.sums))]
     ratio, found = coarse_ratio(layers, picture.shape, whole, cells, choice.times, choice.part_tolerance)

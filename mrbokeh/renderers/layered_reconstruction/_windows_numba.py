@@ -1,12 +1,7 @@
-"""The segment that a partition moves along while the shutter is open, or a stretch of it, over the screen.
+"""Compiled filter of a partition in the true shapes of pupil and shutter, laid behind the others for each part of both on its own.
 
-The true shape of the pupil over the screen, in place of the Gaussian that stands for it.
-
-Filtered layers of a tile laid behind one another, and what none of them claims.
-
-One partition of a tile in the shapes of pupil and shutter, laid behind the others for each part of both on its own.
-
-Whether a partition hides another depends on the place in the pupil and on the time. Within a part of both it is as good as even.
+The pupil's picture stands in place of the Gaussian, and the shutter's segment, or a stretch of it, along which a partition moves. Whether
+a partition hides another depends on the place in the pupil and on the time. Within a part of both it is as good as even.
 """
 
 import math
@@ -20,8 +15,9 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True)
 def line_taps(length_x: float, length_y: float, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (T, 2) and weights, sum 1, of the pixels that a segment centred on a pixel crosses from `begin` to `end`, both from
-    -1/2 to 1/2 of its length, by the length within each."""
+    """Return offsets (T, 2) and weights, sum 1, of the pixels that a segment centred on a pixel crosses from `begin` to `end`, both from
+    -1/2 to 1/2 of its length, by the length within each.
+    """
     reach_x, reach_y = int(math.ceil(0.5 * abs(length_x))), int(math.ceil(0.5 * abs(length_y)))
     kernel = np.zeros((2 * reach_y + 1, 2 * reach_x + 1))
     cuts = np.empty(2 * (reach_x + reach_y) + 2)
@@ -117,7 +113,7 @@ def add_strip(out: np.ndarray, prefix: np.ndarray, one: float, other: float, wei
 
 @njit(cache=True, nogil=True)
 def sums_along_x(planes: np.ndarray) -> np.ndarray:
-    """prefix[y, x]: the sum of planes[y, :x], one longer than the row and once more repeated for reading beyond."""
+    """Return Return prefix[y, x]: the sum of planes[y, :x], one longer than the row and once more repeated for reading beyond."""
     height, width, channels = planes.shape
     prefix = np.zeros((height, width + 2, channels))
     carried = np.zeros(channels)
@@ -134,7 +130,7 @@ def sums_along_x(planes: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def smooth(planes: np.ndarray, variance_px2: float) -> None:
-    """An even Gaussian in place, beyond the border nothing; what the spatial filter has beyond a pixel."""
+    """Smooth by an even Gaussian in place, with nothing beyond the border: what the spatial filter has beyond a pixel."""
     if variance_px2 < 0.04:
         return
     reach = int(math.ceil(3.0 * math.sqrt(variance_px2)))
@@ -157,7 +153,7 @@ def smooth(planes: np.ndarray, variance_px2: float) -> None:
 
 @njit(cache=True, nogil=True)
 def window_guards(scale: float, pupil_radius: float, length_x: float, length_y: float, variance_px2: float) -> tuple[int, int, int, int]:
-    """Guard bands of the segment (x, y), of the pupil and of the spatial filter, in pixels."""
+    """Return guard bands of the segment (x, y), of the pupil and of the spatial filter, in pixels."""
     pupil = int(math.ceil(abs(scale) * pupil_radius)) + 1
     around = int(math.ceil(3.0 * math.sqrt(variance_px2))) if variance_px2 >= 0.04 else 0
     return int(math.ceil(0.5 * abs(length_x))), int(math.ceil(0.5 * abs(length_y))), pupil, around
@@ -190,7 +186,7 @@ def composite(out: np.ndarray, seen_past: np.ndarray, layer: np.ndarray) -> None
 
 @njit(cache=True, nogil=True)
 def share_out(out: np.ndarray, seen_past: np.ndarray) -> None:
-    """Behind the last layer is nothing that was sampled: what no layer claims belongs to those that were seen."""
+    """Divide what no layer claims among the layers that were seen: behind the last layer nothing was sampled."""
     height, width, channels = out.shape
     for y in range(height):
         for x in range(width):
@@ -204,7 +200,7 @@ def share_out(out: np.ndarray, seen_past: np.ndarray) -> None:
 def own_means(
     out: np.ndarray, seen_past: np.ndarray, left: int, top: int, first: int, end: int, geometry: np.ndarray, values: np.ndarray
 ) -> None:
-    """A pixel that no layer reaches shows the mean of its own samples."""
+    """Show in a pixel that no layer reaches the mean of its own samples."""
     height, width, channels = out.shape
     counts = np.zeros((height, width), np.int32)
     for i in range(first, end):
@@ -219,7 +215,7 @@ def own_means(
 
 @njit(cache=True, nogil=True)
 def window_layer(left: int, top: int, shape: tuple, j: int, partitions: Partitions, light: Light, choice: Choice) -> WindowLayer:
-    """The partition j around the tile whose corner is (left, top), reprojected; shape: height, width and channels of the tile.
+    """Return the partition j around the tile whose corner is (left, top), reprojected; shape: height, width and channels of the tile.
 
     The shapes of pupil and shutter are scaled to the variance that the shear leaves.
     """
@@ -263,7 +259,7 @@ def lay_parts(pictures: np.ndarray, seen_past: np.ndarray, one: WindowLayer, pup
 
 @njit(cache=True, nogil=True)
 def drawing(pupil: Pupil, scale: float, cell: int) -> np.ndarray:
-    """The strips of a cell that do for a pupil of this radius in pixels."""
+    """Return the strips of a cell that do for a pupil of this radius in pixels."""
     cells = len(pupil.shares)
     drawings = (len(pupil.starts) - 1) // (2 * cells)
     k = 0

@@ -28,8 +28,8 @@ _BAND_PX = 32  # rows summed by themselves; fixed, so that the sum does not depe
 
 @dataclass(frozen=True)
 class _Tables:
-    """Kernels as taps: those of all kernels one after the other, each from its entry in `starts`; lowers (N,), uppers (N,): of every
-    pixel.
+    """Kernels as Kernels as taps: those of all kernels one after the other, each from its entry in `starts`; lowers (N,), uppers (N,):
+    of every pixel.
     """
 
     taps: Float32[np.ndarray, " taps"]
@@ -127,7 +127,7 @@ def exact_share(
     unit_radius: float,
     each: Callable[[Callable, Iterable], Iterable] = map,
 ) -> Float32[np.ndarray, "height width"]:
-    """How much of each pixel's light has to be spread by its exact kernel: 0 for most, 1 for highlights.
+    """Return how much of each pixel's light needs its exact kernel: 0 for most, 1 for highlights.
 
     diameters_px: unsigned, 0 for pixels that take no part. unit_radius: of the aperture. A pixel's window is the square its light may
     reach (its radius rounded up to a power of two). In every channel two ratios are taken: value over mean of the window, and mean over

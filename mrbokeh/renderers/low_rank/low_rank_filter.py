@@ -45,7 +45,7 @@ _MOST_KERNELS = 4096  # that are kept between calls
 
 @dataclass(frozen=True)
 class LowRankFilter:
-    """A Renderer that spreads light by low-rank kernels; layers, slices and hidden background as in mrbokeh.layering.layering.
+    """Renderer that sums low-rank kernels; layers, slices and hidden background as in mrbokeh.layering.layering.
 
     relative_error: the rank of every kernel is the least from 4 on with this error (McGraw, Eq. 4), at most max_rank.
     per_pixel: McGraw's two passes of varying width with a mask near edges of depth, in place of levels (slower, less exact).

@@ -1,6 +1,6 @@
-"""One part of a picture through polygon_differences: splatted row by row into a ring, summed back as soon as rows are complete.
+"""Compiled loops of polygonal differences: parts of a picture are splatted row by row into a ring and summed back.
 
-Complete rows of the ring back to the picture: sums along the directions, then downwards (Moroto et al. 2021, Eq. 9-11).
+Rows are summed as soon as they are complete: along the directions, then downwards (Moroto et al. 2021, Eq. 9-11).
 """
 
 import math
@@ -31,7 +31,7 @@ FINISHED_PX = 128
 
 @compiled
 def finish_row(sums: Sums, ring: Ring, scratch: Scratch, target: Target, y: int, blurred: tuple[int, int], lit: tuple[int, int]) -> None:
-    """Row y has all its light: advance the sums if they are in use, write the row out and empty it.
+    """Complete row y, which has all its light: advance the sums if they are in use, write the row out and empty it.
 
     blurred and lit: the first and last row that pixels reach through the sums and without them.
     """
@@ -73,7 +73,7 @@ def _clear(ring: Ring, here: int, start: int, end: int, is_blurred: bool) -> Non
 
 @compiled
 def _fold_aliases(ring: Ring, row: int) -> None:
-    """Add what was splatted into the row that stands for this one, before or after the ring proper."""
+    """Add the light in the row that stands for this one, before or after the ring proper."""
     if row < ALIASED_ROWS:
         alias = ALIASED_ROWS + ring.rows + row
     elif row >= ring.rows - ALIASED_ROWS:
@@ -90,7 +90,7 @@ def _fold_aliases(ring: Ring, row: int) -> None:
 
 @compiled
 def _advance(sums: Sums, ring: Ring, scratch: Scratch, y: int, here: int, start: int, end: int) -> None:
-    """One more row of every sum along a direction, and of the sum downwards; cells start..end of it.
+    """Advance every sum along a direction, and the sum downwards, by one row; cells start..end of it.
 
     Inputs and parts of the profile beyond two are rare and added by themselves.
     """
@@ -162,7 +162,7 @@ def _sum_along_row(
     kept: float,
     carry: np.ndarray,
 ) -> None:
-    """The level direction, whose profile is one pixel high: what is summed so far goes on in `carry`."""
+    """Sum along the level direction, whose profile is one pixel high; `carry` takes the sum on to the next cells."""
     for i in range(current.shape[0]):
         current[i] = kept * current[i] + weights[0] * inputs[i] + weights[1] * others[i]
     a, b, c, d = carry[0], carry[1], carry[2], carry[3]
@@ -204,7 +204,7 @@ def add_row(row: np.ndarray, stray: np.ndarray) -> None:
 
 @compiled
 def cut_negative(row: np.ndarray, nonnegative: np.ndarray) -> None:
-    """What is below 0 in channels that have no negative values: rounding, and dips beside the tips of a rectified outline."""
+    """Set values below 0 to 0 in channels that have no negative input: rounding, and dips beside the tips of a rectified outline."""
     zero = np.float32(0.0)
     if nonnegative.all():
         for i in range(row.shape[0]):
@@ -218,8 +218,9 @@ def cut_negative(row: np.ndarray, nonnegative: np.ndarray) -> None:
 def splat_parts(
     picture: Picture, corners: Corners, sums: Sums, exact: Exact, ring: Ring, scratch: Scratch, target: Target, parts: np.ndarray
 ) -> None:
-    """Add the spread light of parts (N, 4) of a picture, each first row, end row, left, right, to the target, whose band holds the
-    rows. The ring is empty before and after."""
+    """Add the blurred light of parts (N, 4) of a picture, each first row, end row, left, right, to the target, whose band holds the
+    rows. The ring is empty before and after.
+    """
     for k in range(parts.shape[0]):
         first, end, left, right = parts[k, 0], parts[k, 1], parts[k, 2], parts[k, 3]
         here = Ring(ring.planes, ring.plane_elements, ring.light_plane, ring.rows, ring.stride, ring.margin, left)
@@ -262,8 +263,9 @@ def _splat_part(
 
 @compiled
 def settle(target: Target, strays: np.ndarray, starts: np.ndarray, half: np.ndarray, line: np.ndarray, nonnegative: np.ndarray) -> None:
-    """Complete the rows of a band. strays (pieces, rows, 4 W): what other bands threw up and down, from rows `starts` on.
-    half (rows, 4 cells): what was spread at half the resolution, or empty; line (4 cells) is scratch space."""
+    """Complete the rows of a band. strays (pieces, rows, 4 W): light of other bands thrown up and down, from rows `starts` on.
+    half (rows, 4 cells): the light blurred at half the resolution, or empty; line (4 cells) is scratch space.
+    """
     for y in range(target.top, target.bottom):
         for piece in range(strays.shape[0]):
             if 0 <= y - starts[piece] < strays.shape[1]:

@@ -1,10 +1,9 @@
-"""Halving the resolution of what is far out of focus, and doubling it again.
+"""Compiled loops that halve the resolution of what is far out of focus, and double it again.
 
-Cell (j, i) of the half picture covers the block of pixels (2 j - 2, 2 i - 2) to (2 j - 1, 2 i - 1): there is one more cell on every
-side. A pixel gives 3/4 of its light to the cell that covers it and 1/4 to the next nearest, in each direction, which keeps the
-centre of its light where it is; pixels take from cells by the same shares.
-
-Which blocks of 2 x 2 pixels are so far out of focus, and so evenly, that they are spread at half the resolution.
+Blocks of 2 x 2 pixels are chosen that are far out of focus, and evenly so. Cell (j, i) of the half picture covers the block of pixels
+(2 j - 2, 2 i - 2) to (2 j - 1, 2 i - 1): there is one more cell on every side. A pixel gives 3/4 of its light to the cell that covers
+it and 1/4 to the next nearest, in each direction, which keeps the centre of its light where it is; pixels take from cells by the same
+shares.
 """
 
 import numpy as np
@@ -24,7 +23,7 @@ def measure_blocks(
     lowest: np.ndarray,
     highest: np.ndarray,
 ) -> None:
-    """Least and greatest signed diameter among the pixels with light of each block of some rows of tiles; inf and -inf without any.
+    """Set the least and greatest signed diameter among the pixels with light of each block of some rows of tiles; inf and -inf without any.
 
     limits: see choose_blocks. Tiles (largest_px, is_full: whether all pixels have light) whose largest diameter does not exceed
     limits[0] are not looked at but taken as in focus.
@@ -90,11 +89,11 @@ def choose_blocks(
     kept: np.ndarray,
     work: np.ndarray,
 ) -> None:
-    """Some rows of tiles: the share of each block's light that is halved, its product with the diameter, and what is left.
+    """Set for some rows of tiles the share of each block's light that is halved, its product with the diameter, and what is left.
 
-    limits: (from_px, to_px, tolerance); the share rises from 0 at from_px to 1 at to_px, where diameters around the block differ
-    by at most tolerance. largest_px (tiles): what it was, and then of pixels that are not halved wholly; kept: whether there are
-    any. work (2, columns of blocks + 2) is scratch space.
+    limits: (from_px, to_px, tolerance); the share rises from 0 at from_px to 1 at to_px, where diameters around the block differ by at
+    most tolerance. largest_px (tiles) is lowered to that of pixels that are not halved wholly; kept: whether there are any. work (2,
+    columns of blocks + 2) is scratch space.
     """
     rows, columns = lowest.shape
     work[0], work[1] = np.inf, -np.inf
@@ -152,7 +151,7 @@ ONE, SIX = np.float32(1.0), np.float32(6.0)
 def halve_rows(
     values: np.ndarray, highlights: np.ndarray, share: np.ndarray, rows: tuple[int, int], line: np.ndarray, half: np.ndarray
 ) -> None:
-    """Some rows of cells, half (rows, 4 cells): the light that is halved. values (H, 4 W); line (4 W + 24) is scratch space."""
+    """Set some rows of cells, half (rows, 4 cells), to the light that is halved. values (H, 4 W); line (4 W + 24) is scratch space."""
     for row in range(rows[0], rows[1]):
         line[:] = 0.0
         for k in range(4):
@@ -170,7 +169,7 @@ def halve_rows(
 
 @compiled
 def _add_row_taken(line: np.ndarray, values: np.ndarray, share: np.ndarray, weight: float) -> None:
-    """Blocks of one share together."""
+    """Add the light taken from a row, blocks of one share together."""
     start = 0
     for block in range(1, share.shape[0] + 1):
         if block == share.shape[0] or share[block] != share[start]:
@@ -187,7 +186,7 @@ def _add_taken(line: np.ndarray, values: np.ndarray, weight: float) -> None:
 
 @compiled
 def _give_back(line: np.ndarray, values: np.ndarray, highlights: np.ndarray, weight: float, of_blocks: np.ndarray) -> None:
-    """The light of highlights is spread elsewhere."""
+    """Give back the light of highlights, which is splatted elsewhere."""
     for x in range(highlights.shape[0]):
         if highlights[x] > 0:
             for c in range(4):
@@ -196,7 +195,7 @@ def _give_back(line: np.ndarray, values: np.ndarray, highlights: np.ndarray, wei
 
 @compiled
 def halve_diameters(share: np.ndarray, weighted_px: np.ndarray, rows: tuple[int, int], work: np.ndarray, half_coc_px: np.ndarray) -> None:
-    """Some rows of cells: the mean diameter, in cells, of the light they get, as if it were even within a block.
+    """Set for some rows of cells the mean diameter, in cells, of the light they get, as if it were even within a block.
 
     work (2, cells + 2) is scratch space.
     """

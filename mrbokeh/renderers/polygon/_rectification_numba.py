@@ -1,20 +1,10 @@
-"""Compiled parts of kernel rectification: the cheapest closed walks from line to line around an outline.
-
-starts, targets, areas: the arcs, line after line, as `mrbokeh.renderers.polygon._rectification_numba.corners` gives them.
-
-Compiled: whether a closed outline (V, 2) of unit size crosses itself, and how far points lie from it.
-
-Compiled parts of kernel rectification: lines of given directions that touch an outline from outside.
+"""Compiled kernel rectification: lines that touch an outline, the pockets at their corners, and the cheapest walks around it.
 
 Outlines here are closed, (V, 2), of unit size, do not cross themselves and turn with positive area, so that the inside
 lies to the left of every edge. A line is a row (x, y, dx, dy, forward, backward) of `lines`: a vertex that it touches,
 its unit direction with the outline to the left, and how far it runs from the vertex, either way, before it enters the
-outline. The matching row of `places` is (index of the vertex, kind).
-
-Compiled parts of kernel rectification: the pockets between an outline and the corners that touching lines make.
-
-Outlines, `lines` and `places` are those of `polygon._rectification_lines_numba`. swept: (V + 1,) twice the area swept from the origin
-along the outline up to each vertex, and once around.
+outline. The matching row of `places` is (index of the vertex, kind). swept: (V + 1,) twice the area swept from the origin
+along the outline up to each vertex, and once around. starts, targets, areas: the arcs of walks, line after line, as `corners` gives them.
 """
 
 import math
@@ -29,7 +19,9 @@ ALIKE = 1e-12
 
 @njit(cache=True)
 def _still_to_pay(period: int, origins: np.ndarray, starts: np.ndarray, targets: np.ndarray, areas: np.ndarray, most: int) -> np.ndarray:
-    """(most + 1, 2 period): the least that a walk costs from each line to the image of any origin, with at most so many more lines."""
+    """Return Return (most + 1, 2 period): the least that a walk costs from each line to the image of any origin, with at most so many more
+    lines.
+    """
     least = np.full((most + 1, 2 * period), np.inf)
     for origin in origins:
         least[:, origin + period] = 0.0
@@ -47,7 +39,7 @@ def _still_to_pay(period: int, origins: np.ndarray, starts: np.ndarray, targets:
 
 @njit(cache=True)
 def cheapest_turn(period: int, origins: np.ndarray, starts: np.ndarray, targets: np.ndarray, areas: np.ndarray, most: int) -> np.ndarray:
-    """The lines of the cheapest walk from one of `origins` to its image one period later, of at most `most` lines; empty if none.
+    """Return the lines of the cheapest walk from one of `origins` to its image one period later, of at most `most` lines; empty if none.
 
     Lines 0..period-1 are one period of the outline, period..2 period-1 the next. Walks that cannot become cheaper than the
     best one so far, even if they might end at any origin, are given up; that leaves little to do after the first origin.
@@ -82,7 +74,7 @@ def cheapest_turn(period: int, origins: np.ndarray, starts: np.ndarray, targets:
 def cheapest_sector(
     first: np.ndarray, last: np.ndarray, starts: np.ndarray, targets: np.ndarray, areas: np.ndarray, most: int
 ) -> np.ndarray:
-    """The lines of the cheapest walk from one mirror axis to the next; empty if none has at most `most` lines with its mirror image.
+    """Return the lines of the cheapest walk from one mirror axis to the next; empty if none has at most `most` lines with its mirror image.
 
     first, last: (lines, 2), what a line costs as the first or last one where it makes a corner with its own image on the axis
     (column 0) or is its own image (column 1); inf where it cannot.
@@ -137,7 +129,7 @@ def cross(ax: float, ay: float, bx: float, by: float) -> float:
 
 @njit(cache=True)
 def crosses_itself(outline: np.ndarray) -> bool:
-    """Whether two edges that are no neighbours cross or overlap by more than rounding."""
+    """Return whether two edges that are no neighbours cross or overlap by more than rounding."""
     count = outline.shape[0]
     for i in range(count):
         a, b = outline[i], outline[(i + 1) % count]
@@ -152,7 +144,7 @@ def crosses_itself(outline: np.ndarray) -> bool:
 
 @njit(cache=True)
 def _side(a: np.ndarray, b: np.ndarray, point: np.ndarray) -> float:
-    """Distance of a point to the left of the line from a to b; 0 where it is within rounding of the line."""
+    """Return the distance of a point to the left of the line from a to b; 0 where it is within rounding of the line."""
     x, y = b[0] - a[0], b[1] - a[1]
     distance = cross(x, y, point[0] - a[0], point[1] - a[1]) / math.hypot(x, y)
     return 0.0 if abs(distance) < SLACK else distance
@@ -160,7 +152,9 @@ def _side(a: np.ndarray, b: np.ndarray, point: np.ndarray) -> float:
 
 @njit(cache=True)
 def farthest_from_outline(points: np.ndarray, outline: np.ndarray, side: int) -> float:
-    """The largest distance of a point from the closed outline, among all points (side 0), those outside (1) or those inside (-1)."""
+    """Return the largest distance of a point from the closed outline, among all points (side 0), those outside (1) or those inside
+    (-1).
+    """
     farthest, count = 0.0, outline.shape[0]
     for i in range(points.shape[0]):
         x, y = points[i]
@@ -191,7 +185,7 @@ FLAT = 1e-11
 
 @njit(cache=True)
 def _kind(inwards: np.ndarray, outwards: np.ndarray, dx: float, dy: float) -> int:
-    """How a line of direction (dx, dy) touches the vertex between two unit edges, or -1 if it enters the outline."""
+    """Return how a line of direction (dx, dy) touches the vertex between two unit edges, or -1 if it enters the outline."""
     turn = cross(inwards[0], inwards[1], outwards[0], outwards[1])
     from_in = cross(inwards[0], inwards[1], dx, dy)
     to_out = cross(dx, dy, outwards[0], outwards[1])
@@ -207,7 +201,7 @@ def _kind(inwards: np.ndarray, outwards: np.ndarray, dx: float, dy: float) -> in
 
 @njit(cache=True)
 def _reach(outline: np.ndarray, vertex: int, dx: float, dy: float, sense: float) -> float:
-    """How far the line through a vertex runs, ahead (sense 1) or back (-1), until it meets an edge that is not the vertex's own."""
+    """Return how far the line through a vertex runs, ahead (sense 1) or back (-1), until it meets an edge that is not the vertex's own."""
     count = outline.shape[0]
     x, y = outline[vertex, 0] + ASIDE * dy, outline[vertex, 1] - ASIDE * dx
     before = (vertex - 1) % count
@@ -230,9 +224,10 @@ def _reach(outline: np.ndarray, vertex: int, dx: float, dy: float, sense: float)
 
 @njit(cache=True)
 def touching_lines(outline: np.ndarray, first: int, last: int, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(lines, places) of all lines along `directions` (unit, both senses) that touch the vertices first..last from outside.
+    """Return Return (lines, places) of all lines along `directions` (unit, both senses) that touch the vertices first..last from outside.
 
-    Ordered along the outline; at a vertex that points outwards by direction, at one that points inwards arriving lines first."""
+    Ordered along the outline; at a vertex that points outwards by direction, at one that points inwards arriving lines first.
+    """
     count, most = outline.shape[0], (last - first + 1) * directions.shape[0]
     lines, places, size = np.empty((most, 6)), np.empty((most, 2), np.int64), 0
     order = np.empty(directions.shape[0])
@@ -260,7 +255,7 @@ def touching_lines(outline: np.ndarray, first: int, last: int, directions: np.nd
 
 @njit(cache=True)
 def _chain(swept: np.ndarray, start: int, stop: int) -> float:
-    """Twice the signed area swept from the origin along the outline from place `start` to `stop` (places count on past a turn)."""
+    """Return twice the signed area swept from the origin along the outline from place `start` to `stop` (places count on past a turn)."""
     count = swept.shape[0] - 1
     turns = stop // count - start // count
     return swept[stop % count] - swept[start % count] + turns * swept[count]
@@ -268,7 +263,7 @@ def _chain(swept: np.ndarray, start: int, stop: int) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _ahead(x: float, y: float, adx: float, ady: float, reach: float, bdx: float, bdy: float, reach_back: float) -> float:
-    """How far a line of direction a runs to where it crosses one of direction b through the point (x, y) from its own; -1 if it does
+    """Return how far a line of direction a runs to where it crosses one of direction b through the point (x, y) from its own; -1 if it does
     not, or beyond the reach of either. The hot spot, thus numbers and not arrays.
     """
     turn = cross(adx, ady, bdx, bdy)
@@ -283,7 +278,7 @@ def _ahead(x: float, y: float, adx: float, ady: float, reach: float, bdx: float,
 
 @njit(cache=True)
 def _area_or_inf(a: np.ndarray, place_a: int, x: float, y: float, b: np.ndarray, place_b: int, swept: np.ndarray) -> float:
-    """The area between the outline and two lines that meet in (x, y); inf where they go around the outline the wrong way."""
+    """Return the area between the outline and two lines that meet in (x, y); inf where they go around the outline the wrong way."""
     swept_by_lines = cross(a[0], a[1], x, y) + cross(x, y, b[0], b[1])
     area = 0.5 * (swept_by_lines - _chain(swept, place_a, place_b))
     return max(area, 0.0) if area > -SLACK else np.inf
@@ -291,7 +286,7 @@ def _area_or_inf(a: np.ndarray, place_a: int, x: float, y: float, b: np.ndarray,
 
 @njit(cache=True)
 def _pocket(a: np.ndarray, place_a: np.ndarray, b: np.ndarray, place_b: np.ndarray, swept: np.ndarray) -> float:
-    """Area between the outline and the corner where line a is left for line b; inf if they make no corner outside."""
+    """Return the area between the outline and the corner where line a is left for line b; inf if they make no corner outside."""
     if place_a[0] == place_b[0]:
         turn = cross(a[2], a[3], b[2], b[3])
         outwards = place_a[1] == THROUGH and place_b[1] == THROUGH and turn > FLAT
@@ -305,7 +300,9 @@ def _pocket(a: np.ndarray, place_a: np.ndarray, b: np.ndarray, place_b: np.ndarr
 
 @njit(cache=True)
 def corners(lines: np.ndarray, places: np.ndarray, sources: int, span: int, swept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(starts, targets, areas): for each of the first `sources` lines, all later lines within `span` places that it makes a corner with."""
+    """Return Return (starts, targets, areas): for each of the first `sources` lines, all later lines within `span` places that it makes a
+    corner with.
+    """
     total = lines.shape[0]
     starts = np.zeros(sources + 1, np.int64)
     room = max(64, 8 * total)
@@ -336,8 +333,8 @@ def corners(lines: np.ndarray, places: np.ndarray, sources: int, span: int, swep
 
 @njit(cache=True)
 def axis_corners(a: np.ndarray, a_places: np.ndarray, b: np.ndarray, b_places: np.ndarray, swept: np.ndarray) -> np.ndarray:
-    """(lines, 2): half the pocket of each line of a with the same line of b, its mirror image beyond the axis: where both make a
-    corner (column 0), or are one line across the axis (column 1); inf where they do not.
+    """Return Return (lines, 2): half the pocket of each line of a with the same line of b, its mirror image beyond the axis: where
+    both make a corner (column 0), or are one line across the axis (column 1); inf where they do not.
     """
     areas = np.full((a.shape[0], 2), np.inf)
     for i in range(a.shape[0]):

@@ -1,9 +1,7 @@
-"""The working memory of polygon_differences: a ring of rows of several planes, four channels to a cell.
+"""Working memory of polygonal differences: a ring of rows of several planes, four channels to a cell, and an aperture's corners in it.
 
-One plane of impulses for each pair of directions that meets in a corner, and, last, one plane of light that needs no sums
+There is one plane of impulses for each pair of directions that meets in a corner, and, last, one plane of light that needs no sums
 (in focus, small kernels, highlights).
-
-Corners of an aperture as places in the ring of polygon_differences.
 """
 
 from typing import NamedTuple
@@ -56,7 +54,7 @@ compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract
 
 
 class Corners(NamedTuple):
-    """mrbokeh.renderers.polygon.directional_differences.PolygonCorners laid out for one ring: steps and places count array elements.
+    """PolygonCorners (mrbokeh.renderers.polygon.directional_differences) laid out for one ring: steps and places count array elements.
 
     Crossings of a corner that are neighbours in a row are added to together, so corners come in three kinds: up to `level`
     crossings 0 and 1 are neighbours and so are 2 and 3, up to `steep` 1 and 2 are, and of the rest none. place (corners, 4):
@@ -86,7 +84,7 @@ class Corners(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Which planes feed which direction, and what of each sum goes to the picture; index arrays end with the total."""
+    """Planes that feed each direction, and the profile by which each sum goes to the picture; index arrays end with the total."""
 
     step_x: np.ndarray
     step_y: np.ndarray
@@ -127,7 +125,7 @@ class Exact(NamedTuple):
 
 
 class Ring(NamedTuple):
-    """planes: flat, light plane last. Row r of the ring proper starts at (ALIASED_ROWS + r) * stride cells.
+    """Ring of rows. Ring of rows. planes: flat, light plane last. Row r of the ring proper starts at (ALIASED_ROWS + r) * stride cells.
 
     Column x of the picture is cell x - left + margin of a row.
     """
@@ -167,9 +165,10 @@ class Scratch(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """values (H, W, 4) and coc_px (H, W) float32; share (H, W) of highlights, halved (blocks of 2 x 2) that is spread at half the
-    resolution, each empty if there is none; nonnegative: channels without values below 0; largest_px: of pixels with light, of
-    each tile."""
+    """Picture of four channels: values (H, W, 4) and coc_px (H, W) float32; share (H, W) of highlights, halved (blocks of 2 x 2) that
+    is blurred at half the resolution, each empty if there is none; nonnegative: channels without values below 0; largest_px: of
+    pixels with light, of each tile.
+    """
 
     values: np.ndarray
     coc_px: np.ndarray
@@ -180,7 +179,7 @@ class Picture(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Where the light of a band of rows top..bottom goes: out (H, 4 W), and above and below (rows, 4 W) what leaves the band."""
+    """Target of the light of a band of rows top..bottom: out (H, 4 W); above and below (rows, 4 W) take the light that leaves the band."""
 
     out: np.ndarray
     above: np.ndarray

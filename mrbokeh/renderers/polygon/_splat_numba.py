@@ -1,8 +1,7 @@
-"""Pixels into the ring as impulses at the corners of their kernels.
+"""Compiled splatting of polygonal differences: pixels of a piece of a row, sorted by how they go into the ring.
 
-Pixels into the ring whose kernels need no sums: in focus, small kernels, and highlights.
-
-A piece of a row: its pixels sorted by how they are splatted.
+Blurred pixels become impulses at the corners of their kernels. Pixels in focus, small kernels and highlights need no sums and are
+splatted whole.
 """
 
 import math
@@ -29,14 +28,14 @@ from mrbokeh.renderers.polygon._survey_numba import TILE_PX
 
 @compiled
 def _cell(ring: Ring, row: int, x: int) -> int:
-    """Where a plane holds column x of a row, which may lie before or after the ring proper."""
+    """Return the place in a plane of column x of a row, which may lie before or after the ring proper."""
     around = ring.rows if row < 0 else (-ring.rows if row >= ring.rows else 0)
     return ((ALIASED_ROWS + row + around) * ring.stride + x - ring.left + ring.margin) * 4
 
 
 @compiled
 def keep(values: np.ndarray, ring: Ring, row: int, y: int, x: int) -> None:
-    """A pixel in focus."""
+    """Add a pixel in focus."""
     cell = ring.light_plane * ring.plane_elements + _cell(ring, row, x)
     for c in range(4):
         ring.planes[cell + c] += values[y, x, c]
@@ -44,7 +43,7 @@ def keep(values: np.ndarray, ring: Ring, row: int, y: int, x: int) -> None:
 
 @compiled
 def splat_small(values: np.ndarray, coc_px: np.ndarray, exact: Exact, ring: Ring, scratch: Scratch, row: int, y: int, count: int) -> None:
-    """The pixels of row y that scratch.small names, each the share of its light in scratch.small_share, by whole kernels."""
+    """Splat the pixels of row y that scratch.small names, each the share of its light in scratch.small_share, by whole kernels."""
     plane, flat = ring.light_plane * ring.plane_elements, values.reshape(-1)
     for j in range(scratch.rows.shape[0]):
         scratch.rows[j] = plane + _cell(ring, row + j - exact.radius, 0)
@@ -59,7 +58,7 @@ def splat_small(values: np.ndarray, coc_px: np.ndarray, exact: Exact, ring: Ring
 def _splat_small(
     diameter_px: float, exact: Exact, ring: Ring, rows: np.ndarray, element: int, value: tuple[float, float, float, float]
 ) -> None:
-    """A whole kernel, between the two of the table nearest in diameter."""
+    """Splat a whole kernel, between the two of the table nearest in diameter."""
     at = (abs(diameter_px) - np.float32(1.0)) * np.float32(exact.per_px)
     level = min(int(at), exact.levels - 1)
     upper = at - np.float32(level)
@@ -73,7 +72,7 @@ def _splat_small(
 def splat_exactly(
     values: np.ndarray, diameter_px: float, exact: Exact, ring: Ring, scratch: Scratch, row: int, y: int, x: int, share: float
 ) -> None:
-    """A highlight, by the kernel of the aperture itself at its very diameter."""
+    """Splat a highlight by the kernel of the aperture itself at its very diameter."""
     radius = max(0, int(math.ceil(abs(diameter_px) * 0.5 * exact.unit_radius - 0.5)))
     size = 2 * radius + 1
     kernel, steps = scratch.kernel[0, : size * size].reshape((size, size)), scratch.kernel[1, : size * size].reshape((size, size))
@@ -92,7 +91,7 @@ def splat_exactly(
 def _add_line(
     planes: np.ndarray, cell: int, taps: np.ndarray, start: int, first: int, end: int, value: tuple[float, float, float, float]
 ) -> None:
-    """Taps first..end of a row of a kernel, which begins at taps[start], to the cells from `cell` on."""
+    """Add taps first..end of a row of a kernel, which begins at taps[start], to the cells from `cell` on."""
     even = first + (end - first) // 2 * 2
     for i in range(first, even, 2):
         add_to_two_cells(planes, cell + 4 * i, taps, start + i, value)
@@ -106,7 +105,7 @@ CELLS_OF_LINE = 4
 
 @compiled
 def splat_corners(values: np.ndarray, corners: Corners, ring: Ring, scratch: Scratch, y: int, row: int, count: int) -> None:
-    """The pixels of row y that scratch.element, radius and gain name, into the ring at `row`."""
+    """Splat the pixels of row y that scratch.element, radius and gain name, into the ring at `row`."""
     _prepare(corners, scratch, count)
     _aim(corners, ring, scratch, row, count)
     _splat(values, corners, ring, scratch, y, count)
@@ -114,7 +113,7 @@ def splat_corners(values: np.ndarray, corners: Corners, ring: Ring, scratch: Scr
 
 @compiled
 def _prepare(corners: Corners, scratch: Scratch, count: int) -> None:
-    """Of every pixel and edge the lattice line above it and the share of the next one; then the gain to an exact sum of 1."""
+    """Set for every pixel and edge the lattice line above it and the share of the next one; then the gain to an exact sum of 1."""
     real = scratch.share.dtype.type
     one, area = real(1.0), scratch.gain[CHUNK_PX : 2 * CHUNK_PX]
     of_square, offset_of_area = real(corners.area), real(corners.area_offset)
@@ -136,7 +135,7 @@ def _prepare(corners: Corners, scratch: Scratch, count: int) -> None:
 
 @compiled
 def _aim(corners: Corners, ring: Ring, scratch: Scratch, row: int, count: int) -> None:
-    """Of every pixel and corner the first of the four crossings, as an element of the ring, and the weights of all four."""
+    """Set for every pixel and corner the first of the four crossings, as an element of the ring, and the weights of all four."""
     here = np.int32((row * ring.stride + ring.margin - ring.left) * 4)
     around = np.int32(ring.rows * ring.stride * 4)
     element = ring.planes.dtype.type
@@ -157,7 +156,7 @@ def _aim(corners: Corners, ring: Ring, scratch: Scratch, row: int, count: int) -
 
 @compiled
 def _splat(values: np.ndarray, corners: Corners, ring: Ring, scratch: Scratch, y: int, count: int) -> None:
-    """Every corner's impulse, on the four crossings of its edges' lattice lines."""
+    """Add every corner's impulse to the four crossings of its edges' lattice lines."""
     element, flat = ring.planes.dtype.type, values.reshape(-1)
     first_of_row = y * values.shape[1] * 4
     for start in range(min(APART_PX, count)):
@@ -170,7 +169,7 @@ def _splat(values: np.ndarray, corners: Corners, ring: Ring, scratch: Scratch, y
 
 @compiled
 def _fetch_below(corners: Corners, ring: Ring, scratch: Scratch, i: int) -> None:
-    """Have what the pixel below will need and this one does not: caches do not foresee corners of kernels."""
+    """Prefetch what the pixel below will need and this one does not: caches do not foresee corners of kernels."""
     for corner in range(corners.below.shape[0]):
         fetch(ring.planes, np.int64(scratch.target[np.uint64(corner * CHUNK_PX + i)]) + corners.below[corner])
 
@@ -207,8 +206,9 @@ LINE_PX = 16
 def splat_chunk(
     picture: Picture, corners: Corners, exact: Exact, ring: Ring, scratch: Scratch, y: int, left: int, right: int
 ) -> tuple[float, float]:
-    """Splat pixels left..right of row y; the largest radius that went through the sums and the largest diameter that did not,
-    both 0 if there was none."""
+    """Splat pixels left..right of row y; return the largest radius that went through the sums and the largest diameter that did not, 0
+    if there was none.
+    """
     row = (y + ring.margin) % ring.rows
     halved, most_halved = _halved(picture.halved, y, left, right)
     if halved >= 1.0 and picture.share.shape[0] == 0:
@@ -231,7 +231,7 @@ def splat_chunk(
 
 @compiled
 def _halved(share: np.ndarray, y: int, left: int, right: int) -> tuple[float, float]:
-    """The least and the greatest share of light that is spread at half the resolution."""
+    """Return the least and the greatest share of light that is blurred at half the resolution."""
     if share.shape[0] == 0:
         return 0.0, 0.0
     least, most = np.float32(1.0), np.float32(0.0)
@@ -242,7 +242,7 @@ def _halved(share: np.ndarray, y: int, left: int, right: int) -> tuple[float, fl
 
 @compiled
 def _largest_px(picture: Picture, y: int, left: int, right: int) -> float:
-    """Of all pixels with light in the tiles around."""
+    """Return the largest diameter of all pixels with light in the tiles around."""
     largest = np.float32(0.0)
     for column in range(left // TILE_PX, (right - 1) // TILE_PX + 1):
         largest = max(largest, picture.largest_px[y // TILE_PX, column])
@@ -251,7 +251,7 @@ def _largest_px(picture: Picture, y: int, left: int, right: int) -> float:
 
 @compiled
 def _fetch_next_row(picture: Picture, y: int, left: int, right: int) -> None:
-    """Pieces of rows are too short for the cache to foresee that they go on below."""
+    """Prefetch the row below: pieces of rows are too short for the cache to foresee that they go on there."""
     height, width = picture.coc_px.shape
     if y < height:
         values, coc_px = picture.values.reshape(-1), picture.coc_px.reshape(-1)
@@ -263,7 +263,7 @@ def _fetch_next_row(picture: Picture, y: int, left: int, right: int) -> None:
 
 @compiled
 def _counted(values: np.ndarray, coc_px: np.ndarray, least_px: float, largest_px: float) -> tuple[int, int]:
-    """How many values are not 0, and how many diameters lie between both."""
+    """Return how many values are not 0, and how many diameters lie between both limits."""
     lit, large = np.int32(0), np.int32(0)
     least, most = np.float32(least_px), np.float32(largest_px)
     for i in range(values.shape[0]):
@@ -276,7 +276,7 @@ def _counted(values: np.ndarray, coc_px: np.ndarray, least_px: float, largest_px
 
 @compiled
 def _take_all(coc_px: np.ndarray, growth: float, left: int, scratch: Scratch) -> None:
-    """All pixels go through the sums; those without light add nothing."""
+    """Send all pixels through the sums; those without light add nothing."""
     real = scratch.radius.dtype.type
     quarter, growth = real(0.25), real(growth)
     for i in range(coc_px.shape[0]):
@@ -289,7 +289,7 @@ def _take_all(coc_px: np.ndarray, growth: float, left: int, scratch: Scratch) ->
 
 @compiled
 def _leave_out(halved: np.ndarray, count: int, scratch: Scratch) -> int:
-    """Take away what is spread at half the resolution; how many pixels are left."""
+    """Take away what is blurred at half the resolution, and return how many pixels are left."""
     left = 0
     for i in range(count):
         share = halved[scratch.element[i] >> 3]
@@ -304,7 +304,9 @@ def _leave_out(halved: np.ndarray, count: int, scratch: Scratch) -> int:
 def _sorted(
     picture: Picture, corners: Corners, exact: Exact, ring: Ring, scratch: Scratch, y: int, row: int, left: int, right: int
 ) -> tuple[int, float, float]:
-    """Splat whole what need not go through the sums; how many pixels do, their largest radius, the largest diameter of the rest."""
+    """Splat whole the pixels that need no sums; return how many go through the sums, their largest radius, and the largest diameter of
+    the rest.
+    """
     values, coc_px = picture.values, picture.coc_px
     count, small, largest, whole = 0, 0, 0.0, np.float32(0.0)
     per_share = 1.0 / (exact.to_px - exact.from_px)

@@ -1,8 +1,6 @@
-"""What polygon_differences must know of a picture before it is spread: where light is, how strong, and which pixels are highlights.
+"""Compiled survey of a picture before it is blurred: where light is, how strong, how it varies over tiles, and which pixels are highlights.
 
-What polygon_differences must know of the tiles of a picture, once its pixels are surveyed: which hold light, and how it varies.
-
-So little work that other threads need not be let in meanwhile, as nogil would: to get back among them takes longer.
+Loops over tiles do so little work that releasing the GIL (nogil) would cost more than it saves.
 """
 
 import numpy as np
@@ -31,7 +29,7 @@ def survey(
     is_full: np.ndarray,
     work: np.ndarray,
 ) -> None:
-    """Some rows of tiles: absolute sums and peaks (tiles, C), largest visible diameter and whether all pixels are visible (tiles),
+    """Set for some rows of tiles: absolute sums and peaks (tiles, C), largest visible diameter and whether all pixels are visible (tiles),
     least values (rows of tiles, C).
 
     values (H, W C); work (5, W C) is scratch space. A visible pixel without a finite diameter makes largest infinite.
@@ -83,7 +81,7 @@ def _gather(
     least: np.ndarray,
     is_full: np.ndarray,
 ) -> None:
-    """From columns of pixels to columns of tiles. of_pixels: largest diameters and least light."""
+    """Gather columns of pixels into columns of tiles. of_pixels: largest diameters and least light."""
     for x in range(of_pixels.shape[1]):
         column = (left + x) // TILE_PX
         largest[column] = max(largest[column], of_pixels[0, x])
@@ -137,7 +135,7 @@ def _raise_diameters(line: np.ndarray, coc_px: np.ndarray, channels: int, larges
 def find_highlights(
     values: np.ndarray, coc_px: np.ndarray, suspects: np.ndarray, integral: np.ndarray, from_px: float, share: np.ndarray
 ) -> bool:
-    """Set share (H, W) of the pixels in suspect tiles (row, column): how much of each is spread by its exact kernel.
+    """Set share (H, W) of the pixels in suspect tiles (row, column): how much of each is splatted by its exact kernel.
 
     A pixel's window is the square of four radii around it. integral (tile rows + 1, tile columns + 1, C): of the sums.
     Only smooth functions of what lies in the window count, so that nothing pops and moved pictures give moved results.
@@ -160,7 +158,7 @@ def find_highlights(
 
 @compiled
 def _share_of_window(values: np.ndarray, integral: np.ndarray, y: int, x: int, c: int, reach: int) -> float:
-    """Of all light within `reach` the share that one pixel gives; 0 where it is certainly too little to count."""
+    """Return the share that one pixel gives of all light within `reach`; 0 if it is certainly too little to count."""
     height, width, _ = values.shape
     top, bottom, left, right = max(0, y - reach), min(height, y + reach + 1), max(0, x - reach), min(width, x + reach + 1)
     value = abs(values[y, x, c])
@@ -185,7 +183,7 @@ _compiled_holding = njit(cache=True, error_model="numpy", _nrt=False)
 def look_over(
     sums: np.ndarray, peaks: np.ndarray, largest_px: np.ndarray, occupied: np.ndarray, darkest: np.ndarray, strongest: np.ndarray
 ) -> tuple[int, int, int, float, float]:
-    """How many tiles hold light, the first row of them and the end, the largest diameter, and the contrast: the strongest value of
+    """Return how many tiles hold light, the first row of them and the end, the largest diameter, and the contrast: the strongest value of
     a channel over the mean of its darkest tile that is not empty, the worst of all channels.
 
     sums, peaks (tiles, C), largest_px (tiles); sets occupied (tiles). darkest, strongest (C,) are scratch space.
@@ -211,7 +209,7 @@ def look_over(
 
 @_compiled_holding
 def find_suspects(sums: np.ndarray, peaks: np.ndarray, largest_px: np.ndarray, from_px: float, suspects: np.ndarray) -> int:
-    """Set suspects (N, 2) to the tiles (row, column) that may hold a highlight blurred by more than from_px; how many there are."""
+    """Set suspects (N, 2) to the tiles (row, column) that may hold a highlight blurred by more than from_px, and return their number."""
     count, least = 0, np.float32(HIGHLIGHT)
     for row in range(sums.shape[0]):
         for column in range(sums.shape[1]):
@@ -239,9 +237,9 @@ def integrate(sums: np.ndarray, integral: np.ndarray) -> None:
 
 @_compiled_holding
 def find_parts(occupied: np.ndarray, rows: tuple[int, int], width: int, step: int, margin: int, parts: np.ndarray) -> int:
-    """Set parts (N, 4) to the first and end row, first and end column, in pixels, of what holds light; how many there are.
+    """Set parts (N, 4) to the first and end row, first and end column, in pixels, of what holds light, and return their number.
 
-    occupied: tiles. rows: first and end. Each column of `step` pixels is cut where nothing is for more than two margins.
+    occupied: tiles. rows: first and end. Each column of `step` pixels is cut where it is dark for more than two margins.
     """
     count = 0
     for start in range(0, width, step):

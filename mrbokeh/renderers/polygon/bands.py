@@ -1,7 +1,4 @@
-"""The pieces of work of polygon_differences, and the threads that work through them.
-
-The working memory of polygon_differences, and the corners of an aperture as places in it.
-"""
+"""Bands: the pieces of work of polygonal differences, the threads that run them, and the working memory of each thread."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -21,7 +18,7 @@ from mrbokeh.system.resources import ZeroedMemory
 
 
 def ring_of(tables: ApertureTables, margin: int, width: int, planes: np.ndarray) -> Ring:
-    """A ring for parts of a picture of at most this width, in `planes`: at least `ring_elements` zeros."""
+    """Return a ring for parts of a picture of at most this width, in `planes`: at least `ring_elements` zeros."""
     rows, stride = 2 * margin + BLOCK_ROWS, width + 2 * margin
     return Ring(planes, (rows + 2 * ALIASED_ROWS) * stride * 4, len(tables.planes), rows, stride, margin, 0)
 
@@ -31,7 +28,7 @@ def ring_elements(tables: ApertureTables, margin: int, width: int) -> int:
 
 
 def laid_out(tables: ApertureTables, ring: Ring) -> Corners:
-    """The corners with steps and places for this ring."""
+    """Return the corners with steps and places for this ring."""
     crossed, count = tables.crossed, len(tables.crossed.plane)
     step, place, plane, below = (np.empty(shape, np.int64) for shape in ((count, 2), (count, 4), count, count))
     lay_out(crossed.steps, crossed.places, crossed.turned, crossed.plane, (ring.stride, ring.plane_elements), (step, place, plane, below))
@@ -75,7 +72,7 @@ _LEAST_ROWS = 64
 
 @dataclass(frozen=True)
 class Band:
-    """Rows top..bottom of a picture: parts of equal width of it that hold light, each first row, end row, left, right."""
+    """Rows top..bottom of a picture, and its parts of equal width that hold light, each first row, end row, left, right."""
 
     top: int
     bottom: int
@@ -101,7 +98,7 @@ def _part_width(width: int, margin: int, bytes_per_cell: int) -> int:
 def parts_of(
     occupied: Bool[np.ndarray, "rows columns"], top: int, bottom: int, width: int, step: int, margin: int
 ) -> Int64[np.ndarray, "parts 4"]:
-    """Column by column, `step` px wide, and within one apart where light of one does not reach that of the other."""
+    """Return parts column by column, `step` px wide; within a column parts are separate if light of one does not reach the other."""
     first, end = top // TILE_PX, -(-bottom // TILE_PX)
     parts = np.empty((-(-width // step) * (end - first), 4), np.int64)
     return parts[: find_parts(occupied, (top, bottom), width, step, margin, parts)]
@@ -109,7 +106,7 @@ def parts_of(
 
 @dataclass(frozen=True)
 class BandRunner:
-    """What all pictures of a call have in common. halve_from_px: see mrbokeh.renderers.polygon.surveyed_light; inf for never."""
+    """Runner of the bands of all pictures of a call. halve_from_px: see mrbokeh.renderers.polygon.surveyed_light; inf for never."""
 
     tables: ApertureTables
     dtype: type
@@ -119,7 +116,9 @@ class BandRunner:
     halve_from_px: float
 
     def sum_resolutions(self, light: SurveyedLight, highlights: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "height width 4"]:
-        """A picture of four channels, the blurriest parts at half the resolution, and of those the blurriest at half of that."""
+        """Sum the kernels of a picture of four channels, the blurriest parts at half the resolution, and of those the blurriest at
+        half of that.
+        """
         halves = halves_of(light, highlights, self.halve_from_px, self.pool)
         half = np.zeros((0, 0), np.float32)
         if halves.half is not None:
@@ -134,7 +133,7 @@ class BandRunner:
         halved: Float32[np.ndarray, "_ _"],
         half: Float32[np.ndarray, "_ _"],
     ) -> Float32[np.ndarray, "height width 4"]:
-        """Bands one by one, by as many threads as there are; what light leaves its band is added in the order of the bands."""
+        """Sum bands one by one, by as many threads as there are; light that leaves its band is added in the order of the bands."""
         out = np.zeros(light.values.shape, np.float32)
         flat, nonnegative = out.reshape(len(out), -1), light.least >= 0.0
         bands, margin = [], 0

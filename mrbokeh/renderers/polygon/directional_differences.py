@@ -37,7 +37,7 @@ _PARALLEL = 1e-6
 
 
 def downwards(direction: Direction) -> Direction:
-    """The sense of a direction that the running sums follow: down, or to the right if level; without common factors."""
+    """Return the sense of a direction that the running sums follow: down, or to the right if level; without common factors."""
     dx, dy = direction
     divisor = gcd(dx, dy)
     if divisor == 0:
@@ -47,7 +47,7 @@ def downwards(direction: Direction) -> Direction:
 
 
 def edge_profile(direction: Direction, binary: bool = False) -> Taps:
-    """{(x, y): weight}: the downward difference of the area below one step of an edge from the lattice point (0, 0).
+    """Return Return {(x, y): weight}: the downward difference of the area below one step of an edge from the lattice point (0, 0).
 
     binary: a pixel belongs to the area if its centre does, as in the paper; otherwise by the share of its area. An upright
     edge has none. Weights of a column sum to 1; the number of columns is the run of the direction.
@@ -68,7 +68,7 @@ def edge_profile(direction: Direction, binary: bool = False) -> Taps:
 
 
 def _mean_ramp(y: float | int, high: float, low: float) -> float:
-    """Mean of max(0, y - t) for t spread evenly over [high, low]."""
+    """Return the mean of max(0, y - t) for t spread evenly over [high, low]."""
     if y <= high:
         return 0.0
     return y - 0.5 * (high + low) if y >= low else (y - high) ** 2 / (2.0 * (low - high))
@@ -115,18 +115,18 @@ class PolygonCorners:
 
     @property
     def origin(self) -> Float64[np.ndarray, " edges"]:
-        """What det(direction, .) adds for the centre of a pixel over its top left corner."""
+        """Increment of det(direction, .) from a pixel's top left corner to its centre."""
         return np.array([0.5 * (dx - dy) for dx, dy in self.direction])
 
     @property
     def growth(self) -> float:
-        """What to add to r^2 so that the area is right on average over the places of edges between lattice lines."""
+        """Amount to add to r^2 so that the area is right on average over the places of edges between lattice lines."""
         return -(self.area[1] + self.curvature.sum() / 6.0) / self.area[0]
 
 
 @dataclass(frozen=True)
 class _Outline:
-    """One polygon: the step of every edge in walking order, the offset of its line at radius 1, and what it is made of."""
+    """Polygon as a walk: the step of every edge in order, the offset of its line at radius 1, and whether the edge was inserted."""
 
     steps: tuple[Direction, ...]
     slope: Float64[np.ndarray, " edges"]
@@ -155,7 +155,7 @@ class _Outline:
 
     @property
     def shift(self) -> Float64[np.ndarray, " edges"]:
-        """How far to move inserted edges in so that each gets BLUNTED steps long."""
+        """Distances to move inserted edges in so that each gets BLUNTED steps long."""
         shift = np.zeros(len(self.steps))
         inserted = np.array(self.inserted)
         if inserted.any():
@@ -164,7 +164,7 @@ class _Outline:
 
 
 def polygon_corners(aperture: Aperture, directions: Sequence[Direction]) -> PolygonCorners:
-    """Edges and corners of an aperture whose edges all run along `directions` (see mrbokeh.renderers.polygon.rectification)."""
+    """Return edges and corners of an aperture whose edges all run along `directions` (see mrbokeh.renderers.polygon.rectification)."""
     known = sorted({downwards(direction) for direction in directions})
     edges: list[Direction] = []
     slopes, shifts, curvatures, weights = [], [], [], []
@@ -192,7 +192,7 @@ def polygon_corners(aperture: Aperture, directions: Sequence[Direction]) -> Poly
 
 
 def _walk(outline: Float64[np.ndarray, "_ 2"], known: Sequence[Direction]) -> list[tuple[Direction, tuple[float, float]]]:
-    """(step, where it starts) of every edge; edges that go straight on are one."""
+    """Return (step, start) of every edge; edges that go straight on are one."""
     walk: list[tuple[Direction, tuple[float, float]]] = []
     extent = float(np.ptp(outline, axis=0).max())
     for here, there in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -214,7 +214,7 @@ def _step_along(edge: Float64[np.ndarray, "2"], known: Sequence[Direction]) -> D
 
 
 def _with_turns(walk: Sequence[tuple[Direction, tuple[float, float]]]) -> _Outline:
-    """With edges of length zero where two neighbours do not span the lattice, so that afterwards all do."""
+    """Insert edges of length zero where two neighbours do not span the lattice, so that afterwards all do."""
     steps, slopes, inserted = [], [], []
     for (previous, _), (step, point) in zip((walk[-1], *walk[:-1]), walk, strict=True):
         while abs(_det(previous, step)) != 1:
@@ -229,7 +229,7 @@ def _with_turns(walk: Sequence[tuple[Direction, tuple[float, float]]]) -> _Outli
 
 
 def _next_turn(previous: Direction, step: Direction) -> Direction:
-    """The step between both that spans the lattice with `previous` and is nearest to `step`."""
+    """Return the step between both that spans the lattice with `previous` and is nearest to `step`."""
     turn = 1 if _det(previous, step) >= 0 else -1
     reach = max(map(abs, (*previous, *step)))
     between = [

@@ -1,8 +1,6 @@
-"""Closed outlines as points (V, 2) in float64: their area, centre, superfluous vertices, and the corners of lines.
+"""Closed outlines as points (V, 2) in float64: area, centre, corners of lines, and the symmetry that they share with a grid of pixels.
 
-Areas are positive where x turns towards y.
-
-The symmetry that an outline shares with a grid of pixels, and outlines unfolded from one of its sectors.
+Areas are positive where x turns towards y. A symmetric outline is unfolded from one of its sectors.
 """
 
 from collections.abc import Iterator
@@ -18,13 +16,13 @@ Outline = Float64[np.ndarray, "_ 2"]
 
 
 def area(outline: Outline) -> float:
-    """Signed area: positive where x turns towards y."""
+    """Return the signed area: positive where x turns towards y."""
     x, y = (outline - outline[0]).T
     return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
 
 
 def centroid(outline: Outline) -> Float64[np.ndarray, "2"]:
-    """The centre of the enclosed area."""
+    """Return the centre of the enclosed area."""
     points = outline - outline[0]
     following = np.roll(points, -1, axis=0)
     swept = points[:, 0] * following[:, 1] - following[:, 0] * points[:, 1]
@@ -32,7 +30,7 @@ def centroid(outline: Outline) -> Float64[np.ndarray, "2"]:
 
 
 def without_flat_vertices(outline: Outline) -> Outline:
-    """The outline without repeated vertices and those within rounding of the line between their neighbours."""
+    """Return the outline without repeated vertices and those within rounding of the line between their neighbours."""
     extent = np.ptp(outline, axis=0).max()
     for _ in range(2):
         outline = outline[np.hypot(*(outline - np.roll(outline, 1, axis=0)).T) > EXACT * extent]
@@ -44,7 +42,7 @@ def without_flat_vertices(outline: Outline) -> Outline:
 
 
 def corner_points(lines: np.ndarray, outwards: float) -> Outline:
-    """The polygon of lines (x, y, dx, dy) in their order, all moved `outwards`, to the right of their directions."""
+    """Return the polygon of lines (x, y, dx, dy) in their order, all moved `outwards`, to the right of their directions."""
     points, along = lines[:, :2] + outwards * lines[:, 3:1:-1] * [1.0, -1.0], lines[:, 2:4]
     offset, following = np.roll(points, -1, axis=0) - points, np.roll(along, -1, axis=0)
     ahead = _cross(offset, following) / _cross(along, following)
@@ -56,7 +54,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def swept_areas(outline: Outline) -> np.ndarray:
-    """(V + 1,) twice the area swept from the origin along the outline up to each vertex, and once around."""
+    """Return Return (V + 1,) twice the area swept from the origin along the outline up to each vertex, and once around."""
     return np.concatenate([[0.0], np.cumsum(_cross(outline, np.roll(outline, -1, axis=0)))])
 
 
@@ -66,7 +64,7 @@ ALIKE = 1e-3
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Turns by 1 / `turns` of a full one and, unless `axis` is None, mirrors: one axis at `axis` times 45 degrees."""
+    """Symmetry by turns of 1 / `turns` of a full one and, unless `axis` is None, mirrors: one axis at `axis` times 45 degrees."""
 
     turns: int
     axis: int | None
@@ -82,12 +80,12 @@ class Symmetry:
 
 
 def mirror_matrix(eighths: int) -> np.ndarray:
-    """Mirror at the axis through the origin at `eighths` times 45 degrees."""
+    """Return the matrix that mirrors at the axis through the origin at `eighths` times 45 degrees."""
     return rotation_matrix(eighths % 4) @ np.diag([1.0, -1.0])
 
 
 def rotation_matrix(quarters: int) -> np.ndarray:
-    """Turn by `quarters` times 90 degrees, x towards y."""
+    """Return the matrix that turns by `quarters` times 90 degrees, x towards y."""
     return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
 
 
@@ -102,7 +100,7 @@ SYMMETRIES = (
 
 @dataclass(frozen=True)
 class Sector:
-    """An exactly symmetric outline, whose vertices 0 to `size` lie in one sector, and what maps that onto the next one or two."""
+    """Exactly symmetric outline whose vertices 0 to `size` lie in one sector, and the matrices that map that onto the next one or two."""
 
     outline: Outline
     size: int
@@ -111,7 +109,7 @@ class Sector:
 
 
 def sectors(shape: Outline, steps: Outline) -> Iterator[Sector]:
-    """The outline unfolded from one sector of every symmetry that it shares with the directions, the largest first."""
+    """Yield the outline unfolded from one sector of every symmetry that it shares with the directions, the largest first."""
     from mrbokeh.renderers.polygon._rectification_numba import farthest_from_outline
 
     def holds(element: np.ndarray) -> bool:
@@ -135,7 +133,7 @@ Unfolded = tuple[Outline, int, tuple[np.ndarray, ...]]
 
 
 def _unfolded_by_turns(shape: Outline, symmetry: Symmetry) -> Unfolded | None:
-    """The outline from vertex 0 to its turned image, repeated."""
+    """Return the outline from vertex 0 to its turned image, repeated."""
     turn = rotation_matrix(4 // symmetry.turns)
     image = turn @ shape[0]
     edges = np.roll(shape, -1, axis=0) - shape
@@ -150,7 +148,7 @@ def _unfolded_by_turns(shape: Outline, symmetry: Symmetry) -> Unfolded | None:
 
 
 def _unfolded_by_mirrors(shape: Outline, symmetry: Symmetry) -> Unfolded | None:
-    """The outline from one mirror axis to the next, mirrored and repeated; None if it does not cross every axis twice."""
+    """Return the outline from one mirror axis to the next, mirrored and repeated; None if it does not cross every axis twice."""
     crossings = [crossing for mirror in symmetry.mirrors for crossing in _crossings(shape, mirror)]
     if len(crossings) != 2 * symmetry.turns:
         return None
@@ -163,7 +161,7 @@ def _unfolded_by_mirrors(shape: Outline, symmetry: Symmetry) -> Unfolded | None:
 
 
 def _crossings(shape: Outline, mirror: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """(place along the outline, point on the axis, mirror) of every vertex on a mirror axis and every edge across it."""
+    """Return Return (place along the outline, point on the axis, mirror) of every vertex on a mirror axis and every edge across it."""
     onto_axis = 0.5 * (np.eye(2) + mirror)
     normal = np.eye(2) - onto_axis
     normal = normal[np.abs(normal).sum(axis=1).argmax()]

@@ -13,7 +13,7 @@ Beyond the paper:
   it. They are used where that is below 1e-4 of the darkest tile, else double precision, which is off by about 1e-10.
   Measured with lights of 1e5 over 0.1: 0.17 of the local signal in single, 2e-7 (the rounding of the result) in double.
 - Small kernels are splatted whole, by the true aperture: below `exact_below_px` they are cheaper and sharper so.
-- What is far out of focus is spread at half the resolution, the blurriest of it at half of that, and so on
+- What is far out of focus is blurred at half the resolution, the blurriest of it at half of that, and so on
   (mrbokeh.renderers.polygon.surveyed_light): such light is smooth, so its kernel's rim may be a cell softer. Centres and light stay.
 - Highlights are splatted whole too: a pixel that gives more than 5 % of the light in the square of four radii around it shows
   its kernel, corners and all, and there can be but few of those. The share spread so rises smoothly from 5 to 10 %.
@@ -60,20 +60,20 @@ picture of 2 megapixels; rounding adds up as the root of their number."""
 
 @dataclass(frozen=True)
 class PolygonDifferences:
-    """A Renderer that spreads light by polygonal differences; layers, slices and hidden background as in mrbokeh.layering.layering.
+    """Renderer that sums kernels by polygonal differences; layers, slices and hidden background as in mrbokeh.layering.layering.
 
     directions, max_edges: of the rectified polygons; an aperture that fits them already is taken as it is.
-    exact_below_px: diameters up to this are splatted whole, those above 7/6 of it through the sums, those between by both.
-      None takes what suits the aperture, 8 to 16 px: the diameter at which its shortest edge is 3/4 of a lattice step.
-    exact_highlights: False also takes highlights through the sums, which is strictly linear (else light scaled as a whole gives
-      the scaled result, but two pictures spread apart add up to their sum only as near as rectified kernels come).
-    halve_from_px: diameters up to this are spread at full resolution, those above 9/8 of it at half of it or less, those between
-      by both; inf for never. Pixels beside others of quite another diameter are never halved, nor is a picture of which less than
-      a quarter is so blurred.
+    exact_below_px: diameters up to this are splatted whole, those above 7/6 of it through the sums, those between by both. None takes what
+      suits the aperture, 8 to 16 px: the diameter at which its shortest edge is 3/4 of a lattice step.
+    exact_highlights: False also takes highlights through the sums, which is strictly linear (else light scaled as a whole gives the scaled
+      result, but two pictures blurred separately add up to their sum only as near as rectified kernels come).
+    halve_from_px: diameters up to this are blurred at full resolution, those above 9/8 of it at half of it or less, those between by both;
+      inf for never. Pixels beside others of quite another diameter are never halved, nor is a picture of which less than a quarter is so
+      blurred.
     precision: of the impulses, "auto" for the choice above; "single" and "double" force it.
     threads: 0 takes all cores. The result does not depend on it, bit for bit.
-    bank: kernels to use instead of the lens's aperture, as polygons fitted to them (what is blurred by up to 1 px stays sharp);
-      apertures: those, if they have been fitted before.
+    bank: kernels to use instead of the lens's aperture, as polygons fitted to them (blur of up to 1 px stays sharp); apertures: those, if
+      they have been fitted before.
     Memory for the rows is kept between calls.
     """
 
@@ -112,7 +112,7 @@ class PolygonDifferences:
     def sum_kernels(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
-        """See mrbokeh.layering.psf_over_field.KernelSum."""
+        """Sum kernels as mrbokeh.layering.psf_over_field.KernelSum says."""
         from mrbokeh.renderers.polygon.bands import BandRunner
         from mrbokeh.renderers.polygon.surveyed_light import NO_HIGHLIGHTS, SurveyedLight
 
@@ -132,7 +132,7 @@ class PolygonDifferences:
         return spreads[0] if values.shape[2] == 4 else np.ascontiguousarray(np.concatenate(spreads, axis=2)[..., : values.shape[2]])
 
     def tables_of(self, aperture: Aperture) -> "ApertureTables":
-        """What is computed once for each aperture and kept as long as it lives."""
+        """Return the tables of an aperture, computed once and kept as long as it lives."""
         from mrbokeh.renderers.polygon.tables import tables_of
 
         tables = self._tables.get(aperture)

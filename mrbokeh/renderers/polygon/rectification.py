@@ -9,11 +9,8 @@ Edges that end on the middle of a slanted edge are left out, as in the paper: th
 
 Beyond the paper: the symmetry that the outline shares with the directions is kept (Section 6.1 leaves this open). The walk
 then covers one sector, from mirror axis to mirror axis or from a line to its turned image, and is unfolded: the smallest
-polygon among those with the same symmetry, not a symmetrised one.
-
-The smallest polygon around an outline, by the cheapest walks over lines that touch it (see `mrbokeh.renderers.polygon.rectification`).
-
-Shapes here are centred, turn with positive area and reach 1 from their middle.
+polygon among those with the same symmetry, not a symmetrised one. For the walks outlines are centred, turn with positive area and
+reach 1 from their middle (`shape`).
 """
 
 from collections.abc import Sequence
@@ -41,7 +38,7 @@ from mrbokeh.system.errors import InputError
 
 
 def smallest_polygon(shape: Outline, steps: Outline, max_edges: int, symmetry_cost: float) -> Outline | None:
-    """The smallest polygon of the largest symmetry that is not too dear; None where nothing closes."""
+    """Return the smallest polygon of the largest symmetry that is not too dear; None where nothing closes."""
     plain = _simple_walk(Sector(shape, len(shape), NO_SYMMETRY, (np.eye(2),)), shape, steps, max_edges)
     if plain is None or symmetry_cost < 0.0:
         return plain
@@ -53,7 +50,7 @@ def smallest_polygon(shape: Outline, steps: Outline, max_edges: int, symmetry_co
 
 
 def _simple_walk(sector: Sector, shape: Outline, steps: Outline, max_edges: int) -> Outline | None:
-    """The smallest polygon around `shape` of the sector's symmetry that does not cross itself.
+    """Return the smallest polygon around `shape` of the sector's symmetry that does not cross itself.
 
     Where two corners on either side of a narrow gap overlap, the smallest walk crosses itself; then fewer edges are tried,
     which closes the gap. Only then the result may fail to be the smallest.
@@ -70,7 +67,7 @@ def _simple_walk(sector: Sector, shape: Outline, steps: Outline, max_edges: int)
 
 
 def _overlaps_itself(polygon: Outline) -> bool:
-    """Whether a polygon crosses itself. Made a little smaller first: then one that touches itself in a point does not."""
+    """Return whether a polygon crosses itself. Made a little smaller first: then one that touches itself in a point does not."""
     from mrbokeh.renderers.polygon._rectification_numba import crosses_itself
 
     edges = np.roll(polygon, -1, axis=0) - polygon
@@ -78,7 +75,7 @@ def _overlaps_itself(polygon: Outline) -> bool:
 
 
 def _enclosing(lines: np.ndarray, shape: Outline) -> Outline:
-    """The polygon of lines in their order, all moved outwards by as much as the shape differs from its symmetric twin."""
+    """Return the polygon of lines in their order, all moved outwards by as much as the shape differs from its symmetric twin."""
     from mrbokeh.renderers.polygon._rectification_numba import farthest_from_outline
 
     outwards, polygon = 0.0, without_flat_vertices(corner_points(lines, 0.0))
@@ -92,7 +89,7 @@ def _enclosing(lines: np.ndarray, shape: Outline) -> Outline:
 
 
 def _turned_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
-    """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each of the turned parts."""
+    """Return lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each of the turned parts."""
     from mrbokeh.renderers.polygon import _rectification_numba as pockets
     from mrbokeh.renderers.polygon import _rectification_numba as walks
     from mrbokeh.renderers.polygon._rectification_numba import touching_lines
@@ -107,7 +104,7 @@ def _turned_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
 
 
 def _fewest_origins(starts: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Lines of which every closed walk contains one: those with a corner across one cut of the outline, for the best cut."""
+    """Return the lines of which every closed walk contains one: those with a corner across one cut of the outline, for the best cut."""
     count = len(starts) - 1
     line = np.flatnonzero(np.diff(starts))
     farthest = targets[starts[line + 1] - 1]
@@ -120,7 +117,7 @@ def _fewest_origins(starts: np.ndarray, targets: np.ndarray) -> np.ndarray:
 
 
 def _mirrored_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
-    """Lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each pair of mirrored sectors."""
+    """Return lines (x, y, dx, dy) of the smallest polygon, with `most` of them in each pair of mirrored sectors."""
     from mrbokeh.renderers.polygon import _rectification_numba as pockets
     from mrbokeh.renderers.polygon import _rectification_numba as walks
     from mrbokeh.renderers.polygon._rectification_numba import touching_lines
@@ -142,12 +139,14 @@ def _mirrored_walk(sector: Sector, steps: Outline, most: int) -> np.ndarray:
 
 
 def _mirrored(lines: np.ndarray, mirror: np.ndarray) -> np.ndarray:
-    """The mirror images of lines (x, y, dx, dy, forward, backward), with the outline to their left as before."""
+    """Return the mirror images of lines (x, y, dx, dy, forward, backward), with the outline to their left as before."""
     return np.column_stack([lines[:, :2] @ mirror.T, -lines[:, 2:4] @ mirror.T, lines[:, [5, 4]]])
 
 
 def _mirrored_places(places: np.ndarray, axis: int) -> np.ndarray:
-    """Places (place, kind) of the mirror images, where the axis lies at place `axis`: what arrives leaves, and the other way round."""
+    """Return places (place, kind) of the mirror images, where the axis lies at place `axis`: arriving lines leave, and the other way
+    round.
+    """
     from mrbokeh.renderers.polygon._rectification_numba import ARRIVING, LEAVING, THROUGH
 
     kinds = places[:, 1]
@@ -169,7 +168,7 @@ def rectify(
     fit: Literal["enclosing", "area"] = "enclosing",
     symmetry_cost: float = 0.05,
 ) -> Outline:
-    """The smallest polygon (W, 2) around an outline (V, 2), with at most `max_edges` edges along `directions`.
+    """Return the smallest polygon (W, 2) around an outline (V, 2), with at most `max_edges` edges along `directions`.
 
     The outline may be concave and wind either way (the result winds alike), but must not cross itself. One whose edges run
     along the directions already comes back as it is. Where a notch narrows, the result may touch itself in a point. Time
@@ -198,12 +197,12 @@ def rectify(
 
 
 def area_excess(rectified: Outline, outline: Outline) -> float:
-    """How much larger the rectified polygon is than its outline, as a share of the outline's area (0 = equal)."""
+    """Return how much larger the rectified polygon is than its outline, as a share of the outline's area (0 = equal)."""
     return abs(area(rectified)) / abs(area(outline)) - 1.0
 
 
 def same_area_and_centroid(rectified: Outline, outline: Outline) -> Outline:
-    """The rectified polygon scaled and shifted to the outline's area and centroid.
+    """Return the rectified polygon scaled and shifted to the outline's area and centroid.
 
     The enclosing polygon is too large on all sides, so a blur with it is too wide and, for lopsided shapes, off centre. Scaled
     about its centroid it keeps the directions of its edges; it then crosses the outline, as much inside as outside.
@@ -213,7 +212,7 @@ def same_area_and_centroid(rectified: Outline, outline: Outline) -> Outline:
 
 
 def rectify_aperture(aperture: Aperture, directions: Sequence[tuple[int, int]] = PAPER_DIRECTIONS, max_edges: int = 16) -> Aperture:
-    """The aperture with every outline rectified on its own, at most `max_edges` edges each.
+    """Return the aperture with every outline rectified on its own, at most `max_edges` edges each.
 
     Each outline keeps its area and centroid, so that every weight still means the same light in the same place. A hole
     (negative weight) is treated like any other outline: once fitted by area, enclosing it or being enclosed is all one.
@@ -222,7 +221,7 @@ def rectify_aperture(aperture: Aperture, directions: Sequence[tuple[int, int]] =
 
 
 def _unit_steps(directions: Sequence[tuple[int, int]], max_edges: int) -> Float64[np.ndarray, "_ 2"]:
-    """Both senses of every direction once, as unit vectors."""
+    """Return both senses of every direction once, as unit vectors."""
     if max_edges < 3:
         raise InputError(f"a polygon has at least 3 edges, but at most {max_edges} were asked for")
     reduced = set()
@@ -250,7 +249,7 @@ def _check(outline: Outline) -> None:
 
 
 def _already_rectified(outline: Outline, steps: Outline, max_edges: int) -> Outline | None:
-    """A copy of the outline if its edges run along the steps and are few enough, with no more than its flat vertices left out."""
+    """Return a copy of the outline if its edges run along the steps and are few enough, with no more than its flat vertices left out."""
     for candidate in (outline, without_flat_vertices(outline)):
         edges = np.roll(candidate, -1, axis=0) - candidate
         lengths = np.hypot(*edges.T)

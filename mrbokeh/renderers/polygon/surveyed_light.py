@@ -1,6 +1,6 @@
-"""What polygon_differences learns from one look at all pixels, before it spreads them.
+"""Surveyed light: a picture and what polygonal differences learn from one look at all its pixels, before they blur it.
 
-What is far out of focus is spread at half the resolution: its light is smooth, and a quarter of the pixels carries it.
+What is far out of focus is blurred at half the resolution: its light is smooth, and a quarter of the pixels carries it.
 """
 
 from concurrent.futures import Executor
@@ -19,8 +19,9 @@ _TILES_AT_ONCE = 256
 
 
 class Tiles(NamedTuple):
-    """Which tiles hold light and how many do, the first row of such and the end; the largest diameter; the strongest value of a
-    channel over the mean of its darkest tile that is not empty, the worst of all channels."""
+    """Tiles that hold light, how many do, the first row of such and the end; the largest diameter; the contrast: the strongest value
+    of a channel over the mean of its darkest tile that is not empty, the worst of all channels.
+    """
 
     occupied: Bool[np.ndarray, "rows columns"]
     lit: int
@@ -32,8 +33,9 @@ class Tiles(NamedTuple):
 
 @dataclass(frozen=True)
 class SurveyedLight:
-    """A picture and what a look at all its pixels told: per tile sums and peaks of its channels, the largest diameter, and
-    whether all pixels have light."""
+    """Picture after a look at all its pixels: per tile sums and peaks of its channels, the largest diameter, and
+    whether all pixels have light.
+    """
 
     values: Float32[np.ndarray, "height width channels"]
     coc_px: Float32[np.ndarray, "height width"]
@@ -76,13 +78,13 @@ class SurveyedLight:
 
     @property
     def pixels(self) -> int:
-        """In tiles that are not empty."""
+        """Number of pixels in tiles that are not empty."""
         from mrbokeh.renderers.polygon._survey_numba import TILE_PX
 
         return self.tiles.lit * TILE_PX**2
 
     def highlights(self, from_px: float, pool: Executor) -> Float32[np.ndarray, "_ _"]:
-        """How much of each pixel is spread by its exact kernel; empty if there is no highlight."""
+        """Return how much of each pixel is splatted by its exact kernel; empty if there is no highlight."""
         from mrbokeh.renderers.polygon._survey_numba import find_highlights, find_suspects, integrate
 
         rows, columns, channels = self.sums.shape
@@ -97,7 +99,7 @@ class SurveyedLight:
         return share if any(list(found)) else NO_HIGHLIGHTS
 
     def group(self, first: int) -> "SurveyedLight":
-        """Four channels, the last ones filled up with zeros."""
+        """Return four channels, the last ones filled up with zeros."""
         if self.values.shape[2] == 4:
             return self
         channels = slice(first, first + 4)
@@ -124,7 +126,7 @@ Limits = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Halves:
-    """A picture in two: `kept` at full resolution, `half` at half of it, None if there is nothing.
+    """Picture in two: `kept` at full resolution, `half` at half of it, None if there is nothing.
 
     share: of each block of 2 x 2 pixels how much of the light is in `half`; empty if there is nothing.
     """
@@ -135,7 +137,9 @@ class Halves:
 
 
 def halves_of(light: SurveyedLight, highlights: Float32[np.ndarray, "_ _"], from_px: float, pool: Executor) -> Halves:
-    """light: four channels. highlights: the share of each pixel that is spread exactly, or empty. from_px: see FULLY."""
+    """Divide a picture in two. light: four channels. highlights: the share of each pixel that is splatted exactly, or empty. from_px:
+    see FULLY.
+    """
     nothing = Halves(light, None, np.zeros((0, 0), np.float32))
     far = light.largest_of_tile_px > FULLY * from_px
     if not far.any() or far.sum() < LEAST_SHARE * light.sums.any(axis=2).sum():

@@ -1,8 +1,7 @@
-"""Tables of polygon_differences: what depends on the aperture alone.
+"""Tables of polygonal differences that depend on the aperture alone: its corners, the sums along directions, and whole kernels.
 
-Corners of polygon_differences by the lattice points on which their edges' lines cross.
-
-Tables of the kernels that polygon_differences splats whole: small ones by levels of diameter, as groups of neighbouring taps.
+Corners go by the lattice points on which their edges' lines cross. Small kernels are splatted whole, by levels of diameter, as groups of
+neighbouring taps.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,7 +20,7 @@ from mrbokeh.renderers.polygon.rectification import rectify_aperture
 
 @dataclass(frozen=True)
 class CrossedCorner:
-    """A corner whose four crossings lie at 0, step, step_after and their sum, lattice points in (x, y).
+    """Corner whose four crossings lie at 0, step, step_after and their sum, lattice points in (x, y).
 
     turned, turned_after: whether the two lines of that edge count backwards, from the one farther along its step.
     """
@@ -62,8 +61,9 @@ class CrossedCorner:
 
 @dataclass(frozen=True)
 class CrossedCorners:
-    """CrossedCorner by CrossedCorner in arrays: steps (corners, 2, 2) and places (corners, 4, 2) in (x, y), turned (corners, 2);
-    those of kind 0 come first, up to `level`, then those of kind 1, up to `steep`."""
+    """Arrays over all CrossedCorner: steps (corners, 2, 2) and places (corners, 4, 2) in (x, y), turned (corners, 2);
+    those of kind 0 come first, up to `level`, then those of kind 1, up to `steep`.
+    """
 
     before: np.ndarray
     after: np.ndarray
@@ -91,7 +91,7 @@ class CrossedCorners:
 
 
 def crossed_corners(corners: PolygonCorners, planes: dict[tuple[Direction, Direction], int]) -> CrossedCorners:
-    """Corners with as many neighbouring crossings as they have, the best kinds first."""
+    """Return the corners with as many neighbouring crossings as they can have, the best kinds first."""
     found = []
     for before, after, weight in zip(corners.before, corners.after, corners.weight, strict=True):
         first, second = corners.direction[before], corners.direction[after]
@@ -121,7 +121,7 @@ Groups = Int64[np.ndarray, "groups 4"]
 
 
 def whole_kernels(aperture: Aperture, below_px: float) -> Exact:
-    """Kernels up to a little more than this diameter, behind the focus and, turned, in front, and the aperture for all others."""
+    """Return kernels up to a little more than this diameter, behind the focus and, turned, in front, and the aperture for all others."""
     above_px = below_px * 7.0 / 6.0
     levels = int(np.ceil((above_px - 1.0) * LEVELS_PER_PX)) + 1
     behind = _stacked([aperture.rasterize(1.0 + level / LEVELS_PER_PX).kernel.astype(np.float32) for level in range(levels + 1)])
@@ -134,7 +134,7 @@ def whole_kernels(aperture: Aperture, below_px: float) -> Exact:
 
 
 def _stacked(kernels: Sequence[Float32[np.ndarray, "_ _"]]) -> Float32[np.ndarray, "kernels size size"]:
-    """Each in the middle of as many pixels as the last, the largest, has."""
+    """Stack kernels, each in the middle of as many pixels as the last, the largest, has."""
     stacked = np.zeros((len(kernels), *kernels[-1].shape), np.float32)
     for whole, kernel in zip(stacked, kernels, strict=True):
         border = (len(whole) - len(kernel)) // 2
@@ -143,8 +143,9 @@ def _stacked(kernels: Sequence[Float32[np.ndarray, "_ _"]]) -> Float32[np.ndarra
 
 
 def _groups(seen: Bool[np.ndarray, "turns levels size size"]) -> tuple[Groups, Int64[np.ndarray, " kernels"]]:
-    """Turn, level, row and first column of the groups of neighbours that cover all that is seen of each row, from its first to its last;
-    and how many each kernel has."""
+    """Return turn, level, row and first column of the groups of neighbours that cover the visible taps of each row, from first to
+    last; and how many groups each kernel has.
+    """
     first, last = seen.argmax(axis=3), seen.shape[3] - 1 - seen[..., ::-1].argmax(axis=3)
     of_row = np.where(seen.any(axis=3), (last - first) // BLENDED_CELLS + 1, 0)
     where = np.repeat(np.argwhere(of_row), of_row[of_row > 0], axis=0)
@@ -153,12 +154,12 @@ def _groups(seen: Bool[np.ndarray, "turns levels size size"]) -> tuple[Groups, I
 
 
 def _laid(groups: Groups, radius: int) -> tuple[UInt64[np.ndarray, " groups"], Int64[np.ndarray, " groups"]]:
-    """Rows from the first of the kernels on, and columns from the pixel's on, in numbers of four channels."""
+    """Return rows from the first of the kernels on, and columns from the pixel's on, in numbers of four channels."""
     return groups[:, 2].astype(np.uint64), 4 * (groups[:, 3] - radius)
 
 
 def _taps(kernels: Float32[np.ndarray, "turns levels size size"], groups: Groups) -> Float32[np.ndarray, " taps"]:
-    """All taps of every group, 0 beyond the kernel."""
+    """Return all taps of every group, 0 beyond the kernel."""
     padded = np.pad(kernels, ((0, 0), (0, 0), (0, 0), (0, BLENDED_CELLS - 1)))
     turn, level, row, column = groups.T
     return padded[turn[:, None], level[:, None], row[:, None], column[:, None] + np.arange(BLENDED_CELLS)].reshape(-1)
@@ -187,7 +188,7 @@ class ApertureTables:
     _laid: dict[np.dtype, Corners] = field(default_factory=dict, repr=False, compare=False)
 
     def corners_in(self, dtype: np.dtype) -> Corners:
-        """In a ring's precision, without steps and places, which depend on the ring."""
+        """Return the corners in a ring's precision, without steps and places, which depend on the ring."""
         if dtype not in self._laid:
             nowhere, corners, crossed = np.empty(0, np.int64), self.corners, self.crossed
             self._laid[dtype] = Corners(
@@ -213,7 +214,7 @@ class ApertureTables:
         return self._laid[dtype]
 
     def margin_px(self, largest_px: float) -> int:
-        """How far the light of a pixel of this diameter is splatted, at most."""
+        """Return how far the light of a pixel of this diameter is splatted, at most."""
         grown = np.sqrt(0.25 * largest_px**2 + max(self.corners.growth, 0.0))
         return max(int(np.ceil(grown * self.extent)) + SPARE_PX, self.exact.radius + BLENDED_CELLS)
 
@@ -233,7 +234,9 @@ def tables_of(aperture: Aperture, directions: tuple[Direction, ...], max_edges: 
 
 
 def _sums(planes: dict[tuple[Direction, Direction], int]) -> Sums:
-    """Corners of a pair in ascending order of directions count as they are, others negative (see `laid_out`)."""
+    """Return the sums along all directions. Return the sums along all directions. Corners of a pair in ascending order of directions
+    count as they are, others negative (see `laid_out`).
+    """
     directions = sorted({direction for pair in planes for direction in pair if direction[0]})
     inputs: list[list[tuple[int, float]]] = []
     profiles: list[list[tuple[int, int, float]]] = []
@@ -260,12 +263,14 @@ def _sums(planes: dict[tuple[Direction, Direction], int]) -> Sums:
 
 
 def _shift(direction: Direction) -> int:
-    """Sums along directions to the left are kept so many cells to the left, so that profiles only look back."""
+    """Return by how many cells sums along a direction are kept shifted: sums along directions to the left are kept so many cells to
+    the left, so that profiles only look back.
+    """
     return max(0, -direction[0])
 
 
 def _profile(direction: Direction) -> list[tuple[int, int, float]]:
-    """(columns back, rows back, weight), beginning with the place itself, then those of earlier rows."""
+    """Return Return (columns back, rows back, weight), beginning with the place itself, then those of earlier rows."""
     taps = {(x + _shift(direction), y): weight for (x, y), weight in edge_profile(direction).items()}
     itself = taps.pop((0, 0), 0.0)
     rest = sorted(taps.items(), key=lambda tap: (tap[0][1] == 0, tap[0]))

@@ -9,14 +9,10 @@ of 40 px: SSIM 0.998 and 55 dB to dense splatting of the same kernels, 56 dB to 
 
 A rounding error of one pixel shows, integrated, all over the picture, and those of an even area all go the same way. So Laplacians
 are summed in whole numbers of 32 bits (`mrbokeh.renderers.spreadlets.sums`), of which every pixel adds 0 in all, rounded by
-dithers that spread evenly; modes are kept and solved in single precision. Pixels that outshine the mean 32 times are splatted tap by
-tap instead (`mrbokeh.renderers.spreadlets.laplacian_spreadlets`), which keeps the whole numbers fine. Measured: within 7e-6 of double precision, as
-a share of the mean, at 960 x 540 and 1e-5 at 1400 x 1400. Whole Laplacians, pyramids and light that is not finite take double precision.
-
-Highlights: pixels so much brighter than the mean that they are splatted tap by tap, so that the rest can be summed in whole numbers.
-
-At most one pixel in as many outshines the mean so many times in one channel: all of their taps are a small share of dense splatting,
-whatever the picture.
+dithers that spread evenly; modes are kept and solved in single precision. Highlights, pixels that outshine the mean 32 times, are
+splatted tap by tap instead, which keeps the whole numbers fine; at most 1/32 of the pixels can do so in one channel, so their taps cost
+little. Measured: within 7e-6 of double precision, as a share of the mean, at 960 x 540 and 1e-5 at 1400 x 1400. Whole Laplacians,
+pyramids and light that is not finite take double precision.
 """
 
 from collections.abc import Callable, Sequence
@@ -87,7 +83,7 @@ def _mean(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> F
 
 
 def highlights_among_plainly(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Highlights:
-    """The plain twin of `highlights_among`."""
+    """Return the plain twin of `highlights_among`."""
     mine, light = (codes >= 0) & sparse[codes], np.abs(values)
     some = light[::_EVERY][mine[::_EVERY]]
     limits = OUTSHINES_MEAN * (some if some.size else light[mine]).mean(axis=0, dtype=np.float64)
@@ -168,10 +164,10 @@ class LaplacianSpreadlets:
         """Return the sum over all pixels of value times the bank's kernel: R, G, B, coverage, then others, as in
         layering.psf_over_field.PsfField.
 
-        Coverage, three times for a bank of three colours, and others take kernels scaled to sum to 1: light that is absorbed
-        darkens what is seen, but is no hole in it. Others go with green. What a bank of one colour is given may also be colour
-        alone, of up to three channels. Circles and what gets lost as in mrbokeh.layering.psf_over_field.KernelSum. densely: all taps of the
-        same kernels.
+        Coverage, three times for a bank of three colours, and others take kernels scaled to sum to 1: light that is absorbed darkens what
+        is seen, but is no hole in it. Others go with green. What a bank of one colour is given may also be colour alone, of up to three
+        channels. Circles of confusion and the border as in mrbokeh.layering.psf_over_field.KernelSum. densely: all taps of the same
+        kernels.
         """
         tables = self._bank_tables
         if tables is None:

@@ -183,7 +183,7 @@ class _Splatting(NamedTuple):
         precision: type,
         gains: Float32[np.ndarray, " lanes"] | None = None,
     ) -> "_Splatting":
-        """Lay points out for splatting. precision: of the sums without gains."""
+        """Lay points out for splatting. Lay points out for splatting. precision: of the sums without gains."""
         return cls(values, cells, Laid.out(points, window.width, precision if gains is None else np.int32), window, gains)
 
     def fill(self, sums: Sums, first: int, end: int) -> None:

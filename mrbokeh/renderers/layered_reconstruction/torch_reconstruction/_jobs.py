@@ -1,6 +1,6 @@
-"""Jobs: one partition of one tile each, with how it is reprojected and filtered, in groups that go through a step together.
+"""Jobs: one partition of one tile each, how it is reprojected and filtered, and its samples reprojected into a window of its own (Eq. 1).
 
-Reprojection of the samples around tiles along the slopes of their partitions (Eq. 1), into one window for each job.
+Jobs go through a step together in groups of equal windows.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,8 @@ _SHARP_PX = 0.5
 
 @dataclass(frozen=True)
 class Jobs:
-    """All partitions. slope: (P, 3) of the reprojection, a, b_x, b_y. guard: (P, 2) how far the filter reads beyond the tile, x and y.
+    """Jobs of all partitions. slope: (P, 3) of the reprojection, a, b_x, b_y. guard: (P, 2) how far the filter reads beyond the tile, x
+    and y.
 
     facts: (P, 10) relative to the corner of a window without a guard band: corner in the picture, first pixel that belongs to
     the job, the one after the last a sample may come to lie in (x and y each), whether samples keep their pixels, the nearest
@@ -61,7 +62,8 @@ class Task:
 
 
 def jobs_of(partitions: Partitions, slopes: Slopes, guard: Int64[Tensor, "jobs 2"], light: TileLight, shared_out: bool) -> Jobs:
-    """The host learns here how many jobs each tile has, how wide their windows are and how many blocks of samples they look at.
+    """Make the jobs. Make the jobs. The host learns here how many jobs each tile has, how wide their windows are and how many blocks of
+    samples they look at.
 
     shared_out: samples that move are shared out among the four nearest pixels, else all keep the pixel they come into.
     """
@@ -82,7 +84,7 @@ def jobs_of(partitions: Partitions, slopes: Slopes, guard: Int64[Tensor, "jobs 2
 def _blocks(
     corner: Int64[Tensor, "jobs 2"], end: Int64[Tensor, "jobs 2"], beyond_px: Float64[Tensor, "jobs 2"], light: TileLight
 ) -> Int64[Tensor, "jobs 4"]:
-    """First block along x and y, number along x, number in all, of those within some pixels of a tile."""
+    """Return the first block along x and y, number along x, number in all, of those within some pixels of a tile."""
     side = light.tile_px // 4
     low = torch.floor((corner - beyond_px) / side).long().clamp(min=0)
     high = torch.floor((end + beyond_px) / side).long()
@@ -92,7 +94,7 @@ def _blocks(
 
 
 def task_of(jobs: Jobs, light: TileLight, members: Int64[np.ndarray, " group"], guard: int) -> Task:
-    """Some jobs, with a guard band that is as wide as theirs or wider."""
+    """Make a task of some jobs, with a guard band that is as wide as theirs or wider."""
     device, entries = jobs.facts.device, int(jobs.host_blocks[members].sum())
     job = torch.from_numpy(members).to(device)
     first_x, first_y, across, count = jobs.blocks[job].unbind(dim=1)
@@ -105,7 +107,7 @@ def task_of(jobs: Jobs, light: TileLight, members: Int64[np.ndarray, " group"], 
 
 
 def batches(jobs: Jobs, jobs_at_once: int) -> Iterator[tuple[int, int]]:
-    """First and end of runs of tiles with at most so many jobs together, or of single tiles."""
+    """Yield first and end of runs of tiles with at most so many jobs together, or of single tiles."""
     ends = np.cumsum(jobs.host_counts)
     begin, before = 0, 0
     while begin < len(ends):
@@ -115,7 +117,7 @@ def batches(jobs: Jobs, jobs_at_once: int) -> Iterator[tuple[int, int]]:
 
 
 def jobs_in(jobs: Jobs, tiles: Int64[np.ndarray, " tiles"]) -> Int64[np.ndarray, " jobs"]:
-    """All jobs of these tiles, which must rise."""
+    """Return all jobs of these tiles, which must rise."""
     ends = np.cumsum(jobs.host_counts)
     return np.concatenate([np.arange(ends[tile] - jobs.host_counts[tile], ends[tile]) for tile in tiles.tolist()])
 
@@ -123,7 +125,7 @@ def jobs_in(jobs: Jobs, tiles: Int64[np.ndarray, " tiles"]) -> Int64[np.ndarray,
 def groups(
     jobs: Jobs, some: Int64[np.ndarray, " jobs"], tile_px: int, pixels_at_once: int
 ) -> Iterator[tuple[Int64[np.ndarray, " group"], int]]:
-    """Of some jobs, those that share a guard band, with it, and no more than so many pixels of windows together."""
+    """Yield groups of jobs that share a guard band, and the band; no more than so many pixels of windows together."""
     widest = jobs.host_guard[some].max(axis=1)
     band = np.searchsorted(GUARDS_PX, widest)
     for which in np.unique(band).tolist():
@@ -138,7 +140,7 @@ Windows = Float32[Tensor, "group side side planes"]
 
 
 def reprojected(jobs: Jobs, light: TileLight, task: Task, enough: float, pairs_at_once: int) -> Windows:
-    """Colour, opacity and weight (C + 2) of each place of each window.
+    """Return colour, opacity and weight (C + 2) of each place of each window.
 
     A sample of the partition adds its values and an opacity, a weight and a count of 1. One behind adds a weight and a count: it
     was seen through this place. One just in front adds a count alone, one far in front nothing. No place weighs more than
@@ -184,7 +186,7 @@ def _add_blocks(
     block: Int64[Tensor, " entries"],
     side: int,
 ) -> None:
-    """See `splat_in_chunks`; all at once."""
+    """Add blocks as `splat_in_chunks` says, all at once."""
     corner_x, corner_y, low_x, low_y, high_x, high_y, is_sharp, nearest, own, tile = facts[group][:, :, None].unbind(dim=1)
     sample = light.starts[block][:, None] + torch.arange(light.most_in_block, device=block.device)
     is_there = sample < light.starts[block + 1][:, None]
@@ -212,7 +214,7 @@ def landing(
     corner: Float32[Tensor, "blocks 1 2"],
     is_sharp: Bool[Tensor, "blocks 1"],
 ) -> tuple[Float32[Tensor, "blocks samples"], Float32[Tensor, "blocks samples"]]:
-    """Where samples come to lie in the window: among the centres of pixels; those that hardly move keep the pixel that they are in."""
+    """Return where samples come to lie in the window, among the centres of pixels; samples that hardly move keep their pixel."""
     x = geometry[..., 0] - slope[..., 0] * geometry[..., 2] - slope[..., 1] * geometry[..., 4] - corner[..., 0]
     y = geometry[..., 1] - slope[..., 0] * geometry[..., 3] - slope[..., 2] * geometry[..., 4] - corner[..., 1]
     return torch.where(is_sharp, torch.floor(x), x - 0.5), torch.where(is_sharp, torch.floor(y), y - 0.5)

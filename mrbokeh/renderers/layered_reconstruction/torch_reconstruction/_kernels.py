@@ -1,6 +1,6 @@
-"""The true shapes of pupil and shutter over the screen, as kernels of pixels: `layered_reconstruction._window_numba` for many jobs.
+"""Kernels over the screen for many jobs: pupil and shutter in their true shapes, or Gaussians in their place and their slow twin.
 
-Gaussians over the screen, in place of pupil and shutter: the sheared recursive filter (Eq. 9 and 10) and its slow twin.
+The shapes follow `layered_reconstruction._windows_numba`; the recursive Gaussian follows Eq. 9 and 10.
 """
 
 import math
@@ -48,28 +48,28 @@ class PupilTables:
         return [cls(torch.from_numpy(table[k :: len(shares)].copy()).to(device), share) for k, share in enumerate(shares.tolist())]
 
     def drawing(self, scale: Number) -> Float64[Tensor, "group strips 5"]:
-        """The strips that do for pupils of these radii in pixels."""
+        """Return the strips that do for pupils of these radii in pixels."""
         finest = len(self.strips) // 2 - 1
         level = torch.ceil(torch.log2((scale.abs() / STRIPS_FOR_PX).clamp(min=1.0))).long().clamp(max=finest)
         return self.strips[level + torch.where(scale > 0.0, finest + 1, 0)]
 
 
 def drawn_sizes(slopes: Slopes) -> tuple[Number, Number, Number]:
-    """Radius of the pupil's picture, negative in front of the focus, and the segment of the shutter, x and y, in pixels."""
+    """Return the radius of the pupil's picture, negative in front of the focus, and the segment of the shutter, x and y, in pixels."""
     scale = slopes.r * torch.sqrt(slopes.kappa_u * (2.0 - slopes.kappa_u))
     share = torch.sqrt(slopes.kappa_t * (2.0 - slopes.kappa_t))
     return scale, share * slopes.m_x, share * slopes.m_y
 
 
 def window_guards(slopes: Slopes, pupil_radius: float, sigma_x_px: float) -> Int64[Tensor, "jobs 2"]:
-    """Guard bands along x and y of segment, pupil and spatial filter together."""
+    """Return guard bands along x and y of segment, pupil and spatial filter together."""
     scale, length_x, length_y = drawn_sizes(slopes)
     pupil = torch.ceil(scale.abs() * pupil_radius) + 1.0 + _rest_reach(sigma_x_px)
     return torch.stack([torch.ceil(0.5 * length.abs()) + pupil for length in (length_x, length_y)], dim=1).long()
 
 
 def line_kernels(slopes: Slopes, offset: Offsets, begin: float = -0.5, end: float = 0.5) -> Kernels:
-    """Segments centred on a pixel, from one time to another, shared out among pixels by the length within each.
+    """Return segments centred on a pixel, from one time to another, shared out among pixels by the length within each.
 
     What lies at x0 is carried to x0 + length t, so the light of a pixel is read around x - length t.
     """
@@ -83,14 +83,15 @@ def line_kernels(slopes: Slopes, offset: Offsets, begin: float = -0.5, end: floa
 def _times_within(
     length: Number, offset: Offsets, begin: float, end: float
 ) -> tuple[Float64[Tensor, "group size"], Float64[Tensor, "group size"]]:
-    """From when to when, between begin and end, a segment is in the pixels of each offset along one axis; by halves of infinity if it
-    stays."""
+    """Return from when to when, between begin and end, a segment is in the pixels of each offset along one axis; without bounds if it
+    stays.
+    """
     one, other = (offset - 0.5) / length[:, None], (offset + 0.5) / length[:, None]
     return torch.minimum(one, other).clamp(min=begin), torch.maximum(one, other).clamp(max=end)
 
 
 def pupil_kernels(slopes: Slopes, tables: PupilTables, offset: Offsets) -> Kernels:
-    """The pupil's picture in strips, shared out among pixels by area; a very small one is a point.
+    """Return the pupil's picture in strips, shared out among pixels by area; a very small one is a point.
 
     What lies at x0 is thrown to x0 + scale u, so the light of a pixel is read around x - scale u.
     """
@@ -110,7 +111,7 @@ def pupil_kernels(slopes: Slopes, tables: PupilTables, offset: Offsets) -> Kerne
 def _covered(
     low: Float64[Tensor, "group strips"], high: Float64[Tensor, "group strips"], offset: Offsets
 ) -> Float64[Tensor, "group strips size"]:
-    """The share of each stretch, relative to the centre of a pixel, that lies on the pixel of each offset."""
+    """Return the share of each stretch, relative to the centre of a pixel, that lies on the pixel of each offset."""
     start = torch.maximum(low[..., None], offset - 0.5)
     end = torch.minimum(high[..., None], offset + 0.5)
     return (end - start).clamp(min=0.0) / (high - low).clamp(min=1e-12)[..., None]
@@ -122,7 +123,7 @@ def _rest_reach(sigma_x_px: float) -> int:
 
 
 def rest_kernel(sigma_x_px: float, offset: Offsets) -> Float64[Tensor, "size size"] | None:
-    """What the spatial filter has beyond a pixel, an even Gaussian, where that is wider than a pixel."""
+    """Return what the spatial filter has beyond a pixel, an even Gaussian; None if that is no wider than a pixel."""
     reach = _rest_reach(sigma_x_px)
     if reach == 0:
         return None
@@ -138,20 +139,20 @@ _LEAST_WEIGHT = 1e-6
 
 
 def less_pixel(v: Covariance) -> Covariance:
-    """The covariance without what a pixel as a bin adds."""
+    """Return the covariance without what a pixel as a bin adds."""
     return Covariance(
         (v.xx - PIXEL_VARIANCE).clamp(min=_LEAST_GAUSSIAN_VARIANCE), v.xy, (v.yy - PIXEL_VARIANCE).clamp(min=_LEAST_GAUSSIAN_VARIANCE)
     )
 
 
 def gaussian_guards(v: Covariance, support: float) -> Int64[Tensor, "jobs 2"]:
-    """Pixels beyond the tile along x and y; a Gaussian that ends within its pixel needs none."""
+    """Return pixels beyond the tile along x and y; a Gaussian that ends within its pixel needs none."""
     both = torch.stack([v.xx, v.yy], dim=1)
     return torch.where(both > _WITHIN_A_PIXEL, torch.ceil(support * torch.sqrt(both)), 0.0).long()
 
 
 def direct_kernels(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offsets) -> Kernels:
-    """The Gaussian sampled at pixels, sum 1."""
+    """Return the Gaussian sampled at pixels, sum 1."""
     x, y = offset[None, None, :].double(), offset[None, :, None].double()
     xx, xy, yy = (each[:, None, None] for each in v)
     det = xx * yy - xy * xy
@@ -162,7 +163,7 @@ def direct_kernels(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offse
 
 
 def sheared_kernels(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offsets) -> Kernels:
-    """The plain Gaussian along (beta, 1), linear between the pixels of a row; a Gaussian within its pixel is a point."""
+    """Return the plain Gaussian along (beta, 1), linear between the pixels of a row; a Gaussian within its pixel is a point."""
     weights, beta = _sheared_weights(v, guard, offset)
     tent = (1.0 - (offset - beta[:, None, None] * offset[None, :, None]).abs()).clamp(min=0.0)
     weights = torch.where(weights < _LEAST_WEIGHT, 0.0, weights)
@@ -172,7 +173,7 @@ def sheared_kernels(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offs
 def recursive_rows(
     planes: Float32[Tensor, "group planes side side2"], v: Covariance, task: Task, guard: Int64[Tensor, "group 2"], passes: int
 ) -> Float32[Tensor, "group planes side side2"]:
-    """Eq. 10 along x, beyond the borders of each job nothing.
+    """Filter by Eq. 10 along x, with nothing beyond the borders of each job.
 
     Forward and backward together weigh what lies n pixels away with gain gamma^|n|; as a matrix that is one product for all rows.
     """
@@ -190,13 +191,13 @@ def recursive_rows(
 
 
 def feedback(variance_px2: Number) -> Number:
-    """gamma of Eq. 10, such that forward and backward together have exactly this variance, 2 gamma / (1 - gamma)^2."""
+    """Return Return gamma of Eq. 10, such that forward and backward together have exactly this variance, 2 gamma / (1 - gamma)^2."""
     q = 1.0 + 1.0 / variance_px2
     return q - torch.sqrt(q * q - 1.0)
 
 
 def _variance_along_x(v: Covariance, guard: Int64[Tensor, "group 2"]) -> tuple[Number, Tensor]:
-    """What is left for the filter along x once linear interpolation has added its own, and where that is nothing."""
+    """Return the variance left for the filter along x once linear interpolation has added its own, and where nothing is left."""
     most = int(guard.amax())
     offset = torch.arange(-most, most + 1, device=guard.device)
     s_u, _, _ = sheared_axes(*axes(v))
@@ -209,7 +210,7 @@ def _variance_along_x(v: Covariance, guard: Int64[Tensor, "group 2"]) -> tuple[N
 
 
 def _sheared_weights(v: Covariance, guard: Int64[Tensor, "group 2"], offset: Offsets) -> tuple[Float64[Tensor, "group size"], Number]:
-    """Weights of rows along the sheared axis, and its beta."""
+    """Return weights of rows along the sheared axis, and its beta."""
     _, s_v, beta = sheared_axes(*axes(v))
     is_point = (s_v <= 1e-3) | (guard.amax(dim=1) == 0)
     weights = torch.exp(-0.5 * (offset / s_v.clamp(min=1e-3)[:, None]) ** 2) * (offset.abs() <= guard[:, 1:])

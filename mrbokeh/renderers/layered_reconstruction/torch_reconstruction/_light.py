@@ -1,9 +1,4 @@
-"""Samples in tiles on a device, with their slopes, buckets and the window they fill.
-
-Light field samples on a device, and the device that a user names.
-
-Depth buckets and cells of motion on a device: `mrbokeh.renderers.layered_reconstruction._samples` by torch.
-"""
+"""Light on a device: samples as they come, and sorted by tile with their slopes, depth buckets, cells of motion and second moments."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +15,7 @@ from mrbokeh.renderers.layered_reconstruction._settings import Settings
 
 @dataclass(frozen=True)
 class DeviceSamples:
-    """N samples of one picture in any order, all of it on one device; see LightFieldSamples for what they are.
+    """Samples of one picture in any order, all of it on one device; see LightFieldSamples for what they are.
 
     values: (N, C) what is reconstructed, linear colour or more. coc_px: (N,) signed diameters of the circle of confusion.
     """
@@ -43,7 +38,7 @@ class DeviceSamples:
         coc_px: Float32[np.ndarray, " samples"],
         device: torch.device,
     ) -> "DeviceSamples":
-        """Samples of the host, copied; their own colour or other values."""
+        """Copy samples of the host; their own colour or other values."""
         arrays = samples.xy_px, samples.lens_uv, samples.time, values, coc_px, samples.depth_m, samples.motion_px
         return cls(samples.width_px, samples.height_px, *(torch.from_numpy(np.ascontiguousarray(each)).to(device) for each in arrays))
 
@@ -60,7 +55,7 @@ _FARTHEST_CELL = 32
 def depth_buckets(
     coc_px: Float32[Tensor, " samples"], depth_m: Float32[Tensor, " samples"], settings: Settings
 ) -> Int64[Tensor, " samples"]:
-    """The bucket of each sample, front to back from 0; see `bucket_of`."""
+    """Return the bucket of each sample, front to back from 0; see `bucket_of`."""
     near_px, steps = settings.near_coc_px, settings.depth_buckets
     index = torch.floor(coc_px.clamp(-near_px, near_px) / settings.coc_step_px + 0.5)
     some_m = depth_m[:: max(1, len(depth_m) // _ENOUGH)].double()
@@ -75,7 +70,7 @@ def depth_buckets(
 
 
 def motion_cells(motion_px: Float32[Tensor, "samples 2"], settings: Settings) -> Int64[Tensor, "samples 2"]:
-    """Column and row of the cell of motion of each sample, from 0."""
+    """Return column and row of the cell of motion of each sample, from 0."""
     if not settings.motion or not math.isfinite(settings.motion_step_px):
         return torch.zeros_like(motion_px, dtype=torch.int64)
     most_px = settings.motion_step_px * _FARTHEST_CELL
@@ -129,7 +124,9 @@ class TileLight:
 
 
 def tile_light(samples: DeviceSamples, settings: Settings) -> TileLight:
-    """The host learns here how many buckets there are, how far the pupil reaches, and how many samples a tile holds."""
+    """Sort samples by tile. Sort samples by tile. The host learns here how many buckets there are, how far the pupil reaches, and how
+    many samples a tile holds.
+    """
     width_px, height_px, tile_px = samples.width_px, samples.height_px, settings.tile_px
     codes = pixel_codes(width_px, height_px, tile_px, samples.time.device)
     pixel = samples.xy_px.int()
@@ -150,7 +147,7 @@ def tile_light(samples: DeviceSamples, settings: Settings) -> TileLight:
 
 @lru_cache(maxsize=4)
 def pixel_codes(width_px: int, height_px: int, tile_px: int, device: torch.device) -> Int32[Tensor, " pixels"] | Int64[Tensor, " pixels"]:
-    """The place of each pixel in the order of samples; the border to the right and below counts as the last pixels."""
+    """Return the place of each pixel in the order of samples; the border to the right and below counts as the last pixels."""
     columns_px, rows_px = (torch.arange(size + 1, device=device).clamp(max=size - 1) for size in (width_px, height_px))
     y, x = torch.meshgrid(rows_px, columns_px, indexing="ij")
     columns, rows = -(-width_px // tile_px), -(-height_px // tile_px)
@@ -159,19 +156,19 @@ def pixel_codes(width_px: int, height_px: int, tile_px: int, device: torch.devic
 
 
 def block_at(x: Int64[Tensor, "*place"], y: Int64[Tensor, "*place"], columns: int) -> Int64[Tensor, "*place"]:
-    """The number of the block in this column and row of blocks of the picture. columns: of tiles."""
+    """Return the number of the block in this column and row of blocks of the picture. columns: of tiles."""
     return ((y // 4) * columns + x // 4) * BLOCKS + morton(x % 4, y % 4)
 
 
 def place_of(block: Int64[Tensor, "*place"], columns: int) -> tuple[Int64[Tensor, "*place"], Int64[Tensor, "*place"]]:
-    """The inverse of `block_at`."""
+    """Return the inverse of `block_at`."""
     tile, within = block // BLOCKS, block % BLOCKS
     x, y = (within & 1) | ((within >> 1) & 2), ((within >> 1) & 1) | ((within >> 2) & 2)
     return tile % columns * 4 + x, tile // columns * 4 + y
 
 
 def morton(x: Int64[Tensor, "*place"], y: Int64[Tensor, "*place"]) -> Int64[Tensor, "*place"]:
-    """The bits of x and y, below 256, interleaved, x first."""
+    """Return the bits of x and y, below 256, interleaved, x first."""
     return _spread_bits(x) | (_spread_bits(y) << 1)
 
 
@@ -193,7 +190,7 @@ def _learned(depth: Tensor, cell: Tensor, lens_uv: Tensor, starts: Tensor) -> tu
 def _held_buckets(
     bucket: Int64[Tensor, " samples"], depths: int, across: int, down: int
 ) -> tuple[Int64[Tensor, " samples"], Int64[Tensor, " buckets"], Int64[Tensor, "buckets 10"]]:
-    """Buckets of samples among those that hold any, the depth of each and its neighbours; waits to learn how many."""
+    """Return buckets of samples among those that hold any, the depth of each and its neighbours; waits to learn how many."""
     is_held = torch.zeros(depths * across * down, dtype=torch.bool, device=bucket.device)
     is_held[bucket] = True
     held = torch.nonzero(is_held)[:, 0]

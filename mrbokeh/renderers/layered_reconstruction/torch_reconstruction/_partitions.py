@@ -1,7 +1,4 @@
-"""The sweep over the rows of tiles: one row of every tile at a time.
-
-Rows of a tile join partitions, and every bucket finds its place among them.
-"""
+"""Partitions of tiles: rows of a tile join them, one row of every tile at a time, and every bucket finds its place among them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -25,7 +22,8 @@ def sweep_row_by_row(
     numbers: tuple[float, float, float],
     look_back: int,
 ) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " tiles"]]:
-    """One row of every tile at a time; waits once. of_rows: extents of each row by itself. limits: of the distance of slopes.
+    """Sweep the rows of tiles, one row of every tile at a time; waits once. of_rows: extents of each row by itself. limits: of the
+    distance of slopes.
 
     numbers: sigma_x_px, bandwidth, the least share of extents.
     """
@@ -42,7 +40,7 @@ def sweep_row_by_row(
 
 
 def _active(lengths: Int64[Tensor, " tiles"]) -> Int64[Tensor, " steps"]:
-    """How many tiles have more rows than 0, 1, 2 and so on."""
+    """Return how many tiles have more rows than 0, 1, 2 and so on."""
     return len(lengths) - torch.cumsum(torch.bincount(lengths), 0)[:-1]
 
 
@@ -68,7 +66,7 @@ class _Sweep:
         self.back = torch.arange(look_back, device=order.device)
 
     def joined(self, row: Int64[Tensor, " active"]) -> Int64[Tensor, " active"]:
-        """The partition that the next row of each of the first tiles joins."""
+        """Return the partition that the next row of each of the first tiles joins."""
         at = torch.arange(len(row), device=row.device)
         count = self.count[: len(row)]
         before = count[:, None] - 1 - self.back
@@ -96,7 +94,7 @@ class _Sweep:
 
 @dataclass(frozen=True)
 class Partitions:
-    """Of all tiles, tile by tile, front to back.
+    """Partitions of all tiles, tile by tile, front to back.
 
     sums: (P, 8). tile, rank: (P,) the tile and the number within it. nearest: (P,) the first depth bucket. place: (T, U) where each
     bucket lies among those of a tile: 2 rank in one, 2 rank - 1 before it. counts: (T,) of each tile.
@@ -130,7 +128,7 @@ def partitions_of(rows: Rows, light: TileLight, settings: Settings) -> Partition
 
 
 def faint_rows(rows: Rows, light: TileLight, settings: Settings) -> Bool[Tensor, " rows"]:
-    """Which rows can hardly be seen, spread over the area of their filter; none of a tile where all are."""
+    """Return which rows can hardly be seen, spread over the area of their filter; none of a tile where all are."""
     if not (settings.merge and settings.faint > 0.0):
         return torch.zeros_like(rows.tile, dtype=torch.bool)
     tiles = len(rows.first) - 1
@@ -151,7 +149,7 @@ def _by_slopes(
     light: TileLight,
     settings: Settings,
 ) -> Int64[Tensor, " faint"]:
-    """The partition of its tile by whose slopes the mean sample of each of these rows goes least wrong."""
+    """Return the partition of its tile by whose slopes the mean sample of each of these rows goes least wrong."""
     tile, rank = rows.tile[faint], torch.arange(int(counts.max()), device=faint.device)
     of = ((torch.cumsum(counts, 0) - counts)[tile][:, None] + rank).clamp(max=len(sums) - 1)
     one = rows.sums[faint][:, None].expand(*of.shape, -1)
@@ -160,7 +158,7 @@ def _by_slopes(
 
 
 def merged_rows(rows: Rows, window: Float64[Tensor, "4"], settings: Settings) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " tiles"]]:
-    """The partition of each row within its tile, and how many a tile has: a sweep over the rows of each tile.
+    """Return the partition of each row within its tile, and how many a tile has: a sweep over the rows of each tile.
 
     A row joins the last partition of which the common filter is hardly narrower than that of any part, and the slopes are alike.
     """
@@ -179,7 +177,9 @@ def merged_rows(rows: Rows, window: Float64[Tensor, "4"], settings: Settings) ->
 def _places(
     rows: Rows, own: Int64[Tensor, " rows"], tile: Int64[Tensor, " partitions"], nearest: Int64[Tensor, " partitions"], light: TileLight
 ) -> Int64[Tensor, "tiles buckets"]:
-    """Buckets that no row of the tile knows belong to a row beside them, in depth or motion, the foremost; else between partitions."""
+    """Return the place of every bucket. Return the place of every bucket. Buckets that no row of the tile knows belong to a row beside
+    them, in depth or motion, the foremost; else between partitions.
+    """
     tiles = len(rows.first) - 1
     of = torch.where(rows.place >= 0, 2 * own[rows.place.clamp(min=0)], -1)
     padded = torch.cat([of, torch.full_like(of[:, :1], -1)], dim=1)

@@ -1,8 +1,5 @@
-"""Samples on a device become a picture on the device.
-
-Jobs of tiles become pictures of tiles, front to back.
-
-Which parts of pupil and shutter are merged: `layered_reconstruction._parts_numba` for many tiles.
+"""Pictures on a device from samples on the device: jobs of tiles filtered, composited front to back, in parts where that makes a
+difference.
 """
 
 from collections.abc import Iterator
@@ -45,7 +42,7 @@ Tiles = Float32[Tensor, "tiles channels side side"]
 def composited(
     layers: Float32[Tensor, "jobs planes parts side side"], counts: Int64[np.ndarray, " tiles"], shares: list[float]
 ) -> tuple[Tiles, Tensor]:
-    """e(x) = e_0(x) + sum_j e_j(x) prod_{k<j} (1 - alpha_k(x)), and the product over all that is left, (T, side, side).
+    """Return Return e(x) = e_0(x) + sum_j e_j(x) prod_{k<j} (1 - alpha_k(x)), and the product over all that is left, (T, side, side).
 
     Both are the mean over parts of pupil and shutter, by their shares, each of which is composited on its own.
     layers: colour, opacity and weight, both of which the weight divides, of jobs tile by tile; a layer of no weight is not there.
@@ -70,14 +67,14 @@ def composited(
 
 
 def put_together(tiles: Tiles, light: TileLight) -> Float32[Tensor, "height width channels"]:
-    """The picture of all tiles, in rows; the last may be cut."""
+    """Return the picture of all tiles, in rows; the last may be cut."""
     channels, side = tiles.shape[1], light.tile_px
     picture = tiles.view(light.rows, light.columns, channels, side, side).permute(0, 3, 1, 4, 2)
     return picture.reshape(light.rows * side, light.columns * side, channels)[: light.height_px, : light.width_px]
 
 
 def own_means(light: TileLight) -> Float32[Tensor, "height width channels"]:
-    """The mean of the samples of each pixel, 0 where it has none."""
+    """Return the mean of the samples of each pixel, 0 where it has none."""
     x = light.geometry[:, 0].long().clamp(max=light.width_px - 1)
     y = light.geometry[:, 1].long().clamp(max=light.height_px - 1)
     sums = light.values.new_zeros((light.height_px * light.width_px, light.values.shape[1] + 1))
@@ -90,21 +87,21 @@ Coarse = Float32[Tensor, "tiles channels side side"]
 
 
 def coarse_inside(light: TileLight, tile: Int64[Tensor, " tiles"]) -> Bool[Tensor, "tiles side side"]:
-    """Which coarse pixels of these tiles hold any of the picture."""
+    """Return which coarse pixels of these tiles hold any of the picture."""
     at = torch.arange(light.tile_px // COARSE_PX, device=tile.device) * COARSE_PX
     x, y = (tile % light.columns * light.tile_px)[:, None] + at, (tile // light.columns * light.tile_px)[:, None] + at
     return (y < light.height_px)[:, :, None] & (x < light.width_px)[:, None, :]
 
 
 def ratio_of(alike: Coarse, apart: Coarse) -> Coarse:
-    """Parts over the whole, from 0 to MOST_RATIO, 1 where the whole is 0."""
+    """Return parts over the whole, from 0 to MOST_RATIO, 1 where the whole is 0."""
     return torch.where(alike == 0.0, 1.0, (apart / torch.where(alike == 0.0, 1.0, alike)).clamp(0.0, MOST_RATIO))
 
 
 def too_detailed(
     alike: Coarse, apart: Coarse, inside: Bool[Tensor, "tiles side side"], tolerance: float
 ) -> Bool[Tensor, "tiles side side"]:
-    """Where coarse pixels cannot hold what parts add to the whole: all in the box around what was found."""
+    """Return where coarse pixels cannot hold what parts add to the whole: the box around all that were found."""
     mask = inside[:, None].float()
     added = (apart - alike) * mask
     mean = avg_pool2d(added, 3, 1, 1) / avg_pool2d(mask, 3, 1, 1).clamp(min=1e-6)
@@ -143,7 +140,7 @@ _UNSEEN = 0.999
 
 @dataclass(frozen=True)
 class TorchReconstruction:
-    """Clean pictures from few samples, on a device; see LayeredReconstruction, whose settings and pictures these are.
+    """Reconstruction of clean pictures from few samples, on a device; see LayeredReconstruction, whose settings and pictures these are.
 
     device: 'cuda', 'cuda:1', 'cpu'. seed: of the choice that the sparse statistics look at.
     Takes the screen filters "windows", "sheared" and "direct".
@@ -157,7 +154,7 @@ class TorchReconstruction:
         device_named(self.device)
 
     def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
-        """The picture that more samples would converge to: opaque, with the depth of the nearest sample of each pixel."""
+        """Return the picture that more samples would converge to: opaque, with the depth of the nearest sample of each pixel."""
         here = DeviceSamples.of(samples, samples.rgb, samples.coc_px(lens), device_named(self.device))
         picture, _ = self.picture(here, lens.aperture)
         return opaque(picture.cpu().numpy(), _nearest_depth_m(here).cpu().numpy())
@@ -170,7 +167,7 @@ class TorchReconstruction:
         aperture: Aperture,
         shared_out: bool = True,
     ) -> tuple[Float32[np.ndarray, "height width channels"], tuple[float, float]]:
-        """Any values (N, C) from the host and back, and how many partitions a tile has before they are merged and after."""
+        """Reconstruct any values (N, C) from the host; return them and how many partitions a tile has before they are merged and after."""
         here = DeviceSamples.of(samples, values, coc_px, device_named(self.device))
         picture, counts = self.picture(here, aperture, shared_out)
         return picture.cpu().numpy(), counts
@@ -179,7 +176,7 @@ class TorchReconstruction:
     def picture(
         self, samples: DeviceSamples, aperture: Aperture, shared_out: bool = True
     ) -> tuple[Float32[Tensor, "height width channels"], tuple[float, float]]:
-        """The picture, on the device, and the mean number of partitions of tiles with samples, before they are merged and after.
+        """Return the picture, on the device, and the mean number of partitions of tiles with samples, before they are merged and after.
 
         shared_out: samples that move are shared out among the four nearest pixels, else all keep the pixel they come into.
         """
@@ -207,7 +204,7 @@ class TorchReconstruction:
         return torch.where(unseen, own_means(light), picture) if bool(unseen.any()) else picture.contiguous()
 
     def _in_parts(self, light: TileLight, jobs: Jobs, screen: ScreenFilter, tiles: Int64[np.ndarray, " tiles"]) -> tuple[Tiles, Tensor]:
-        """Pictures of tiles and what is left of each pixel; alone in a tile, a job hides nothing and is whole."""
+        """Return pictures of tiles and what is left of each pixel; alone in a tile, a job hides nothing and is whole."""
         counts, members = jobs.host_counts[tiles], jobs_in(jobs, tiles)
         layers = light.values.new_zeros((max(1, len(members)), light.values.shape[1] + 2, len(screen.shares), *(light.tile_px,) * 2))
         is_one_of_many = np.repeat(counts, counts) > 1
@@ -219,7 +216,7 @@ class TorchReconstruction:
     def _in_merged_parts(
         self, light: TileLight, jobs: Jobs, screen: ScreenFilter, tiles: Int64[np.ndarray, " tiles"]
     ) -> tuple[Tiles, Tensor]:
-        """The same, in parts only where these make a difference."""
+        """Return the same, in parts only where these make a difference."""
         counts, members, coarse_px = jobs.host_counts[tiles], jobs_in(jobs, tiles), light.tile_px // COARSE_PX
         planes_and = max(1, len(members)), light.values.shape[1] + 2
         whole = light.values.new_zeros((*planes_and, 1, *(light.tile_px,) * 2))
@@ -246,7 +243,9 @@ class TorchReconstruction:
     def _planes(
         self, light: TileLight, jobs: Jobs, members: Int64[np.ndarray, " members"], some: Int64[np.ndarray, " some"]
     ) -> Iterator[tuple[Int64[Tensor, " group"], Tensor, Task, int]]:
-        """Of some of these jobs, in groups of one guard band: their places among them, reprojected planes, what they are, the band."""
+        """Yield for some of these jobs, in groups of one guard band: their places among the jobs, reprojected planes, their task, the
+        band.
+        """
         pairs, pixels, _ = AT_ONCE[light.values.device.type]
         for together, guard in groups(jobs, members[some], light.tile_px, pixels):
             task = task_of(jobs, light, together, guard)

@@ -39,7 +39,7 @@ _BEYOND = 2
 
 
 class ScreenFilter:
-    """One of FILTERS. aperture: the opening in its true shape, for "windows"."""
+    """Screen-space filter, one of FILTERS. aperture: the opening in its true shape, for "windows"."""
 
     def __init__(self, settings: Settings, aperture: Aperture, light: TileLight) -> None:
         if settings.screen_filter not in FILTERS:
@@ -54,7 +54,7 @@ class ScreenFilter:
         self.shares = [cell.share / self.times for cell in self.cells for _ in range(self.times)] or [1.0]
 
     def guards(self, slopes: Slopes) -> Int64[Tensor, "jobs 2"]:
-        """How many pixels beyond a tile the filter of each job reads, along x and y."""
+        """Return how many pixels beyond a tile the filter of each job reads, along x and y."""
         if self.whole is not None:
             return window_guards(slopes, self.pupil_radius, self.settings.sigma_x_px)
         return gaussian_guards(self._covariance(slopes), self.settings.support)
@@ -62,7 +62,7 @@ class ScreenFilter:
     def filtered(
         self, planes: Float32[Tensor, "group side side planes"], jobs: Jobs, task: Task, guard: int, in_parts: bool
     ) -> Float32[Tensor, "group planes parts tile tile"]:
-        """What of the windows comes to lie on the tiles in their middles, through each part of pupil and shutter or through all."""
+        """Filter windows and return the tiles in their middles, through each part of pupil and shutter or through all."""
         slopes = Slopes(*(each[task.job] for each in jobs.slopes))
         values = planes.permute(0, 3, 1, 2)
         size = transform_size(task.side + _BEYOND)
@@ -76,7 +76,7 @@ class ScreenFilter:
     def filtered_coarse(
         self, planes: Float32[Tensor, "group side side planes"], jobs: Jobs, task: Task, guard: int, in_parts: bool
     ) -> Float32[Tensor, "group planes parts coarse coarse"]:
-        """The same in pixels COARSE_PX as large."""
+        """Return the same in pixels COARSE_PX as large."""
         slopes = Slopes(*(each[task.job] for each in jobs.slopes))
         slopes = slopes._replace(r=slopes.r / COARSE_PX, m_x=slopes.m_x / COARSE_PX, m_y=slopes.m_y / COARSE_PX)
         wider = -guard % COARSE_PX
@@ -88,7 +88,7 @@ class ScreenFilter:
         return _met(spectrum, self._windows(slopes, offset, in_parts), tile, size)
 
     def _smoothed(self, values: Float32[Tensor, "group planes side side"]) -> Float32[Tensor, "group planes side side"]:
-        """By what the spatial filter has beyond a pixel."""
+        """Smooth by what the spatial filter has beyond a pixel."""
         side = values.shape[-1]
         size = transform_size(side + _BEYOND)
         rest = rest_kernel(self.settings.sigma_x_px, _offsets(size, values.device))
@@ -100,7 +100,7 @@ class ScreenFilter:
     def _spectra(
         self, slopes: Slopes, guard: Int64[Tensor, "group 2"], offset: Int64[Tensor, " size"], in_parts: bool
     ) -> Iterator[Complex128[Tensor, "group size half"]]:
-        """Of the filter of each part: cell by cell of the pupil, time by time within each."""
+        """Yield the spectrum of each part's filter: cell by cell of the pupil, time by time within each."""
         if self.whole is None:
             make = sheared_kernels if self.settings.screen_filter == "sheared" else direct_kernels
             yield torch.fft.rfft2(make(self._covariance(slopes), guard, offset))
@@ -110,7 +110,7 @@ class ScreenFilter:
             yield window if rest is None else window * torch.fft.rfft2(rest)
 
     def _windows(self, slopes: Slopes, offset: Int64[Tensor, " size"], in_parts: bool) -> Iterator[Complex128[Tensor, "group size half"]]:
-        """Of pupil and shutter in their true shapes."""
+        """Yield the spectra of pupil and shutter in their true shapes."""
         cells, times = (self.cells, self.times) if in_parts or self.whole is None else ([self.whole], 1)
         borders = [time / times - 0.5 for time in range(times + 1)]
         lines = [torch.fft.rfft2(line_kernels(slopes, offset, begin, end)) for begin, end in pairwise(borders)]
@@ -131,7 +131,7 @@ def _offsets(size: int, device: torch.device) -> Int64[Tensor, " size"]:
 def _met(
     spectrum: Complex128[Tensor, "group planes size half"], kernels: Iterator[Complex128[Tensor, "group size half"]], tile: slice, size: int
 ) -> Float32[Tensor, "group planes parts tile tile"]:
-    """What of the products with each kernel lies on the tile."""
+    """Return the part of the products with each kernel that lies on the tile."""
     parts = [
         torch.fft.irfft(torch.fft.ifft(spectrum * kernel.conj()[:, None], dim=-2)[..., tile, :], n=size)[..., tile].float()
         for kernel in kernels
@@ -140,7 +140,7 @@ def _met(
 
 
 def transform_size(least: int) -> int:
-    """The least product of 2, 3 and 5 that is even and no smaller."""
+    """Return the least product of 2, 3 and 5 that is even and no smaller."""
     size = least + least % 2
     while True:
         rest = size

@@ -1,8 +1,7 @@
-"""Sums over the samples of each tile and bucket, from all samples or a sparse stratified choice in Morton order.
+"""Sums over the samples of each tile and bucket, and the sheared filter that follows from them, for all partitions at once.
 
-The sheared filter of partitions, all at once; the formulas of `layered_reconstruction._filter_numba`, in its words.
-
-Sums are (..., 8): count, r, r^2, m_x, m_y, m_x^2, m_x m_y, m_y^2, with r half the signed circle of confusion.
+The formulas and words are those of `layered_reconstruction._filter_numba`. Sums are (..., 8): count, r, r^2, m_x, m_y, m_x^2, m_x m_y,
+m_y^2, with r half the signed circle of confusion, from all samples or a sparse stratified choice in Morton order.
 """
 
 from collections.abc import Iterator
@@ -33,7 +32,7 @@ class Slopes(NamedTuple):
 
 
 class Covariance(NamedTuple):
-    """A symmetric matrix of two by two."""
+    """Symmetric matrix of two by two."""
 
     xx: Number
     xy: Number
@@ -41,7 +40,7 @@ class Covariance(NamedTuple):
 
 
 def features(slopes: Tensor) -> Float64[Tensor, "*samples 8"]:
-    """What samples with slopes (..., 3) add to a row of sums."""
+    """Return what samples with slopes (..., 3) add to a row of sums."""
     r, m_x, m_y = slopes.double().unbind(dim=-1)
     return torch.stack([torch.ones_like(r), r, r * r, m_x, m_y, m_x * m_x, m_x * m_y, m_y * m_y], dim=-1)
 
@@ -62,7 +61,7 @@ def sheared_slopes(sums: Sums, window: Window, sigma_x_px: float, bandwidth: flo
 
 
 def screen_covariance(slopes: Slopes, window: Window, sigma_x_px: float) -> Covariance:
-    """Of the Gaussian over the screen."""
+    """Return the covariance of the Gaussian over the screen."""
     lens = slopes.kappa_u * (2.0 - slopes.kappa_u) * slopes.r**2
     shutter = slopes.kappa_t * (2.0 - slopes.kappa_t) * window[3]
     xx = sigma_x_px**2 + lens * window[0] + shutter * slopes.m_x**2
@@ -70,13 +69,13 @@ def screen_covariance(slopes: Slopes, window: Window, sigma_x_px: float) -> Cova
 
 
 def axes(v: Covariance) -> tuple[Number, Number, Number]:
-    """(sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
+    """Return Return (sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
     middle, half = 0.5 * (v.xx + v.yy), torch.hypot(0.5 * (v.xx - v.yy), v.xy)
     return torch.sqrt(middle + half), torch.sqrt((middle - half).clamp(min=0.0)), 0.5 * torch.atan2(2.0 * v.xy, v.xx - v.yy)
 
 
 def sheared_axes(sigma_u: Number, sigma_v: Number, theta: Number) -> tuple[Number, Number, Number]:
-    """(s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
+    """Return Return (s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
     cosine, sine = torch.cos(theta), torch.sin(theta)
     rho = torch.sqrt((sigma_v * cosine) ** 2 + (sigma_u * sine) ** 2)
     flat, safe = rho == 0.0, rho.clamp(min=1e-300)
@@ -85,20 +84,22 @@ def sheared_axes(sigma_u: Number, sigma_v: Number, theta: Number) -> tuple[Numbe
 
 
 def extents(sums: Sums, window: Window, sigma_x_px: float, bandwidth: float) -> tuple[Number, Number]:
-    """Standard deviations of the screen-space filter along its axes, the longer first."""
+    """Return standard deviations of the screen-space filter along its axes, the longer first."""
     sigma_u, sigma_v, _ = axes(screen_covariance(sheared_slopes(sums, window, sigma_x_px, bandwidth), window, sigma_x_px))
     return sigma_u, sigma_v
 
 
 def blur_px(sums: Sums, window: Window, sigma_x_px: float) -> tuple[Number, Number]:
-    """Standard deviations of the blur of the mean sample along its axes, the longer first."""
+    """Return standard deviations of the blur of the mean sample along its axes, the longer first."""
     r, m_x, m_y = (sums[..., k] / sums[..., 0] for k in (1, 3, 4))
     sigma_u, sigma_v, _ = axes(_blur(r, m_x, m_y, window, sigma_x_px)[0])
     return sigma_u, sigma_v
 
 
 def slope_distance(one: Sums, other: Sums, window: Window, sigma_x_px: float) -> Number:
-    """By how much reprojection along the mean slopes of the other goes wrong for the mean sample of one, in units of its own blur."""
+    """Return by how much reprojection along the mean slopes of the other goes wrong for the mean sample of one, in units of its own
+    blur.
+    """
     r, m_x, m_y = (one[..., k] / one[..., 0] for k in (1, 3, 4))
     off_r, off_x, off_y = (other[..., k] / other[..., 0] - mean for k, mean in ((1, r), (3, m_x), (4, m_y)))
     out, det = _blur(r, m_x, m_y, window, sigma_x_px)
@@ -108,7 +109,7 @@ def slope_distance(one: Sums, other: Sums, window: Window, sigma_x_px: float) ->
 
 
 def _blur(r: Number, m_x: Number, m_y: Number, window: Window, sigma_x_px: float) -> tuple[Covariance, Number]:
-    """The blur of the mean sample (what of the spectrum passes pupil, shutter and pixel), and its determinant."""
+    """Return the blur of the mean sample (what of the spectrum passes pupil, shutter and pixel), and its determinant."""
     out = Covariance(
         sigma_x_px**2 + r * r * window[0] + window[3] * m_x * m_x,
         r * r * window[1] + window[3] * m_x * m_y,
@@ -139,7 +140,8 @@ class Rows:
 
 
 def tile_rows(light: TileLight, every: int, seed: int) -> Rows:
-    """Statistics of what a tile holds, from one sample of `every`, and of what only the blocks around it hold; waits for their number.
+    """Return statistics of what a tile holds, from one sample of `every`, and of what only the blocks around it hold; waits for their
+    number.
 
     Buckets of which no sample was chosen are summed from all of theirs, and count as much as the others.
     """
@@ -173,7 +175,7 @@ def _light_of_rows(light: TileLight, place: Int64[Tensor, "tiles buckets"], rows
 
 
 def chosen_samples(light: TileLight, every: int, seed: int) -> Int64[Tensor, " chosen"]:
-    """One of every so many samples of a tile, the last of those left."""
+    """Choose one of every so many samples of a tile, the last of those left."""
     device = light.block.device
     if every == 1:
         return torch.arange(len(light.block), device=device)
@@ -186,7 +188,7 @@ def chosen_samples(light: TileLight, every: int, seed: int) -> Int64[Tensor, " c
 
 @lru_cache(maxsize=4)
 def chance(seed: int, tiles: int, steps: int, device: torch.device) -> Int64[Tensor, "tiles steps"]:
-    """The first numbers of a xor-shift generator of each tile (Marsaglia 2003), those of the compiled renderer."""
+    """Return the first numbers of a xor-shift generator of each tile (Marsaglia 2003), those of the compiled renderer."""
     start = np.uint64(seed * 2654435761 + 374761393 & 0xFFFFFFFF)
     state = (start + np.arange(tiles, dtype=np.uint64) * np.uint64(2246822519)) & _WORD
     state = np.where(state == 0, np.uint64(1), state)
@@ -207,7 +209,7 @@ def _xorshift(state: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def ring_of_tiles(columns: int, rows: int, device: torch.device) -> Int64[Tensor, "20 tiles"]:
-    """The blocks of other tiles that touch each tile; one beyond the last block outside of the picture."""
+    """Return the blocks of other tiles that touch each tile; one beyond the last block outside of the picture."""
     tile = torch.arange(columns * rows, device=device)
     ring = []
     for step_y in range(-1, 5):
@@ -220,7 +222,7 @@ def ring_of_tiles(columns: int, rows: int, device: torch.device) -> Int64[Tensor
 
 
 def _kinds(holds: Bool[Tensor, "blocks_and_none buckets"], ring: Int64[Tensor, "20 tiles"]) -> Int8[Tensor, "tiles buckets"]:
-    """Which buckets a tile holds, and which only the blocks around it hold."""
+    """Return which buckets a tile holds, and which only the blocks around it hold."""
     within = holds[:-1].view(-1, BLOCKS, holds.shape[1]).any(dim=1)
     around = holds[ring[0]]
     for blocks in ring[1:]:
@@ -229,7 +231,7 @@ def _kinds(holds: Bool[Tensor, "blocks_and_none buckets"], ring: Int64[Tensor, "
 
 
 def _needed(kind: Int8[Tensor, "tiles buckets"], ring: Int64[Tensor, "20 tiles"]) -> Bool[Tensor, "blocks_and_none buckets"]:
-    """Buckets of each block whose samples count although none was chosen, in its own tile or in one that it touches."""
+    """Return buckets of each block whose samples count although none was chosen, in its own tile or in one that it touches."""
     within, outside = kind == _WITHIN, kind == _OUTSIDE
     needed = torch.cat([within.repeat_interleave(BLOCKS, dim=0), torch.zeros_like(within[:1])])
     for blocks in ring:
@@ -241,7 +243,9 @@ def _needed(kind: Int8[Tensor, "tiles buckets"], ring: Int64[Tensor, "20 tiles"]
 def _unchosen(
     light: TileLight, sample: Int64[Tensor, " needed"], kind: Int8[Tensor, "tiles buckets"]
 ) -> list[tuple[Int64[Tensor, " some"], Int64[Tensor, " some"]]]:
-    """Of these samples, those that count for their own tile and for those beside, above or below, and across the corner, each with it."""
+    """Return of these samples those that count for their own tile and for tiles beside, above or below, and across the corner, each
+    with its tile.
+    """
     found = []
     for some, tile, outside in _touched(light, sample):
         which = torch.nonzero(kind[tile, light.bucket[some]] == (_OUTSIDE if outside else _WITHIN))[:, 0]
@@ -250,8 +254,9 @@ def _unchosen(
 
 
 def _touched(light: TileLight, sample: Int64[Tensor, " samples"]) -> Iterator[tuple[Int64[Tensor, " some"], Int64[Tensor, " some"], bool]]:
-    """Samples with the tile they lie in, then those of them whose block touches a tile beside, above or below, or across the corner,
-    with that tile; and whether it is another."""
+    """Yield samples with the tile they lie in, then those of them whose block touches a tile beside, above or below, or across the corner,
+    with that tile; and whether it is another.
+    """
     x, y = place_of(light.block[sample], light.columns)
     step_x, step_y = (at % 4 // 3 - (3 - at % 4) // 3 for at in (x, y))
     for with_x, with_y in ((0, 0), (1, 0), (0, 1), (1, 1)):

@@ -1,8 +1,6 @@
-"""Reprojection as one kernel with atomic additions, for NVIDIA GPUs; imported only where triton is there.
+"""Triton kernels for NVIDIA GPUs: reprojection with atomic additions, and the sweep over the rows of tiles; imported only with triton.
 
-The sweep over the rows of tiles as one kernel, for NVIDIA GPUs; imported only where triton is there.
-
-One tile needs the outcome of a row before the next, so that by torch alone each row of all tiles costs a hundred launches.
+In the sweep a tile needs the outcome of a row before the next, so that by torch alone each row of all tiles costs a hundred launches.
 """
 
 from typing import no_type_check
@@ -29,7 +27,7 @@ def splat_by_kernel(
     block: Int64[Tensor, " entries"],
     side: int,
 ) -> None:
-    """See `_reprojection.splat_in_chunks`, its twin."""
+    """Splat as `_jobs.splat_in_chunks` does."""
     tensors = planes, light.geometry, light.values, light.bucket, light.depth, light.starts, slope, facts, place, entry, block
     channels = light.values.shape[1]
     wide = triton.next_power_of_2(channels + 3)
@@ -58,7 +56,7 @@ def _splat(
     WIDE: tl.constexpr,
     SAMPLES: tl.constexpr,
 ):
-    """One program: the samples of one block, for one job. Planes are colour, opacity, weight and count."""
+    """Splat the samples of one block, for one job, in one program. Planes are colour, opacity, weight and count."""
     group, at_block = tl.load(entry + tl.program_id(0)), tl.load(block + tl.program_id(0))
     first, end = tl.load(starts + at_block), tl.load(starts + at_block + 1)
     a, b_x, b_y = tl.load(slope + group * 3), tl.load(slope + group * 3 + 1), tl.load(slope + group * 3 + 2)
@@ -102,7 +100,7 @@ def sweep_by_kernel(
     numbers: tuple[float, float, float],
     look_back: int,
 ) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " tiles"]]:
-    """See `_sweep.sweep_row_by_row`, its twin."""
+    """Sweep as `_partitions.sweep_row_by_row` does."""
     own = torch.empty_like(rows.tile)
     counts = torch.empty_like(rows.first[1:])
     chosen = torch.tensor(numbers, dtype=torch.float64).to(window.device, non_blocking=True)
@@ -156,7 +154,7 @@ def _distance(r, m_x, m_y, to_r, to_x, to_y, d_uu, d_uv, d_vv, d_tt, sigma):
 @triton.jit
 @no_type_check
 def _sweep(own, counts, first, sums, widths, limits, window, chosen, BACK: tl.constexpr):
-    """One program: one tile. Lanes hold the last BACK partitions, the one of number k in the lane k % BACK."""
+    """Sweep one tile in one program. Lanes hold the last BACK partitions, the one of number k in the lane k % BACK."""
     begin, end = tl.load(first + tl.program_id(0)), tl.load(first + tl.program_id(0) + 1)
     d_uu, d_uv, d_vv, d_tt = tl.load(window), tl.load(window + 1), tl.load(window + 2), tl.load(window + 3)
     sigma, bandwidth, least = tl.load(chosen), tl.load(chosen + 1), tl.load(chosen + 2)

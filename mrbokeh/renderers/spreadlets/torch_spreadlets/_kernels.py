@@ -118,8 +118,8 @@ _LARGEST_SUM = 64.0  # far above the 8 that banks were seen to have, so that uni
 
 @dataclass(frozen=True)
 class PointTable:
-    """Points of kernels: xy (N, 2) right and down of the source; weights (N, K), one column for each colour; cell i has count[i] points
-    from first[i].
+    """Points of kernels: Points of kernels: xy (N, 2) right and down of the source; weights (N, K), one column for each colour; cell i
+    has count[i] points from first[i].
 
     most: the largest count. reach_px: no point lies farther away. largest_sum: no sum of points times light, one of them from
     every pixel around, exceeds this times the brightest light.
@@ -135,7 +135,7 @@ class PointTable:
 
 
 def table_of(points: Points, device: torch.device) -> PointTable:
-    """The points of the CPU's renderer on a device."""
+    """Return the points of the CPU's renderer on a device."""
     count, weights = np.diff(points.starts), points.weights[:, None]
     largest = _largest_at(np.zeros((2 * points.reach_px + 1,) * 2), points.xy, weights)
     xy, values, first, counts = _on(device, points.xy, weights, points.starts[:-1].astype(np.int32), count.astype(np.int32))
@@ -164,7 +164,9 @@ class BankPoints:
         self._xy, self._weights = _on(self.device, np.zeros((0, 2), np.int32), np.zeros((0, self.tables.bank.channels)))
 
     def of(self, codes: Int64[np.ndarray, " codes"]) -> PointTable:
-        """A table whose cells are all codes of the bank; these have their points. Its reach is rounded up, so as to change rarely."""
+        """Return a table whose cells are all codes of the bank; these have their points. Its reach is rounded up, so as to change
+        rarely.
+        """
         new = codes[self._count[codes] == 0]
         if new.size:
             self._add(new)

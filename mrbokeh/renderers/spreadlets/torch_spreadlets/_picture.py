@@ -78,7 +78,7 @@ class TorchSpreadlets:
         return torch.cat([result[..., :3], result[..., 3:].mean(dim=2, keepdim=True)], dim=2)
 
     def sum_kernels(self, layer: DeviceLayer) -> Channels:
-        """The sum over all pixels of light times kernel: R, G, B and coverage, or three coverages for a bank of three colours.
+        """Return the sum over all pixels of light times kernel: R, G, B and coverage, or three coverages for a bank of three colours.
 
         See LaplacianSpreadlets.sum_bank_kernels, with which this agrees to rounding where Laplacians are whole. The
         far field of sparse points feels the border, which lies elsewhere here (2e-4 in a picture up to 4).
@@ -126,7 +126,7 @@ def over(front: Channels, behind: Channels) -> Channels:
 
 
 def _finite(layer: DeviceLayer, lit: Bool[Tensor, "height width"]) -> tuple[DeviceLayer, Bool[Tensor, "height width"]]:
-    """The layer with 0 where a plane is not a number, so that it may index tables, and where that is seen. Depth may be inf."""
+    """Return the layer with 0 where a plane is not a number, so that it may index tables, and where that is seen. Depth may be inf."""
     bad = lit & ~torch.isfinite(layer.coc_px)
     for plane in (layer.motion_px, layer.field_xy):
         bad |= lit & (False if plane is None else ~torch.isfinite(plane).all(dim=2))

@@ -24,7 +24,7 @@ Planes = Float[Tensor, "channels height width"]
 
 
 def integrate(source: Planes) -> Planes:
-    """The planes whose 3x3 Laplacian is this, zero beyond the border; in the precision of the source, on its device."""
+    """Return the planes whose 3x3 Laplacian is this, zero beyond the border; in the precision of the source, on its device."""
     _, height, width = source.shape
     if min(height, width) < 3:
         raise InputError(f"a Laplacian to integrate needs at least 3 x 3 pixels, got {width} x {height}")
@@ -43,14 +43,14 @@ def _inverse(height: int, width: int, precision: torch.dtype, device: torch.devi
 
 
 def _down(planes: Planes) -> Planes:
-    """The sine transform of the first kind along columns; twice it is 2 (height + 1)."""
+    """Return the sine transform of the first kind along columns; twice it is 2 (height + 1)."""
     border = torch.zeros_like(planes[:, :1])
     odd = torch.cat([border, planes, border, -planes.flip(1)], dim=1)
     return torch.fft.rfft(odd, dim=1).imag[:, 1 : planes.shape[1] + 1].neg()
 
 
 def _along(planes: Planes) -> Planes:
-    """The sine transform of the second kind along rows, as a cosine transform of every other pixel negated (Makhoul 1980)."""
+    """Return the sine transform of the second kind along rows, as a cosine transform of every other pixel negated (Makhoul 1980)."""
     width = planes.shape[2]
     order = torch.cat([planes[..., ::2], -planes[..., 1::2].flip(2)], dim=2)
     half = torch.fft.rfft(order, dim=2) * _turn(width, planes.dtype, planes.device)
@@ -59,7 +59,7 @@ def _along(planes: Planes) -> Planes:
 
 
 def _back_along(modes: Planes) -> Planes:
-    """The inverse of `_along`."""
+    """Return the inverse of `_along`."""
     width = modes.shape[2]
     cosine = modes.flip(2)
     beyond = torch.cat([torch.zeros_like(cosine[..., :1]), cosine.flip(2)[..., : width // 2]], dim=2)
