@@ -1,9 +1,6 @@
 """`mrbokeh lens psf`, `export` and `show` as a user meets them: real files, builds that stopped half way, and mistakes."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +22,13 @@ from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.bank.kernel_files import build_spreadlets, spreadlets_beside
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import mrbokeh
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 
 
 def run(*arguments: object) -> str:
     return CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False).stdout
-
-
-def process(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own, for its exit code and what it says."""
-    command = [sys.executable, "-m", "mrbokeh.cli", "lens", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200", "NO_COLOR": "1"})
 
 
 def picture_file(path: Path) -> Path:
@@ -276,11 +268,11 @@ def test_mistakes_are_one_sentence_and_leave_nothing(mistake: str, tmp_path: Pat
 
 
 def test_exit_codes_of_real_processes(tmp_path: Path) -> None:
-    done = process("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    done = mrbokeh("lens", "psf", "simple", "--out", tmp_path / "bank", *SMALL)
     assert done.returncode == 0 and "wrote" in done.stdout, done.stderr
     shutil.rmtree(tmp_path / "bank" / "cells")
     for arguments in (["show", tmp_path / "bank"], ["export", tmp_path / "bank"]):
-        done = process(*arguments, "--out", tmp_path / "sheet.png")
+        done = mrbokeh("lens", *arguments, "--out", tmp_path / "sheet.png")
         assert done.returncode == 2 and "Traceback" not in done.stderr
         assert done.stderr.startswith("error: ") and "only 0 of its 4 kernels are built" in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "sheet.png").exists()
