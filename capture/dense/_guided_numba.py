@@ -1,13 +1,10 @@
-"""Weighted median around the edges of a depth map, compiled.
-
-Semi-global aggregation of costs in 0..255 along eight directions with penalties that bend to a guide picture, compiled.
-
-Tridiagonal solves of the fast global smoother along rows and columns, compiled.
-"""
+"""Compiled loops of `guided_depth`: weighted medians, and semi-global aggregation of costs in 0..255 along eight directions."""
 
 import numpy as np
 
 from mrbokeh.system.kernels import njit
+
+_FAR = np.float32(1e9)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -21,7 +18,10 @@ def weighted_medians(
     rows: tuple[int, int],
     out: np.ndarray,
 ) -> None:
-    """For each pixel of rows first <= y < end marked in `where`: see `dense_edges.weighted_medians_plainly`, the twin."""
+    """Replace each pixel marked in `where`, of rows first <= y < end, by the weighted median of its window.
+
+    See `guided_depth.weighted_medians`.
+    """
     height, width = values.shape
     colours = guide.shape[2]
     found = np.empty((2 * radius + 1) ** 2, np.float32)
@@ -52,13 +52,12 @@ def weighted_medians(
                     break
 
 
-_FAR = np.float32(1e9)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _step(before: np.ndarray, cost: np.ndarray, small: np.float32, large: np.float32, path: np.ndarray) -> None:
-    """Cheapest way to each label of this pixel from any of the previous one; both carry a margin of one on either side, and the
-    cheapest of all at their end."""
+    """Compute the path cost of each label of this pixel from the previous one.
+
+    Both arrays carry a margin of one on either side, and the least cost of all labels at their end.
+    """
     count = cost.shape[0]
     cheapest = before[count + 2]
     jump = cheapest + large
@@ -101,7 +100,7 @@ def _sweep(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def aggregate(costs: np.ndarray, guide: np.ndarray, small: float, large: float, contrast: float) -> np.ndarray:
-    """(H, W, L) uint8 costs to their sums over eight paths, uint16, rounded down path by path."""
+    """Sum (H, W, L) uint8 costs over eight paths as uint16, rounded down path by path."""
     total = np.zeros(costs.shape, np.uint16)
     for direction in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)):
         _sweep(costs, guide, direction, small, large, contrast, total)
@@ -110,7 +109,7 @@ def aggregate(costs: np.ndarray, guide: np.ndarray, small: float, large: float, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def winners(total: np.ndarray, apart: int, index: np.ndarray, margin: np.ndarray) -> None:
-    """Per pixel the fractional index of the cheapest label, and how much dearer the cheapest one more than `apart` labels away is."""
+    """Find per pixel the fractional index of the cheapest label, and the lead over the cheapest one more than `apart` labels away."""
     height, width, labels = total.shape
     for y in range(height):
         for x in range(width):
@@ -131,56 +130,3 @@ def winners(total: np.ndarray, apart: int, index: np.ndarray, margin: np.ndarray
                 bend = before + after - np.float32(2.0) * here
                 if bend > 0:
                     index[y, x] += min(max(np.float32(0.5) * (before - after) / bend, np.float32(-0.5)), np.float32(0.5))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve_rows(values: np.ndarray, links: np.ndarray, smoothness: float, first: int, end: int) -> None:
-    """Rows first <= y < end of values (H, W, C) become the u of (1 + s (l_left + l_right)) u - s l_left u_left - s l_right u_right
-    = value; links (H, W - 1) join a pixel with its right neighbour. Thomas's algorithm."""
-    _, width, channels = values.shape
-    ahead = np.empty(width)
-    solved = np.empty((width, channels))
-    for y in range(first, end):
-        left = 0.0
-        for x in range(width):
-            right = smoothness * links[y, x] if x < width - 1 else 0.0
-            carried = left * ahead[x - 1] if x > 0 else 0.0
-            pivot = 1.0 / (1.0 + left + right - carried)
-            ahead[x] = right * pivot
-            for c in range(channels):
-                before = left * solved[x - 1, c] if x > 0 else 0.0
-                solved[x, c] = (values[y, x, c] + before) * pivot
-            left = right
-        for x in range(width - 2, -1, -1):
-            for c in range(channels):
-                solved[x, c] += ahead[x] * solved[x + 1, c]
-        for x in range(width):
-            for c in range(channels):
-                values[y, x, c] = solved[x, c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve_columns(values: np.ndarray, links: np.ndarray, smoothness: float, first: int, end: int) -> None:
-    """The same along columns first <= x < end; links (H - 1, W) join a pixel with the one below."""
-    height, _, channels = values.shape
-    ahead = np.empty((height, end - first))
-    solved = np.empty((height, end - first, channels))
-    for y in range(height):
-        for x in range(first, end):
-            i = x - first
-            above = smoothness * links[y - 1, x] if y > 0 else 0.0
-            below = smoothness * links[y, x] if y < height - 1 else 0.0
-            carried = above * ahead[y - 1, i] if y > 0 else 0.0
-            pivot = 1.0 / (1.0 + above + below - carried)
-            ahead[y, i] = below * pivot
-            for c in range(channels):
-                before = above * solved[y - 1, i, c] if y > 0 else 0.0
-                solved[y, i, c] = (values[y, x, c] + before) * pivot
-    for y in range(height - 2, -1, -1):
-        for i in range(end - first):
-            for c in range(channels):
-                solved[y, i, c] += ahead[y, i] * solved[y + 1, i, c]
-    for y in range(height):
-        for x in range(first, end):
-            for c in range(channels):
-                values[y, x, c] = solved[y, x - first, c]

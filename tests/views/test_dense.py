@@ -8,22 +8,20 @@ import pytest
 
 from capture.dense._guided_numba import aggregate
 from capture.dense.dense_depth import DenseSettings, dense_depth, halvings, level_sizes
-from capture.dense.depth_priors import Clues, Consistency, FocusVote, SparseDepths, ViewDepth, consistency
+from capture.dense.depth_priors import DepthPriors, Consistency, FocusVote, SparseDepths, ViewDepth, consistency
 from capture.dense.finish import FILLED, FOCUS, SWEEP, DenseDepth, sweep_trust, with_consistency
 from capture.dense.guided_depth import (
     Penalties,
-    aggregate_plainly,
     interpolate,
     label_planes,
     near_steps,
     smooth,
-    smooth_plainly,
     weighted_medians,
-    weighted_medians_plainly,
 )
-from capture.dense.patch_match import on_original_pixels, patch_match_clue, patch_match_obstacle
+from capture.dense.patch_match import on_original_pixels, patch_match_prior, patch_match_obstacle
 from capture.dense.sweep_view import SweepView
 from mrbokeh.optics.camera import Camera
+from tests.scenes.dense_references import aggregate_reference, weighted_medians_reference
 from tests.scenes.plane_sweep_scenes import FOCAL_PX, HEIGHT_PX, WIDTH_PX, TracedViews, card, grey_card, traced, wall
 
 RANGE = (0.4, 1.7)
@@ -53,7 +51,7 @@ def test_semi_global_costs_are_those_of_the_open_loops() -> None:
     guide = RNG.uniform(0, 1, (9, 11)).astype(np.float32)
     rules = Penalties(20.0, 150.0, 0.2)
     fast = aggregate(costs, guide, rules.small, rules.large, rules.contrast).astype(int)
-    assert np.abs(fast - aggregate_plainly(costs, guide, rules).astype(int)).max() <= 8
+    assert np.abs(fast - aggregate_reference(costs, guide, rules).astype(int)).max() <= 8
 
 
 def test_labels_jump_where_the_guide_does() -> None:
@@ -73,8 +71,28 @@ def test_margin_is_wide_where_costs_speak_and_nothing_where_they_do_not() -> Non
 
 
 def test_smoothing_is_that_of_full_matrices() -> None:
-    values, guide = RNG.uniform(0, 2, (13, 17, 2)).astype(np.float32), RNG.uniform(0, 1, (13, 17, 3)).astype(np.float32)
+    values = RNG.uniform(0, 2, (13, 17, 2)).astype(np.float32)
+    guide = (RNG.integers(0, 256, (13, 17, 3)) / 255).astype(np.float32)
+    guide[0, 0] = 1.0
     np.testing.assert_allclose(smooth(values, guide, 50.0, 0.3), smooth_plainly(values, guide, 50.0, 0.3), atol=1e-5)
+
+
+def smooth_plainly(values: np.ndarray, guide: np.ndarray, smoothness: float, contrast: float) -> np.ndarray:
+    """Weighted least squares by full matrices, line by line, in three rounds (Min et al. 2014, Algorithm 2)."""
+    result = values.astype(np.float64)
+    across, down = (np.exp(-np.linalg.norm(np.diff(guide, axis=axis), axis=-1) / contrast) for axis in (1, 0))
+    for strength in (1.5 * 4.0 ** (3 - t) / (4.0**3 - 1.0) * smoothness for t in (1, 2, 3)):
+        for y in range(result.shape[0]):
+            result[y] = np.linalg.solve(line_matrix(across[y], strength), result[y])
+        for x in range(result.shape[1]):
+            result[:, x] = np.linalg.solve(line_matrix(down[:, x], strength), result[:, x])
+    return result
+
+
+def line_matrix(links: np.ndarray, strength: float) -> np.ndarray:
+    """Identity plus strength times the graph Laplacian of a line."""
+    differences = np.diff(np.eye(len(links) + 1), axis=0)
+    return np.eye(len(links) + 1) + strength * differences.T @ (links[:, None] * differences)
 
 
 def test_smoothing_keeps_the_mean_and_stops_at_edges() -> None:
@@ -100,7 +118,7 @@ def test_weighted_medians_are_those_of_the_open_loops() -> None:
     values, weights = (RNG.uniform(0.1, 2, (14, 15)).astype(np.float32) for _ in range(2))
     guide, where = RNG.uniform(0, 0.3, (14, 15, 3)).astype(np.float32), RNG.uniform(0, 1, (14, 15)) > 0.4
     fast = weighted_medians(values, weights, guide, where, 3, 0.1)
-    np.testing.assert_array_equal(fast, weighted_medians_plainly(values, weights, guide, where, 3, 0.1))
+    np.testing.assert_array_equal(fast, weighted_medians_reference(values, weights, guide, where, 3, 0.1))
 
 
 def test_a_fattened_edge_goes_back_to_the_edge_of_the_picture() -> None:
@@ -183,7 +201,7 @@ def test_sparse_points_settle_what_has_no_texture() -> None:
     flat = np.full_like(scene.rgb[0], 0.4)
     blank = [SweepView(np.full_like(each.structure, 0.6), each.camera) for each in scene.views]
     xy_px = np.array([[20.5, 20.5], [140.5, 30.5], [80.5, 60.5], [30.5, 90.5], [130.5, 100.5]])
-    found = dense_depth(flat, blank[0], blank[1:], RANGE, Clues(sparse=SparseDepths(xy_px, np.full(5, 1.25))))
+    found = dense_depth(flat, blank[0], blank[1:], RANGE, DepthPriors(sparse=SparseDepths(xy_px, np.full(5, 1.25))))
     np.testing.assert_allclose(found.depth_m, 1.25, rtol=0.03)
     assert found.confidence.max() < 0.2, "a guess from five points is no measurement"
 
@@ -200,7 +218,7 @@ def test_focus_finds_what_no_neighbour_sees() -> None:
     elsewhere = [SweepView(RNG.uniform(0, 1, each.structure.shape).astype(np.float32), each.camera) for each in scene.views[1:]]
     ones = np.ones_like(scene.dioptre)
     vote = FocusVote(0.8 * ones, ones, 2.0 * ones, 0.1)
-    found = dense_depth(scene.rgb[0], scene.views[0], elsewhere, RANGE, Clues(focus=vote))
+    found = dense_depth(scene.rgb[0], scene.views[0], elsewhere, RANGE, DepthPriors(focus=vote))
     assert np.median(np.abs(1.0 / found.depth_m - 0.8)) < 0.02
     assert np.mean(found.source == FOCUS) > 0.8
     assert 0.1 < np.median(found.confidence) <= 0.6
@@ -222,8 +240,8 @@ def test_undistorted_depth_is_seen_at_the_pixels_of_the_real_picture() -> None:
     distorted_x = 80.0 + FOCAL_PX * u * (1 + k1 * u * u)  # of the point at 130 px in the undistorted picture
     assert depth[56, int(distorted_x)] == pytest.approx(1.0 + 0.01 * 129.5, abs=0.011)
     assert np.isnan(depth[56, 5])
-    clue = patch_match_clue(depth)
-    assert len(clue.depth_m) == np.isfinite(depth).sum()
+    prior = patch_match_prior(depth)
+    assert len(prior.depth_m) == np.isfinite(depth).sum()
 
 
 def test_a_range_that_reaches_infinity_gives_depths_before_it() -> None:
