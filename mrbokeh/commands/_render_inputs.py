@@ -2,11 +2,60 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
+
+
+@dataclass(frozen=True)
+class SharpOptions:
+    """Pictures, layers or samples to blur."""
+
+    rgb: Annotated[Path | None, typer.Option(help="All-in-focus picture, scene-linear: .exr, .hdr or float .tif.")] = None
+    depth: Annotated[Path | None, typer.Option(help="Its depth: EXR channel Z, depth.Z or Y in metres; inf or <= 0: background.")] = None
+    layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with premultiplied RGBA and Z; repeat it, front first.")] = None
+    behind: Annotated[
+        list[Path] | None, typer.Option(help="EXR layer behind --rgb: what is known of what it hides (clean plate, other view).")
+    ] = None
+    motion: Annotated[
+        Path | None, typer.Option(help="EXR with forward.u and forward.v: how far --rgb moves right and up, in pixels of one frame.")
+    ] = None
+    shutter: Annotated[float, typer.Option(help="Part of the frame's time for which the shutter is open: 0.5 is 180 degrees.", min=0.0)] = (
+        0.5
+    )
+    samples: Annotated[
+        Path | None, typer.Option(help="Noisy light field samples (.npz, .exr) in place of pictures, for --method lrdm or laplacian.")
+    ] = None
+    srgb: Annotated[bool, typer.Option("--srgb", help="--rgb holds integers encoded as sRGB (highlights are lost).")] = False
+
+    @property
+    def files(self) -> tuple[Path | None, ...]:
+        """Input files of these options."""
+        return (self.rgb, self.depth, self.motion, self.samples, *(self.layer or ()), *(self.behind or ()))
+
+    @property
+    def shows_pictures(self) -> bool:
+        """Whether there are pictures, layers or motion to blur beside samples."""
+        return any((self.rgb, self.depth, self.layer, self.behind, self.motion))
+
+
+@dataclass(frozen=True)
+class FocusOptions:
+    """Focus in place of the lens file's."""
+
+    focus_distance_m: Annotated[
+        float | None, typer.Option("--focus", help="Focus distance in metres in place of the lens file's; inf is allowed.")
+    ] = None
+    focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None
+
+    @property
+    def is_given(self) -> bool:
+        return self.focus_distance_m is not None or self.focus_at is not None
 
 
 def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) -> Layer:
@@ -18,56 +67,36 @@ def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) ->
     return renderer.reconstruct(read_samples(samples), lens)
 
 
-def focused(lens: Lens, sharp: dict[str, Layer], focus_distance_m: float | None, focus_at: str | None) -> Lens:
-    """The lens at the distance that was asked for, or focused on what is frontmost at a pixel."""
-    if focus_distance_m is not None and focus_at is not None:
+def focused(lens: Lens, sharp: dict[str, Layer], focus: FocusOptions) -> Lens:
+    """Return the lens at the distance that was asked for, or focused on what is frontmost at a pixel."""
+    if focus.focus_distance_m is not None and focus.focus_at is not None:
         raise InputError("give either --focus or --focus-at, not both")
-    if focus_distance_m is not None:
-        return lens.focused_at(focus_distance_m)
-    if focus_at is None:
+    if focus.focus_distance_m is not None:
+        return lens.focused_at(focus.focus_distance_m)
+    if focus.focus_at is None:
         return lens
     try:
-        x_px, y_px, radius_px = (*map(int, focus_at.split(",")), 0)[:3]
+        x_px, y_px, radius_px = (*map(int, focus.focus_at.split(",")), 0)[:3]
     except ValueError:
-        raise InputError(f"--focus-at: expected X,Y or X,Y,RADIUS in whole pixels, got {focus_at!r}") from None
+        raise InputError(f"--focus-at: expected X,Y or X,Y,RADIUS in whole pixels, got {focus.focus_at!r}") from None
     return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))
 
 
-@dataclass(frozen=True)
-class Sources:
-    """The files. depth and motion are those of rgb; srgb: its numbers are encoded. layers and behind come front first.
-
-    shutter: part of a frame's time for which it is open.
-    """
-
-    rgb: Path | None
-    depth: Path | None
-    layers: tuple[Path, ...] = ()
-    behind: tuple[Path, ...] = ()
-    motion: Path | None = None
-    shutter: float = 0.5
-    srgb: bool = False
-
-    @property
-    def are_given(self) -> bool:
-        return any((self.rgb, self.depth, self.layers, self.behind, self.motion))
-
-
-def read_sharp(sources: Sources) -> dict[str, Layer]:
+def read_sharp(sources: SharpOptions) -> dict[str, Layer]:
     """Layers by the file that they came from, front first, all with the same extra channels, motion among them."""
     return _with_all_extras(_moving(_read(sources), sources))
 
 
-def _read(sources: Sources) -> dict[str, Layer]:
+def _read(sources: SharpOptions) -> dict[str, Layer]:
     rgb, depth = sources.rgb, sources.depth
-    sharp = {str(path): _whole_layer(path) for path in sources.layers}
+    sharp = {str(path): _whole_layer(path) for path in sources.layer or ()}
     if (rgb is None) != (depth is None):
         raise InputError("--rgb and --depth belong together: give both, or only --layer")
     if rgb is not None and depth is not None:
         sharp[str(rgb)] = _picture(rgb, depth, sources.srgb)
     if sources.behind and rgb is None:
         raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
-    sharp |= {str(path): _whole_layer(path) for path in sources.behind}
+    sharp |= {str(path): _whole_layer(path) for path in sources.behind or ()}
     if not sharp:
         raise InputError("nothing to blur: give --rgb AIF.exr with --depth Z.exr, or --layer RGBAZ.exr, or both")
     if len({each.alpha.shape for each in sharp.values()}) > 1:
@@ -95,7 +124,7 @@ def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
     return opaque(colour, depth_m)
 
 
-def _moving(sharp: dict[str, Layer], sources: Sources) -> dict[str, Layer]:
+def _moving(sharp: dict[str, Layer], sources: SharpOptions) -> dict[str, Layer]:
     """Add motion: of the picture from its own file, of layers from their channels forward.u and forward.v."""
     from mrbokeh.layering.motion import with_motion
     from mrbokeh.stacks.exr_layers.render_channels import read_motion, taken_from_channels

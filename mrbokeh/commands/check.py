@@ -106,7 +106,7 @@ def _settings(made: SourceOptions, limits: LimitOptions) -> CheckSettings:
     from mrbokeh.optics.lens_file import read_lens
 
     return CheckSettings(
-        layer_files={name: path for name, path in (("virtual", made.virtual), ("sharp", made.sharp)) if path is not None},
+        layers={name: path for name, path in (("virtual", made.virtual), ("sharp", made.sharp)) if path is not None},
         lens=None if made.lens is None else read_lens(made.lens),
         energy_tolerance=limits.energy_tolerance,
         flicker_limit=limits.flicker_limit,

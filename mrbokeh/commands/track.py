@@ -1,11 +1,12 @@
 """`mrbokeh track`: the camera of a clip from a printed board, and camera tracks from one kind of file to another."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.commands._former_names import formerly
+from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.atomic_files import refuse_existing, require_safe_outputs
 from mrbokeh.system.errors import InputError
 
@@ -26,20 +27,42 @@ RotationOption = Annotated[str, typer.Option(metavar="ORDER", help="Of a .chan: 
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the track where it exists.")]
 
 
+@dataclass(frozen=True)
+class IntrinsicsOptions:
+    """Source of the camera's intrinsics."""
+
+    camera: Annotated[
+        Path | None, typer.Option(metavar="CAMERA.json", help="Intrinsics: a camera or a track with its distortion. Else give --calibrate.")
+    ] = None
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the intrinsics from the clip itself.")] = False
+
+
+@dataclass(frozen=True)
+class SmoothingOptions:
+    """Gaps to bridge, and smoothing of poses."""
+
+    longest_gap: Annotated[int, typer.Option(min=0, metavar="FRAMES", help="Bridge so many frames in which the board is not seen.")] = 10
+    smooth: Annotated[bool, typer.Option(help="Smooth poses as far as the scatter of the corners leaves them open.")] = True
+    steadier: Annotated[float, typer.Option(min=0.0, metavar="PX", help="Smooth further, by so many pixels in the picture.")] = 0.0
+
+
+@dataclass(frozen=True)
+class ResultOptions:
+    """Format and replacement of the track."""
+
+    format_: FormatOption = None
+    overwrite: OverwriteOption = False
+
+
 @app.command("clip")
+@grouped
 def track(
     clip: Annotated[Path, typer.Argument(metavar="CLIP", help="Video in which the board lies still.")],
     board: Annotated[Path, typer.Option(metavar="BOARD.json", help="The board, as `mrbokeh viewfinder board` writes it, or a .toml.")],
     out: OutOption,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="CAMERA.json", help="Intrinsics: a camera or a track with its distortion. Else give --calibrate.")
-    ] = None,
-    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the intrinsics from the clip itself.")] = False,
-    longest_gap: Annotated[int, typer.Option(min=0, metavar="FRAMES", help="Bridge so many frames in which the board is not seen.")] = 10,
-    smooth: Annotated[bool, typer.Option(help="Smooth poses as far as the scatter of the corners leaves them open.")] = True,
-    steadier: Annotated[float, typer.Option(min=0.0, metavar="PX", help="Smooth further, by so many pixels in the picture.")] = 0.0,
-    format_: FormatOption = None,
-    overwrite: OverwriteOption = False,
+    known: IntrinsicsOptions,
+    smoothing: SmoothingOptions,
+    result: ResultOptions,
 ) -> None:
     """Track a clip by the printed board in it; the world of the track is the board's, in metres.
 
@@ -49,14 +72,14 @@ def track(
     from mrbokeh.tracking.camera_track.formats import format_of_name
     from mrbokeh.tracking.charuco.board import read_board
 
-    require_safe_outputs((out,), (clip, board, camera), overwrite)
-    if format_ is None:
+    require_safe_outputs((out,), (clip, board, known.camera), result.overwrite)
+    if result.format_ is None:
         format_of_name(out)
-    if calibrate == (camera is not None):
+    if known.calibrate == (known.camera is not None):
         raise InputError("expected either --camera CAMERA.json or --calibrate, which finds the camera from the clip: give one of them")
     printed = read_board(board)
-    if camera is not None:
-        intrinsics, distortion = _intrinsics(camera)
+    if known.camera is not None:
+        intrinsics, distortion = _intrinsics(known.camera)
     else:
         found = calibrate_clip(clip, printed)
         intrinsics, distortion = found.camera, found.distortion
@@ -64,32 +87,54 @@ def track(
             f"calibrated from {found.views} frames: focal length {intrinsics.focal_px[0]:.1f} px +- {100 * found.focal_sigma:.1f} %, "
             f"{_named(found.distortion)}; corners as first read scatter by {found.residual_px:.2f} px"
         )
-    settings = TrackSettings(longest_gap, smooth, steadier)
+    settings = TrackSettings(smoothing.longest_gap, smoothing.smooth, smoothing.steadier)
     tracked = track_board(clip, printed, intrinsics, distortion, settings)
-    _write(out, tracked.track, None, format_)
+    _write(out, tracked.track, None, result.format_)
     typer.echo(_told(tracked, out))
 
 
-@app.command("convert", cls=formerly("frame_rate"))
+@dataclass(frozen=True)
+class FactOptions:
+    """Facts that the file of IN may leave open."""
+
+    size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the pictures; needed for a .chan.")] = None
+    up: UpOption = None
+    rotation_order: RotationOption = "ZXY"
+    sensor_width: Annotated[float | None, typer.Option(min=0.1, metavar="MM", help="Of OpenTrackIO samples that do not tell it.")] = None
+    metric: Annotated[
+        bool | None, typer.Option("--metric/--no-metric", help="Whether lengths are metres, where the file leaves it open.")
+    ] = None
+    distortion: Annotated[bool, typer.Option(help="Leave the lens distortion of IN out with --no-distortion.")] = True
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Numbers and times of the frames."""
+
+    frame_rate: Annotated[
+        float | None, typer.Option("--rate", min=0.001, help="Frames per second: gives frames the times of their numbers.")
+    ] = None
+    frame_offset: Annotated[int, typer.Option(help="Added to every frame number.")] = 0
+
+
+@dataclass(frozen=True)
+class ConvertedOptions:
+    """World, format and replacement of OUT."""
+
+    out_up: Annotated[str | None, typer.Option(metavar="AXIS", help="Which axis is to be up in OUT.")] = None
+    format_: FormatOption = None
+    overwrite: OverwriteOption = False
+
+
+@app.command("convert")
+@grouped
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="A track: .json, .chan, .jsonl, transforms.json or a folder of COLMAP.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; the suffix says in which format.")],
+    result: ConvertedOptions,
+    facts: FactOptions,
+    frames: FrameOptions,
     from_: Annotated[str | None, typer.Option("--from", metavar="FORMAT", help="Format of IN; by default what the file shows.")] = None,
-    format_: FormatOption = None,
-    size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the pictures; needed for a .chan.")] = None,
-    up: UpOption = None,
-    out_up: Annotated[str | None, typer.Option(metavar="AXIS", help="Which axis is to be up in OUT.")] = None,
-    rotation_order: RotationOption = "ZXY",
-    sensor_width: Annotated[float | None, typer.Option(min=0.1, metavar="MM", help="Of OpenTrackIO samples that do not tell it.")] = None,
-    frame_rate: Annotated[
-        float | None, typer.Option("--rate", min=0.001, help="Frames per second: gives frames the times of their numbers.")
-    ] = None,
-    frame_offset: Annotated[int, typer.Option(help="Added to every frame number.")] = 0,
-    metric: Annotated[
-        bool | None, typer.Option("--metric/--no-metric", help="Whether lengths are metres, where the file leaves it open.")
-    ] = None,
-    distortion: Annotated[bool, typer.Option(help="Leave the lens distortion of IN out with --no-distortion.")] = True,
-    overwrite: OverwriteOption = False,
 ) -> None:
     """Turn a camera track into another format.
 
@@ -98,11 +143,11 @@ def convert(
     from mrbokeh.tracking.camera_track.formats import read_track
     from mrbokeh.tracking.camera_track.track import TrackOptions
 
-    refuse_existing(out, overwrite)
-    options = TrackOptions(up, _size_px(size), rotation_order, sensor_width, metric, distortion)
-    read = read_track(source, options, from_).shifted(frame_offset)
-    read = read.timed(frame_rate) if frame_rate is not None else read
-    _write(out, read, TrackOptions(out_up, None, rotation_order, sensor_width), format_)
+    refuse_existing(out, result.overwrite)
+    options = TrackOptions(facts.up, _size_px(facts.size), facts.rotation_order, facts.sensor_width, facts.metric, facts.distortion)
+    read = read_track(source, options, from_).shifted(frames.frame_offset)
+    read = read.timed(frames.frame_rate) if frames.frame_rate is not None else read
+    _write(out, read, TrackOptions(result.out_up, None, facts.rotation_order, facts.sensor_width), result.format_)
     unit = "" if read.metric else ", the scale of its lengths is arbitrary"
     typer.echo(f"{out}: {len(read.frames)} frames, {read.numbers[0]} to {read.numbers[-1]}, {read.size_px[0]}x{read.size_px[1]} px{unit}")
 

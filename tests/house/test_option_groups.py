@@ -1,13 +1,17 @@
 """Options in groups make the very command line that options one by one make."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
+import click
 import pytest
 import typer
+from typer.main import get_command
 from typer.testing import CliRunner
 
-from mrbokeh.commands import composite, video
+from mrbokeh.cli import SUB_COMMANDS
+from mrbokeh.commands import check, composite, refocus, render, transfer, video
 from mrbokeh.commands._option_groups import grouped
 
 
@@ -53,7 +57,7 @@ def test_what_an_option_asks_is_checked() -> None:
     assert "Says what came" in said("--help")
 
 
-@pytest.mark.parametrize("module", [composite, video])
+@pytest.mark.parametrize("module", [check, composite, refocus, render, transfer, video])
 def test_every_option_says_what_it_is(module: object) -> None:
     command = typer.main.get_command(module.app)  # type: ignore[attr-defined]
     assert all(getattr(each, "help", None) for each in command.params)
@@ -68,3 +72,30 @@ def test_composite_and_video_share_what_they_can() -> None:
     assert shared <= one.keys() & other.keys()
     assert all(one[name].help == other[name].help for name in shared)  # type: ignore[attr-defined]
     assert {name for name in shared if one[name].default != other[name].default} == {"scene_renderer"}
+
+
+def commands(command: Any, path: tuple[str, ...]) -> dict[tuple[str, ...], click.Command]:
+    if hasattr(command, "commands"):
+        return {k: v for name, each in command.commands.items() for k, v in commands(each, (*path, name)).items()}
+    return {path: command}
+
+
+def options_of_all() -> dict[str, set[str]]:
+    """Commands by option."""
+    found: dict[str, set[str]] = {}
+    for name, each in SUB_COMMANDS.items():
+        for path, command in commands(get_command(import_module(each.module).app), (name,)).items():
+            for option in (word for parameter in command.params for word in parameter.opts if word.startswith("--")):
+                found.setdefault(option, set()).add(" ".join(path))
+    return found
+
+
+def test_one_thing_has_one_name() -> None:
+    """Where the focus lies, the lens's length, its sensor, the width of pictures, the nearest and farthest distance, pictures a second."""
+    options = options_of_all()
+    for other in ("focus-distance-m", "focal-length-mm", "sensor-width-mm", "image-width-px", "nearest-m", "farthest-m", "frame-rate"):
+        assert f"--{other}" not in options, options.get(f"--{other}")
+    assert {"render", "composite", "transfer", "refocus", "lens new", "lens match", "lens psf"} <= options["--focus"]
+    assert {"lens new", "lens match", "lens psf", "capture plan", "track convert"} <= options["--sensor-width"]
+    assert {"video", "transfer", "track convert"} <= options["--rate"]
+    assert {"capture process", "capture report", "capture ingest", "capture merge"} <= options["--overwrite"]
