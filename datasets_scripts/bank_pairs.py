@@ -19,7 +19,7 @@ import numpy as np
 import typer
 from jaxtyping import Bool, Float32
 
-from datasets_scripts.made_sets.bokeh_view import LICENCE, slice_name, stack_record
+from datasets_scripts.made_sets.stack_manifest import LICENCE, focus_index, slice_name, stack_record
 from datasets_scripts.scenes.textures import checks, mottled, wood
 from datasets_scripts.tracers.traced_scene import Texture
 from mrbokeh.images.camera_rgb import write_camera_rgb
@@ -150,9 +150,7 @@ def _make_stack(folder: Path, plan: PairsPlan, number: int, lens: Lens, renderer
     for index, distance_m in enumerate(distances_m):
         blurred = renderer.render(layers, lens.focused_at(distance_m))
         write_camera_rgb(folder / slice_name(index), blurred.rgb, None)
-    dioptres = 1.0 / np.asarray(distances_m)
-    focus_index = np.interp(1.0 / sharp.depth_m, dioptres[::-1], np.arange(len(dioptres))[::-1].astype(np.float64)).astype(np.float32)
-    write_merged(folder, sharp.rgb, focus_index, np.ones_like(sharp.depth_m), sharp.depth_m)
+    write_merged(folder, sharp.rgb, focus_index(sharp.depth_m, distances_m), np.ones_like(sharp.depth_m), sharp.depth_m)
     focal_px = lens.focal_length_mm * plan.width_px / lens.sensor_width_mm
     camera = Camera(plan.width_px, plan.height_px, (focal_px, focal_px), (0.5 * plan.width_px, 0.5 * plan.height_px))
     slices = tuple(Slice(slice_name(index), distance_m) for index, distance_m in enumerate(distances_m))

@@ -19,9 +19,11 @@ import typer
 from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
-from datasets_scripts.tracers.sheet import Sheet, pack_table, trace_sheet, with_noise
+from datasets_scripts.scenes.textures import mottled
+from datasets_scripts.tracers._sheet_numba import PackedTable
+from datasets_scripts.tracers.sheet import Sheet, trace_sheet, with_noise
 from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens import MM_PER_M, Lens
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
@@ -68,6 +70,29 @@ def _wander(sines: tuple[tuple[float, float], ...], time_s: float, rng: np.rando
 
 
 _FOCAL_LENGTH_MM, _SENSOR_WIDTH_MM = 22.0, 24.0
+_TABLE_TEXELS = 256
+
+
+def pack_table(sheet: Sheet, seed: int = 0) -> PackedTable:
+    """The print as a grid of uneven cells, each black or not: a point is looked up exactly, by two searches."""
+    # Neighbours share edges but for rounding, which must not open gaps.
+    begin, end = sheet.black_mm[:, :2].round(6), (sheet.black_mm[:, :2] + sheet.black_mm[:, 2:]).round(6)
+    edges = [_merged(np.concatenate([begin[:, axis], end[:, axis]])) for axis in (0, 1)]
+    black = np.zeros((len(edges[1]) - 1, len(edges[0]) - 1), bool)
+    for low, high in zip(begin, end, strict=True):
+        (left, right), (top, bottom) = (
+            (np.abs(edges[axis] - low[axis]).argmin(), np.abs(edges[axis] - high[axis]).argmin()) for axis in (0, 1)
+        )
+        black[top:bottom, left:right] = True
+    outline = np.concatenate([begin.min(axis=0) - sheet.margin_mm, end.max(axis=0) + sheet.margin_mm])
+    table = mottled(_TABLE_TEXELS, np.random.default_rng(seed), (0.10, 0.07, 0.05), (0.34, 0.25, 0.18)).astype(np.float64)
+    white, ink = np.full(3, sheet.paper), np.full(3, sheet.ink)
+    return PackedTable(edges[0] / MM_PER_M, edges[1] / MM_PER_M, black, outline / MM_PER_M, white, ink, table)
+
+
+def _merged(edges_mm: Float64[np.ndarray, " edges"]) -> Float64[np.ndarray, " merged"]:
+    unique = np.unique(edges_mm)
+    return unique[np.append(True, np.diff(unique) > 1e-4)]
 
 
 @dataclass(frozen=True)

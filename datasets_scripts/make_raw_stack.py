@@ -12,7 +12,7 @@ What is known exactly about a made RAW stack, as the JSON file beside it.
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from datetime import timedelta
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +20,7 @@ import numpy as np
 import typer
 from jaxtyping import Float
 
+from datasets_scripts.made_sets.file_job import Job, claim_folder
 from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, film_plane_distance_m, write_dng
 from datasets_scripts.scenes.stack_scenes import STACK_SCENES, StackScene
 from datasets_scripts.tracers.thin_lens import trace, trace_pinhole
@@ -29,7 +30,7 @@ from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_to_json
-from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-raw-stack-truth"
@@ -178,73 +179,41 @@ _BETWEEN_SLICES = timedelta(seconds=2)
 _BETWEEN_VIEWS = timedelta(minutes=5)
 
 
-@dataclass(frozen=True)
-class _Job:
-    """One file (or pair of files) to make, and how."""
+def make_raw_stack(out: Path, plan: StackPlan, *, overwrite: bool = False) -> int:
+    """Write all that is missing of the plan into `out` and return how many jobs ran.
 
-    paths: tuple[Path, ...]
-    make: Callable[[Scene], None]
-
-    @property
-    def done(self) -> bool:
-        return all(path.is_file() for path in self.paths)
-
-
-def make_raw_stack(out: Path, plan: StackPlan, *, force: bool = False, progress: Callable[[int, int], None] | None = None) -> int:
-    """Write all that is missing of the plan into `out`; returns how many jobs ran. `progress` hears (files done, files in all).
-
-    Raises InputError where `out` holds something else, unless `force` says to replace it.
+    Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
     """
     most = plan.stage.viewpoints
     if not 1 <= plan.viewpoints <= most or plan.slices < 1:
         raise InputError(f"expected 1 to {most} viewpoints and at least 1 slice, got {plan.viewpoints} and {plan.slices}")
-    jobs = list(_jobs(out, plan))
-    _claim_folder(out, plan, [path for job in jobs for path in job.paths], force)
+    jobs = list(_jobs(out, plan, cache(partial(plan.stage.build, plan.seed))))
+    claim_folder(out / "truth.json", truth_document(plan), [path for job in jobs for path in job.paths], overwrite)
     waiting = [job for job in jobs if not job.done]
-    scene = plan.stage.build(plan.seed) if waiting else Scene()
-    for index, job in enumerate(waiting):
-        if progress:
-            progress(len(jobs) - len(waiting) + index, len(jobs))
-        job.make(scene)
-    if progress:
-        progress(len(jobs), len(jobs))
+    for job in track(waiting, "tracing"):
+        job.make()
     return len(waiting)
 
 
-def _claim_folder(out: Path, plan: StackPlan, paths: list[Path], force: bool) -> None:
-    """Go on only in a folder that is empty or holds the same plan; truth.json is the sign of it and is written first."""
-    truth_path, document = out / "truth.json", truth_document(plan)
-    if force:
-        for path in (*paths, truth_path):
-            path.unlink(missing_ok=True)
-    if truth_path.exists():
-        if read_json(truth_path, "the truth of a RAW stack") != document:
-            raise InputError(f"{out} holds a RAW stack made with other settings: choose another folder, or --force to replace its files")
-    elif any(path.exists() for path in paths):
-        raise InputError(f"{out} holds slices or truth without a truth.json: choose another folder, or --force to replace them")
-    else:
-        write_json(truth_path, document)
-
-
-def _jobs(out: Path, plan: StackPlan) -> Iterator[_Job]:
+def _jobs(out: Path, plan: StackPlan, scene: Callable[[], Scene]) -> Iterator[Job]:
+    """Yield the files of a stack; the scene is built when the first of them is made."""
     for view in range(plan.viewpoints):
         folder = out / "truth" / f"view_{view}"
-        aif_path, depth_path = folder / "all_in_focus.exr", folder / "depth.exr"
-        yield _Job((aif_path, depth_path), partial(_make_truth, plan=plan, view=view, aif_path=aif_path, depth_path=depth_path))
+        yield Job((folder / "all_in_focus.exr", folder / "depth.exr"), partial(_make_truth, scene, plan, view, folder))
         for index in range(plan.slices if view < plan.photographed else 0):
             path = out / f"view_{view}" / f"slice_{index:02d}.dng"
-            yield _Job((path,), partial(_make_slice, plan=plan, view=view, index=index, path=path))
+            yield Job((path,), partial(_make_slice, scene, plan, view, index, path))
 
 
-def _make_truth(scene: Scene, plan: StackPlan, view: int, aif_path: Path, depth_path: Path) -> None:
-    rgb, depth_m = trace_pinhole(scene, plan.reference_camera(view), plan.samples, plan.seed, plan.sensor.footprint_px)
+def _make_truth(scene: Callable[[], Scene], plan: StackPlan, view: int, folder: Path) -> None:
+    rgb, depth_m = trace_pinhole(scene(), plan.reference_camera(view), plan.samples, plan.seed, plan.sensor.footprint_px)
     comment = "metres along the optical axis at pixel centres"
-    write_exr(depth_path, ExrPart({"Z": depth_m.astype(np.float16)}, attributes={"comments": comment}))
-    write_image(aif_path, rgb, half=True)
+    write_exr(folder / "depth.exr", ExrPart({"Z": depth_m.astype(np.float16)}, attributes={"comments": comment}))
+    write_image(folder / "all_in_focus.exr", rgb, half=True)
 
 
-def _make_slice(scene: Scene, plan: StackPlan, view: int, index: int, path: Path) -> None:
-    rgb = traced_slice(scene, plan, view, index)
+def _make_slice(scene: Callable[[], Scene], plan: StackPlan, view: int, index: int, path: Path) -> None:
+    rgb = traced_slice(scene(), plan, view, index)
     mosaic = plan.sensor.photograph(rgb, np.random.default_rng([plan.seed, view, index]))
     base = ShotMetadata(plan.lens_at(index))
     taken_at = base.taken_at + view * _BETWEEN_VIEWS + index * _BETWEEN_SLICES
@@ -277,18 +246,14 @@ def main(
     full_well: Annotated[float, typer.Option(help="Electrons at raw white: 10000 is 1 % photon noise there.")] = 60000.0,
     jitter_px: Annotated[float, typer.Option(help="Slices are shifted by up to this much.")] = 0.0,
     jitter_deg: Annotated[float, typer.Option(help="Slices are rolled by up to this much.")] = 0.0,
-    force: Annotated[bool, typer.Option("--force", help="Replace a stack made with other settings.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", "--force", help="Replace a stack made with other settings.")] = False,
 ) -> None:
     """Make DNG focal stacks of a still life with their all-in-focus image, depth and camera as truth."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
     # The black level keeps its share of the range at every bit depth.
     sensor = SensorModel(bits=bits, black_level=1008 * 2**bits // 2**14, full_well_electrons=full_well)
     plan = StackPlan(viewpoints, slices, width, height, seed, samples, sensor, scene, stacks, jitter_px, jitter_deg)
     try:
-        with Progress("tracing", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar:
-            task = bar.add_task("tracing", total=None)
-            ran = make_raw_stack(out, plan, force=force, progress=lambda done, total: bar.update(task, completed=done, total=total))
+        ran = make_raw_stack(out, plan, overwrite=overwrite)
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from None

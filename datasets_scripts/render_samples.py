@@ -19,8 +19,9 @@ import numpy as np
 import typer
 
 from datasets_scripts.made_sets.file_job import claim_folder
-from datasets_scripts.scenes.moving_scenes import LENS, SCENES, MovingScene, make_scene
+from datasets_scripts.scenes.moving_scenes import LENS, SCENES, make_scene
 from datasets_scripts.tracers.samples import WIDEST_PX, Advance, SampleArrays, SampleTracer
+from datasets_scripts.tracers.traced_scene import MovingScene
 from mrbokeh.images.image_io import read_image, write_image, write_layer
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.layering.light_field_samples import LightFieldSamples

@@ -1,9 +1,5 @@
-"""One viewpoint of a set as a FocalStack folder: slices through the lens, the same view through a pinhole, depth; each made once.
+"""One viewpoint of a set of bokeh stacks as a FocalStack folder, each file made once, and the manifest of all of them."""
 
-The manifest of a set of traced stacks: hashes, split, radiance and noise, measured on the files as they were written.
-"""
-
-import hashlib
 from collections.abc import Iterator
 from dataclasses import asdict
 from functools import cached_property, partial
@@ -14,6 +10,7 @@ import numpy as np
 
 from datasets_scripts.made_sets.bokeh_plan import StacksPlan
 from datasets_scripts.made_sets.file_job import Job
+from datasets_scripts.made_sets.stack_manifest import LICENCE, focus_index, slice_name, stack_record
 from datasets_scripts.scenes.bokeh_scenes import bokeh_scene
 from datasets_scripts.tracers.truth import Opening, Picture, TruthTracer, make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import pack
@@ -21,8 +18,7 @@ from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
-from mrbokeh.stacks.focal_stack_dataset import FileRecord, FocalStackDataset, Part, RadianceRange, StackRecord
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset
 from mrbokeh.system.errors import InputError
 
 NOISE_FLOOR = "noiseFloorDb"
@@ -79,13 +75,7 @@ class StackView:
         if not np.isfinite(depth_m).all():
             raise InputError(f"{self._scene} is open somewhere: expected a scene in which every pixel has a depth")
         confidence = np.ones_like(depth_m)
-        write_merged(self.folder, 0.5 * (first.rgb + second.rgb), self._focus_index(depth_m), confidence, depth_m)
-
-    def _focus_index(self, depth_m: np.ndarray) -> np.ndarray:
-        """The fractional index of the sharpest slice."""
-        dioptres = 1.0 / np.asarray(self.focus_distances_m)
-        order = np.argsort(dioptres)
-        return np.interp(1.0 / depth_m, dioptres[order], order.astype(np.float64)).astype(np.float32)
+        write_merged(self.folder, 0.5 * (first.rgb + second.rgb), focus_index(depth_m, self.focus_distances_m), confidence, depth_m)
 
     def _make_stack(self) -> None:
         stack = FocalStack(
@@ -98,17 +88,6 @@ class StackView:
             metadata={"traced": True, "scene": self._scene, "shape": self._plan.shape, "opening": self._plan.opening.document()},
         )
         write_focal_stack(stack)
-
-
-def slice_name(index: int) -> str:
-    return f"slice_{index:02d}.exr"
-
-
-LICENCE = (
-    "These pictures are computed from scenes that a program of this project makes up; no photograph, model or texture of anybody is in "
-    "them. Use them as you like (CC0 1.0)."
-)
-_QUANTILES = ("0.5", "0.99", "0.999", "0.9999")
 
 
 def dataset_of(out: Path, plan: StacksPlan) -> FocalStackDataset:
@@ -127,27 +106,5 @@ def dataset_of(out: Path, plan: StacksPlan) -> FocalStackDataset:
     return FocalStackDataset(out, LICENCE, max(each.radiance.largest for each in records), records, metadata)
 
 
-def stack_record(out: Path, name: str, part: Part) -> StackRecord:
-    """Reads every picture once."""
-    stack = read_focal_stack(out / name)
-    depth_m = stack.depth_m()
-    largest_px = max(float(np.abs(stack.coc_px(index, depth_m)).max()) for index in range(len(stack)))
-    paths = [STACK_FILE, *(each.path for each in stack.slices), stack.all_in_focus_path.name, stack.depth_path.name]
-    files = {path: file_record(stack.folder / path) for path in paths}
-    return StackRecord(name, part, len(stack), depth_m.shape[1], depth_m.shape[0], largest_px, radiance_range(stack), {"any": 0.0}, files)
-
-
-def radiance_range(stack: FocalStack) -> RadianceRange:
-    """The quantiles are those of the picture in which they are largest."""
-    peaks = [rgb.max(axis=2) for rgb in (stack.all_in_focus(), *stack.iter_rgb())]
-    quantiles = {each: max(float(np.quantile(peak, float(each))) for peak in peaks) for each in _QUANTILES}
-    return RadianceRange(max(float(peak.max()) for peak in peaks), quantiles)
-
-
 def noise_floors_db(stack: FocalStack) -> list[float]:
     return [round(float(read_exr(stack.folder / each.path)[0].attributes[NOISE_FLOOR]), 2) for each in stack.slices]
-
-
-def file_record(path: Path) -> FileRecord:
-    with path.open("rb") as file:
-        return FileRecord(hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)

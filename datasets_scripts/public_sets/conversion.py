@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy import ndimage
 
-from datasets_scripts.made_sets.bokeh_view import stack_record
+from datasets_scripts.made_sets.stack_manifest import focus_index, slice_name, stack_record
 from datasets_scripts.public_sets.adapters import PublicLens, PublicSlice, PublicStack
 from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
 from mrbokeh.images.exr_io import read_exr
@@ -146,7 +146,7 @@ def _write_stack(stack: PublicStack, folder: Path, conversion: Conversion) -> No
     slices = tuple(_write_slice(stack, index, folder, conversion, (sharp, depth_m, whole_width_px)) for index in range(len(stack.slices)))
     confidence = np.ones_like(depth_m)
     distances_m = [each.focus_distance_m for each in slices if each.focus_distance_m is not None]
-    write_merged(folder, sharp, _focus_index(depth_m, distances_m), confidence, depth_m)
+    write_merged(folder, sharp, focus_index(depth_m, distances_m), confidence, depth_m)
     write_masks(folder / "exclusion.exr", {"saturated": clipped})
     lens = _stated(conversion, distances_m[0])
     metadata = {"public": conversion.kind, "clipped": stack.sharp.suffix.lower() not in _LINEAR, **stack.facts}
@@ -161,7 +161,7 @@ def _write_slice(
     if whole.shape[1] != whole_width_px:
         raise InputError(f"{source.path} is {_size(whole)} px, but its sharp picture {stack.sharp} is {whole_width_px} px wide")
     window = _window(whole, conversion.crop_px, stack.name)
-    rgb, name = whole[window], f"slice_{index:02d}.exr"
+    rgb, name = whole[window], slice_name(index)
     distance_m = source.focus_distance_m or conversion.focus_m or sharpest_depth_m(sharp, rgb, depth_m)
     write_camera_rgb(folder / name, rgb, None, saturated=clipped[window])
     facts = {
@@ -206,12 +206,6 @@ def _window(rgb: Rgb, crop_px: tuple[int, int] | None, name: str) -> tuple[slice
         raise InputError(f"{name} is {_size(rgb)} px, too small for --crop {crop_px[0]}x{crop_px[1]}")
     left, top = (width - crop_px[0]) // 2, (height - crop_px[1]) // 2
     return slice(top, top + crop_px[1]), slice(left, left + crop_px[0])
-
-
-def _focus_index(depth_m: Float32[np.ndarray, "height width"], distances_m: Sequence[float]) -> Float32[np.ndarray, "height width"]:
-    dioptres = 1.0 / np.asarray(distances_m)
-    order = np.argsort(dioptres)
-    return np.interp(1.0 / depth_m, dioptres[order], order.astype(np.float64)).astype(np.float32)
 
 
 def _size(picture: np.ndarray) -> str:

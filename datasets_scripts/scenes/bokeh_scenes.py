@@ -17,9 +17,9 @@ from datasets_scripts.scenes.truth_scenes import (
     fine,
     slanted_board,
     stage,
-    triple,
     twig,
 )
+from datasets_scripts.tracers.traced_scene import vector
 from datasets_scripts.tracers.truth_scene import Body, Lamp, TruthScene, ball, box, quad, wire
 from mrbokeh.system.errors import InputError
 
@@ -133,7 +133,7 @@ def _lights(rng: np.random.Generator, count: int, depths_m: tuple[float, float])
 
 def _light(rng: np.random.Generator, centre_m: np.ndarray, tint: np.ndarray) -> Lamp:
     radius_m = float(rng.uniform(*_LIGHT_RADIUS) * centre_m[2])
-    return Lamp(triple(centre_m), radius_m, triple(np.exp(rng.uniform(*np.log(_RADIANCE))) * tint))
+    return Lamp(vector(centre_m), radius_m, vector(np.exp(rng.uniform(*np.log(_RADIANCE))) * tint))
 
 
 def _tint(rng: np.random.Generator) -> np.ndarray:

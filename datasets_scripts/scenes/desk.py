@@ -13,7 +13,7 @@ from scipy import ndimage
 from datasets_scripts.scenes.textures import bricks, checks, mottled, page_of_text, spots, wood
 from datasets_scripts.tracers.baked_lighting import bake_lighting
 from datasets_scripts.tracers.thin_lens import trace_pinhole
-from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector
+from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector, vector
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
@@ -68,7 +68,7 @@ def fairy_lights(scene: Scene, cameras: Sequence[Camera], rng: np.random.Generat
                     hung_m.append(point_m)
                     tint = np.asarray(_TINTS[(index + number) % len(_TINTS)])
                     radius_m = rng.uniform(*_RADIUS_M_AT_1_M) * max(float(view.depth_m[row, column]), 0.8)
-                    yield DiscLight(_triple(point_m), float(radius_m), _triple(tint * rng.uniform(*_RADIANCE)))
+                    yield DiscLight(vector(point_m), float(radius_m), vector(tint * rng.uniform(*_RADIANCE)))
                     break
 
 
@@ -86,10 +86,6 @@ def _apart(point_m: Float[np.ndarray, "3"], others_m: Sequence[Float[np.ndarray,
         return True
     xy_px, _ = camera.project(np.stack([point_m, *others_m]))
     return bool(np.hypot(*(xy_px[1:] - xy_px[0]).T).min() >= _LEAST_DISTANCE_SHARE * camera.width_px)
-
-
-def _triple(vector: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])
 
 
 TABLE_Y_M = 0.24
@@ -150,7 +146,7 @@ def desk_furniture(rng: np.random.Generator) -> Scene:
     """Room, books, boxes, cards and balls under the sun; no lamps, light not baked yet."""
     sun = np.asarray(_SUN_TOWARDS) / np.linalg.norm(_SUN_TOWARDS)
     quads = (*_room(rng), *_books(rng), *_boxes(rng), *_cards(rng))
-    return Scene(quads, _balls(rng), (), _vector(sun), 0.46, 0.3, (0.05, 0.05, 0.06))
+    return Scene(quads, _balls(rng), (), vector(sun), 0.46, 0.3, (0.05, 0.05, 0.06))
 
 
 def _room(rng: np.random.Generator) -> tuple[Quad, ...]:
@@ -191,12 +187,7 @@ class _Box:
             (front_left + away, -away, down, side),
             (front_left + away, right, -away, top),
         )
-        return tuple(Quad(_vector(start), _vector(u), _vector(v), texture, self.repeats) for start, u, v, texture in faces)
-
-
-def _vector(values: Float[np.ndarray, "3"]) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
+        return tuple(Quad(vector(start), vector(u), vector(v), texture, self.repeats) for start, u, v, texture in faces)
 
 
 def _books(rng: np.random.Generator) -> tuple[Quad, ...]:
@@ -256,7 +247,7 @@ def _cards(rng: np.random.Generator) -> tuple[Quad, ...]:
         down = height * (np.cos(lean) * np.array([0.0, 1.0, 0.0]) - np.sin(lean) * back)
         corner = np.array([x_m, TABLE_Y_M, z_m]) - down - 0.5 * width * right
         texture = page_of_text(int(420 * height / width), 420, rng, ink, paper, cell=6)
-        cards.append(Quad(_vector(corner), _vector(width * right), _vector(down), texture))
+        cards.append(Quad(vector(corner), vector(width * right), vector(down), texture))
     return tuple(cards)
 
 

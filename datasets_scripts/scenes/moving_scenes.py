@@ -8,80 +8,16 @@ Whirl, Coins, Rain and Gear of Leimkuehler et al. 2018. Contents come from a see
 Circles of confusion and motion are in widths of the frame (see `Stage`); they reach about 0.1 of it, 50 px at 512.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
 from datasets_scripts.scenes.textures import coloured, fractal_noise, mottled, page_of_text, spots, wood
-from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector, plain_texture
+from datasets_scripts.tracers.traced_scene import DiscLight, Mover, MovingScene, Quad, Sphere, Texture, Vector, plain_texture, vector
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-
-_STILL: Vector = (0.0, 0.0, 0.0)
-_SUN_DIRECTION: Vector = (-0.36, -0.64, -0.68)
-
-
-@dataclass(frozen=True, eq=False)
-class Mover:
-    """A body where it is in the middle of the exposure, and what it moves in metres per shutter.
-
-    is_round: of a quad, only the ellipse that touches its edges. in_front: part of the front layer, else of the rest.
-    """
-
-    body: Quad | Sphere | DiscLight
-    velocity_m: Vector = _STILL
-    is_round: bool = False
-    in_front: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class MovingScene:
-    """Bodies and light; axes of the camera (x right, y down, z forward, the lens at the origin), metres."""
-
-    movers: tuple[Mover, ...]
-    sun_direction: Vector = _SUN_DIRECTION
-    sun: float = 0.75
-    ambient: float = 0.45
-    background_rgb: Vector = (0.0, 0.0, 0.0)
-
-    @property
-    def ordered(self) -> tuple[Mover, ...]:
-        """Quads first, then spheres, then lamps: the order of a packed scene."""
-        return tuple(mover for kind in (Quad, Sphere, DiscLight) for mover in self.movers if isinstance(mover.body, kind))
-
-    @property
-    def has_layers(self) -> bool:
-        return len({mover.in_front for mover in self.movers}) == 2
-
-    def part(self, in_front: bool) -> "MovingScene":
-        """The front layer or everything else, as if the other were not there."""
-        return replace(self, movers=tuple(mover for mover in self.movers if mover.in_front == in_front))
-
-    def at(self, time: float) -> Scene:
-        """All bodies where they are at a time of the exposure, 0 to 1."""
-        moved = [_moved(mover.body, (time - 0.5) * np.asarray(mover.velocity_m)) for mover in self.ordered]
-        return Scene(
-            tuple(body for body in moved if isinstance(body, Quad)),
-            tuple(body for body in moved if isinstance(body, Sphere)),
-            tuple(body for body in moved if isinstance(body, DiscLight)),
-            self.sun_direction,
-            self.sun,
-            self.ambient,
-            self.background_rgb,
-        )
-
-
-def _moved(body: Quad | Sphere | DiscLight, by_m: np.ndarray) -> Quad | Sphere | DiscLight:
-    if isinstance(body, Quad):
-        return replace(body, corner_m=vector(body.corner_m + by_m))
-    return replace(body, centre_m=vector(body.centre_m + by_m))
-
-
-def vector(values: Sequence[float] | np.ndarray) -> Vector:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 @dataclass(frozen=True)

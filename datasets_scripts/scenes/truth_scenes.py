@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from datasets_scripts.scenes.textures import bricks, checks, fractal_noise, mottled, page_of_text, spots, wood
-from datasets_scripts.tracers.traced_scene import Texture, Vector
+from datasets_scripts.tracers.traced_scene import Texture, Vector, vector
 from datasets_scripts.tracers.truth_scene import Body, Lamp, TruthScene, ball, box, leaf, quad, wire
 from mrbokeh.system.errors import InputError
 
@@ -133,7 +133,7 @@ def _lamps(rng: np.random.Generator, count: int, depths_m: tuple[float, float]) 
         place = (rng.uniform(-0.95, 0.95) * HALF_X * depth_m, rng.uniform(-0.9, 0.35) * HALF_Y * depth_m, depth_m)
         radius_m = rng.uniform(0.7e-3, 1.4e-3) * depth_m
         radiance = np.exp(rng.uniform(np.log(10.0), np.log(1000.0))) * np.asarray(TINTS[rng.integers(len(TINTS))])
-        lamps.append(Lamp(triple(np.array(place)), float(radius_m), triple(radiance)))
+        lamps.append(Lamp(vector(np.array(place)), float(radius_m), vector(radiance)))
     return tuple(lamps)
 
 
@@ -161,8 +161,4 @@ def _clouds(rng: np.random.Generator) -> Texture:
 
 
 def colour(rng: np.random.Generator, brightness: float) -> Vector:
-    return triple(np.clip(brightness * rng.uniform(0.65, 1.35, 3), 0.01, 0.92))
-
-
-def triple(values: np.ndarray) -> Vector:
-    return float(values[0]), float(values[1]), float(values[2])
+    return vector(np.clip(brightness * rng.uniform(0.65, 1.35, 3), 0.01, 0.92))

@@ -19,12 +19,11 @@ from os import cpu_count
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt32
 
-from datasets_scripts.scenes.moving_scenes import Mover, MovingScene
 from datasets_scripts.tracers import _moving_bodies_numba as layout
 from datasets_scripts.tracers._moving_bodies_numba import DIMENSIONS, LAMP, RADIANCE, LensTable, PackedBodies
 from datasets_scripts.tracers._samples_numba import TILE_PX, Pinhole, follow_lamp, gather_rows, mean_rows, sample_rows, sharp_rows
 from datasets_scripts.tracers.sobol import reversed_bits
-from datasets_scripts.tracers.traced_scene import Quad, Sphere, plain_texture
+from datasets_scripts.tracers.traced_scene import Mover, MovingScene, Quad, Sphere, plain_texture
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.aperture_shapes import net_area

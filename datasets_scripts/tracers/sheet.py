@@ -9,12 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from datasets_scripts.scenes.textures import mottled
 from datasets_scripts.tracers._sheet_numba import PackedLens, PackedTable, shade
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import MM_PER_M, Lens
-
-_TABLE_TEXELS = 256
 
 
 @dataclass(frozen=True)
@@ -30,28 +27,6 @@ class Sheet:
     def middle_m(self) -> Float64[np.ndarray, "3"]:
         ends = self.black_mm[:, :2] + self.black_mm[:, 2:]
         return np.append((self.black_mm[:, :2].min(axis=0) + ends.max(axis=0)) / 2.0, 0.0) / MM_PER_M
-
-
-def pack_table(sheet: Sheet, seed: int = 0) -> PackedTable:
-    """The print as a grid of uneven cells, each black or not: a point is looked up exactly, by two searches."""
-    # Neighbours share edges but for rounding, which must not open gaps.
-    begin, end = sheet.black_mm[:, :2].round(6), (sheet.black_mm[:, :2] + sheet.black_mm[:, 2:]).round(6)
-    edges = [_merged(np.concatenate([begin[:, axis], end[:, axis]])) for axis in (0, 1)]
-    black = np.zeros((len(edges[1]) - 1, len(edges[0]) - 1), bool)
-    for low, high in zip(begin, end, strict=True):
-        (left, right), (top, bottom) = (
-            (np.abs(edges[axis] - low[axis]).argmin(), np.abs(edges[axis] - high[axis]).argmin()) for axis in (0, 1)
-        )
-        black[top:bottom, left:right] = True
-    outline = np.concatenate([begin.min(axis=0) - sheet.margin_mm, end.max(axis=0) + sheet.margin_mm])
-    table = mottled(_TABLE_TEXELS, np.random.default_rng(seed), (0.10, 0.07, 0.05), (0.34, 0.25, 0.18)).astype(np.float64)
-    white, ink = np.full(3, sheet.paper), np.full(3, sheet.ink)
-    return PackedTable(edges[0] / MM_PER_M, edges[1] / MM_PER_M, black, outline / MM_PER_M, white, ink, table)
-
-
-def _merged(edges_mm: Float64[np.ndarray, " edges"]) -> Float64[np.ndarray, " merged"]:
-    unique = np.unique(edges_mm)
-    return unique[np.append(True, np.diff(unique) > 1e-4)]
 
 
 def trace_sheet(

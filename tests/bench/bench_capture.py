@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the scene; everything was tuned on 1, so that others are held out")
     options = parser.parse_args()
     plan = StackPlan(options.views, 12, 960, 640, options.seed, 64, SensorModel(full_well_electrons=1e4), "lab", None, 1.2, 0.03)
-    make_raw_stack(options.lab, plan, progress=lambda done, total: print(f"tracing the lab: {done} of {total}", end="\r"))
+    make_raw_stack(options.lab, plan)
     truths = [view_truth(options.lab, view) for view in range(options.views)]
     with tempfile.TemporaryDirectory() as folder:
         captured(options.lab, Path(folder) / "scene", truths)

@@ -51,7 +51,7 @@ def main() -> None:
 def quality(lab: Path, folder: Path, peers: dict[str, str]) -> None:
     if not (lab / "view_0" / "slice_11.dng").is_file():
         plan = StackPlan(1, 12, 960, 640, 1, 64, SensorModel(full_well_electrons=1e4), "lab", 1, 1.2, 0.03)
-        make_raw_stack(lab, plan, progress=lambda done, total: print(f"tracing the lab: {done} of {total}", end="\r"))
+        make_raw_stack(lab, plan)
     truth = view_truth(lab, 0)
     mrbokeh("capture", "ingest", lab / "view_0", "--out", folder / "lab")
     cpu_s, memory_mb = mrbokeh("capture", "merge", folder / "lab")

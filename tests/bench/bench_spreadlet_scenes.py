@@ -21,7 +21,7 @@ import typer
 from jaxtyping import Float32
 
 from datasets_scripts.render_samples import SamplesPlan, SamplesSet, render_samples
-from datasets_scripts.scenes.moving_scenes import MovingScene
+from datasets_scripts.tracers.traced_scene import MovingScene
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.image_metrics import psnr, ssim
 from mrbokeh.layering.light_field_samples import LightFieldSamples

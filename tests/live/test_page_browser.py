@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_scripts.gallery.headless_chromium import CHROMIUM, Page, chromium_page
 
+from datasets_scripts.gallery.headless_chromium import CHROMIUM, Page, chromium_page
 from tests.scenes.made_viewfinder import LENS_RGB, VIEW_RGB, Made, in_time, made_viewfinder
 from viewfinder.server.access import Access
 from viewfinder.server.sessions import Role, Sessions

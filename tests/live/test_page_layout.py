@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from datasets_scripts.gallery.headless_chromium import CHROMIUM, Page, chromium_page
 
+from datasets_scripts.gallery.headless_chromium import CHROMIUM, Page, chromium_page
 from tests.scenes.made_viewfinder import in_time, made_viewfinder
 
 pytestmark = [

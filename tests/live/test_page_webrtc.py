@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from aiohttp import web
-from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
 
+from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
 from tests.live.test_page_browser import color_at
 from tests.scenes.made_viewfinder import LENS_RGB, VIEW_RGB, Made, in_time, made_viewfinder
 from viewfinder.server.access import Access

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from aiohttp import web
-from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
 
+from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.video.color import code_from_linear
 from tests.scenes.streaming_viewers import BARS, Feed, bars, in_time, output, streaming

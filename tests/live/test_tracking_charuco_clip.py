@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_scripts.charuco_clip import BoardClip, HandHeld, read_clip_cameras, read_sheet, write_clip
+from datasets_scripts.charuco_clip import BoardClip, HandHeld, pack_table, read_clip_cameras, read_sheet, write_clip
 from datasets_scripts.tracers._sheet_numba import is_black
-from datasets_scripts.tracers.sheet import Sheet, pack_table, trace_sheet, with_noise
+from datasets_scripts.tracers.sheet import Sheet, trace_sheet, with_noise
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
 
+from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
 from tests.scenes.layer_viewfinder import HEIGHT, WIDTH, in_time, running, write_plate
 from viewfinder.sources.playback import VideoFileSource
 

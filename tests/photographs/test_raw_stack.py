@@ -189,10 +189,10 @@ def test_a_stack_is_resumed_and_never_overwritten(tmp_path: Path, monkeypatch: p
     assert path.read_bytes() == first, "the seed must decide every bit"
     assert (tmp_path / "view_0" / "slice_00.dng").stat().st_mtime_ns == kept
     other = StackPlan(viewpoints=1, slices=2, width_px=48, height_px=32, samples=8, seed=2)
-    with pytest.raises(InputError, match="--force"):
+    with pytest.raises(InputError, match="--overwrite"):
         make_raw_stack(tmp_path, other)
     assert path.read_bytes() == first
-    assert make_raw_stack(tmp_path, other, force=True) == 3
+    assert make_raw_stack(tmp_path, other, overwrite=True) == 3
     assert path.read_bytes() != first
 
 
@@ -212,7 +212,7 @@ def test_jittered_slices_map_onto_the_reference_as_stated() -> None:
 
 def test_views_beyond_the_stacks_have_truth_only() -> None:
     plan = StackPlan(3, 2, 48, 32, samples=8, stacks=1, scene="lab", jitter_px=1.0)
-    paths = [str(path) for job in _jobs(Path("x"), plan) for path in job.paths]
+    paths = [str(path) for job in _jobs(Path("x"), plan, Scene) for path in job.paths]
     assert sum(path.endswith(".dng") for path in paths) == 2
     assert sum("truth" in path for path in paths) == 6
     views = truth_document(plan)["views"]
