@@ -49,7 +49,7 @@ def merge_command(
     ] = False,
 ) -> None:
     from capture.merging.merge import merge_scene
-    from capture.merging.metres.known_metres import told_options
+    from capture.merging.metres.known_metres import scale_options
     from capture.merging.metres.relative_stack import ORDER
     from capture.merging.preferred_side import preferred_lines, preferred_side
     from capture.merging.retouch import retouched_stacks, stacks_before
@@ -66,7 +66,7 @@ def merge_command(
         return
     keep_freed_pictures()
     before = [each for each in stacks_before(scene) if overwrite or not each.merged]
-    retouched, scaled = retouched_stacks(before), {each.folder: told_options(each) for each in before}
+    retouched, scaled = retouched_stacks(before), {each.folder: scale_options(each) for each in before}
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         stacks = merge_scene(scene, overwrite, registration, prefer)
     for stack in stacks:

@@ -49,7 +49,7 @@ def process_command(
     from capture.scale.answer import parse_distance
     from capture.scale.board import board_from_options
     from capture.stacks.session import FILE_NAME as SESSION_NAME
-    from capture.stacks.session import taken_away_when_refused
+    from capture.stacks.session import undone_when_refused
     from mrbokeh.stacks.focal_stack import find_focal_stacks
     from mrbokeh.system.errors import InputError
 
@@ -60,7 +60,7 @@ def process_command(
         board_from_options(board, square_mm, marker_mm, "DICT_4X4_50")
     if (out / SESSION_NAME).exists() and not overwrite:
         typer.echo(f"{out} is there already: what is finished is kept, the rest goes on (--overwrite makes all of it again)")
-    with taken_away_when_refused(out, _is_of_use):
+    with undone_when_refused(out, _is_of_use):
         ingest_command(photographs, out, sidecar=sidecar, max_width=max_width, overwrite=overwrite)
         merge_command(out, prefer=prefer, overwrite=overwrite)
     if len(find_focal_stacks(out)) < 2:

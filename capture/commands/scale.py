@@ -91,7 +91,7 @@ def scale_command(
 
 def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | None, overwrite: bool) -> None:
     from capture.merging.metres.known_metres import Fact, parse_known_distance, parse_length
-    from capture.merging.metres.stack_metres import lines_of, tell_metres, tell_nearest
+    from capture.merging.metres.stack_metres import apply_known_metres, apply_known_nearest, lines_of
     from mrbokeh.stacks.focal_stack import find_focal_stacks
     from mrbokeh.stacks.guessed_metres import metres_note
 
@@ -103,10 +103,10 @@ def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | 
         )
     stack = stacks[0]
     if nearest is not None:
-        stack = tell_nearest(stack, nearest == "first")
+        stack = apply_known_nearest(stack, nearest == "first")
         typer.echo(f"{stack.folder}: the {nearest} slice is the nearest")
     if facts:
-        typer.echo("\n".join(lines_of(tell_metres(stack, facts, overwrite))))
+        typer.echo("\n".join(lines_of(apply_known_metres(stack, facts, overwrite))))
     elif note := metres_note(stack):
         typer.echo(note)
 

@@ -23,7 +23,7 @@ from capture.merging.registration.registration_file import Registration, read_re
 from capture.merging.restored_lights import RestoredLight, restored_lights, with_restored_lights
 from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS, SliceOptics
-from capture.stacks.slice_files import stated_by_sentinel, told_when_full
+from capture.stacks.slice_files import reporting_full_disk, stated_by_sentinel
 from mrbokeh.figures.stack_pictures import depth_codes, write_merge_sheet
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.camera import Camera
@@ -52,7 +52,7 @@ def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None 
 
 def merge_stack(stack: FocalStack, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> FocalStack:
     """Register, find depth and merge; stack.json is written last. An interrupted run goes on, unless told to overwrite."""
-    with told_when_full(stack.all_in_focus_path):
+    with reporting_full_disk(stack.all_in_focus_path):
         return _merged(stack, overwrite, registration, prefer)
 
 
@@ -67,11 +67,11 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
         # Its pictures change from here on; an interrupted run must not leave a stack that says it is merged.
         write_focal_stack(replace(given, merged=False))
     extremes = Extremes()
-    made = extremes.watching(track(slices.made(keep=not overwrite), f"{name}: register", len(stack)))
+    made = extremes.watching(track(slices.resampled(keep=not overwrite), f"{name}: register", len(stack)))
     volume = focus_volume(made, slices.valid, len(stack))
     merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
-    sharp = sharp_all_in_focus(slices.passing, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
-    lights, restored = restored_lights(slices.passing, sharp, extremes)
+    sharp = sharp_all_in_focus(slices.stored, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
+    lights, restored = restored_lights(slices.stored, sharp, extremes)
     if restored:
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
     merged = _with_highlights(merged, restored)
@@ -84,7 +84,7 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
         merged = with_solved_blur(merged, slices, sharp, focus)
     if prefer is not None:
         rims = vetoed(lights.slice_index(), slices.saturated)
-        merged, sharp = with_preferred(merged, sharp, slices.passing, volume, focus.focus_index, rims, prefer)
+        merged, sharp = with_preferred(merged, sharp, slices.stored, volume, focus.focus_index, rims, prefer)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
     codes = depth_codes(merged)
     write_readable_pictures(merged, sharp, codes)

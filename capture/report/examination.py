@@ -12,7 +12,7 @@ from capture.report.exclusion import LEAST_CONFIDENCE, Disagreement, moving
 from capture.report.findings import SliceFindings, StackFindings, focus_curve
 from capture.report.gates import DEPTH_OFF_PX
 from capture.report.picture_sharpness import PictureEvidence, PictureLook
-from capture.report.registration_check import PlaceEvidence
+from capture.report.registration_check import DisplacementEvidence
 from capture.report.slice_fit import DepthCheck, DepthEvidence, Prediction, fit_slice, low_frequency_gain
 from capture.report.stack_view import Reblur, StackView
 from mrbokeh.images.color import luminance
@@ -50,7 +50,7 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
     """Examine a stack. watch: is told each slice and its prediction. Raises InputError if the stack is not merged."""
     height, width = view.all_in_focus.shape[:2]
     found, disagreements, saturated, evidence = [], [], [], DepthEvidence()
-    picture, places = PictureEvidence(), PlaceEvidence()
+    picture, places = PictureEvidence(), DisplacementEvidence()
     for index in track(range(len(view)), f"{view.stack.folder.name}: examine"):
         stored = view.stored(index)
         picture.add(stored.rgb, stored.camera_rgb, stored.masks.valid)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32
 
 from capture.report.gates import exact
 from capture.report.picture_sharpness import PictureFindings
-from capture.report.registration_check import NeighbourPlace, RegistrationDrift, registration_drift
+from capture.report.registration_check import NeighbourDisplacement, RegistrationDrift, registration_drift
 from capture.report.slice_fit import NAMES, Change, SliceFit
 from capture.stacks.slice_files import stated_by_sentinel
 from mrbokeh.stacks.focal_stack import FocalStack
@@ -98,7 +98,7 @@ class StackFindings:
     depth_off_share: float | None
     moving_share: float | None
     picture: PictureFindings
-    pairs: tuple[NeighbourPlace, ...]
+    pairs: tuple[NeighbourDisplacement, ...]
 
     @property
     def name(self) -> str:
@@ -235,13 +235,13 @@ def _picture_from(document: dict[str, Any]) -> PictureFindings:
     )
 
 
-def pair_document(found: NeighbourPlace, number: Number) -> dict[str, Any]:
+def pair_document(found: NeighbourDisplacement, number: Number) -> dict[str, Any]:
     return {"first": found.first, "off_px": number(found.off_px), "error_px": number(found.error_px), "place_px": list(found.place_px)}
 
 
-def _pair_from(document: dict[str, Any]) -> NeighbourPlace:
+def _pair_from(document: dict[str, Any]) -> NeighbourDisplacement:
     x, y = document["place_px"]
-    return NeighbourPlace(int(document["first"]), _number(document["off_px"]), float(document["error_px"]), (int(x), int(y)))
+    return NeighbourDisplacement(int(document["first"]), _number(document["off_px"]), float(document["error_px"]), (int(x), int(y)))
 
 
 def _change_document(change: Change, number: Number) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32
 
 from capture.report.gates import LARGEST_FLAT, LARGEST_LOST, LARGEST_TOP, LIGHT, PLACES, SEAMS, SHARP
 from capture.report.picture_sharpness import PictureLook
-from capture.report.registration_check import NeighbourPlace
+from capture.report.registration_check import NeighbourDisplacement
 from capture.report.stack_view import StackView
 from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.figures.stack_pictures import depth_picture
@@ -126,7 +126,7 @@ def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *
     ]
 
 
-def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[NeighbourPlace]) -> list[Place]:
+def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[NeighbourDisplacement]) -> list[Place]:
     """Return up to three places for a gate that fails, one where none does. focus_index: which slice each pixel was taken from."""
     return [*_lost(look), *_seams(look, focus_index), *_brightest(look), *_farthest_apart(pairs)]
 
@@ -209,11 +209,11 @@ def _brightest(look: PictureLook) -> list[Place]:
     return places
 
 
-def _farthest_apart(pairs: Sequence[NeighbourPlace]) -> list[Place]:
+def _farthest_apart(pairs: Sequence[NeighbourDisplacement]) -> list[Place]:
     known = [each for each in pairs if each.off_px is not None]
     if not known:
         return []
-    worst = max(known, key=NeighbourPlace.rank)
+    worst = max(known, key=NeighbourDisplacement.rank)
     names = tuple((index, f"slice {index}") for index in (worst.first, worst.first + 1))
     x, y = (max(each - BLOCK_PX // 2, 0) for each in worst.place_px)
     return [Place(PLACES.name, (x, y), f"slices {worst.first} and {worst.first + 1} lie {worst.off_px:.2f} px apart", names)]

@@ -40,7 +40,7 @@ Displacements = Float64[np.ndarray, "patches 2"]
 
 
 @dataclass(frozen=True)
-class NeighbourPlace:
+class NeighbourDisplacement:
     """Displacement of slice first + 1 against slice first.
 
     off_px: root mean square of the fitted displacements, in pixels of the stored pictures; None where too few patches are sharp in both.
@@ -62,7 +62,7 @@ class NeighbourPlace:
 
 
 @dataclass
-class PlaceEvidence:
+class DisplacementEvidence:
     """Evidence of the slices, taken one after the other, all at one size; two are held at a time."""
 
     _last: tuple[Plane, Mask, Plane] | None = None
@@ -80,7 +80,7 @@ class PlaceEvidence:
         self._sharpest = energy if self._sharpest is None else np.maximum(self._sharpest, energy)
         self._last = (fine, usable, energy)
 
-    def places(self, stored_per_px: float = 1.0) -> tuple[NeighbourPlace, ...]:
+    def places(self, stored_per_px: float = 1.0) -> tuple[NeighbourDisplacement, ...]:
         """Return the displacement of every pair of neighbours. stored_per_px: pixels of the stored pictures for each of those added."""
         if self._sharpest is None:
             return ()
@@ -213,16 +213,16 @@ def _peak(three: Float32[np.ndarray, "3"]) -> float:
     return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
 
 
-def _place(first: int, patches: _Patches, sharpest: Plane, stored_per_px: float) -> NeighbourPlace:
+def _place(first: int, patches: _Patches, sharpest: Plane, stored_per_px: float) -> NeighbourDisplacement:
     x, y = patches.at.astype(int).T
     sharp = patches.kept(patches.energy >= _SHARP_IN_BOTH * sharpest[y, x]) if len(x) else patches
     if len(sharp.at) < FEWEST_PATCHES:
-        return NeighbourPlace(first, None, float("inf"), _best_place(sharp if len(sharp.at) else patches, stored_per_px))
+        return NeighbourDisplacement(first, None, float("inf"), _best_place(sharp if len(sharp.at) else patches, stored_per_px))
     fitted, error_px = _fitted(sharp)
     sizes = np.hypot(*fitted.T)
     off_px = float(np.sqrt(np.mean(sizes**2)))
     farthest = sharp.at[int(sizes.argmax())]
-    return NeighbourPlace(first, off_px * stored_per_px, error_px * stored_per_px, _stored(farthest, stored_per_px))
+    return NeighbourDisplacement(first, off_px * stored_per_px, error_px * stored_per_px, _stored(farthest, stored_per_px))
 
 
 def _best_place(patches: _Patches, stored_per_px: float) -> tuple[int, int]:

@@ -32,7 +32,7 @@ VERSION = 3
 
 
 @dataclass(frozen=True)
-class KeptPicture:
+class CachedPicture:
     """JPEG file and what it shows."""
 
     path: Path
@@ -43,22 +43,22 @@ class KeptPicture:
 
 
 @dataclass(frozen=True)
-class KeptPlace:
+class CachedPlace:
     """Place where the merged picture is worst for a gate. at_px: x, y of the first pixel of a block."""
 
     gate: str
     at_px: tuple[int, int]
     caption: str
-    pictures: tuple[KeptPicture, ...]
+    pictures: tuple[CachedPicture, ...]
 
 
 @dataclass(frozen=True)
-class KeptExamination:
+class CachedExamination:
     """Findings in memory; pictures, those of the worst places, and moving_path where anybody knows what moved, on disk."""
 
     findings: StackFindings
-    pictures: tuple[KeptPicture, ...]
-    places: tuple[KeptPlace, ...]
+    pictures: tuple[CachedPicture, ...]
+    places: tuple[CachedPlace, ...]
     moving_path: Path | None
 
     def moving(self) -> Mask | None:
@@ -78,9 +78,9 @@ def signature_of(stack: FocalStack, reblur: Reblur, widest_px: int) -> Signature
     return {"version": VERSION, "width_px": widest_px, "renderer": reblur.identity, "files": files}
 
 
-def keep(
+def write_cache(
     stack: FocalStack, signature: Signature, examination: Examination, pictures: Sequence[Shown], places: Sequence[ShownPlace]
-) -> KeptExamination:
+) -> CachedExamination:
     """Write what was found, in place of what was kept before. signature: taken before the stack was examined."""
     folder = stack.folder / FOLDER
     _forget(folder)
@@ -102,7 +102,7 @@ def keep(
     return _from_document(document, stack)
 
 
-def kept(stack: FocalStack, signature: Signature) -> KeptExamination | None:
+def read_cache(stack: FocalStack, signature: Signature) -> CachedExamination | None:
     """Return what was found in just this way, else None; what cannot be read, or misses a picture, is found again."""
     path = stack.folder / FOLDER / JSON_NAME
     try:
@@ -117,18 +117,18 @@ def kept(stack: FocalStack, signature: Signature) -> KeptExamination | None:
     return found if all(each.is_file() for each in files) else None
 
 
-def _from_document(document: dict[str, Any], stack: FocalStack) -> KeptExamination:
+def _from_document(document: dict[str, Any], stack: FocalStack) -> CachedExamination:
     folder = stack.folder / FOLDER
     places = tuple(
-        KeptPlace(each["gate"], (int(each["at_px"][0]), int(each["at_px"][1])), each["caption"], _pictures_from(each["pictures"], folder))
+        CachedPlace(each["gate"], (int(each["at_px"][0]), int(each["at_px"][1])), each["caption"], _pictures_from(each["pictures"], folder))
         for each in document["places"]
     )
     moving_path = None if document["moving"] is None else folder / document["moving"]
-    return KeptExamination(findings_from(document["findings"], stack), _pictures_from(document["pictures"], folder), places, moving_path)
+    return CachedExamination(findings_from(document["findings"], stack), _pictures_from(document["pictures"], folder), places, moving_path)
 
 
-def _pictures_from(listed: list[dict[str, Any]], folder: Path) -> tuple[KeptPicture, ...]:
-    return tuple(KeptPicture(folder / each["file"], each["caption"]) for each in listed)
+def _pictures_from(listed: list[dict[str, Any]], folder: Path) -> tuple[CachedPicture, ...]:
+    return tuple(CachedPicture(folder / each["file"], each["caption"]) for each in listed)
 
 
 def _written(folder: Path, name: str, pictures: Sequence[Shown]) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from capture.report.exclusion import exclusion_masks, has_fresh_exclusions, writ
 from capture.report.findings import StackFindings, pair_document, picture_document, slice_document
 from capture.report.gates import PICTURE_RULES, STACK_RULES, Gate, Verdict, absent, absent_names, counts, failed, finite, picture_verdict
 from capture.report.pictures import Shown, ShownPlace, shown_places, slice_triple, stack_maps, worst_places
-from capture.report.report_cache import keep, kept, signature_of
+from capture.report.report_cache import read_cache, signature_of, write_cache
 from capture.report.scene_gates import SCENE_RULES, WHERE, Reconstruction, merged_gate, read_reconstruction, scene_gates
 from capture.report.stack_gates import stack_gates
 from capture.report.stack_section import ExaminedStack, gate_table, stack_section
@@ -146,13 +146,13 @@ def report_scene(scene: Path, reblur: Reblur | None = None, widest_px: int = DEF
 def examine_stack(stack: FocalStack, reblur: Reblur, widest_px: int, *, overwrite: bool = False) -> ExaminedStack:
     """Return findings, gates and pictures of a merged stack, found now or before; its exclusion.exr is made fresh."""
     signature = signature_of(stack, reblur, widest_px)
-    found = None if overwrite else kept(stack, signature)
+    found = None if overwrite else read_cache(stack, signature)
     reused = found is not None
     if found is None:
         view = StackView(stack, widest_px)
         examination, pictures = _examine(view, reblur)
         write_exclusions(stack, exclusion_masks(stack, examination.moving))
-        found = keep(stack, signature, examination, pictures, _places(view, examination))
+        found = write_cache(stack, signature, examination, pictures, _places(view, examination))
     elif not has_fresh_exclusions(stack):
         write_exclusions(stack, exclusion_masks(stack, found.moving()))
     return ExaminedStack(

@@ -49,7 +49,7 @@ from capture.report.gates import (
     Gate,
     Rule,
 )
-from capture.report.registration_check import NeighbourPlace
+from capture.report.registration_check import NeighbourDisplacement
 from capture.report.slice_fit import Change
 from mrbokeh.stacks.guessed_metres import metres_facts
 
@@ -137,7 +137,7 @@ def _places(findings: StackFindings) -> Gate:
     return PLACES.judge(findings.name, value, "; ".join(parts), not (wrong or disagree))
 
 
-def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourPlace]) -> dict[int, float]:
+def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourDisplacement]) -> dict[int, float]:
     """Return, by the first slice of each pair that was not measured, the smaller residual, for a pair that is wrong raises both."""
     residuals = () if findings.drift is None else findings.drift.residuals_px
     if len(residuals) != len(findings.slices):

@@ -8,7 +8,7 @@ import numpy as np
 
 from capture.report.findings import StackFindings
 from capture.report.gates import LARGEST_BLUR_GAIN, LARGEST_EXPOSURE, LARGEST_FOCUS_PX, LEAST_DB, Gate, counts
-from capture.report.report_cache import KeptPicture, KeptPlace
+from capture.report.report_cache import CachedPicture, CachedPlace
 from mrbokeh.system.html_page import cell, table
 
 WIDTH, HEIGHT = 380.0, 200.0
@@ -23,8 +23,8 @@ class ExaminedStack:
 
     findings: StackFindings
     gates: Sequence[Gate]
-    pictures: Sequence[KeptPicture] = ()
-    places: Sequence[KeptPlace] = ()
+    pictures: Sequence[CachedPicture] = ()
+    places: Sequence[CachedPlace] = ()
     reused: bool = False
 
     @property
@@ -67,7 +67,7 @@ def place_section(examined: ExaminedStack) -> str:
     return '<p class="muted">The worst places, pixel by pixel; pictures of one row show the same pixels.</p>' + "".join(parts)
 
 
-def _crops(place: KeptPlace) -> str:
+def _crops(place: CachedPlace) -> str:
     return "".join(each.html() for each in place.pictures)
 
 

@@ -91,7 +91,7 @@ class ExposureGain:
         return self.measured is not None and abs(math.log(self.measured / self.residual)) > math.log1p(_DEAD_ZONE)
 
 
-def evened_out(reference: LowFrequency, slice_: LowFrequency, stated: float | None) -> ExposureGain:
+def gain_to_reference(reference: LowFrequency, slice_: LowFrequency, stated: float | None) -> ExposureGain:
     """Return the gain to apply. stated: the ratio of exposures according to metadata, or None where they do not tell.
 
     Of the measured rest, what lies within the error of measurement (1 %) is not applied; and no more than a third of

@@ -21,8 +21,8 @@ from capture.photos.photo_files import PhotoFolder, SkippedFile, find_photos, no
 from capture.photos.raw import read_raw_metadata
 from capture.photos.sidecar import sidecar_of
 from capture.stacks.grouping import Grouping, Photo, PhotoGroup, group_photos, in_focus_order, why_aside
-from capture.stacks.session import CameraChoice, Session, open_session, taken_away_when_refused
-from capture.stacks.slice_files import told_when_full
+from capture.stacks.session import CameraChoice, Session, open_session, undone_when_refused
+from capture.stacks.slice_files import reporting_full_disk
 from capture.stacks.stack_description import FEWEST_TO_MERGE, StackReport, finish_stack, finished_before, ingest_digest, lens_text
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
 from mrbokeh.stacks.focal_stack import FocalStack
@@ -54,7 +54,7 @@ class IngestReport:
 
 def ingest(given: Sequence[Path], scene: Path, settings: IngestSettings | None = None) -> IngestReport:
     """Make or complete the stacks of a scene. Unusable files are reported and left out; InputError where nothing is usable."""
-    with taken_away_when_refused(Path(scene), bool):
+    with undone_when_refused(Path(scene), bool):
         return _ingested(given, Path(scene), settings or IngestSettings())
 
 
@@ -66,7 +66,7 @@ def _ingested(given: Sequence[Path], scene: Path, settings: IngestSettings) -> I
         labelled = [(each.label, photos_of_folder(each, settings.sidecar, advance)) for each in folders]
         groups = group_photos(labelled, settings.grouping)
         developing = progress.add_task("developing", total=sum(len(each.photos) for each in groups))
-        with told_when_full(scene):
+        with reporting_full_disk(scene):
             session = open_session(scene, groups, settings.development.white_balance, overwrite=settings.overwrite)
             reports = [ingest_group(group, session, settings, lambda: progress.advance(developing)) for group in groups]
     skipped = _without_their_raw(skipped, reports)
@@ -98,11 +98,11 @@ def ingest_group(group: PhotoGroup, session: Session, settings: IngestSettings, 
         return before
     work = _developed(group, choice, session, settings, advance)
     if len(work.finished) < min(FEWEST_TO_MERGE, len(group.aside)):
-        work = _of_what_lies_aside(group, work, session, settings)
+        work = _developed_aside(group, work, session, settings)
     else:
         work.skipped += why_aside(group)
     try:
-        if work.finished and work.leave_out_what_is_odd(sizes_only=settings.grouping is Grouping.none):
+        if work.finished and work.leave_out_odd_slices(sizes_only=settings.grouping is Grouping.none):
             work = work.with_another_reference()
     except InputError as error:
         work.give_up()
@@ -122,7 +122,7 @@ def _developed(
     return work
 
 
-def _of_what_lies_aside(group: PhotoGroup, unusable: StackWork, session: Session, settings: IngestSettings) -> StackWork:
+def _developed_aside(group: PhotoGroup, unusable: StackWork, session: Session, settings: IngestSettings) -> StackWork:
     """Make a stack of what other cameras took, where too little of the usual one's photographs can be used."""
     unusable.give_up()
     left_out = [SkippedFile(each.photo.path, "too few photographs of its camera can be used") for each in unusable.finished]

@@ -75,7 +75,7 @@ def duplicates(candidates: Sequence[Candidate]) -> Odd:
     return odd
 
 
-def strangers(candidates: Sequence[Candidate]) -> Odd:
+def other_scenes(candidates: Sequence[Candidate]) -> Odd:
     """Find those of another scene than most. Raises InputError where no scene has more than half of them."""
     scenes = sorted(_scenes([each.look for each in candidates]), key=len, reverse=True)
     if len(scenes) < 2:
@@ -92,7 +92,7 @@ def strangers(candidates: Sequence[Candidate]) -> Odd:
 def _scenes(looks: Sequence[SliceLook]) -> list[list[int]]:
     """Return indices that hang together: first each with the one before it, then what that leaves apart with some of every other scene.
 
-    Many scenes are not compared: that is a folder of stacks, not a stack with one or two strangers.
+    Many scenes are not compared: that is a folder of stacks, not a stack with one or two other_scenes.
     """
     scenes: list[list[int]] = []
     for index, look in enumerate(looks):

@@ -101,7 +101,7 @@ def camera_of(photos: Sequence[Photo]) -> str:
 
 
 @contextmanager
-def taken_away_when_refused(scene: Path, is_kept: Callable[[Sequence[FocalStack]], bool]) -> Iterator[None]:
+def undone_when_refused(scene: Path, is_kept: Callable[[Sequence[FocalStack]], bool]) -> Iterator[None]:
     """Take away what a block that raises InputError has put into a scene, so that a run with other photographs finds nothing of it.
 
     All stays where the scene was begun before, where its new stacks (by name) are to be kept, and where a full disk stopped the work: that

@@ -39,7 +39,7 @@ class DiskFullError(InputError):
 
 
 @contextmanager
-def told_when_full(path: Path, needed_bytes: int = 0) -> Iterator[None]:
+def reporting_full_disk(path: Path, needed_bytes: int = 0) -> Iterator[None]:
     """Turn a write that fails for want of space into DiskFullError.
 
     Libraries in C++ say so in words at best: otherwise it is the disk if it has less left than needed_bytes.
@@ -73,7 +73,7 @@ def write_slice(
     half: bool,
 ) -> None:
     """Write a linear slice with its saturation mask and its record, atomically. Raises DiskFullError."""
-    with told_when_full(path, rgb.nbytes + saturated.nbytes):
+    with reporting_full_disk(path, rgb.nbytes + saturated.nbytes):
         write_camera_rgb(path, rgb, rec709_from_camera, saturated=saturated, half=half, attributes={_ATTRIBUTE: json.dumps(record)})
 
 

@@ -1,8 +1,8 @@
 """Looks of slices from afar: whether two are the same photograph, whether one shows nothing, and whether two show one scene.
 
 Defocus, breathing, a tint and another exposure leave the light of large areas alike: on 90 photographed stacks neighbours correlate by 0.97
-or more, strangers by 0.9 at most. Where hands moved the camera far between two slices, features that match tell instead. Fine detail, block
-by block, tells copies of a photograph; merging and the report use it to say how sharp a picture is beside its slices.
+or more, those of other scenes by 0.9 at most. Where hands moved the camera far between two slices, features that match tell instead. Fine
+detail, block by block, tells copies of a photograph; merging and the report use it to say how sharp a picture is beside its slices.
 """
 
 from dataclasses import dataclass

@@ -14,9 +14,9 @@ from capture.photos.developing import develop, is_raw
 from capture.photos.libraw import WhiteBalance
 from capture.photos.photo_files import SkippedFile
 from capture.photos.raw import DecodedPhoto
-from capture.stacks.exposure import ExposureGain, LowFrequency, evened_out, gain_to_session, stated_gain
+from capture.stacks.exposure import ExposureGain, LowFrequency, gain_to_reference, gain_to_session, stated_gain
 from capture.stacks.grouping import Photo
-from capture.stacks.odd_slices import Candidate, Odd, blown, duplicates, odd_sizes, strangers
+from capture.stacks.odd_slices import Candidate, Odd, blown, duplicates, odd_sizes, other_scenes
 from capture.stacks.session import CameraChoice
 from capture.stacks.slice_files import FOLDER, DiskFullError, find_slices, slice_metadata, source_record, write_slice
 from capture.stacks.slice_looks import SliceLook, look_at, look_of
@@ -82,14 +82,14 @@ class StackWork:
         except InputError as error:
             self.skipped.append(SkippedFile(photo.path, str(error).replace(str(photo.path), "it", 1)))
 
-    def leave_out_what_is_odd(self, *, sizes_only: bool) -> bool:
+    def leave_out_odd_slices(self, *, sizes_only: bool) -> bool:
         """Name and leave out slices that do not belong (`capture.stacks.odd_slices`). True if the first is left out.
 
         Raises InputError if no more than half of the slices belong together.
         """
         first = self.finished[0]
         self._leave_out(odd_sizes([(each.photo.path.name, tuple(each.record["size_px"])) for each in self.finished]))
-        for odd in () if sizes_only else (blown, duplicates, strangers):
+        for odd in () if sizes_only else (blown, duplicates, other_scenes):
             self._leave_out(odd([Candidate(each.photo, self._look(each)) for each in self.finished]))
         return self.finished[0] is not first
 
@@ -149,7 +149,7 @@ class StackWork:
         look = look_of(decoded)
         primaries = self.rec709_from_camera if self.finished else decoded.rec709_from_camera
         gain = self._gain(decoded, look.light, request)
-        rgb = in_primaries(decoded, primaries)
+        rgb = converted_to_primaries(decoded, primaries)
         if gain.total != 1.0:
             rgb = rgb * np.float32(gain.total)
         record = {
@@ -178,7 +178,7 @@ class StackWork:
         if self._reference is None:
             self._reference = look_of(self._developed(self.finished[0].photo)).light
         base = self.finished[0].record["metadata"]
-        gain = evened_out(self._reference, light, request["stated_gain"])
+        gain = gain_to_reference(self._reference, light, request["stated_gain"])
         return replace(gain, session=base["exposure_gain_session"], session_from=base["exposure_gain_session_from"])
 
     def _scale_stack(self) -> Path | None:
@@ -200,7 +200,7 @@ def stack_work(folder: Path, development: Development, choice: CameraChoice, *, 
     return StackWork(folder, development, choice, existing)
 
 
-def in_primaries(decoded: DecodedPhoto, rec709_from_camera: Matrix3x3 | None) -> Float32[np.ndarray, "height width 3"]:
+def converted_to_primaries(decoded: DecodedPhoto, rec709_from_camera: Matrix3x3 | None) -> Float32[np.ndarray, "height width 3"]:
     """Return the photograph in the RGB that rec709_from_camera leads from: developed pictures and RAW can share a stack."""
     if decoded.rec709_from_camera == rec709_from_camera:
         return decoded.rgb

@@ -11,7 +11,7 @@ import pytest
 import mrbokeh.images.camera_rgb
 import mrbokeh.images.exr_io
 from capture.stacks.ingest import ingest
-from capture.stacks.slice_files import DiskFullError, find_slices, told_when_full
+from capture.stacks.slice_files import DiskFullError, find_slices, reporting_full_disk
 from mrbokeh.images.exr_io import ExrPart
 from mrbokeh.images.image_io import write_image
 from mrbokeh.system.atomic_files import atomic_path
@@ -48,11 +48,11 @@ def test_a_full_disk_is_one_clear_line_and_finished_slices_stay(shoot: Path, tmp
 
 def test_a_full_disk_is_told_from_other_errors(tmp_path: Path) -> None:
     for error in (OSError(errno.ENOSPC, "No space left on device"), OSError(errno.EDQUOT, "quota"), RuntimeError("write failed")):
-        with pytest.raises(DiskFullError), told_when_full(tmp_path / "a.exr", needed_bytes=2**80):
+        with pytest.raises(DiskFullError), reporting_full_disk(tmp_path / "a.exr", needed_bytes=2**80):
             raise error
-    with pytest.raises(PermissionError), told_when_full(tmp_path / "a.exr"):
+    with pytest.raises(PermissionError), reporting_full_disk(tmp_path / "a.exr"):
         raise PermissionError(errno.EACCES, "no")
-    with pytest.raises(RuntimeError, match="something else"), told_when_full(tmp_path / "a.exr"):
+    with pytest.raises(RuntimeError, match="something else"), reporting_full_disk(tmp_path / "a.exr"):
         raise RuntimeError("something else")
 
 

@@ -13,13 +13,13 @@ from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import Sidecar
 from capture.stacks.grouping import Grouping, Photo
 from capture.stacks.ingest import IngestSettings, ingest
-from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, strangers
+from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, other_scenes
 from capture.stacks.slice_looks import look_at, look_of, one_scene, same_photograph
 from mrbokeh.images.image_io import write_image
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_photographs import Picture, defocused, make_shoot, only_stack, scene_rgb, sources
 
-CHECKS = (blown, duplicates, strangers)
+CHECKS = (blown, duplicates, other_scenes)
 
 
 def candidate(path: Path) -> Candidate:
@@ -54,7 +54,7 @@ def test_real_strangers_and_copies_are_found(shared_data: Path, tmp_path: Path) 
     cv2.imwrite(str(again), photographed, [cv2.IMWRITE_JPEG_QUALITY, 90])
     files = [own[0], other[0], *own[1:4], other[9], *own[4:], again]
     candidates = [candidate(each) for each in files]
-    assert list(strangers(candidates)) == [1, 5]
+    assert list(other_scenes(candidates)) == [1, 5]
     assert duplicates(candidates) == {len(files) - 1: f"it is the same photograph as {own[1].name}"}
 
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from capture.cli import app
 from capture.stacks.ingest import ingest
-from capture.stacks.session import taken_away_when_refused
+from capture.stacks.session import undone_when_refused
 from capture.stacks.slice_files import DiskFullError
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.system.errors import InputError
@@ -84,7 +84,7 @@ def test_work_to_go_on_with_stays(error: BaseException, is_kept: Kept, left: boo
     scene = tmp_path / "scene"
 
     def stopped() -> None:
-        with taken_away_when_refused(scene, is_kept):
+        with undone_when_refused(scene, is_kept):
             ingest([make_shoot(tmp_path / "shoot")], scene)
             raise error
 

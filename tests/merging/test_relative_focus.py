@@ -12,7 +12,7 @@ from capture.merging.merge import merge_scene
 from capture.merging.metres.blur_evidence import DIAMETERS_PX, DRAWN_PX, disc_kernel
 from capture.merging.metres.focus_order import Contours, Direction, focus_order
 from capture.merging.metres.relative_focus import RelativeFocus, _Places, solve_relative_focus
-from capture.merging.metres.relative_stack import FROM_DISTANCES, gauge_of, told_direction
+from capture.merging.metres.relative_stack import FROM_DISTANCES, gauge_of, stated_direction
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.layer import opaque
@@ -250,7 +250,7 @@ def test_nothing_lies_beyond_infinity(places: list[int], near_first: bool | None
     relative = RelativeFocus(np.array([-6.0, -2.0, 2.0, 6.0]), np.ones(4), plane, plane)
     stack = FocalStack(Path(), tuple(Slice("", float("inf") if index in places else None) for index in range(4)))
     expected = None if near_first is None else Direction(near_first, FROM_DISTANCES, sure=True)
-    assert told_direction(stack, relative) == expected
+    assert stated_direction(stack, relative) == expected
 
 
 def test_blur_is_right_in_pixels_beside_a_slice_at_infinity(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import affine_transform, gaussian_filter
 
 from capture.photos.photo_metadata import StatedExposure
-from capture.stacks.exposure import ExposureGain, evened_out, fit_gain, low_frequency, overlap_gain
+from capture.stacks.exposure import ExposureGain, fit_gain, gain_to_reference, low_frequency, overlap_gain
 from capture.stacks.ingest import ingest
 from tests.scenes.made_photographs import Picture, make_raw_photo, only_stack, scene_rgb
 
@@ -51,7 +51,7 @@ def test_gains_are_limited_and_small_ones_left_alone() -> None:
     none_full = np.zeros(rgb.shape[:2], bool)
 
     def gain_of(factor: float, stated: float | None) -> ExposureGain:
-        return evened_out(low_frequency(rgb, none_full), low_frequency(rgb * np.float32(factor), none_full), stated)
+        return gain_to_reference(low_frequency(rgb, none_full), low_frequency(rgb * np.float32(factor), none_full), stated)
 
     assert gain_of(1.005, None).total == 1.0  # within the error of measurement
     assert gain_of(0.5, 2.0).total == pytest.approx(2.0)  # metadata explain it

@@ -15,7 +15,7 @@ from capture.report import report_cache, stack_view
 from capture.report.examination import examine
 from capture.report.findings import FocusCurve, SliceFindings, StackFindings, findings_document, findings_from
 from capture.report.picture_sharpness import PictureFindings
-from capture.report.registration_check import NeighbourPlace
+from capture.report.registration_check import NeighbourDisplacement
 from capture.report.scene_report import examine_stack, report_scene
 from capture.report.slice_fit import Change, SliceFit
 from capture.report.stack_view import Reblur
@@ -182,7 +182,7 @@ def test_findings_are_read_back_exactly(scene: Path) -> None:
     fit = SliceFit(*(Change(0.1 * k, float("inf") if k == 3 else 1.0 / (3.0 + k)) for k in range(7)))
     slices = (SliceFindings(0, 1.0 / 3.0, 0.0, 0.5, 7.25, float("inf"), 20.1, fit), SliceFindings(1, 1.5, 0.0, 1.0))
     curve = FocusCurve(np.array([1 / 3, 2 / 3]), 0.7, 0.1, 0.2)
-    pairs = (NeighbourPlace(0, 0.1 / 3.0, 0.02, (3, 4)), NeighbourPlace(1, None, float("inf"), (160, 107)))
+    pairs = (NeighbourDisplacement(0, 0.1 / 3.0, 0.02, (3, 4)), NeighbourDisplacement(1, None, float("inf"), (160, 107)))
     picture = PictureFindings(1.0 / 300.0, None, float("inf"), 1.0 / 3.0, (320, 214))
     findings = StackFindings(stack, (160, 107), (320, 214), slices, curve, 0.01, None, picture, pairs)
     write_json(scene / "there.json", findings_document(findings))

@@ -18,8 +18,8 @@ from capture.commands.report import report_command
 from capture.report.findings import FocusCurve, SliceFindings, StackFindings
 from capture.report.gates import LIGHT, PLACES, SEAMS, SHARP, Gate
 from capture.report.picture_sharpness import PictureFindings
-from capture.report.registration_check import NeighbourPlace, PlaceEvidence
-from capture.report.report_cache import KeptPlace
+from capture.report.registration_check import DisplacementEvidence, NeighbourDisplacement
+from capture.report.report_cache import CachedPlace
 from capture.report.scene_report import GATE_NAMES, SceneReport, report_scene
 from capture.report.stack_gates import picture_gates
 from capture.stacks.slice_looks import BLOCK_PX
@@ -135,7 +135,7 @@ def gate(report: SceneReport, name: str) -> Gate:
     return next(each for each in report.gates if each.name == name)
 
 
-def places(report: SceneReport, name: str) -> list[KeptPlace]:
+def places(report: SceneReport, name: str) -> list[CachedPlace]:
     return [each for each in report.stacks[0].places if each.gate == name]
 
 
@@ -205,7 +205,7 @@ def test_measured_flux_supports_what_no_slice_shows(tmp_path: Path) -> None:
 
 def test_a_shift_is_measured() -> None:
     """2 px to the right between slices 1 and 2, and back again; 0 between the others, to a tenth of a pixel."""
-    evidence = PlaceEvidence()
+    evidence = DisplacementEvidence()
     for rgb in shifted_slice()[0]:
         evidence.add(rgb, np.ones((HEIGHT_PX, WIDTH_PX), bool))
     first, second, third = evidence.places()
@@ -220,7 +220,7 @@ def test_a_turn_is_measured_as_what_it_moves() -> None:
     middle = np.array([WIDTH_PX / 2 - 0.5, HEIGHT_PX / 2 - 0.5])
     turn = cv2.getRotationMatrix2D(tuple(middle), float(np.rad2deg(0.006)), 1.0)
     turned = cv2.warpAffine(surface(), turn, (WIDTH_PX, HEIGHT_PX), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    evidence = PlaceEvidence()
+    evidence = DisplacementEvidence()
     for rgb in (surface(), turned):
         evidence.add(rgb, np.ones((HEIGHT_PX, WIDTH_PX), bool))
     y, x = np.mgrid[32:FLAT_FROM_ROW, 32 : WIDTH_PX - 32]
@@ -232,7 +232,7 @@ def test_what_has_no_data_is_not_compared() -> None:
     """Where the second slice lacks data it shows the first moved by 5 px: not looked at."""
     other, usable = surface().copy(), np.ones((HEIGHT_PX, WIDTH_PX), bool)
     other[:, :300], usable[:, :300] = np.roll(surface(), 5, axis=1)[:, :300], False
-    evidence = PlaceEvidence()
+    evidence = DisplacementEvidence()
     evidence.add(surface(), np.ones_like(usable))
     evidence.add(other, usable)
     assert evidence.places()[0].off_px == pytest.approx(0.0, abs=0.1)
@@ -241,7 +241,7 @@ def test_what_has_no_data_is_not_compared() -> None:
 SHARP_PICTURE = PictureFindings(0.0, 1.0, 0.5, 0.5, (1000, 800))
 
 
-def findings_with(tmp_path: Path, residuals_px: list[float | None], pairs: tuple[NeighbourPlace, ...]) -> StackFindings:
+def findings_with(tmp_path: Path, residuals_px: list[float | None], pairs: tuple[NeighbourDisplacement, ...]) -> StackFindings:
     """Of pictures 1000 px wide."""
     write_json(tmp_path / "registration.json", {"correlations": [1.0] * len(pairs), "residuals_px": residuals_px})
     metadata = {"reference_from_slice": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]}
@@ -284,7 +284,7 @@ def test_the_residual_of_the_registration_stands_in_where_nothing_is_sharp_in_bo
     residuals_px: list[float | None], pairs: tuple[tuple[float | None, float], ...], verdict: str, tmp_path: Path
 ) -> None:
     """0.3% of 1000 px are 3 px. A pair that is wrong raises the residuals of both its slices, so that the smaller counts."""
-    measured = tuple(NeighbourPlace(first, off_px, error_px, (500, 400)) for first, (off_px, error_px) in enumerate(pairs))
+    measured = tuple(NeighbourDisplacement(first, off_px, error_px, (500, 400)) for first, (off_px, error_px) in enumerate(pairs))
     found = next(each for each in picture_gates(findings_with(tmp_path, residuals_px, measured)) if each.name == PLACES.name)
     assert found.verdict == verdict
     if residuals_px[-1] is None and verdict != "failed":
@@ -349,4 +349,4 @@ def test_a_gate_that_nobody_knows_is_refused_before_the_work(command: Callable[.
 
 def test_names_of_gates_are_told_apart() -> None:
     assert len(set(GATE_NAMES)) == len(GATE_NAMES) == 20
-    assert replace(NeighbourPlace(0, 1.4, 0.3, (0, 0)), error_px=0.6).exceeds(1.0) is False
+    assert replace(NeighbourDisplacement(0, 1.4, 0.3, (0, 0)), error_px=0.6).exceeds(1.0) is False

@@ -71,14 +71,14 @@ def parse_known_distance(text: str) -> KnownDistance:
     return KnownDistance(*_numbers(text, 3, "--distance-at", "X,Y,METRES such as 310,220,0.35"))
 
 
-def told_facts(stack: FocalStack) -> list[Fact]:
+def stored_facts(stack: FocalStack) -> list[Fact]:
     """Return the lengths and distances that were told of a stack."""
     return [_fact(each) for each in metres_facts(stack).get(TOLD, ())]
 
 
-def told_options(stack: FocalStack) -> str:
+def scale_options(stack: FocalStack) -> str:
     """Return the options of `mrbokeh capture scale` that tell again what was told of a stack; empty where nothing was."""
-    options = [each.option for each in told_facts(stack)]
+    options = [each.option for each in stored_facts(stack)]
     if (metres_facts(stack).get("gauge") or {}).get("near_first_from") == NEAREST_OPTION:
         options.append(f"{NEAREST_OPTION} {'first' if is_near_first(stack) else 'last'}")
     return " ".join(options)

@@ -122,7 +122,7 @@ class _Places:
     def widest_px(self) -> float:
         return float(np.sqrt(self.squares_px2[-1]))
 
-    def is_told(self, cells: Cells | slice, one: int, diameter_px: Float[np.ndarray, " some"]) -> Bool[np.ndarray, " some"]:
+    def can_tell(self, cells: Cells | slice, one: int, diameter_px: Float[np.ndarray, " some"]) -> Bool[np.ndarray, " some"]:
         """Return which cells have data in a slice, and no wider disc there than the rungs reach."""
         return (self.errors[cells, one, 0] >= 0.0) & (diameter_px <= self.widest_px)
 
@@ -265,7 +265,7 @@ def _summed_curves(
     cells = np.argsort(group, kind="stable")
     cells = cells[weight[cells] > 0.0]
     for one in range(places.count):
-        told = cells[places.is_told(cells, one, base[cells, one])]
+        told = cells[places.can_tell(cells, one, base[cells, one])]
         if not len(told):
             continue
         diameters = np.maximum(base[told, one] + candidates[:, None], 0.0)
@@ -283,7 +283,7 @@ def _offset_costs(
     # The shares of the slices that a cell's sharp picture is of sum to 1.
     own_blur = places.own @ positions**2 - place * (2.0 * (places.own @ positions) - place)
     for one, position in enumerate(positions):
-        told = np.flatnonzero(places.is_told(slice(None), one, np.abs(position - start)))
+        told = np.flatnonzero(places.can_tell(slice(None), one, np.abs(position - start)))
         misfits = places.misfits(told, one, (position - place[:, told]) ** 2 - own_blur[:, told])
         costs[:, told] += misfits / (1.0 + misfits / np.float32(_SPENT))
     return costs

@@ -96,10 +96,10 @@ def with_solved_blur(merged: FocalStack, slices: RegisteredSlices, all_in_focus:
     """Solve the blur of registered slices and write it to depth.exr; the stack that comes back has it and guessed metres."""
     index, confidence = focus.focus_index, focus.confidence
     contours = Contours.of(index)
-    passing = lambda: contours.watching(slices.passing())  # noqa: E731
+    passing = lambda: contours.watching(slices.stored())  # noqa: E731
     relative = solve_relative_focus(passing, all_in_focus, index, confidence, len(merged), slices.valid, slices.saturated)
     scales, as_given = [each.scale for each in merged.slices], ORDER not in merged.metadata
-    direction = told_direction(merged, relative) or contours.direction(relative.positions_px, scales, as_given)
+    direction = stated_direction(merged, relative) or contours.direction(relative.positions_px, scales, as_given)
     size_px = all_in_focus.shape[1], all_in_focus.shape[0]
     gauge = gauge_of(merged, nearness_px(relative.positions_px, direction), size_px)
     guessed = with_guessed_metres(merged, relative, direction, gauge, size_px)
@@ -172,7 +172,7 @@ def gauge_of(stated: FocalStack, positions_px: Float[np.ndarray, " slices"], siz
     return Gauge(growth, _FARTHEST_DIOPTRES - farthest_px / growth, "guess", "guess")
 
 
-def told_direction(stack: FocalStack, relative: RelativeFocus) -> Direction | None:
+def stated_direction(stack: FocalStack, relative: RelativeFocus) -> Direction | None:
     """Return the direction that two or more stated distances tell, or one at infinity, beyond which nothing lies; else None."""
     told = [(p, 1.0 / d) for p, d in zip(relative.positions_px, stack.focus_distances_m, strict=True) if d is not None]
     if len({d for _, d in told}) > 1:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import least_squares
 
-from capture.merging.metres.known_metres import NEAREST_OPTION, Fact, told_facts, with_known_nearest, write_changed_metres
+from capture.merging.metres.known_metres import NEAREST_OPTION, Fact, stored_facts, with_known_nearest, write_changed_metres
 from capture.merging.metres.relative_stack import FROM_DISTANCES
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.optics.camera import Camera
@@ -49,7 +49,7 @@ _Unknowns = Callable[[Float[np.ndarray, " numbers"]], tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Regauged:
+class ScaledStack:
     """A stack with other metres. stack: as written. errors: by how much each fact told is missed, as a share."""
 
     stack: FocalStack
@@ -87,7 +87,7 @@ class _Solution(NamedTuple):
     directed: bool
 
 
-def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False) -> Regauged:
+def apply_known_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False) -> ScaledStack:
     """Put the metres that follow from all facts told into stack.json and depth.exr. overwrite: earlier ones count no more.
 
     Raises InputError where the stack's metres are known already, or facts contradict one another.
@@ -106,7 +106,7 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
         raise InputError(f"{stack.folder} was made from another stack, with another lens: tell that stack, and make this one again")
     equations = [_Equation.of(each, depth_m, camera) for each in facts]
     found = _solution(equations, _stated_dioptres(stack), known["gauge"])
-    changed = _regauged(stack, found.p, found.q)
+    changed = _rescaled(stack, found.p, found.q)
     gauge = dict(changed.metadata[METRES]["gauge"]) | {"offset_from": TOLD}
     gauge |= {} if gauge["scale_from"] == "lens" else {"scale_from": TOLD}
     if found.directed:
@@ -114,10 +114,10 @@ def tell_metres(stack: FocalStack, told: Sequence[Fact], overwrite: bool = False
         changed = with_known_nearest(changed, found.q < 0.0)
     changed = replace(changed, metadata=changed.metadata | {METRES: _known_facts(stack, gauge, facts, found.deep)})
     _write(changed, found.p, found.q)
-    return Regauged(changed, tuple((each.fact, each.error(found.p, found.q)) for each in equations))
+    return ScaledStack(changed, tuple((each.fact, each.error(found.p, found.q)) for each in equations))
 
 
-def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
+def apply_known_nearest(stack: FocalStack, first: bool) -> FocalStack:
     """Put what the user knows of the sweep's direction into stack.json and depth.exr: that its first (or last) slice is the nearest.
 
     Turned in the middle of its planes of focus, or so that a stated distance and lengths told of one depth stay. Raises InputError where
@@ -131,7 +131,7 @@ def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
         raise InputError(f"{stack.folder} knows its nearest slice from its distances: --nearest is for stacks that have to guess it")
     turned = is_near_first(stack) != first
     p, q = _turn(stack, stated) if turned else (0.0, 1.0)
-    changed = with_known_nearest(_regauged(stack, p, q), turned)
+    changed = with_known_nearest(_rescaled(stack, p, q), turned)
     facts = changed.metadata[METRES]
     known = {"near_first_from": NEAREST_OPTION, "near_first_sure": True}
     facts = facts | {"why": facts["why"].partition(_GUESSED_END)[0], "gauge": facts["gauge"] | known}
@@ -140,7 +140,7 @@ def tell_nearest(stack: FocalStack, first: bool) -> FocalStack:
     return changed
 
 
-def lines_of(done: Regauged) -> list[str]:
+def lines_of(done: ScaledStack) -> list[str]:
     """Return lines that tell people what was found."""
     distances_m = [each for each in done.stack.focus_distances_m if each is not None]
     facts = metres_facts(done.stack)
@@ -155,7 +155,7 @@ def _turn(stack: FocalStack, stated: Float[np.ndarray, " slices"]) -> tuple[floa
     """Return p and q below 0 that turn the stack; what is stated or told stays at its dioptres."""
     facts, dioptres = metres_facts(stack), [1.0 / each for each in stack.focus_distances_m if each]
     depth_m = _told_depth_m(stack)
-    told = [1.0 / _depth_at(depth_m, *pixel) for each in told_facts(stack) for pixel in each.pixels]
+    told = [1.0 / _depth_at(depth_m, *pixel) for each in stored_facts(stack) for pixel in each.pixels]
     kept, ends = [*stated, *told], min(dioptres) + max(dioptres)
     if not kept:
         return ends, -1.0
@@ -167,7 +167,7 @@ def _turn(stack: FocalStack, stated: Float[np.ndarray, " slices"]) -> tuple[floa
 
 def _with_earlier(stack: FocalStack, told: Sequence[Fact], overwrite: bool) -> tuple[Fact, ...]:
     """Return facts of earlier calls, and the new ones in place of those at the same pixels."""
-    earlier = [] if overwrite else told_facts(stack)
+    earlier = [] if overwrite else stored_facts(stack)
     return tuple({each.pixels: each for each in (*earlier, *told)}.values())
 
 
@@ -248,9 +248,9 @@ def _known_facts(stack: FocalStack, gauge: Mapping[str, Any], facts: Sequence[Fa
     return {"known": True, "why": f"metres rest on {count}", "guessed": "; ".join(guessed) or None, TOLD: told, "gauge": dict(gauge)}
 
 
-def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
+def _rescaled(stack: FocalStack, p: float, q: float) -> FocalStack:
     """Return the stack with dioptres p + q D; what its metres rest on is left to the caller."""
-    slices = tuple(_regauged_slice(stack, each, p, q) for each in stack.slices)
+    slices = tuple(_rescaled_slice(stack, each, p, q) for each in stack.slices)
     distances_m = [float(each.focus_distance_m or 0.0) for each in slices]
     gauge = dict(metres_facts(stack)["gauge"])
     gauge |= {"px_per_dioptre": gauge["px_per_dioptre"] / abs(q), "offset_dioptres": p + q * gauge["offset_dioptres"]}
@@ -259,7 +259,7 @@ def _regauged(stack: FocalStack, p: float, q: float) -> FocalStack:
     return replace(stack, slices=slices, lens=_lens_at(stack, distances_m), metadata=stack.metadata | {METRES: facts})
 
 
-def _regauged_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
+def _rescaled_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice:
     dioptres = p + q / float(each.focus_distance_m or np.inf)
     if dioptres < 0.0:
         raise InputError(f"{stack.folder}: by what was told {each.path} is focused beyond infinity: check what you told and tell it again")

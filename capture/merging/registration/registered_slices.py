@@ -101,7 +101,7 @@ class IngestedSlices:
             self.read(path)
         return self._small[path]
 
-    def taken(self, path: Path) -> tuple[Rgb, Plane]:
+    def read_last(self, path: Path) -> tuple[Rgb, Plane]:
         """Return what `read` does, for the last time."""
         found = self.read(path)
         self._held.pop(path, None)
@@ -124,7 +124,7 @@ class RegisteredSlices:
     _held: list[Half] = field(default_factory=list)
     _buffer: Rgb | None = None
 
-    def made(self, keep: bool) -> Iterator[Rgb]:
+    def resampled(self, keep: bool) -> Iterator[Rgb]:
         """Resample and write every slice, and give it; its colours hold until the next.
 
         keep: a file that is newer than slice and registration is read instead.
@@ -148,7 +148,7 @@ class RegisteredSlices:
         """Return whether a file of an earlier run was made with the gain that its slice has now."""
         return read_exr(path)[0].attributes.get(_GAIN_ATTRIBUTE) == str(self.tint_gains[index].tolist())
 
-    def passing(self) -> Iterator[Rgb]:
+    def stored(self) -> Iterator[Rgb]:
         """Yield the slices once more, after they were all made; the colours of one hold until the next."""
         for index in range(len(self.stack)):
             yield self._single(self._held[index] if self._held else self._kept(self.path(index))[0])
@@ -201,7 +201,7 @@ class RegisteredSlices:
         return np.asarray(stored, np.float16), saturated
 
     def _resampled(self, index: int) -> tuple[Half, Plane]:
-        rgb, saturated = self.ingested.taken(self.stack.folder / source_path(self.stack.slices[index]))
+        rgb, saturated = self.ingested.read_last(self.stack.folder / source_path(self.stack.slices[index]))
         transform, gain = self.registration.reference_from_slice[index], self.tint_gains[index]
         lit = partial(with_gain, gain=gain) if (gain != 1.0).any() else None
         moved = warp(rgb, transform, lit)

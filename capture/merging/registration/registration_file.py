@@ -126,7 +126,7 @@ def breathing_of(
       farthest known focus.
     """
     if lens_scales is not None:
-        scales = _told_by_pictures(lens_scales, unknown, measured)
+        scales = _filled_from_pictures(lens_scales, unknown, measured)
         lens = Breathing(tuple(float(scale / scales[0]) for scale in scales), "lens")
         known = {pair: scale for pair, scale in measured.items() if not set(pair) & set(unknown)}
         if not known or np.median([abs(scale / lens.scale(*pair) - 1.0) for pair, scale in known.items()]) <= LARGEST_DEPARTURE:
@@ -157,7 +157,7 @@ def _transform(rows: Any) -> Transform:
     return matrix
 
 
-def _told_by_pictures(lens_scales: Sequence[float], unknown: Collection[int], measured: Mapping[Pair, float]) -> list[float]:
+def _filled_from_pictures(lens_scales: Sequence[float], unknown: Collection[int], measured: Mapping[Pair, float]) -> list[float]:
     """Fill in unknown scales one after the other, by the median of their pairs with known ones; without such pairs they stay as given."""
     scales = {index: float(scale) for index, scale in enumerate(lens_scales) if index not in unknown}
     least_known = min(scales.values(), default=np.inf)
