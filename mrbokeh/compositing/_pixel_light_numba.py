@@ -42,7 +42,7 @@ def add_grain(
     shot: np.ndarray,
     read: np.ndarray,
 ) -> None:
-    """Add grain in place to light (h, w, 3), with the variance of `plate_look.grain`. start: the texture's row and column at (0, 0)."""
+    """Add grain in place to light (h, w, 3), as much as `plate_look.grain` states. start: the texture row and column at (0, 0)."""
     height, width = alpha.shape
     side = texture.shape[0]
     for y in range(height):

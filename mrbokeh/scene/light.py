@@ -144,18 +144,21 @@ def solid_angles_sr(height_px: int, width_px: int) -> Float[np.ndarray, "height 
     return np.repeat(((border[:-1] - border[1:]) * 2 * np.pi / width_px)[:, None], width_px, axis=1)
 
 
-def split_sun(environment: Environment, width_rad: float = 0.12, ceiling_percentile: float = 99.0) -> tuple[Environment, Light]:
+_SUN_RADIUS_RAD, _SKY_PERCENTILE = 0.12, 99.0
+
+
+def split_sun(environment: Environment) -> tuple[Environment, Light]:
     """Take the sun out of a panorama: (the sky without it, a directional light of the same irradiance).
 
-    A panorama alone casts no shadow. Within `width_rad` of the brightest spot everything above the percentile of the map's
+    A panorama alone casts no shadow. Within 0.12 rad of the brightest spot everything above the 99th percentile of the map's
     luminance becomes the light; the rest stays in the sky, so that no energy is lost.
     """
     radiance = environment.radiance
     towards = directions(*radiance.shape[:2])
     luminance = radiance @ np.array([0.2126, 0.7152, 0.0722], np.float32)
     brightest = np.unravel_index(np.argmax(luminance), luminance.shape)
-    near = towards @ towards[brightest] > np.cos(width_rad)
-    ceiling = np.percentile(luminance, ceiling_percentile)
+    near = towards @ towards[brightest] > np.cos(_SUN_RADIUS_RAD)
+    ceiling = np.percentile(luminance, _SKY_PERCENTILE)
     keep = np.where(near, np.minimum(1.0, ceiling / np.maximum(luminance, 1e-20)), 1.0)[..., None]
     taken = radiance * (1.0 - keep) * solid_angles_sr(*luminance.shape)[..., None]
     rgb = taken.sum((0, 1))

@@ -36,9 +36,7 @@ _WIDEST_CONE_COSINE = 0.5
 _NO_EFFECT = LEAST_CHANGE / 8
 
 
-def cast_light_change(
-    renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, samples: int = 64, seed: int = 0
-) -> LightChange:
+def cast_light_change(renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, samples: int = 64) -> LightChange:
     """Return the light change by the ray caster. samples: rays per pixel towards the environment where objects may hide it."""
     seen = seen_surface(EmbreeRaycaster(), camera, catcher)
     surfaces, centre_m, pixels = _met_surfaces(camera, catcher)
@@ -56,7 +54,7 @@ def cast_light_change(
         maps = lighting_maps(environment)
         table = reflected_share_table()
         add_environment(surfaces, maps.peaks, maps.irradiance, maps.reflections, table, maps.environment_from_world, total)
-        taken += _hidden_sky(_Objects(drawn), environment, surfaces, centre_m, samples, seed)
+        taken += _hidden_sky(_Objects(drawn), environment, surfaces, centre_m, samples)
     return changed(seen, pixels, (total, taken, nothing))
 
 
@@ -102,14 +100,14 @@ class _Objects:
 
 
 def _hidden_sky(
-    objects: _Objects, environment: Environment, surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"], samples: int, seed: int
+    objects: _Objects, environment: Environment, surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"], samples: int
 ) -> Float32[np.ndarray, "points 3"]:
     """Radiance that white surfaces lose as objects stand before the environment."""
     lost = np.zeros((len(surfaces.alpha), 3), np.float32)
     points_m = surfaces.shadow_origin + centre_m
     sine2 = (objects.radius_m / np.maximum(np.linalg.norm(objects.middle_m - points_m, axis=1), 1e-12)) ** 2
     near = np.flatnonzero(sine2 > _NO_EFFECT)
-    rng, at_once = np.random.default_rng(seed), max(1, _RAYS_AT_ONCE // samples)
+    rng, at_once = np.random.default_rng(0), max(1, _RAYS_AT_ONCE // samples)
     grid = Sobol(2, scramble=True, rng=rng).random(1 << (samples - 1).bit_length())
     for start in range(0, len(near), at_once):
         some = near[start : start + at_once]

@@ -51,10 +51,6 @@ class Scene:
         """The scene with more lights."""
         return replace(self, lights=(*self.lights, *lights))
 
-    def with_light_strength(self, factor: float) -> "Scene":
-        """The lights times a factor: 1 / 683 brings a Blender file's lux and candela back to watts."""
-        return replace(self, lights=tuple(light.brighter(factor) for light in self.lights))
-
     def without_lights(self) -> "Scene":
         """The scene without the lights that its file brought."""
         return replace(self, lights=())
@@ -62,10 +58,6 @@ class Scene:
     def with_environment(self, environment: Environment | None) -> "Scene":
         """The scene in another environment."""
         return replace(self, environment=environment)
-
-    def with_meshes(self, *meshes: Mesh) -> "Scene":
-        """The scene with more meshes."""
-        return replace(self, meshes=(*self.meshes, *meshes))
 
     @property
     def bounds_m(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

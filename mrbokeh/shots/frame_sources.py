@@ -65,6 +65,7 @@ def _remark(path: Path) -> str:
 
 
 Plane = Float32[np.ndarray, "height width"]
+_WARM_UP = 48
 
 
 @dataclass(frozen=True)
@@ -129,13 +130,12 @@ class FocusPulled:
 class DepthFiles:
     """Description of the depth of the photographed scene: one file for all frames, or numbered ones (depth.%04d.exr).
 
-    steady: numbered depth goes through a temporal filter. It looks at `warm_up` frames before the first one asked for, so that
+    steady: numbered depth goes through a temporal filter. It looks at 48 frames before the first one asked for, so that
     a segment begins as if the one before had gone through it too; the clip itself begins with a filter that has settled.
     """
 
     path: Path
     steady: bool = False
-    warm_up: int = 48
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -196,11 +196,10 @@ class _SteadyDepth:
         if self._next == number:
             return [number]
         self._filter = TemporalDepthFilter()
-        warm_up = self._described.warm_up
-        first = next(each for each in range(max(number - warm_up, 0), number + 1) if each == number or self._is_there(each))
+        first = next(each for each in range(max(number - _WARM_UP, 0), number + 1) if each == number or self._is_there(each))
         if first > 0 and self._is_there(first - 1):
             return range(first, number + 1)
-        ahead = [each for each in range(first + 1, first + warm_up + 1) if self._is_there(each)]
+        ahead = [each for each in range(first + 1, first + _WARM_UP + 1) if self._is_there(each)]
         return [*reversed(ahead), *range(first, number + 1)]
 
     def _is_there(self, number: int) -> bool:

@@ -11,7 +11,7 @@ from mrbokeh.compositing.over import OverPhotograph, behind
 from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.compositing.plate_look.colour_match import ColourMatch
 from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, finished
-from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, added_variance, measured_grain
+from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, measured_grain
 from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff
 from mrbokeh.images.image_io import read_image
@@ -210,13 +210,30 @@ def test_grain_stands_in_the_frame_and_not_in_the_box() -> None:
     np.testing.assert_array_equal(found[0][20:, :350], found[1][20:, :350])
 
 
+def added_variance_reference(virtual: Layer, photo_rgb: np.ndarray, plate_rgb: np.ndarray, level: NoiseLevel) -> np.ndarray:
+    """Return the variance that grain adds to each value; 0 where nothing virtual is."""
+    kept = (1.0 - virtual.alpha[..., None]) ** 2
+    missing = level.variance(photo_rgb + virtual.rgb) - kept * level.variance(plate_rgb)
+    touched = (virtual.alpha != 0.0) | (virtual.rgb != 0.0).any(axis=2)
+    return np.where(touched[..., None], np.maximum(missing, 0.0), 0.0).astype(np.float32)
+
+
+def values_reference(draw: GrainDraw, size_px: tuple[int, int]) -> np.ndarray:
+    """Return (h, w, 3) of variance 1: the part of the texture that a frame takes."""
+    side = draw.grain.texture.shape[0]
+    rows, columns = ((np.arange(length) + start) % side for length, start in zip(size_px, draw.start, strict=True))
+    return draw.sign * draw.grain.texture[np.ix_(rows, columns)]
+
+
 def test_the_compiled_loop_agrees_with_its_plain_twin() -> None:
     plate = scene_plate()
     inserted = put_in(plate, soft_disc((0.9, 0.2, 0.05)))
     draw = GrainDraw(GRAIN, 7)
     light = inserted.virtual.rgb.copy()
     add_grain_to(light, inserted.virtual.alpha, inserted.photo_rgb, plate.rgb, draw)
-    expected = np.sqrt(added_variance(inserted.virtual, inserted.photo_rgb, plate.rgb, GRAIN.level)) * draw.values(SIZE)
+    expected = np.sqrt(added_variance_reference(inserted.virtual, inserted.photo_rgb, plate.rgb, GRAIN.level)) * values_reference(
+        draw, SIZE
+    )
     np.testing.assert_allclose(light - inserted.virtual.rgb, expected, atol=2e-6)
 
 
@@ -226,7 +243,7 @@ def test_added_variance_is_the_formula_and_never_negative() -> None:
     layer = soft_disc()
     a, v = layer.alpha[..., None], layer.rgb
     expected = SHOT * (v + a * (1 - a) * 0.4) + READ * a * (2 - a)
-    found = added_variance(layer, behind(plate.rgb, layer), plate.rgb, GRAIN.level)
+    found = added_variance_reference(layer, behind(plate.rgb, layer), plate.rgb, GRAIN.level)
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert (found >= 0).all() and (found[layer.alpha == 0] == 0).all()
 

@@ -1,7 +1,4 @@
-"""Stage: the virtual scene for every frame of the stream, at its newest pose, however long a drawing takes.
-
-Fade: an object whose track is lost goes away over half a second and comes back as slowly, so that neither startles.
-"""
+"""Stage: the virtual scene for every frame of the stream, at its newest pose, however long a drawing takes; it fades with the track."""
 
 import time
 from dataclasses import replace
@@ -31,14 +28,14 @@ FADE_S = 0.5
 
 
 class Fade:
-    """opacity: 0 to 1; it begins with 1, for a scene that appears for the first time has nothing to come back from."""
+    """Fade of an object whose track is lost, over half a second. opacity: 0 to 1; a scene that appears begins with 1."""
 
     def __init__(self) -> None:
         self.opacity = 1.0
         self._last_s: float | None = None
 
     def at(self, is_tracked: bool, time_s: float) -> float:
-        """The opacity at a time; times that go back count as no time at all."""
+        """Return the opacity at a time; times that go back count as no time at all."""
         step = 0.0 if self._last_s is None else max(time_s - self._last_s, 0.0) / FADE_S
         self._last_s = time_s
         self.opacity = min(self.opacity + step, 1.0) if is_tracked else max(self.opacity - step, 0.0)
@@ -50,12 +47,14 @@ _STILL_S = 0.4
 
 
 class Stage:
-    """A OverlaySource. `overlay` and `picture` belong to one thread, the compositing one; everything else may be called from any."""
+    """OverlaySource of a scene file. `overlay` and `picture` belong to the compositing thread; everything else may be called from any."""
 
     views = VIEWS
 
     def __init__(self, scene: Path, backend: SceneRenderer | None = None) -> None:
-        """scene: a scene file (mrbokeh.scene.staging.scene_file); InputError for what is wrong in it.
+        """Load the scene.
+
+        scene: a scene file (mrbokeh.scene.staging.scene_file); InputError for what is wrong in it.
 
         backend: None takes the graphics card where there is one, else the ray caster.
         """
@@ -69,21 +68,21 @@ class Stage:
 
     @property
     def lens(self) -> Lens | None:
-        """The lens that the scene file names."""
+        """Lens that the scene file names."""
         return self._thread.setup.lens
 
     @property
     def up(self) -> str:
-        """Which direction of the tracker's world is up, as the scene file says it."""
+        """Direction of the tracker's world that is up, as the scene file says it."""
         return self._thread.setup.staged.description.up
 
     @property
     def objects(self) -> tuple[PlacedObject, ...]:
-        """As they stand now."""
+        """Objects as they stand now."""
         return self._thread.setup.staged.description.objects
 
     def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:
-        """The newest drawing, moved to this pose; asks for a new one where it is too old. Takes about a millisecond.
+        """Move the newest drawing to this pose, and ask for a new one where it is too old. Takes about a millisecond.
 
         pose None: the track is lost; what is shown fades where it was. It fades, too, where a pose is not certain. intrinsics: of this
         frame's size, its pose is not looked at. lens: as it is focused now. time_s: of the frame, `CameraFrame.captured_s`; animations
@@ -125,17 +124,17 @@ class Stage:
         return status_of(self._thread, self._wanted, self._fade.opacity)
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
-        """One of `views`, of the frame for which `overlay` was asked last."""
+        """Return one of `views`, of the frame for which `overlay` was asked last."""
         return view_picture(view, plate_bgr, self.seen, tables)
 
     def depth_at_m(self, x_px: float, y_px: float) -> float:
-        """What a tap there focuses on; InputError where nothing is known."""
+        """Return the depth that a tap there focuses on; InputError where nothing is known."""
         if self.seen is None:
             raise InputError("cannot focus there yet: the scene has not been drawn; wait until the camera is tracked")
         return depth_at_m(self.seen, x_px, y_px)
 
     def sharp_layers(self, camera: Camera) -> list[Layer]:
-        """Objects, then their shadow, in focus and at every pixel, as a camera (with its pose in the tracker's world) sees them now."""
+        """Draw objects, then their shadow, in focus and at every pixel, as a camera (its pose in the tracker's world) sees them."""
         setup, wanted = self._thread.setup, self._wanted
         frame = upright_camera(camera, setup.staged.description.up)
         layers = sharp_layers(setup.staged, wanted.time_s if wanted else 0.0, frame, setup.render_setup)
@@ -151,7 +150,7 @@ class Stage:
         self._thread.change(lambda setup: setup.with_staged(setup.staged.with_object(name, position_m=position_m)))
 
     def show_object(self, name: str, visible: bool) -> None:
-        """The same for whether it is there at all."""
+        """Show or hide an object, until the scene file is written again."""
         self._thread.change(lambda setup: setup.with_staged(setup.staged.with_object(name, visible=visible)))
 
     def close(self) -> None:
@@ -163,7 +162,7 @@ def _nothing() -> Overlay:
 
 
 def status_of(thread: DrawingThread, wanted: DrawRequest | None, opacity: float) -> StageStatus:
-    """wanted: what was asked for last, None before the first frame."""
+    """Return the status. wanted: what was asked for last, None before the first frame."""
     drawn, setup = thread.newest, thread.setup
     return StageStatus(
         layer_age_ms=None if drawn is None else 1e3 * (time.monotonic() - drawn.started_s),

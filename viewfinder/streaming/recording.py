@@ -1,7 +1,4 @@
-"""Recorder: a FrameSink that writes what the viewer shows to a file, each picture at the time at which it was captured.
-
-The file of one recording: pictures in, each at the time at which it was captured, until they end or change their size.
-"""
+"""Recorder: a FrameSink that writes what the viewer shows to a file, each picture at the time at which it was captured."""
 
 import logging
 import queue
@@ -29,7 +26,7 @@ _LIVE_H264 = {"crf": "14", "preset": "superfast"}
 
 @dataclass(frozen=True)
 class FileForm:
-    """tables: of the codes of the pictures. encoding: of mrbokeh.video.frames, None goes by the suffix."""
+    """Form of a file. tables: of the codes of the pictures. encoding: of mrbokeh.video, None goes by the suffix."""
 
     tables: CodeTables
     frame_rate: Fraction
@@ -38,7 +35,7 @@ class FileForm:
 
 @dataclass(frozen=True)
 class Written:
-    """note: why the file ended before the pictures did, None where it did not."""
+    """Result of a file. note: why it ended before the pictures did, None where it did not."""
 
     frame_count: int
     duration_s: float
@@ -46,7 +43,7 @@ class Written:
 
 
 def write_recording(path: Path, frames: Iterator[OutputFrame], form: FileForm) -> Written:
-    """The file appears whole at the end. InputError where there is no picture."""
+    """Write a file, which appears whole at the end. InputError where there is no picture."""
     first = next(frames, None)
     if first is None:
         raise InputError(f"{path}: expected at least one picture, got none; the video was not written")
@@ -78,7 +75,7 @@ def _write(writer: VideoWriter, bgr: UInt8[np.ndarray, "rows columns 3"], time_s
 
 
 def _stored(path: Path, bgr: Bgr, form: FileForm) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Without a last odd row and column where chroma is halved."""
+    """Cut off a last odd row and column where chroma is halved."""
     if "420" not in encoding_for(path, form.encoding).pixel_format:
         return bgr
     width, height = even_size(bgr)
@@ -93,7 +90,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Recording:
-    """A finished file. dropped: pictures that came while the encoder was busy; their time is shown by the picture before.
+    """Finished file. dropped: pictures that came while the encoder was busy; their time is shown by the picture before.
 
     note: why it ended before it was stopped, None where it did not.
     """
@@ -106,7 +103,7 @@ class Recording:
 
 
 class Recorder:
-    """Writes MP4 (H.264) or QuickTime (.mov, ProRes 4444 unless `encoding` says otherwise), one recording at a time.
+    """FrameSink that writes MP4 (H.264) or QuickTime (.mov, ProRes 4444 unless `encoding` says otherwise), one at a time.
 
     transfer: of the codes of the pictures (see FrameSource); files are BT.709. waiting: how many pictures the encoder may lag behind.
     Files appear whole when they are stopped, and none is overwritten.
@@ -154,7 +151,7 @@ class Recorder:
         self._shown_one.set()
 
     def fail(self, _sentence: str) -> None:
-        """The camera may come back; until then the last picture stands."""
+        """Keep the last picture: the camera may come back."""
 
     def stop(self) -> Recording:
         """End the file with what was shown until now; InputError where nothing was or it could not be written.
@@ -192,7 +189,7 @@ class Recorder:
             self._failure = InputError(f"{self._path} could not be written ({error}): check the folder and the space on the disk")
 
     def _shown(self) -> Iterator[OutputFrame]:
-        """Pictures as they come; after the stop those that wait already."""
+        """Yield pictures as they come; after the stop those that wait already."""
         while True:
             try:
                 yield self._frames.get(timeout=_POLL_S)
@@ -202,7 +199,7 @@ class Recorder:
 
 
 def recording_path(folder: Path, suffix: str = ".mp4") -> Path:
-    """A name in the folder that is not taken: the date and time, and a number where one second sees two recordings."""
+    """Return a name in the folder that is not taken: the date and time, and a number where one second sees two recordings."""
     stem = f"viewfinder-{datetime.now():%Y%m%d-%H%M%S}"
     path, number = folder / f"{stem}{suffix}", 1
     while path.exists():

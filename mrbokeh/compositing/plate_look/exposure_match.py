@@ -67,24 +67,21 @@ def matched_exposure(plate: Exposure, reference: Exposure | None = None) -> Colo
     return ColourMatch((gain, gain, gain))
 
 
-def exposure_of_photo(path: Path | str, f_number: float | None = None) -> Exposure:
-    """Read the exposure from the Exif of a JPEG, TIFF or PNG. f_number: for manual lenses that state none. Raises InputError if one is
-    missing.
-    """
+def exposure_of_photo(path: Path | str) -> Exposure:
+    """Read the exposure from the Exif of a JPEG, TIFF or PNG. Raises InputError if a number is missing."""
     tags = exif_tags(Path(path))
     iso = tags.get(_ISO)
     known = {
         "exposure_time_s": tags.get(_EXPOSURE_TIME),
         "iso": iso[0] if isinstance(iso, tuple) and iso else iso,
-        "f_number": f_number or tags.get(_F_NUMBER),
+        "f_number": tags.get(_F_NUMBER),
     }
     return exposure_of_metadata(known, str(path))
 
 
-def exposure_of_metadata(metadata: Mapping[str, Any], where: str = "the slice", f_number: float | None = None) -> Exposure:
+def exposure_of_metadata(metadata: Mapping[str, Any], where: str = "the slice") -> Exposure:
     """Return the exposure that stack.json keeps of a slice (exposure_time_s, iso, f_number, exposure_gain)."""
-    stated = {**metadata, "f_number": f_number or metadata.get("f_number")}
-    found = {name: positive_rational(stated.get(name)) for name in ("exposure_time_s", "iso", "f_number")}
+    found = {name: positive_rational(metadata.get(name)) for name in ("exposure_time_s", "iso", "f_number")}
     missing = [name for name, value in found.items() if value is None]
     if missing:
         raise InputError(
@@ -114,13 +111,6 @@ def stated_exposure(path: Path) -> Exposure:
     return exposure_of_metadata({name: header.get(attribute) for name, attribute in _OF_EXR.items()}, str(path))
 
 
-_LIGHT_SOURCE = 0x9208
-KELVIN_OF_LIGHT_SOURCE = {1: 5500.0, 3: 2856.0, 4: 5500.0, 9: 5500.0, 10: 6500.0, 11: 7500.0, 17: 2856.0, 20: 5503.0, 21: 6504.0} | {
-    22: 7504.0,
-    23: 5003.0,
-    24: 3200.0,
-}
-"""Exif's LightSource, where it names one temperature: daylight, tungsten, flash, fine, cloudy, shade, A, D55, D65, D75, D50, studio."""
 COLDEST_K, WARMEST_K, BLACK_BODY_TO_K, DAYLIGHT_FROM_K = 25000.0, 2000.0, 4000.0, 5000.0
 
 
@@ -148,12 +138,6 @@ def white_balance_gain(plate_k: float, reference_k: float = 6504.0) -> Triple:
     """
     reference, plate = white_of_kelvin(reference_k), white_of_kelvin(plate_k)
     return triple_of(np.array(reference) / np.array(plate))
-
-
-def kelvin_of_photo(path: Path | str) -> float | None:
-    """Read the colour temperature that the Exif of a photograph was balanced for; None if it names none (automatic)."""
-    source = exif_tags(Path(path)).get(_LIGHT_SOURCE)
-    return KELVIN_OF_LIGHT_SOURCE.get(source) if isinstance(source, int) else None
 
 
 def _daylight_xy(kelvin: float) -> tuple[float, float]:

@@ -35,7 +35,6 @@ from mrbokeh.compositing.plate_look.noise_measurement import (
     noise_blocks_of_pair,
     white,
 )
-from mrbokeh.images.layer import Layer
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 
@@ -160,25 +159,6 @@ def _numbers(document: dict[str, Any], key: str, shape: tuple[int, ...], path: P
     return values
 
 
-def added_variance(virtual: Layer, photo_rgb: Picture, plate_rgb: Picture, level: NoiseLevel) -> Float32[np.ndarray, "height width 3"]:
-    """Variance that grain adds to each value; 0 where nothing virtual is. The plain twin of the compiled loop."""
-    kept = (1.0 - virtual.alpha[..., None]) ** 2
-    missing = level.variance(photo_rgb + virtual.rgb) - kept * level.variance(plate_rgb)
-    touched = (virtual.alpha != 0.0) | (virtual.rgb != 0.0).any(axis=2)
-    return np.where(touched[..., None], np.maximum(missing, 0.0), 0.0).astype(np.float32)
-
-
-def add_grain_to(
-    light: Picture, alpha: Float32[np.ndarray, "height width"], photo_rgb: Picture, plate_rgb: Picture, draw: "GrainDraw"
-) -> None:
-    """Add grain in place to light (h, w, 3), a part of the frame like the others."""
-    from mrbokeh.compositing._pixel_light_numba import add_grain
-
-    shot, read = (np.array(each, np.float32) for each in (draw.grain.level.shot, draw.grain.level.read))
-    alpha, photo_rgb, plate_rgb = (np.ascontiguousarray(each) for each in (alpha, photo_rgb, plate_rgb))
-    add_grain(light, alpha, photo_rgb, plate_rgb, draw.grain.texture, draw.start, draw.sign, shot, read)
-
-
 class GrainDraw:
     """Part of the texture that a frame takes: drawn from seed and frame alone, so that neither the box nor the order of frames matters."""
 
@@ -189,8 +169,13 @@ class GrainDraw:
         row, column = (int(each) for each in rng.integers(0, side, 2))
         self.start = (row + origin_px[0]) % side, (column + origin_px[1]) % side
 
-    def values(self, size_px: tuple[int, int]) -> Picture:
-        """(h, w, 3) of variance 1: the plain twin of what the compiled loop looks up."""
-        side = self.grain.texture.shape[0]
-        rows, columns = ((np.arange(length) + start) % side for length, start in zip(size_px, self.start, strict=True))
-        return self.sign * self.grain.texture[np.ix_(rows, columns)]
+
+def add_grain_to(
+    light: Picture, alpha: Float32[np.ndarray, "height width"], photo_rgb: Picture, plate_rgb: Picture, draw: GrainDraw
+) -> None:
+    """Add grain in place to light (h, w, 3), a part of the frame like the others."""
+    from mrbokeh.compositing._pixel_light_numba import add_grain
+
+    shot, read = (np.array(each, np.float32) for each in (draw.grain.level.shot, draw.grain.level.read))
+    alpha, photo_rgb, plate_rgb = (np.ascontiguousarray(each) for each in (alpha, photo_rgb, plate_rgb))
+    add_grain(light, alpha, photo_rgb, plate_rgb, draw.grain.texture, draw.start, draw.sign, shot, read)

@@ -80,19 +80,18 @@ class EmbreeRaycaster:
     `threads` threads.
     """
 
-    def __init__(self, threads: int | None = None, most_layers: int = 16, edge_samples: int = 16, shadow_step_px: int = 1) -> None:
+    def __init__(self, threads: int | None = None, edge_samples: int = 16, shadow_step_px: int = 1) -> None:
         """Set up the ray caster.
 
-        threads: None or 0 uses all cores. most_layers: number of see-through surfaces that a ray follows behind each other.
+        threads: None or 0 uses all cores.
 
         Two settings make pictures quicker that are drawn again and again. edge_samples: rays in a pixel at an edge, 16 or 4; with 4,
         coverage at an edge has steps of a quarter. shadow_step_px: shadow masks are traced at every n-th pixel only and interpolated
         between.
         """
-        if most_layers < 1 or (threads or 0) < 0:
-            raise InputError(f"expected at least one thread and one layer, got {threads} and {most_layers}")
+        if (threads or 0) < 0:
+            raise InputError(f"expected a number of threads from 0 up, got {threads}: 0 takes all cores")
         self._threads = threads or cores()
-        self._most_layers = most_layers
         self._offsets, self._shadow_step_px = _checked(edge_samples, shadow_step_px)
         self._kept = PreparedScenes()
 
@@ -176,7 +175,7 @@ class EmbreeRaycaster:
         footprint = pixel_share / float(np.sqrt(camera.focal_px[0] * camera.focal_px[1]))
         eye_m = camera.world_from_camera[:3, 3]
         return RaySamples.joined(
-            self._in_threads(lambda part: shaded(placed.ready, eye_m, part, footprint, placed.lights, maps, self._most_layers), directions)
+            self._in_threads(lambda part: shaded(placed.ready, eye_m, part, footprint, placed.lights, maps), directions)
         )
 
     def _in_threads(self, work: Callable[[Float[np.ndarray, "some 3"]], _Result], directions: Float[np.ndarray, "rays 3"]) -> list[_Result]:

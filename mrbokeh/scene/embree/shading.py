@@ -14,7 +14,8 @@ from mrbokeh.scene.embree.prepared_scenes import NOTHING_LEFT, STEP, PreparedSce
 from mrbokeh.scene.environment_filter import LightingMaps, reflected_share_table
 from mrbokeh.scene.light import Light
 
-_MOST_SHADOW_LAYERS = 16
+MOST_LAYERS = 16
+"""See-through surfaces that a ray follows behind each other, from the eye and towards a light."""
 
 
 def visible(
@@ -31,7 +32,7 @@ def visible(
     if scene.see_through_rays is None:
         return reaching
     active, start = np.flatnonzero(reaching), np.zeros(np.count_nonzero(reaching))
-    for _ in range(_MOST_SHADOW_LAYERS):
+    for _ in range(MOST_LAYERS):
         rays = towards[active]
         hits = closest(scene.see_through_rays, origins[active] + start[:, None] * rays, rays)
         met = np.flatnonzero(hits >= 0)
@@ -149,7 +150,6 @@ def shaded(
     footprint: float,
     lights: Sequence[Light],
     maps: LightingMaps | None,
-    most_layers: int,
 ) -> RaySamples:
     """Follow rays front to back through see-through and cut-out surfaces; directions are 1 long along the optical axis."""
     count, eye = len(directions), eye_m - scene.centre_m
@@ -157,7 +157,7 @@ def shaded(
     lit = np.ones(count, np.float32)
     depth_m, mesh, normal = np.full(count, np.inf), np.full(count, -1, np.int32), np.zeros((count, 3), np.float32)
     active, start = np.arange(count), np.zeros(count)
-    for _ in range(most_layers):
+    for _ in range(MOST_LAYERS):
         rays = directions[active]
         hits = closest(scene.all_rays, eye + start[:, None] * rays, rays)
         met = np.flatnonzero(hits >= 0)

@@ -119,13 +119,12 @@ class MitsubaTracer:
         seed: int = 0,
         threads: int = 0,
         denoise: bool = False,
-        shows_progress: bool = True,
     ) -> None:
         """Set up the tracer and Mitsuba's compiler.
 
         samples: paths per pixel, rounded up to a number that divides into a grid. most_bounces: surfaces that light meets on its way to
         the camera; 1 is direct light only. threads: 0 leaves the compiler's number, all cores at first. denoise: pays with few samples;
-        needs `pyoidn`. shows_progress: a bar while a picture takes long; not within another bar.
+        needs `pyoidn`.
 
         Raises MissingExtraError if Mitsuba or the denoiser is not installed and InputError if its compiler is missing.
         """
@@ -137,13 +136,9 @@ class MitsubaTracer:
         if denoise:
             require_denoiser()
         self.samples, self.most_bounces, self.seed = samples, most_bounces, seed
-        self._threads, self._denoise, self._shows_progress = threads, denoise, shows_progress
+        self._threads, self._denoise = threads, denoise
         self.caster = EmbreeRaycaster(threads)
         self._kept: tuple[Scene, tuple[Mesh, ...], Any] | None = None
-
-    def bar(self, description: str) -> str | None:
-        """Return the text of a progress bar; None for no bar."""
-        return description if self._shows_progress else None
 
     def prepare(self) -> None:
         """Choose Mitsuba's variant, which is one for the whole process, and the number of threads."""
@@ -182,7 +177,7 @@ class MitsubaTracer:
 
         world = self._world(scene, tuple(surroundings))
         lens, parts = CameraRays(camera, world.centre_m, self.samples), []
-        for origin, direction, width, sampler in lens.parts(pixels, self.seed, self.bar("tracing paths")):
+        for origin, direction, width, sampler in lens.parts(pixels, self.seed, "tracing paths"):
             rays = Rays(origin, direction, mi.Bool(True), from_camera=True, width_per_m=width)
             parts.append(lens.means(followed(world, rays, sampler, self.most_bounces)))
         share, radiance, albedo, normal = (np.concatenate(column) for column in zip(*parts, strict=True))

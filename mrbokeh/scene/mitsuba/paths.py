@@ -254,14 +254,14 @@ class CameraRays:
         self._numbers, self._width_px = mi.Float(np.array(numbers, np.float32)), camera.width_px
         self._width_per_m = dr.opaque(mi.Float, (camera.focal_px[0] * camera.focal_px[1] * self.samples) ** -0.5)
 
-    def parts(self, pixels: Int64[np.ndarray, " pixels"], seed: int, description: str | None) -> Iterator[tuple[Any, Any, Any, Any]]:
+    def parts(self, pixels: Int64[np.ndarray, " pixels"], seed: int, description: str) -> Iterator[tuple[Any, Any, Any, Any]]:
         """Yield (origin, direction, width that a ray stands for at one metre, sampler) for as many pixels as are traced at once.
 
-        description: of the progress bar if there are several parts; None shows none.
+        description: of the progress bar if there are several parts.
         """
         at_once = max(1, _RAYS_AT_ONCE // self.samples)
         starts = range(0, len(pixels), at_once)
-        for number in track(starts, description) if description and len(starts) > 1 else starts:
+        for number in track(starts, description) if len(starts) > 1 else starts:
             part = pixels[number : number + at_once]
             sampler = self._sampler.clone()
             sampler.set_samples_per_wavefront(self.samples)

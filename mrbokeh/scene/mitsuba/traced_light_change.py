@@ -37,7 +37,7 @@ def traced_light_change(tracer: MitsubaTracer, scene: Scene, camera: Camera, cat
     tracer.prepare()
     table = _Table(scene, real)
     lens, parts = CameraRays(camera, table.centre_m, tracer.samples), []
-    for origin, direction, _width, sampler in lens.parts(pixels, tracer.seed, tracer.bar("tracing the change of light")):
+    for origin, direction, _width, sampler in lens.parts(pixels, tracer.seed, "tracing the change of light"):
         sums = [lens.sums(*each) for each in table.light(origin, direction, sampler, tracer.most_bounces)]
         parts.append(np.sum(sums, axis=0))
     met, *light = np.concatenate(parts, axis=1)

@@ -16,15 +16,13 @@ class ShutterTiming:
     """A shutter that turns once per frame, and rows that are read one after the other.
 
     angle_deg: of 360, for which it is open: 180 at 24 frames per second is 1/48 s.
-    phase_deg: where it opens, from the frame's time; None puts the frame's time into the middle (Nuke's shutter offset "centred"),
-    0 at the beginning ("start").
+    The frame's time is in the middle of the exposure.
     readout_s: how much later the lower edge is exposed than the upper one; negative for a sensor that is read upwards.
     rows_px: upper and lower edge of the sensor in the rendered picture, where that has overscan (`within`); None is all of it.
     """
 
     frame_rate: float
     angle_deg: float = 180.0
-    phase_deg: float | None = None
     readout_s: float = 0.0
     rows_px: tuple[float, float] | None = None
 
@@ -43,14 +41,9 @@ class ShutterTiming:
     def is_rolling(self) -> bool:
         return self.readout_s != 0.0
 
-    def first_row_middle_s(self, time_s: float) -> float:
-        """The middle of the exposure of the upper edge, for a frame of this time."""
-        phase_deg = -0.5 * self.angle_deg if self.phase_deg is None else self.phase_deg
-        return time_s + (phase_deg + 0.5 * self.angle_deg) / 360.0 / self.frame_rate
-
     def middle_s(self, time_s: float) -> float:
         """The middle of the exposure of the middle row."""
-        return self.first_row_middle_s(time_s) + 0.5 * self.readout_s
+        return time_s + 0.5 * self.readout_s
 
     def row_delay_s(self, y_px: float, height_px: int) -> float:
         """Return the delay of a height in a rendered picture behind the upper edge of the sensor."""

@@ -47,7 +47,7 @@ def accumulated(rendering: Rendering, filmed: FilmedScene, time_s: float, sample
 def _band(rendering: Rendering, filmed: FilmedScene, time_s: float, samples: int, rows: tuple[int, int]) -> Layer:
     shutter = filmed.shutter
     height_px = filmed.camera_at(time_s).height_px
-    middle_s = shutter.first_row_middle_s(time_s) + shutter.row_delay_s(0.5 * (rows[0] + rows[1]), height_px)
+    middle_s = time_s + shutter.row_delay_s(0.5 * (rows[0] + rows[1]), height_px)
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     order = np.argsort(np.abs(offsets), kind="stable")
     total: Layer | None = None

@@ -79,13 +79,16 @@ class SceneDescription:
         return (self.path, *(path for path in named if path is not None))
 
 
+_SHADOW_SIZE_M = 2.0
+"""Side of the part of the ground that catches the shadow of one object."""
+
+
 @dataclass(frozen=True)
 class OneObject:
     """Object that stands before a camera, with its light, described by the options of a command.
 
     stands_at_m: in camera axes (x right, y down, z forward). tilt_rad: how far the camera looks down. height_m: scaled to it; None
     keeps the size of the file. turn_rad: about the vertical, clockwise seen from above. shadow: darkness of the shadow, 0 to 1.
-    shadow_size_m: side of the part of the ground that catches it.
     """
 
     glb: Path
@@ -95,14 +98,13 @@ class OneObject:
     tilt_rad: float = 0.0
     light: Lighting = field(default_factory=Lighting)
     shadow: float = 0.0
-    shadow_size_m: float = 2.0
 
     def described(self) -> SceneDescription:
         """The scene in a world whose vertical is true and whose origin is the camera."""
         foot_m = _world_from_camera(self.tilt_rad) @ np.asarray(self.stands_at_m)
         place = (float(foot_m[0]), float(foot_m[1]), float(foot_m[2]))
         placed = PlacedObject(self.glb.stem, self.glb, place, self.turn_rad, self.height_m)
-        shadow = ShadowPlane(self.shadow_size_m, self.shadow, place) if self.shadow > 0 else None
+        shadow = ShadowPlane(_SHADOW_SIZE_M, self.shadow, place) if self.shadow > 0 else None
         return SceneDescription(self.glb, "-y", (placed,), self.light, shadow)
 
     def seen_by(self, camera: Camera) -> Camera:

@@ -26,6 +26,7 @@ from mrbokeh.system.errors import InputError
 _TILE_PX = (2048, 512)
 _ROUNDED_TO_PX = 64
 _KEPT_POOLS, _KEPT_CANVASES = 2, 6
+_MOST_LAYERS, _VEILS = 8, 3
 _Kept = TypeVar("_Kept")
 
 
@@ -48,20 +49,17 @@ class WgpuRasterizer:
     per scene: moving the camera uploads a few hundred bytes. A new pose of an animated mesh is a new Scene, whose triangles are
     uploaded again, while its textures stay.
 
-    Limits: of blended surfaces `most_layers` are seen through, and `veils` dim a light; triangles smaller than a texel of the
+    Limits: of blended surfaces 8 are seen through, and 3 dim a light; triangles smaller than a texel of the
     shadow map (1/`shadow_map_px` of the scene) have shadows with borders as coarse as the texel.
     """
 
-    def __init__(self, shadow_map_px: int = 2048, most_layers: int = 8, veils: int = 3) -> None:
-        if not 16 <= shadow_map_px <= 8192 or most_layers < 1 or veils < 0:
-            raise InputError(
-                f"expected shadow maps of 16 to 8192 px, at least one layer and no negative number of veils, "
-                f"got {shadow_map_px}, {most_layers} and {veils}"
-            )
+    def __init__(self, shadow_map_px: int = 2048) -> None:
+        if not 16 <= shadow_map_px <= 8192:
+            raise InputError(f"expected shadow maps of 16 to 8192 px, got {shadow_map_px}")
         self._gpu = gpu()
         self._visibility = Visibility(self._gpu)
         self._shading = Shading(self._gpu, self._visibility)
-        self._shadow_map_px, self._most_layers, self._veils = shadow_map_px, most_layers, veils
+        self._shadow_map_px = shadow_map_px
         self._scenes: WeakKeyDictionary[Scene, _Ready] = WeakKeyDictionary()
         self._grounds: WeakKeyDictionary[Mesh, tuple[GpuGeometry, Any]] = WeakKeyDictionary()
         self._panoramas: WeakKeyDictionary[Environment, GpuPanorama] = WeakKeyDictionary()
@@ -101,7 +99,7 @@ class WgpuRasterizer:
         canvas, layer = self._canvas(job), 0
         encoder = self._gpu.device.create_command_encoder()
         self._visibility.draw_camera(encoder, job.geometry, job.group, job.camera, canvas.targets, None, near_m)
-        for layer in range(self._most_layers if job.layered else 0):
+        for layer in range(_MOST_LAYERS if job.layered else 0):
             self._visibility.draw_camera(encoder, job.geometry, job.group, job.camera, canvas.targets, layer, near_m)
             self._shading.run(encoder, job, canvas, layer, is_last=False)
             self._gpu.device.queue.submit([encoder.finish()])
@@ -134,7 +132,7 @@ class WgpuRasterizer:
         geometry = uploaded(self._gpu, drawn, self._pool)
         group = self._visibility.geometry_group(geometry)
         lights, environment = scene.lighting
-        shadows = lights_with_shadows(self._gpu, self._visibility, geometry, group, lights, self._shadow_map_px, self._veils)
+        shadows = lights_with_shadows(self._gpu, self._visibility, geometry, group, lights, self._shadow_map_px, _VEILS)
         self._scenes[scene] = _Ready(geometry, group, Lighting(geometry, shadows, self._panorama(environment)))
         return self._scenes[scene]
 
