@@ -111,12 +111,13 @@ def spread_rows(size: tuple[int, int]) -> None:
             ("pyramid", {"integration": "pyramid"}),
         ):
             renderer = LaplacianSpreadlets(**changed)
-            first_ms = milliseconds(lambda r=renderer, c=coc_px: r.spread(values, c, DISC))
-            dense = renderer.spread_densely(values, coc_px, DISC)
+            first_ms = milliseconds(lambda r=renderer, c=coc_px: r.sum_kernels(values, c, DISC))
+            dense = renderer.sum_kernels(values, coc_px, DISC, densely=True)
             took_ms, dense_ms = in_turns(
-                lambda r=renderer, c=coc_px: r.spread(values, c, DISC), lambda r=renderer, c=coc_px: r.spread_densely(values, c, DISC)
+                lambda r=renderer, c=coc_px: r.sum_kernels(values, c, DISC),
+                lambda r=renderer, c=coc_px: r.sum_kernels(values, c, DISC, densely=True),
             )
-            found = renderer.spread(values, coc_px, DISC)
+            found = renderer.sum_kernels(values, coc_px, DISC)
             like = f"SSIM {ssim(found[..., :3], dense[..., :3]):.4f}, {psnr(found[..., :3], dense[..., :3]):.1f} dB"
             times = f"{took_ms:7.0f} ms, dense {dense_ms:7.0f} ms: {dense_ms / took_ms:5.1f} times"
             print(f"  mean {coc_px.mean():5.1f} px {name:<17} {times}   {like}   (first {first_ms / 1e3:.1f} s)", flush=True)
@@ -138,11 +139,11 @@ def reference_row(size: tuple[int, int]) -> None:
     size = size[0] // 2, size[1] // 2
     values, coc_px = frame(size), hills_px(size, 40.0)
     exact_ms, kept = 0.0, []
-    exact_ms = milliseconds(lambda: kept.append(ScatterReference().spread(values, coc_px, DISC)))
+    exact_ms = milliseconds(lambda: kept.append(ScatterReference().sum_kernels(values, coc_px, DISC)))
     renderer = LaplacianSpreadlets()
-    renderer.spread(values, coc_px, DISC)
-    (took_ms,) = in_turns(lambda: renderer.spread(values, coc_px, DISC))
-    found, exact = renderer.spread(values, coc_px, DISC)[..., :3], kept[0][..., :3]
+    renderer.sum_kernels(values, coc_px, DISC)
+    (took_ms,) = in_turns(lambda: renderer.sum_kernels(values, coc_px, DISC))
+    found, exact = renderer.sum_kernels(values, coc_px, DISC)[..., :3], kept[0][..., :3]
     print(
         f"{size[1]} x {size[0]}, mean 40 px, against exact kernels ({exact_ms:.0f} ms): {exact_ms / took_ms:.0f} times as fast, "
         f"SSIM {ssim(found, exact):.4f}, {psnr(found, exact):.1f} dB"

@@ -100,8 +100,8 @@ def _one(name: str, samples: LightFieldSamples, exact: np.ndarray) -> None:
     )
     for variant, settings in VARIANTS.items():
         method = LayeredReconstruction(settings)
-        rgb, counts = method.reconstruct_counted(samples, LENS)
-        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_counted, samples, LENS))
+        rgb, counts = method.reconstruct_values(samples, samples.rgb, LENS)
+        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_values, samples, samples.rgb, LENS))
         print(
             f"  {variant}: {psnr(rgb, exact):.1f} dB, {passed_ms:.0f} ms ({spent_ms:.0f} ms of all cores), "
             f"partitions per tile {counts.before:.1f} -> {counts.after:.1f}"
@@ -128,9 +128,9 @@ def _set(folder: Path) -> None:
     )
     for variant in OF_SETS:
         method = LayeredReconstruction(VARIANTS[variant])
-        rgb, counts = method.reconstruct_counted(samples, lens)
+        rgb, counts = method.reconstruct_values(samples, samples.rgb, lens)
         displayed = linear_to_srgb(np.clip(rgb, 0, 1))
-        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_counted, samples, lens))
+        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_values, samples, samples.rgb, lens))
         print(
             f"  {variant}: {psnr(rgb, exact):.1f} / {psnr(displayed, shown):.1f} dB, SSIM {ssim(displayed, shown):.3f}, {passed_ms:.0f} ms "
             f"({spent_ms:.0f} ms of all cores), partitions per tile {counts.before:.1f} -> {counts.after:.1f}"

@@ -40,13 +40,13 @@ def fence_samples(width_px: int, height_px: int, per_pixel: int) -> LightFieldSa
 
 def row(name: str, settings: Settings, samples: LightFieldSamples, on_device: DeviceSamples, device: torch.device) -> None:
     compiled, by_torch = LayeredReconstruction(settings), TorchReconstruction(settings, str(device))
-    known, _ = compiled.reconstruct_counted(samples, LENS)
+    known, _ = compiled.reconstruct_values(samples, samples.rgb, LENS)
     picture, (before, after) = by_torch.picture(on_device, LENS.aperture)
     found = picture.cpu().numpy()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     took_ms = milliseconds(lambda: by_torch.picture(on_device, LENS.aperture), device)
-    cpu_ms = milliseconds(lambda: compiled.reconstruct_counted(samples, LENS), torch.device("cpu"))
+    cpu_ms = milliseconds(lambda: compiled.reconstruct_values(samples, samples.rgb, LENS), torch.device("cpu"))
     memory = f", {torch.cuda.max_memory_allocated(device) / 2**20:.0f} MB of the device" if device.type == "cuda" else ""
     print(f"{name}: {took_ms:.1f} ms; compiled {cpu_ms:.0f} ms, {cpu_ms / took_ms:.2f} times as long{memory}")
     print(

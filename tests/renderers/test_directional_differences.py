@@ -1,16 +1,44 @@
 """Sparse differenced kernels: the counts of the paper's Table 1, and that summing brings the kernel back."""
 
+from collections.abc import Callable, Mapping, Sequence
+from math import ceil
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.polygon.directional_differences import Direction, Taps, differenced_kernel, downwards, edge_profile, polygon_corners
+from mrbokeh.renderers.polygon.directional_differences import Direction, Taps, downwards, edge_profile, polygon_corners
 from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, rectify_aperture
 from mrbokeh.system.errors import InputError
 
 Corners = list[tuple[int, int]]
+
+
+def binary_profile(direction: Direction) -> Taps:
+    """Return the profile of an edge in the paper: a pixel belongs to the area if its centre does."""
+    dx, dy = downwards(direction)
+    middles = [(column + 0.5) * dy / abs(dx) for column in range(abs(dx))]
+    return {(column if dx > 0 else -column - 1, ceil(middle - 0.5)): 1.0 for column, middle in enumerate(middles)}
+
+
+def differenced_kernel(corners: Sequence[tuple[int, int]], profile: Callable[[Direction], Taps]) -> Mapping[Direction, Taps]:
+    """Return the non-zero elements of K'' of the paper's Eq. 4, by direction, for a polygon with its corners on the lattice.
+
+    corners in the order in which x turns towards y (clockwise on screen). profile: of an edge.
+    """
+    grouped: dict[Direction, Taps] = {}
+    for here, there in zip(corners, (*corners[1:], corners[0]), strict=True):
+        direction = downwards((there[0] - here[0], there[1] - here[1]))
+        if direction[0] == 0:
+            continue
+        taps = grouped.setdefault(direction, {})
+        for (x, y), weight in profile(direction).items():
+            for end, sign in ((here, 1.0), (there, -1.0)):
+                place = (end[0] + x, end[1] + y)
+                taps[place] = taps.get(place, 0.0) + sign * weight * (1 if direction[0] > 0 else -1)
+    return {direction: {place: weight for place, weight in taps.items() if weight} for direction, taps in grouped.items()}
 
 
 def polygon(half: Corners) -> Corners:
@@ -43,7 +71,7 @@ def hexadecagon(r: int) -> Corners:
 @pytest.mark.parametrize("radius_px", [25, 100])
 def test_counts_of_table_1(shape, count: int, radius_px: int) -> None:  # type: ignore[no-untyped-def]
     """Moroto et al. 2021, Table 1, column "Ours": constant in the radius."""
-    assert sum(len(taps) for taps in differenced_kernel(shape(radius_px)).values()) == count
+    assert sum(len(taps) for taps in differenced_kernel(shape(radius_px), binary_profile).values()) == count
 
 
 def summed_back(grouped: dict[Direction, Taps], size: int) -> np.ndarray:
@@ -73,7 +101,7 @@ def test_binary_kernels_come_back(shape) -> None:  # type: ignore[no-untyped-def
         height = y0 + (x - x0) * (y1 - y0) / (x1 - x0) if x1 != x0 else y
         # Edges below the centre count; a centre on an edge belongs to the area under it, as in edge_profile.
         inside ^= between & (height > y + 1e-9)
-    np.testing.assert_array_equal(summed_back(dict(differenced_kernel(shape(12))), size), inside)
+    np.testing.assert_array_equal(summed_back(dict(differenced_kernel(shape(12), binary_profile)), size), inside)
 
 
 @pytest.mark.parametrize("shape", [hexagon, octagon, dodecagon, hexadecagon])
@@ -84,7 +112,7 @@ def test_covered_area_comes_back(shape) -> None:  # type: ignore[no-untyped-def]
     psf = Aperture((((corners - 0.5) / extent).astype(float),), (1.0,)).rasterize(2 * extent).kernel
     size = 2 * (psf.shape[0] // 2 + 4) + 1
     expected = np.pad(psf, (size - psf.shape[0]) // 2)
-    kernel = summed_back(dict(differenced_kernel(shape(12), binary=False)), size)
+    kernel = summed_back(dict(differenced_kernel(shape(12), edge_profile)), size)
     np.testing.assert_allclose(kernel / kernel.sum(), expected, atol=1e-12)
     assert kernel.max() == pytest.approx(1.0)
 

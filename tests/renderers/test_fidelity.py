@@ -52,6 +52,7 @@ def mean(cases: list[Case], measures: list[dict[str, float]], what: str, **of: s
     )
 
 
+@pytest.mark.slow
 def test_the_shipped_truth_is_what_it_should_be(traced: list[Case], baselines: dict[str, list[dict[str, float]]]) -> None:
     """Two scenes, five apertures, three focus distances, about as hard as the scenes that the bounds were measured on; less
     than 0.5 dB easier for scatter without order, from which the bounds were drawn."""
@@ -81,9 +82,9 @@ def test_traced_scenes_from_a_picture_with_depth(traced: list[Case], plain: list
 
 @pytest.mark.parametrize("method", ON_TRACED)
 def test_traced_scenes_from_two_layers(traced: list[Case], method: str) -> None:
-    """35.9 dB."""
+    """35.9 dB over all cases; every fifth is blurred here."""
     renderer = make_renderer(method)
-    layered = [case for case in traced if case.layers]
+    layered = [case for case in traced if case.layers][::5]
     reached = [case.measure(renderer.render(case.layers, case.lens).rgb) for case in layered]
     assert mean(layered, reached, "frame") > 33.0
 

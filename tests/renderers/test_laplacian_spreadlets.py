@@ -20,14 +20,14 @@ from mrbokeh.renderers.kernels.laplacian_tables import (
     joined_points,
     kind_of,
     stands_out,
-    stands_out_plainly,
     taps_of,
 )
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets, highlights_among, highlights_among_plainly
-from mrbokeh.renderers.spreadlets.sums import FOUR, Laid, Window, _Splatting, gains_for, splat, splat_plainly
+from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets, highlights_among
+from mrbokeh.renderers.spreadlets.sums import FOUR, Laid, Window, _Splatting, gains_for, splat
 from mrbokeh.system.errors import InputError
+from tests.scenes.spreadlet_references import highlights_among_reference, splat_reference, stands_out_reference
 
 DISC, PENTAGON = Aperture.disc(), Aperture.blades(5)
 SIZE = (96, 120)
@@ -57,14 +57,14 @@ def test_whole_laplacians_are_dense_splatting_to_rounding(aperture: Aperture, si
     reach, dense = taps.reach_px, np.zeros((SIZE[0] + 2 * taps.reach_px, SIZE[1] + 2 * taps.reach_px, 4))
     splat(dense, values, cells.reshape(SIZE).astype(np.int32), taps, (-reach, -reach))
     np.testing.assert_allclose(renderer.sum_kernels(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=2e-7)
-    np.testing.assert_allclose(renderer.sum_kernels_densely(values, coc_px, aperture), dense[reach:-reach, reach:-reach], atol=5e-5)
+    np.testing.assert_allclose(renderer.sum_kernels(values, coc_px, aperture, densely=True), dense[reach:-reach, reach:-reach], atol=5e-5)
 
 
 def test_sparse_points_come_near_dense_splatting_of_the_same_kernels() -> None:
     """Mean circle 40 px. What the bench measures on a larger picture, here in small: SSIM within 0.01, more than 45 dB."""
     renderer = LaplacianSpreadlets()
     values, coc_px = picture(1), slope_px(30.0, 50.0)
-    found, dense = renderer.sum_kernels(values, coc_px, DISC), renderer.sum_kernels_densely(values, coc_px, DISC)
+    found, dense = renderer.sum_kernels(values, coc_px, DISC), renderer.sum_kernels(values, coc_px, DISC, densely=True)
     assert ssim(found[..., :3], dense[..., :3]) > 0.99
     assert psnr(found, dense) > 45.0
 
@@ -106,7 +106,7 @@ def test_a_lamp_shows_its_exact_disc() -> None:
     lamp[96, 96, :3] = 1e5
     renderer = LaplacianSpreadlets()
     alone = renderer.sum_kernels(lamp, coc_px, DISC) - renderer.sum_kernels(values, coc_px, DISC)
-    dense = renderer.sum_kernels_densely(lamp, coc_px, DISC) - renderer.sum_kernels_densely(values, coc_px, DISC)
+    dense = renderer.sum_kernels(lamp, coc_px, DISC, densely=True) - renderer.sum_kernels(values, coc_px, DISC, densely=True)
     np.testing.assert_allclose(alone[..., :3], dense[..., :3], atol=2e-3 * dense.max())
     assert np.abs(alone[:60]).max() < 1e-3, "1e-8 of the lamp"
 
@@ -127,7 +127,7 @@ def test_the_number_of_threads_changes_no_bit_of_sparse_sums() -> None:
 
 def test_the_pyramid_is_another_integration_and_a_worse_one() -> None:
     values, coc_px = picture(8), slope_px(30.0, 50.0)
-    dense = LaplacianSpreadlets().sum_kernels_densely(values, coc_px, DISC)
+    dense = LaplacianSpreadlets().sum_kernels(values, coc_px, DISC, densely=True)
     exact, pyramid = (LaplacianSpreadlets(integration=name).sum_kernels(values, coc_px, DISC) for name in ("exact", "pyramid"))
     assert psnr(exact, dense) > psnr(pyramid, dense) + 6.0 > 26.0
 
@@ -139,7 +139,7 @@ def test_splatting_agrees_with_its_plain_twin() -> None:
     values, cells = rng.uniform(size=(40, 37, 3)).astype(np.float32), rng.integers(-1, 3, (40, 37)).astype(np.int32)
     found, plain = np.zeros((56, 53, 3)), np.zeros((56, 53, 3))
     splat(found, values, cells, points, (-8, -8))
-    splat_plainly(plain, values, cells, points, (-8, -8))
+    splat_reference(plain, values, cells, points, (-8, -8))
     np.testing.assert_allclose(found, plain, atol=1e-12)
 
 
@@ -152,7 +152,7 @@ def test_neighbours_of_one_kernel_agree_with_the_plain_twin() -> None:
     values = rng.uniform(size=(*cells.shape, 4)).astype(np.float32)
     found, plain = np.zeros((90, 65, 4)), np.zeros((90, 65, 4))
     splat(found, values, cells, points, (-10, -10))
-    splat_plainly(plain, values, cells, points, (-10, -10))
+    splat_reference(plain, values, cells, points, (-10, -10))
     np.testing.assert_allclose(found, plain, atol=1e-14)
 
 
@@ -163,7 +163,7 @@ def test_what_stands_out_agrees_with_its_plain_twin() -> None:
         values = rng.uniform(size=(*size, 3)).astype(np.float32) ** 20
         values[0, 0, 1] = values[-1, -1, 2] = 30.0
         found = stands_out(values)
-        np.testing.assert_array_equal(found, stands_out_plainly(values))
+        np.testing.assert_array_equal(found, stands_out_reference(values))
         assert found[0, 0]
         assert not found.all()
 
@@ -244,7 +244,7 @@ def sums_in_whole_numbers(values: np.ndarray, cells: np.ndarray, kernels: list, 
     reals, plain = np.zeros((*window[2:], FOUR), np.float32), np.zeros((*window[2:], FOUR))
     for first, end in pairwise((0, *ends, window.height)):
         splatting.fill(reals, first, end)
-    splat_plainly(plain, values, cells, points, window[:2])
+    splat_reference(plain, values, cells, points, window[:2])
     return reals.astype(np.float64), plain, gains
 
 
@@ -301,7 +301,7 @@ def test_lamps_agree_with_their_plain_twin(share: float) -> None:
     values[rng.uniform(size=(90, 150)) < 2e-3] *= 100.0
     codes = np.where(rng.uniform(size=(90, 150)) < share, rng.integers(-1, 2, (90, 150)), rng.integers(2, 5, (90, 150))).astype(np.int32)
     sparse = np.array([False, False, True, True, True])
-    found, plain = highlights_among(values, codes, sparse), highlights_among_plainly(values, codes, sparse)
+    found, plain = highlights_among(values, codes, sparse), highlights_among_reference(values, codes, sparse)
     np.testing.assert_array_equal(found.found, plain.found)
     assert 0 < found.found.sum() < 0.03 * found.found.size
     assert np.all(found.largest >= plain.largest)

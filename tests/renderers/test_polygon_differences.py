@@ -99,12 +99,11 @@ def point(size: int, diameter_px: float, aperture: Aperture, renderer: PolygonDi
     return renderer.sum_kernels(values, np.full((size, size), diameter_px, np.float32), aperture)[..., 0].astype(np.float64)
 
 
-@pytest.mark.parametrize("name", APERTURES)
-@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(("name", "side"), [("heart", 1.0), ("heart", -1.0), ("ring", 1.0), ("octagon", -1.0)])
 def test_the_plain_twin_agrees(name: str, side: float) -> None:
     """Signed light, so that nothing is set to 0; the result is rounded to float32, the impulses are not."""
-    values = (picture(20, 26) - 0.5).astype(np.float32)
-    coc_px = np.float32(side) * waves(20, 26, 8.0, 26.0)
+    values = (picture(14, 18) - 0.5).astype(np.float32)
+    coc_px = np.float32(side) * waves(14, 18, 8.0, 26.0)
     expected = plain_scatter(values, coc_px, name)
     np.testing.assert_allclose(SUMS_ONLY.sum_kernels(values, coc_px, APERTURES[name]), expected, atol=6e-8 * np.abs(expected).max())
     single = PolygonDifferences(exact_below_px=6.0, exact_highlights=False, precision="single")
@@ -210,9 +209,9 @@ def test_an_even_field_stays_even(name: str) -> None:
 def test_lights_of_1e5_leave_their_surroundings_alone() -> None:
     """Error below 1e-4 of the local signal, beside and behind lights of 1e5 under small and large kernels. Against the plain
     twin in float64, so that all light goes through the sums."""
-    values, coc_px = 0.1 * picture(44, 60), waves(44, 60, 8.0, 24.0)
-    values[10, 20:24] = values[30, 40] = values[20, 50] = 1e5
-    coc_px[30, 40] = 8.0
+    values, coc_px = 0.1 * picture(32, 40), waves(32, 40, 8.0, 24.0)
+    values[8, 12:16] = values[22, 28] = values[14, 34] = 1e5
+    coc_px[22, 28] = 8.0
     expected = plain_scatter(values, coc_px, "octagon")
     automatic = PolygonDifferences(exact_below_px=6.0, exact_highlights=False)
     error = np.abs(automatic.sum_kernels(values, coc_px, APERTURES["octagon"]) - expected)

@@ -8,8 +8,15 @@ import shapely
 from shapely import Polygon, affinity
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, area_excess, rectify, rectify_aperture, same_area_and_centroid
+from mrbokeh.renderers.polygon.outlines import Outline, area
+from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, rectify, rectify_aperture, same_area_and_centroid
 from mrbokeh.system.errors import InputError
+
+
+def area_excess(rectified: Outline, outline: Outline) -> float:
+    """Return how much larger the rectified polygon is than its outline, as a share of the outline's area (0 = equal)."""
+    return abs(area(rectified)) / abs(area(outline)) - 1.0
+
 
 EIGHTHS = ((1, 0), (0, 1), (1, 1), (1, -1))
 UPRIGHT = ((1, 0), (0, 1))

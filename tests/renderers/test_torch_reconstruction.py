@@ -84,7 +84,7 @@ def by_torch(samples: LightFieldSamples, settings: Settings | None = None, seed:
 def test_shipped_samples_give_the_picture_of_the_compiled_renderer(name: str, screen_filter: str) -> None:
     samples, lens = read_samples(SHIPPED / name / "samples.npz"), read_lens(SHIPPED / name / "lens.json")
     settings = Settings(screen_filter=screen_filter)  # type: ignore[arg-type]
-    known, known_counts = LayeredReconstruction(settings).reconstruct_counted(samples, lens)
+    known, known_counts = LayeredReconstruction(settings).reconstruct_values(samples, samples.rgb, lens)
     found, counts = TorchReconstruction(settings).reconstruct_values(samples, samples.rgb, samples.coc_px(lens), lens.aperture)
     assert counts == pytest.approx((known_counts.before, known_counts.after), abs=1e-9), "the same partitions"
     assert psnr(found, known) > 90.0

@@ -19,13 +19,13 @@ from mrbokeh.psf_models.build import build_bank
 from mrbokeh.psf_models.combined import Combined
 from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.renderers.kernels.laplacian_integration import integrate as integrate_compiled
-from mrbokeh.renderers.kernels.laplacian_integration import integrate_plainly
 from mrbokeh.renderers.kernels.laplacian_tables import Points, by_rows, joined_points, taps_of
 from mrbokeh.renderers.kernels.laplacian_tables import stands_out as stands_out_compiled
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_laplacian
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
-from mrbokeh.renderers.spreadlets.sums import add_light, splat_plainly, window_of
+from mrbokeh.renderers.spreadlets.sums import add_light, window_of
 from mrbokeh.system.errors import InputError
+from tests.scenes.spreadlet_references import integrate_reference, splat_reference
 
 torch = pytest.importorskip("torch")
 
@@ -33,11 +33,11 @@ from mrbokeh.renderers.spreadlets.torch_spreadlets import DeviceLayer, TorchSpre
 from mrbokeh.renderers.spreadlets.torch_spreadlets._kernels import (  # noqa: E402
     BankCells,
     stands_out,
-    table_of,  # noqa: E402
+    table_of,
 )
 from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import (  # noqa: E402
-    add_light_on,  # noqa: E402
-    integrate,  # noqa: E402
+    add_light_on,
+    integrate,
     splat,
     splat_in_chunks,
 )
@@ -93,7 +93,7 @@ def test_integration_by_transforms_is_that_by_sweeps(size: tuple[int, int]) -> N
     source = np.random.default_rng(1).standard_normal((*size, 2))
     found = integrate(torch.from_numpy(source).permute(2, 0, 1)).permute(1, 2, 0).numpy()
     np.testing.assert_allclose(found, integrate_compiled(source), atol=1e-12)
-    np.testing.assert_allclose(found, integrate_plainly(source), atol=1e-12)
+    np.testing.assert_allclose(found, integrate_reference(source), atol=1e-12)
 
 
 def test_the_number_of_threads_changes_no_bit_of_the_integration() -> None:
@@ -117,7 +117,7 @@ def test_sums_are_the_plain_ones_and_the_same_bits_in_chunks_of_any_size() -> No
     table = replace(table, weights=torch.cat([table.weights, -0.5 * table.weights], dim=1))
     light, where = torch.from_numpy(values), torch.from_numpy(cells)
     plain = np.zeros((window.height, window.width, 3))
-    splat_plainly(plain, values * np.float32([1.0, -0.5, 1.0]), cells, points, (window.top, window.left))
+    splat_reference(plain, values * np.float32([1.0, -0.5, 1.0]), cells, points, (window.top, window.left))
     found = splat(light, where, table, window, 1.0, (0, 1, 0))
     np.testing.assert_allclose(found.permute(1, 2, 0).numpy(), plain, atol=1e-14)
     sums = [torch.zeros((window.height, window.width, 3), dtype=torch.int64) for _ in range(3)]
@@ -338,6 +338,7 @@ from triton import compile
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from mrbokeh.renderers.spreadlets.torch_spreadlets._splat_triton import _splat
+from tests.scenes.spreadlet_references import integrate_reference, splat_reference  # noqa: E402
 sizes = {"CHANNELS": 6, "COLUMNS": 3, "WIDE": 8, "PIXELS": 64, "SEGMENT": 128}
 types = {"sums": "*i64", "values": "*fp32", "weights": "*fp64", **dict.fromkeys(("pixels", "width", "window_width", "corner"), "i32")}
 signature = {name: "constexpr" if name in sizes else types.get(name, "*i32") for name in _splat.arg_names}

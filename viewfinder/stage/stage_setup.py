@@ -1,4 +1,4 @@
-"""StageSetup: one version of everything a drawing depends on beside pose, lens and time; and how it is loaded from the scene file.
+"""StageSetup: everything a drawing depends on beside pose, lens and time, loaded from the scene file and again when it changes.
 
 SceneWatch: whether the scene file or a file that it names was written since it was read; asks the file system, waits for nothing.
 """
@@ -21,7 +21,7 @@ from viewfinder.stage.reprojection import LayerDepth
 
 
 class SceneWatch:
-    """A file that is being written changes again and again: `changed` says so only once it has kept still between two calls."""
+    """Watch over the scene's files: `changed` tells only once a file that is being written has kept still between two calls."""
 
     def __init__(self, files: Iterable[Path]) -> None:
         self._read = self._seen = _state(files)
@@ -32,7 +32,7 @@ class SceneWatch:
         return is_still and now != self._read
 
     def follow(self, files: Iterable[Path]) -> None:
-        """What `changed` saw has been read, or refused; watch these files from here on."""
+        """Watch these files from here on: what `changed` saw has been read, or refused."""
         # Of a file that was watched already it is the state before the reading: what was written during it is not missed.
         self._read = self._seen = {path: self._seen.get(path, modified_s(path)) for path in files}
 
@@ -43,7 +43,7 @@ def _state(files: Iterable[Path]) -> dict[Path, float]:
 
 @dataclass(frozen=True, eq=False)
 class StageSetup:
-    """Two setups are the same only if they are one object. lens: of the scene file, None where it names none."""
+    """Set-up of a stage. Two are the same only if they are one object. lens: of the scene file, None where it names none."""
 
     staged: StagedScene
     render_setup: RenderSetup
@@ -61,7 +61,7 @@ LIVE_LAYERING = Layering(slices=8)
 
 
 def live_renderer(name: str) -> Renderer:
-    """A renderer of mrbokeh.renderers.choose, or a network's file, as it suits a stream.
+    """Make a renderer of mrbokeh.renderers.choose, or a network's file, as it suits a stream.
 
     8 slices of blur in place of 16 take 0.8 of the time, and the picture changes by no more than between 16 and 32 (86 to 98 dB on
     tests/bench/bench_stage.py's helmet). One thread leaves the other core to whoever composites and encodes.
@@ -73,7 +73,7 @@ _LIVE_EDGE_SAMPLES, _LIVE_SHADOW_STEP_PX = 4, 2
 
 
 def live_backend(backend: SceneRenderer) -> SceneRenderer:
-    """A backend as it suits a stream: the ray caster with fewer rays at edges and in shadows; any other as it is.
+    """Return a backend as it suits a stream: the ray caster with fewer rays at edges and in shadows; any other as it is.
 
     A drawing of tests/bench/bench_stage.py takes 0.54 of the time and is 66 dB near the best one. What the ray
     caster has prepared is shared with `backend`.
@@ -84,13 +84,13 @@ def live_backend(backend: SceneRenderer) -> SceneRenderer:
 
 
 class SetupLoader:
-    """Loads a scene file, again and again; what did not change is kept. One core is left for whoever composites the frames."""
+    """Loader of a scene file, again and again; what did not change is kept. One core is left for whoever composites the frames."""
 
     def __init__(self, path: Path, backend: SceneRenderer | None = None) -> None:
         self.path, self._backend, self._assets, self._depth = path, backend, Assets(), LayerDepth()
 
     def load(self, before: StageSetup | None = None) -> StageSetup:
-        """InputError with one sentence for any mistake. before: its renderer is kept where the file does not name another than it did."""
+        """Load the file; InputError for any mistake. before: its renderer is kept where the file does not name another than it did."""
         described = read_scene_file(self.path)
         staged = StagedScene.load(described, self._assets)
         occlusion = read_occlusion(described.occlusion, described.up)

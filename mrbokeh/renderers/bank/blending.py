@@ -117,7 +117,7 @@ def blend_colours(tables: BlendedTables, sum_side: SideSum, values: Channels, co
     sides = {side: here for side, here in ((1, behind), (-1, lit & ~behind)) if here.any()}
 
     def summed(picked: Channels, colours: int, channel: int) -> Channels:
-        """Sum both sides of the focus. Sum both sides of the focus. picked: channels of the picture, the first of which are colours."""
+        """Sum both sides of the focus. picked: channels of the picture, the first of which are colours."""
         total = np.zeros_like(picked) if len(sides) != 1 else None
         for side, here in sides.items():
             passed = _passed(tables.lattice, coc_px, side, channel, around)

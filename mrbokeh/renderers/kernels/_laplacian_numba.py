@@ -127,7 +127,7 @@ def _mirror_ends(columns: np.ndarray, width: int, channels: int, radius_px: int)
 
 @njit(cache=True, nogil=True)
 def pivots(diagonal: np.ndarray, height: int) -> np.ndarray:
-    """Return Return (height, modes) reciprocal pivots of Thomas's elimination for rows -u[y-1] + diagonal u[y] - u[y+1].
+    """Return (height, modes) reciprocal pivots of Thomas's elimination for rows -u[y-1] + diagonal u[y] - u[y+1].
 
     diagonal: (modes,), at least 2.
     """

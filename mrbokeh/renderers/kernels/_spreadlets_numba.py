@@ -78,7 +78,7 @@ def relax(points: np.ndarray, xy: np.ndarray, importance: np.ndarray, steps: int
 
 @njit(cache=True, nogil=True)
 def cell_sums(points: np.ndarray, xy: np.ndarray, charges: np.ndarray) -> np.ndarray:
-    """Return Return (N, C) sums of the charges in the Voronoi cell of every point."""
+    """Return (N, C) sums of the charges in the Voronoi cell of every point."""
     owner = np.empty(xy.shape[0], np.int64)
     nearest(points, xy, owner)
     values = np.zeros((points.shape[0], charges.shape[1]))

@@ -79,7 +79,7 @@ def _adding_to(cells: int) -> Any:
 
 @intrinsic
 def _scaled(typing_context: Any, values: Any, at: Any, gain: Any) -> Lowering:
-    """Return Return values[at : at + 4] * gain, in the type of gain; values is flat, `at` is not checked."""
+    """Return values[at : at + 4] * gain, in the type of gain; values is flat, `at` is not checked."""
     signature = types.UniTuple(gain, 4)(values, types.intp, gain)
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:

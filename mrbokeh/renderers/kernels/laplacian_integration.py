@@ -100,21 +100,6 @@ def _system(height: int, width: int) -> tuple[Float64[np.ndarray, " modes"], Flo
     return beside, pivots((20.0 - 8.0 * cosine) / 6.0 / beside, height)
 
 
-def integrate_plainly(source: Channels) -> Float64[np.ndarray, "height width channels"]:
-    """Return the same by a sparse linear solver: the slow and obvious twin of `integrate`."""
-    from scipy.sparse import diags, eye, kron
-    from scipy.sparse.linalg import spsolve
-
-    height, width, channels = source.shape
-    ends = np.zeros(width)
-    ends[[0, -1]] += 1.0  # antisymmetric about the border: the neighbour beyond is minus the pixel itself
-    row = diags([np.ones(width - 1), -ends, np.ones(width - 1)], [-1, 0, 1])
-    column = diags([np.ones(height - 1), np.ones(height - 1)], [-1, 1], shape=(height, height))
-    matrix = kron(eye(height), 4.0 * row - 20.0 * eye(width)) + kron(column, row + 4.0 * eye(width))
-    solved = [spsolve((matrix / 6.0).tocsc(), source[..., c].ravel().astype(np.float64)) for c in range(channels)]
-    return np.stack([each.reshape(height, width) for each in solved], axis=2)
-
-
 def integrate_by_pyramid(source: Channels) -> Channels:
     """Return nearly the same as `integrate` by a convolution pyramid (Farbman et al. 2011): a few small filters per level, no transform."""
     import cv2

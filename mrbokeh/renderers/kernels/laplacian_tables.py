@@ -115,7 +115,7 @@ def taps_of(kernel: Float[np.ndarray, "size size *channels"]) -> Spreadlet:
 
 
 def kind_of(code: int) -> int:
-    """Return Return DENSE, SPARSE or WHOLE."""
+    """Return DENSE, SPARSE or WHOLE."""
     return code // _BLOCK % 3
 
 
@@ -145,15 +145,6 @@ def stands_out(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.
     with workers(found.size) as pool:
         in_bands(pool, len(light), _ROWS_AT_ONCE, lambda first, end: find_outshining(found, light, AROUND_PX, OUTSHINES, first, end))
     return found
-
-
-def stands_out_plainly(values: Float32[np.ndarray, "height width channels"]) -> Bool[np.ndarray, "height width"]:
-    """Return the plain twin of `stands_out`."""
-    import cv2
-
-    window = (2 * AROUND_PX + 1, 2 * AROUND_PX + 1)
-    around = cv2.boxFilter(np.abs(values, dtype=np.float64), cv2.CV_64F, window, borderType=cv2.BORDER_REFLECT_101)
-    return np.any(np.abs(values) > OUTSHINES * around.reshape(values.shape), axis=2)
 
 
 def used_codes(codes: Int[np.ndarray, "height width"]) -> Int[np.ndarray, " codes"]:

@@ -48,7 +48,7 @@ class LowRankKernel:
 
     @property
     def scaled_columns(self) -> Float64[np.ndarray, "rank size"]:
-        """Columns Columns u' = sqrt(|s|) u of McGraw's Section 3."""
+        """Columns u' = sqrt(|s|) u of McGraw's Section 3."""
         return np.sqrt(np.abs(self.weights))[:, None] * self.columns
 
     @property
@@ -69,7 +69,7 @@ def relative_errors(kernel: Float[np.ndarray, "rows columns"]) -> Float64[np.nda
 
 
 def aperture_errors(aperture: Aperture, diameter_px: float) -> Float64[np.ndarray, " size"]:
-    """Return Return `relative_errors` of the PSF at this diameter: one curve of McGraw's Fig. 3."""
+    """Return `relative_errors` of the PSF at this diameter: one curve of McGraw's Fig. 3."""
     return relative_errors(aperture.rasterize(diameter_px).kernel)
 
 

@@ -42,7 +42,7 @@ _LEAST_MOMENT = 1e-9
 
 @lru_cache(maxsize=8)
 def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
-    """Return Return K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
+    """Return K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
     half = fast_width(_DOMAIN // 2 * reach_px + 2)
     source = np.zeros((2 * half + 1, 2 * half + 1, 1))
     source[half, half] = 1.0
@@ -51,7 +51,7 @@ def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
 
 
 def potential_of(charges: Float64[np.ndarray, "size size channels"], table: Float64[np.ndarray, "side side"]) -> np.ndarray:
-    """Return Return K L on the pixels of L; the table must reach across."""
+    """Return K L on the pixels of L; the table must reach across."""
     reach = charges.shape[0] - 1
     quarter = table[: reach + 1, : reach + 1]
     half = np.concatenate([quarter[:0:-1], quarter])

@@ -89,12 +89,8 @@ class LayeredReconstruction:
 
     def reconstruct(self, samples: LightFieldSamples, lens: Lens) -> Layer:
         """Return the picture that more samples would converge to: opaque, with the depth of the nearest sample of each pixel."""
-        rgb, _ = self.reconstruct_counted(samples, lens)
+        rgb, _ = self.reconstruct_values(samples, samples.rgb, lens)
         return opaque(rgb, _nearest_depth_m(samples))
-
-    def reconstruct_counted(self, samples: LightFieldSamples, lens: Lens) -> tuple[Float32[np.ndarray, "height width 3"], PartitionCounts]:
-        """Return the colour alone, and how many partitions it took."""
-        return self.reconstruct_values(samples, samples.rgb, lens)
 
     def reconstruct_values(
         self, samples: LightFieldSamples, values: Float32[np.ndarray, "samples channels"], lens: Lens

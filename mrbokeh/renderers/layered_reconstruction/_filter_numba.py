@@ -182,7 +182,7 @@ PIXEL_VARIANCE = 1.0 / 12.0
 
 @njit(cache=True, nogil=True)
 def sheared_slopes(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: float) -> tuple[float, float, float, float, float]:
-    """Return Return (r, m_x, m_y, kappa_u, kappa_t): the mean slopes of a partition and the shares of them that the filter is sheared
+    """Return (r, m_x, m_y, kappa_u, kappa_t): the mean slopes of a partition and the shares of them that the filter is sheared
     by.
     """
     n = sums[0]
@@ -208,7 +208,7 @@ def sheared_slopes(sums: np.ndarray, window: np.ndarray, sigma_x_px: float, band
 def sheared_filter(
     sums: np.ndarray, window: np.ndarray, sigma_x_px: float, bandwidth: float
 ) -> tuple[float, float, float, float, float, float]:
-    """Return Return (a, b_x, b_y, V_xx, V_xy, V_yy): reprojection x' = x - a (u, v) - b (t - 1/2), then a Gaussian of covariance V."""
+    """Return (a, b_x, b_y, V_xx, V_xy, V_yy): reprojection x' = x - a (u, v) - b (t - 1/2), then a Gaussian of covariance V."""
     r, m_x, m_y, kappa_u, kappa_t = sheared_slopes(sums, window, sigma_x_px, bandwidth)
     lens, shutter = kappa_u * (2.0 - kappa_u) * r * r, kappa_t * (2.0 - kappa_t) * window[3]
     v_xx = sigma_x_px**2 + lens * window[0] + shutter * m_x * m_x
@@ -219,14 +219,14 @@ def sheared_filter(
 
 @njit(cache=True, nogil=True)
 def axes(v_xx: float, v_xy: float, v_yy: float) -> tuple[float, float, float]:
-    """Return Return (sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
+    """Return (sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
     middle, half = 0.5 * (v_xx + v_yy), math.hypot(0.5 * (v_xx - v_yy), v_xy)
     return math.sqrt(middle + half), math.sqrt(max(middle - half, 0.0)), 0.5 * math.atan2(2.0 * v_xy, v_xx - v_yy)
 
 
 @njit(cache=True, nogil=True)
 def sheared_axes(sigma_u: float, sigma_v: float, theta: float) -> tuple[float, float, float]:
-    """Return Return (s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
+    """Return (s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
     cosine, sine = math.cos(theta), math.sin(theta)
     rho = math.sqrt((sigma_v * cosine) ** 2 + (sigma_u * sine) ** 2)
     if rho == 0.0:

@@ -44,7 +44,7 @@ _LEAST_VARIANCE = 1e-3
 
 @njit(cache=True, nogil=True)
 def feedback(variance_px2: float) -> float:
-    """Return Return gamma of Eq. 10, such that forward and backward together have exactly this variance.
+    """Return gamma of Eq. 10, such that forward and backward together have exactly this variance.
 
     The impulse response of both is (1 - gamma) / (1 + gamma) gamma^|n| with variance 2 gamma / (1 - gamma)^2. The paper's
     exp(-sqrt(2) / sigma) is the same for large sigma and 15 % too narrow at 1 px.

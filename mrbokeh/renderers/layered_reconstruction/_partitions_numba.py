@@ -96,7 +96,7 @@ def add_unknown(rows: Rows, known: int, first: int, end: int, light: Light) -> N
 
 @njit(cache=True, nogil=True)
 def add_sample(rows: Rows, bucket: int, slope: np.ndarray) -> None:
-    """Add a sample to its bucket's row. Add a sample to its bucket's row. slope: half the signed circle of confusion, motion x and y."""
+    """Add a sample to its bucket's row. slope: half the signed circle of confusion, motion x and y."""
     if rows.place[bucket] < 0:
         new = rows.used[0]
         rows.place[bucket], rows.buckets[new] = new, bucket

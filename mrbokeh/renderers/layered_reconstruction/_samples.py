@@ -200,7 +200,7 @@ def prepared(
     coc_px: Float32[np.ndarray, " samples"],
     settings: Settings,
 ) -> Light:
-    """Sort samples by tile. Sort samples by tile. values: (N, C) what is reconstructed, the samples' rgb or more. coc_px: their
+    """Sort samples by tile. values: (N, C) what is reconstructed, the samples' rgb or more. coc_px: their
     circles of confusion.
     """
     from mrbokeh.renderers.layered_reconstruction._filter_numba import gather, tile_order

@@ -107,7 +107,7 @@ class Settings:
 
 
 def footprint_sigmas(energy: float) -> float:
-    """Return Return alpha of Eq. 3: half the side, in standard deviations, of the square that holds this share of a 2D Gaussian."""
+    """Return alpha of Eq. 3: half the side, in standard deviations, of the square that holds this share of a 2D Gaussian."""
     from scipy.special import erfinv
 
     return float(np.sqrt(2.0) * erfinv(np.sqrt(energy)))

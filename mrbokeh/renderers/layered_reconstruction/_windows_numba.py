@@ -113,7 +113,7 @@ def add_strip(out: np.ndarray, prefix: np.ndarray, one: float, other: float, wei
 
 @njit(cache=True, nogil=True)
 def sums_along_x(planes: np.ndarray) -> np.ndarray:
-    """Return Return prefix[y, x]: the sum of planes[y, :x], one longer than the row and once more repeated for reading beyond."""
+    """Return prefix[y, x]: the sum of planes[y, :x], one longer than the row and once more repeated for reading beyond."""
     height, width, channels = planes.shape
     prefix = np.zeros((height, width + 2, channels))
     carried = np.zeros(channels)

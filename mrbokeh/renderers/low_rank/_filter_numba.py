@@ -76,7 +76,7 @@ def splat_pixels(
 
 @njit(cache=True, nogil=True)
 def _blended(taps: np.ndarray, table: np.ndarray, position: float) -> None:
-    """Set Set taps (K,) between two neighbouring rows of a table (levels, K)."""
+    """Set taps (K,) between two neighbouring rows of a table (levels, K)."""
     level = min(int(position), table.shape[0] - 2)
     upper = np.float32(position - level)
     for j in range(taps.shape[0]):

@@ -19,7 +19,7 @@ ALIKE = 1e-12
 
 @njit(cache=True)
 def _still_to_pay(period: int, origins: np.ndarray, starts: np.ndarray, targets: np.ndarray, areas: np.ndarray, most: int) -> np.ndarray:
-    """Return Return (most + 1, 2 period): the least that a walk costs from each line to the image of any origin, with at most so many more
+    """Return (most + 1, 2 period): the least that a walk costs from each line to the image of any origin, with at most so many more
     lines.
     """
     least = np.full((most + 1, 2 * period), np.inf)
@@ -224,7 +224,7 @@ def _reach(outline: np.ndarray, vertex: int, dx: float, dy: float, sense: float)
 
 @njit(cache=True)
 def touching_lines(outline: np.ndarray, first: int, last: int, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Return (lines, places) of all lines along `directions` (unit, both senses) that touch the vertices first..last from outside.
+    """Return (lines, places) of all lines along `directions` (unit, both senses) that touch the vertices first..last from outside.
 
     Ordered along the outline; at a vertex that points outwards by direction, at one that points inwards arriving lines first.
     """
@@ -300,7 +300,7 @@ def _pocket(a: np.ndarray, place_a: np.ndarray, b: np.ndarray, place_b: np.ndarr
 
 @njit(cache=True)
 def corners(lines: np.ndarray, places: np.ndarray, sources: int, span: int, swept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Return (starts, targets, areas): for each of the first `sources` lines, all later lines within `span` places that it makes a
+    """Return (starts, targets, areas): for each of the first `sources` lines, all later lines within `span` places that it makes a
     corner with.
     """
     total = lines.shape[0]
@@ -333,7 +333,7 @@ def corners(lines: np.ndarray, places: np.ndarray, sources: int, span: int, swep
 
 @njit(cache=True)
 def axis_corners(a: np.ndarray, a_places: np.ndarray, b: np.ndarray, b_places: np.ndarray, swept: np.ndarray) -> np.ndarray:
-    """Return Return (lines, 2): half the pocket of each line of a with the same line of b, its mirror image beyond the axis: where
+    """Return (lines, 2): half the pocket of each line of a with the same line of b, its mirror image beyond the axis: where
     both make a corner (column 0), or are one line across the axis (column 1); inf where they do not.
     """
     areas = np.full((a.shape[0], 2), np.inf)

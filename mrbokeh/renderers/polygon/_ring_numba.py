@@ -125,7 +125,7 @@ class Exact(NamedTuple):
 
 
 class Ring(NamedTuple):
-    """Ring of rows. Ring of rows. planes: flat, light plane last. Row r of the ring proper starts at (ALIASED_ROWS + r) * stride cells.
+    """Ring of rows. planes: flat, light plane last. Row r of the ring proper starts at (ALIASED_ROWS + r) * stride cells.
 
     Column x of the picture is cell x - left + margin of a row.
     """

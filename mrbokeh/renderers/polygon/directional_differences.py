@@ -17,7 +17,7 @@ the curvature of the area, sum of curvature f (1 - f).
 The lattice holds the corners of pixels: lattice point (0, 0) is the top left corner of pixel (0, 0).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, floor, gcd
 
@@ -46,20 +46,17 @@ def downwards(direction: Direction) -> Direction:
     return sense * dx // divisor, sense * dy // divisor
 
 
-def edge_profile(direction: Direction, binary: bool = False) -> Taps:
-    """Return Return {(x, y): weight}: the downward difference of the area below one step of an edge from the lattice point (0, 0).
+def edge_profile(direction: Direction) -> Taps:
+    """Return {(x, y): weight}: the downward difference of the area below one step of an edge from the lattice point (0, 0).
 
-    binary: a pixel belongs to the area if its centre does, as in the paper; otherwise by the share of its area. An upright
-    edge has none. Weights of a column sum to 1; the number of columns is the run of the direction.
+    Pixels count by the share of their area that belongs to it. An upright edge has no profile. Weights of a column sum to 1; the
+    number of columns is the run of the direction.
     """
     dx, dy = downwards(direction)
     taps: Taps = {}
     for column in range(abs(dx)):
         high, low = column * dy / abs(dx), (column + 1) * dy / abs(dx)
         x = column if dx > 0 else -column - 1
-        if binary:
-            taps[x, ceil(0.5 * (high + low) - 0.5)] = 1.0
-            continue
         for y in range(floor(high), ceil(low) + 1):
             weight = _mean_ramp(y + 1, high, low) - 2.0 * _mean_ramp(y, high, low) + _mean_ramp(y - 1, high, low)
             if weight > 1e-12:
@@ -72,24 +69,6 @@ def _mean_ramp(y: float | int, high: float, low: float) -> float:
     if y <= high:
         return 0.0
     return y - 0.5 * (high + low) if y >= low else (y - high) ** 2 / (2.0 * (low - high))
-
-
-def differenced_kernel(corners: Sequence[tuple[int, int]], binary: bool = True) -> Mapping[Direction, Taps]:
-    """K'' of the paper's Eq. 4 for a polygon with its corners on the lattice: the non-zero elements, by direction.
-
-    corners in the order in which x turns towards y (clockwise on screen). binary as in `edge_profile`.
-    """
-    grouped: dict[Direction, Taps] = {}
-    for here, there in zip(corners, (*corners[1:], corners[0]), strict=True):
-        direction = downwards((there[0] - here[0], there[1] - here[1]))
-        if direction[0] == 0:
-            continue
-        taps = grouped.setdefault(direction, {})
-        for (x, y), weight in edge_profile(direction, binary).items():
-            for end, sign in ((here, 1.0), (there, -1.0)):
-                place = (end[0] + x, end[1] + y)
-                taps[place] = taps.get(place, 0.0) + sign * weight * (1 if direction[0] > 0 else -1)
-    return {direction: {place: weight for place, weight in taps.items() if weight} for direction, taps in grouped.items()}
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def swept_areas(outline: Outline) -> np.ndarray:
-    """Return Return (V + 1,) twice the area swept from the origin along the outline up to each vertex, and once around."""
+    """Return (V + 1,) twice the area swept from the origin along the outline up to each vertex, and once around."""
     return np.concatenate([[0.0], np.cumsum(_cross(outline, np.roll(outline, -1, axis=0)))])
 
 
@@ -161,7 +161,7 @@ def _unfolded_by_mirrors(shape: Outline, symmetry: Symmetry) -> Unfolded | None:
 
 
 def _crossings(shape: Outline, mirror: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Return Return (place along the outline, point on the axis, mirror) of every vertex on a mirror axis and every edge across it."""
+    """Return (place along the outline, point on the axis, mirror) of every vertex on a mirror axis and every edge across it."""
     onto_axis = 0.5 * (np.eye(2) + mirror)
     normal = np.eye(2) - onto_axis
     normal = normal[np.abs(normal).sum(axis=1).argmax()]

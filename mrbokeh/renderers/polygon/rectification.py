@@ -196,11 +196,6 @@ def rectify(
     return same_area_and_centroid(polygon, outline) if fit == "area" else polygon
 
 
-def area_excess(rectified: Outline, outline: Outline) -> float:
-    """Return how much larger the rectified polygon is than its outline, as a share of the outline's area (0 = equal)."""
-    return abs(area(rectified)) / abs(area(outline)) - 1.0
-
-
 def same_area_and_centroid(rectified: Outline, outline: Outline) -> Outline:
     """Return the rectified polygon scaled and shifted to the outline's area and centroid.
 

@@ -234,7 +234,7 @@ def tables_of(aperture: Aperture, directions: tuple[Direction, ...], max_edges: 
 
 
 def _sums(planes: dict[tuple[Direction, Direction], int]) -> Sums:
-    """Return the sums along all directions. Return the sums along all directions. Corners of a pair in ascending order of directions
+    """Return the sums along all directions. Corners of a pair in ascending order of directions
     count as they are, others negative (see `laid_out`).
     """
     directions = sorted({direction for pair in planes for direction in pair if direction[0]})
@@ -270,7 +270,7 @@ def _shift(direction: Direction) -> int:
 
 
 def _profile(direction: Direction) -> list[tuple[int, int, float]]:
-    """Return Return (columns back, rows back, weight), beginning with the place itself, then those of earlier rows."""
+    """Return (columns back, rows back, weight), beginning with the place itself, then those of earlier rows."""
     taps = {(x + _shift(direction), y): weight for (x, y), weight in edge_profile(direction).items()}
     itself = taps.pop((0, 0), 0.0)
     rest = sorted(taps.items(), key=lambda tap: (tap[0][1] == 0, tap[0]))

@@ -51,7 +51,7 @@ class _Points(NamedTuple):
         builder.position_at_end(after)
 
     def products(self, n: Any, to: Vectors) -> Vectors:
-        """Return Return weights[n] times the light, added to vectors."""
+        """Return weights[n] times the light, added to vectors."""
         builder = self.builder
         weight = filled(builder, builder.load(builder.gep(self.weights, [n])), self.light[0].type.count)
         each = [builder.fmul(vector, weight, flags=("contract",)) for vector in self.light]

@@ -40,7 +40,7 @@ from mrbokeh.system.resources import ZeroedMemory, workers
 
 OUTSHINES_MEAN = 32.0
 _ROWS_AT_ONCE = 64
-_EVERY = 8  # rows whose mean stands for that of all; how many lamps there may be is no matter of a few percent
+EVERY = 8  # rows whose mean stands for that of all; how many lamps there may be is no matter of a few percent
 
 Codes = Int[np.ndarray, "height width"]
 Values = Float32[np.ndarray, "height width channels"]
@@ -75,20 +75,11 @@ def _mean(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> F
     from mrbokeh.renderers.spreadlets._splat_numba import add_up
 
     sums = np.zeros(values.shape[2])
-    for step in (_EVERY, 1):
+    for step in (EVERY, 1):
         count = add_up(sums, values[::step], codes[::step], sparse)
         if count:
             return sums / count
     return sums
-
-
-def highlights_among_plainly(values: Values, codes: Codes, sparse: Bool[np.ndarray, " kinds"]) -> Highlights:
-    """Return the plain twin of `highlights_among`."""
-    mine, light = (codes >= 0) & sparse[codes], np.abs(values)
-    some = light[::_EVERY][mine[::_EVERY]]
-    limits = OUTSHINES_MEAN * (some if some.size else light[mine]).mean(axis=0, dtype=np.float64)
-    found = mine & (light > limits.astype(np.float32)).any(axis=2)
-    return Highlights(found, light[mine & ~found].max(axis=0, initial=0.0))
 
 
 _MOST_KEPT_BYTES = 1 << 27
@@ -143,16 +134,18 @@ class LaplacianSpreadlets:
         return reconstructed(samples, lens, self)
 
     def sum_kernels(
-        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+        self,
+        values: Float32[np.ndarray, "height width channels"],
+        coc_px: Float32[np.ndarray, "height width"],
+        aperture: Aperture,
+        densely: bool = False,
     ) -> Float32[np.ndarray, "height width channels"]:
-        """Sum kernels as mrbokeh.layering.psf_over_field.KernelSum says."""
-        return self._sum(values, coc_px, aperture, densely=False)
-
-    def sum_kernels_densely(
-        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
-    ) -> Float32[np.ndarray, "height width channels"]:
-        """Sum all taps of the same kernels without a Laplacian; `sum_kernels` is measured against this."""
-        return self._sum(values, coc_px, aperture, densely=True)
+        """Sum kernels as mrbokeh.layering.psf_over_field.KernelSum says. densely: all taps of the same kernels, without a Laplacian."""
+        sharp = np.zeros_like(values)
+        codes = self._tables.codes(sharp, values, coc_px, aperture)
+        kinds = {int(code): densely or kind_of(int(code)) == DENSE for code in used_codes(codes)}
+        self._add_summed(sharp, values, codes, kinds, lambda some, dense: self._tables.points(some, aperture, self.threads, dense))
+        return sharp
 
     def sum_bank_kernels(
         self,
@@ -190,13 +183,6 @@ class LaplacianSpreadlets:
             return summed([0, 1, 2][: values.shape[2]], others, 0)
         each = [summed([c], others if c == 1 else [3], c) for c in range(3)]
         return np.concatenate([*(light[..., :1] for light in each), *(light[..., 1:2] for light in each), each[1][..., 2:]], axis=2)
-
-    def _sum(self, values: np.ndarray, coc_px: np.ndarray, aperture: Aperture, densely: bool) -> np.ndarray:
-        sharp = np.zeros_like(values)
-        codes = self._tables.codes(sharp, values, coc_px, aperture)
-        kinds = {int(code): densely or kind_of(int(code)) == DENSE for code in used_codes(codes)}
-        self._add_summed(sharp, values, codes, kinds, lambda some, dense: self._tables.points(some, aperture, self.threads, dense))
-        return sharp
 
     def _add_summed(
         self,

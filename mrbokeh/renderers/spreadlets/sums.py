@@ -183,7 +183,7 @@ class _Splatting(NamedTuple):
         precision: type,
         gains: Float32[np.ndarray, " lanes"] | None = None,
     ) -> "_Splatting":
-        """Lay points out for splatting. Lay points out for splatting. precision: of the sums without gains."""
+        """Lay points out for splatting. precision: of the sums without gains."""
         return cls(values, cells, Laid.out(points, window.width, precision if gains is None else np.int32), window, gains)
 
     def fill(self, sums: Sums, first: int, end: int) -> None:
@@ -204,14 +204,6 @@ def splat(sums: Sums, values: Values, cells: Cells, points: Points, origin: tupl
         fill = partial(_Splatting.of(part, cells, points, Window(*origin, *into.shape[:2]), sums.dtype.type).fill, into)
         list(each(fill, *zip(*_strips(len(into), points.reach_px), strict=True)))
         sums[..., first : first + FOUR] += into[..., : sums.shape[2] - first]
-
-
-def splat_plainly(sums: Sums, values: Values, cells: Cells, points: Points, origin: tuple[int, int]) -> None:
-    """The slow and obvious twin of `splat`."""
-    for y, x in np.argwhere(cells >= 0):
-        part = slice(points.starts[cells[y, x]], points.starts[cells[y, x] + 1])
-        for (right, down), weight in zip(points.xy[part], points.weights[part], strict=True):
-            sums[y + down - origin[0], x + right - origin[1]] += weight * values[y, x]
 
 
 def _fours(values: Values) -> Iterator[tuple[int, Values]]:

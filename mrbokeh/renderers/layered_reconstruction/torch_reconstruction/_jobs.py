@@ -62,7 +62,7 @@ class Task:
 
 
 def jobs_of(partitions: Partitions, slopes: Slopes, guard: Int64[Tensor, "jobs 2"], light: TileLight, shared_out: bool) -> Jobs:
-    """Make the jobs. Make the jobs. The host learns here how many jobs each tile has, how wide their windows are and how many blocks of
+    """Make the jobs. The host learns here how many jobs each tile has, how wide their windows are and how many blocks of
     samples they look at.
 
     shared_out: samples that move are shared out among the four nearest pixels, else all keep the pixel they come into.

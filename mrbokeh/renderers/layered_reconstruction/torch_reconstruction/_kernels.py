@@ -191,7 +191,7 @@ def recursive_rows(
 
 
 def feedback(variance_px2: Number) -> Number:
-    """Return Return gamma of Eq. 10, such that forward and backward together have exactly this variance, 2 gamma / (1 - gamma)^2."""
+    """Return gamma of Eq. 10, such that forward and backward together have exactly this variance, 2 gamma / (1 - gamma)^2."""
     q = 1.0 + 1.0 / variance_px2
     return q - torch.sqrt(q * q - 1.0)
 

@@ -124,7 +124,7 @@ class TileLight:
 
 
 def tile_light(samples: DeviceSamples, settings: Settings) -> TileLight:
-    """Sort samples by tile. Sort samples by tile. The host learns here how many buckets there are, how far the pupil reaches, and how
+    """Sort samples by tile. The host learns here how many buckets there are, how far the pupil reaches, and how
     many samples a tile holds.
     """
     width_px, height_px, tile_px = samples.width_px, samples.height_px, settings.tile_px

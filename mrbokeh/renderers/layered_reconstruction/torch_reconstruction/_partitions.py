@@ -177,7 +177,7 @@ def merged_rows(rows: Rows, window: Float64[Tensor, "4"], settings: Settings) ->
 def _places(
     rows: Rows, own: Int64[Tensor, " rows"], tile: Int64[Tensor, " partitions"], nearest: Int64[Tensor, " partitions"], light: TileLight
 ) -> Int64[Tensor, "tiles buckets"]:
-    """Return the place of every bucket. Return the place of every bucket. Buckets that no row of the tile knows belong to a row beside
+    """Return the place of every bucket. Buckets that no row of the tile knows belong to a row beside
     them, in depth or motion, the foremost; else between partitions.
     """
     tiles = len(rows.first) - 1

@@ -42,7 +42,7 @@ Tiles = Float32[Tensor, "tiles channels side side"]
 def composited(
     layers: Float32[Tensor, "jobs planes parts side side"], counts: Int64[np.ndarray, " tiles"], shares: list[float]
 ) -> tuple[Tiles, Tensor]:
-    """Return Return e(x) = e_0(x) + sum_j e_j(x) prod_{k<j} (1 - alpha_k(x)), and the product over all that is left, (T, side, side).
+    """Return e(x) = e_0(x) + sum_j e_j(x) prod_{k<j} (1 - alpha_k(x)), and the product over all that is left, (T, side, side).
 
     Both are the mean over parts of pupil and shutter, by their shares, each of which is composited on its own.
     layers: colour, opacity and weight, both of which the weight divides, of jobs tile by tile; a layer of no weight is not there.

@@ -69,13 +69,13 @@ def screen_covariance(slopes: Slopes, window: Window, sigma_x_px: float) -> Cova
 
 
 def axes(v: Covariance) -> tuple[Number, Number, Number]:
-    """Return Return (sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
+    """Return (sigma_u, sigma_v, theta) with sigma_u >= sigma_v and theta the angle of the u axis from x towards y."""
     middle, half = 0.5 * (v.xx + v.yy), torch.hypot(0.5 * (v.xx - v.yy), v.xy)
     return torch.sqrt(middle + half), torch.sqrt((middle - half).clamp(min=0.0)), 0.5 * torch.atan2(2.0 * v.xy, v.xx - v.yy)
 
 
 def sheared_axes(sigma_u: Number, sigma_v: Number, theta: Number) -> tuple[Number, Number, Number]:
-    """Return Return (s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
+    """Return (s_u, s_v, beta) of Eq. 9: the same Gaussian as one along x after one along (beta, 1)."""
     cosine, sine = torch.cos(theta), torch.sin(theta)
     rho = torch.sqrt((sigma_v * cosine) ** 2 + (sigma_u * sine) ** 2)
     flat, safe = rho == 0.0, rho.clamp(min=1e-300)

@@ -118,7 +118,7 @@ _LARGEST_SUM = 64.0  # far above the 8 that banks were seen to have, so that uni
 
 @dataclass(frozen=True)
 class PointTable:
-    """Points of kernels: Points of kernels: xy (N, 2) right and down of the source; weights (N, K), one column for each colour; cell i
+    """Points of kernels: xy (N, 2) right and down of the source; weights (N, K), one column for each colour; cell i
     has count[i] points from first[i].
 
     most: the largest count. reach_px: no point lies farther away. largest_sum: no sum of points times light, one of them from
