@@ -1,11 +1,18 @@
 """Shapes and types of array annotations are checked while tests run (jaxtyping + beartype); shared places of test data."""
 
+import contextlib
 import functools
+import importlib
 import inspect
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+# Each of the workers has a core of its own: threads of libraries would wait for one another, and spin. They read this when imported.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import jaxtyping
 import pytest
@@ -49,6 +56,17 @@ class _ChecksOfFirstCalls:
 
 jaxtyping.jaxtyped = _ChecksOfFirstCalls()
 jaxtyping.install_import_hook(_modules(), "beartype.beartype")
+
+
+def pytest_collection() -> None:
+    """Import test modules from the last to the first in every second worker.
+
+    In a fresh clone each is compiled, and that is kept: two workers that went the same way at once would both compile everything.
+    """
+    if os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:] in ("1", "3", "5", "7"):
+        for path in sorted((ROOT / "tests").glob("*/test_*.py"), reverse=True):
+            with contextlib.suppress(pytest.skip.Exception, ImportError):
+                importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
 
 
 # Tests send Ctrl-C to themselves and to programs they start; what runs in the background of a shell is deaf to it, and so are its children.

@@ -1,9 +1,4 @@
-"""What travels through the viewfinder: a frame of the camera with what is known of it, and the finished picture.
-
-Newest: the hand-over between two threads that keeps one thing, the newest; never a queue.
-
-What viewers are told of a picture, whichever way it comes to them.
-"""
+"""Frames of the viewfinder: from the camera, finished, and as viewers are told of them; and the slot that keeps the newest."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -19,14 +14,14 @@ Pose = Float64[np.ndarray, "4 4"]
 
 @dataclass(frozen=True)
 class LensState:
-    """What somebody knows of the lens at one moment; None is not known. focus_distance_m: from the entrance pupil, inf is allowed."""
+    """Knowledge of the lens at one moment; None is not known. focus_distance_m: from the entrance pupil, inf is allowed."""
 
     focus_distance_m: float | None = None
     f_number: float | None = None
     focal_length_mm: float | None = None
 
     def completed_by(self, other: "LensState") -> "LensState":
-        """What is not known here, from there."""
+        """Return this state, completed by the other where something is not known."""
         return LensState(*(theirs if mine is None else mine for mine, theirs in zip(self._values(), other._values(), strict=True)))
 
     def _values(self) -> tuple[float | None, ...]:
@@ -38,7 +33,9 @@ UNKNOWN_LENS = LensState()
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """bgr: (H, W, 3) 8-bit display codes, blue first. captured_s: `time.monotonic` when the camera gave it. sequence: counts captures.
+    """Frame of a camera with what is known of it.
+
+    bgr: (H, W, 3) 8-bit display codes, blue first. captured_s: `time.monotonic` when the camera gave it. sequence: counts captures.
 
     lens, camera_from_world: what the source itself knows (a tracked camera, the Exif of a tethered one); most know nothing.
     full_picture: gives the picture as large as the camera gave it, where bgr was made smaller; for captures, it may take its time.
@@ -54,7 +51,7 @@ class CameraFrame:
 
 @dataclass(frozen=True)
 class FrameStatus:
-    """What the page tells about a picture.
+    """Status that the page shows with a picture.
 
     focus_distance_m, f_number: of the lens that blurred the virtual layer; focus_pending: another one was asked for and is not shown yet.
     tracking: quality of the pose from 0 (lost) to 1, None without a tracker. tracking_unsure: another pose would fit as well, so that
@@ -74,7 +71,7 @@ class FrameStatus:
 
 @dataclass(frozen=True)
 class OutputFrame:
-    """One finished picture (H, W, 3), 8-bit display codes, blue first; captured_s, sequence: of the capture it shows."""
+    """Finished picture (H, W, 3), 8-bit display codes, blue first; captured_s, sequence: of the capture it shows."""
 
     bgr: Bgr
     captured_s: float
@@ -86,7 +83,7 @@ Item = TypeVar("Item")
 
 
 class Newest(Generic[Item]):
-    """One slot: `put` replaces what was not taken in time, `take` waits for something new."""
+    """Slot between two threads that keeps one thing: `put` replaces what was not taken in time, `take` waits for something new."""
 
     def __init__(self) -> None:
         self._changed = Condition()
@@ -98,7 +95,7 @@ class Newest(Generic[Item]):
             self._changed.notify()
 
     def take(self, timeout_s: float) -> Item | None:
-        """The newest item, which leaves the slot; None if nothing came in time."""
+        """Return the newest item, which leaves the slot; None if nothing came in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None, timeout_s)
             item, self._item = self._item, None
@@ -112,12 +109,12 @@ class Newest(Generic[Item]):
 
 
 def finite(metres: float) -> float | None:
-    """Infinity is null, for JSON has no word for it."""
+    """Return None for infinity, for which JSON has no word."""
     return metres if abs(metres) != float("inf") else None
 
 
 def frame_header(frame: OutputFrame) -> dict[str, Any]:
-    """What the page is told of a picture, ready for JSON; captured_ms is `time.monotonic`, as the clock's answers are."""
+    """Return what the page is told of a picture, ready for JSON; captured_ms is `time.monotonic`, as the clock's answers are."""
     status = frame.status
     return {
         "sequence": frame.sequence,

@@ -14,7 +14,7 @@ FOCUS_SOURCES = (*FOCUS_BY_DEFAULT, "board")
 
 @dataclass(frozen=True)
 class ListeningOptions:
-    """Where a command listens. interface: None takes the one private one. qr: print a QR code for a network."""
+    """Address that a command listens on. interface: None takes the one private one. qr: print a QR code for a network."""
 
     port: int = 8080
     lan: bool = False
@@ -33,7 +33,7 @@ class ListeningOptions:
 
 @dataclass(frozen=True)
 class PhoneOptions:
-    """A phone on the hot shoe. source: in the words of --source. camera: its intrinsics. rig: of `mrbokeh viewfinder calibrate-phone`."""
+    """Phone on the hot shoe. source: in the words of --source. camera: its intrinsics. rig: of `mrbokeh viewfinder calibrate-phone`."""
 
     source: str
     camera: Path

@@ -14,7 +14,7 @@ from tests.scenes.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, camera, ren
 from viewfinder.stage.drawing import DrawRequest, draw
 from viewfinder.stage.occlusion import Occlusion, RealDepth
 from viewfinder.stage.reprojection import MovableLayer
-from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, object_at, table_point_m, view_picture
+from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, object_at, view_picture
 
 TWO_CARDS = ONE_CARD + ONE_CARD.replace('"card"', '"far"') + "position_m = [0.3, -0.5, 0]\n"
 TABLES = code_tables("srgb")
@@ -70,25 +70,13 @@ def test_the_nearer_of_two_is_picked_and_what_a_wall_hides_is_not(tmp_path: Path
     assert depth_at_m(scene, 110.0, 56.0) == pytest.approx(1.2)
 
 
-def test_points_on_the_table(tmp_path: Path) -> None:
-    scene = seen(tmp_path, view=ABOVE)
-    for point_m in ((0.0, 0.0, 0.0), (0.15, 0.1, 0.0), (-0.2, -0.3, 0.0)):
-        (x_px, y_px), _ = ABOVE.project(np.array(point_m))
-        assert table_point_m(scene, float(x_px), float(y_px)) == pytest.approx(point_m, abs=1e-9)
-    (x_px, y_px), _ = ABOVE.project(np.array([0.1, 0.0, -0.05]))
-    assert table_point_m(scene, float(x_px), float(y_px), height_m=0.05) == pytest.approx((0.1, 0.0, -0.05), abs=1e-9)
-    # Level along the table, the ray through the middle never meets it, the one above goes up.
-    level = seen(tmp_path)
-    assert table_point_m(level, 80.0, 56.0) is None and table_point_m(level, 80.0, 20.0) is None
-    with pytest.raises(InputError, match="point in the picture"):
-        table_point_m(scene, -3.0, 0.0)
-
-
 def test_a_tap_focuses_on_the_object_or_else_on_the_table(tmp_path: Path) -> None:
     scene = seen(tmp_path)
     assert depth_at_m(scene, 80.0, 56.0) == pytest.approx(1.0)
     # 0.1 m above the table, 40 px below the horizon: f h / y = 150 * 0.1 / 40.
     assert depth_at_m(scene, 10.0, 96.0) == pytest.approx(0.375)
+    with pytest.raises(InputError, match="point in the picture"):
+        depth_at_m(scene, -3.0, 0.0)
     with pytest.raises(InputError, match="cannot focus at"):
         depth_at_m(scene, 10.0, 10.0)
 

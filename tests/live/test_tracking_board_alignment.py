@@ -10,9 +10,10 @@ import pytest
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
+from tests.scenes.immediate_detections import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
-from viewfinder.tracking.charuco_tracker import CharucoTracker, ImmediateDetections
+from viewfinder.tracking.charuco_tracker import CharucoTracker
 
 
 @cache

@@ -15,9 +15,10 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, FrameHistory, Grey, flow
 from mrbokeh.video.clip import read_display_frames
+from tests.scenes.immediate_detections import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
-from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker, DetectionThread, ImmediateDetections
+from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker, DetectionThread
 from viewfinder.tracking.tracker import TrackedPose
 
 

@@ -13,18 +13,16 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import pose_between
 from mrbokeh.tracking.world_axes import inverted, pan_tilt_roll_deg, rigid
+from tests.scenes.tracking_senders import encode_opentrackio, freed_message, opentrackio_document, packets, write_freed
 from viewfinder.frames import LensState
-from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, freed_sample, read_encoder_table, read_freed, write_freed
+from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_sample, read_encoder_table, read_freed
 from viewfinder.tracking.opentrackio import (
     CBOR,
     JSON,
     Reassembly,
     StageReading,
     decode_opentrackio,
-    encode_opentrackio,
     fletcher16,
-    opentrackio_document,
-    packets,
     read_packet,
 )
 from viewfinder.tracking.phone_rig import rigid_of

@@ -14,9 +14,9 @@ import pytest
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import inverted, rigid
+from tests.scenes.immediate_detections import ImmediateDetections
 from tests.scenes.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera
 from viewfinder.frames import CameraFrame, Pose
-from viewfinder.tracking.charuco_tracker import ImmediateDetections
 from viewfinder.tracking.map_localiser import MapLocaliser, matches, pose_in_map, pose_refined
 from viewfinder.tracking.map_tracker import MapTracker
 from viewfinder.tracking.phone_rig import angle_deg

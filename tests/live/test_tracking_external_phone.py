@@ -17,8 +17,7 @@ from viewfinder.tracking.phone_rig import (
     PhoneRig,
     PosePair,
     angle_deg,
-    calibrate_across_worlds,
-    calibrate_in_one_world,
+    calibrate_rig,
     read_phone_rig,
     rigid_of,
     write_phone_rig,
@@ -36,15 +35,13 @@ def shaken(pose: np.ndarray, rng: np.random.Generator, turn_deg: float, shift_m:
     return rigid_of(np.concatenate([np.radians(rng.normal(0, turn_deg, 3)), rng.normal(0, shift_m, 3)])) @ pose
 
 
-def pairs(
-    count: int, rng: np.random.Generator, turn_deg: float = 0.0, shift_m: float = 0.0, worlds: np.ndarray | None = None
-) -> list[PosePair]:
-    """Views of a board from about 0.7 m, turned by up to 30 degrees. worlds: the phone's world from that of the camera."""
+def pairs(count: int, rng: np.random.Generator, turn_deg: float = 0.0, shift_m: float = 0.0) -> list[PosePair]:
+    """Views of a board from about 0.7 m, turned by up to 30 degrees."""
     result = []
     for _ in range(count):
         turn = np.radians(rng.uniform(-30, 30, 3))
         phone = rigid_of(np.concatenate([turn, [*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.5, 0.9)]]))
-        camera = CAMERA_FROM_PHONE @ phone @ (np.eye(4) if worlds is None else worlds)
+        camera = CAMERA_FROM_PHONE @ phone
         result.append(PosePair(shaken(phone, rng, turn_deg, shift_m), shaken(camera, rng, turn_deg, shift_m)))
     return result
 
@@ -55,10 +52,8 @@ def off(rig: PhoneRig) -> tuple[float, float]:
     return angle_deg(error), 1000 * float(np.linalg.norm(error[:3, 3]))
 
 
-@pytest.mark.parametrize("calibrate", [calibrate_in_one_world, calibrate_across_worlds])
-def test_exact_pairs_give_the_rig_back(calibrate: object) -> None:
-    worlds = None if calibrate is calibrate_in_one_world else rigid_of(np.array([2.0, 0.5, -1.0, 3.0, 1.0, -2.0]))
-    rig = calibrate(pairs(8, np.random.default_rng(0), worlds=worlds))  # type: ignore[operator]
+def test_exact_pairs_give_the_rig_back() -> None:
+    rig = calibrate_rig(pairs(8, np.random.default_rng(0)))
     assert off(rig) == (pytest.approx(0.0, abs=1e-4), pytest.approx(0.0, abs=1e-3))
     assert rig.residual_deg < 1e-3 and rig.residual_mm < 1e-2 and rig.pairs == 8
 
@@ -69,7 +64,7 @@ def test_noise_averages_out_and_is_stated() -> None:
     A phone that turns by 0.2 degrees 0.7 m before the board moves what it says of itself by 2.4 mm; with both poses and three axes
     the residual is near sqrt(3 * 2) (0.2 degrees; and 2 mm with what turns of the pose do to a place that far away).
     """
-    rig = calibrate_in_one_world(pairs(40, np.random.default_rng(1), 0.2, 0.002))
+    rig = calibrate_rig(pairs(40, np.random.default_rng(1), 0.2, 0.002))
     degrees, millimetres = off(rig)
     assert degrees < 0.16 and millimetres < 2.5
     assert rig.residual_deg == pytest.approx(0.2 * np.sqrt(6), rel=0.25)
@@ -78,7 +73,7 @@ def test_noise_averages_out_and_is_stated() -> None:
 def test_one_wrong_pair_does_little() -> None:
     good = pairs(20, np.random.default_rng(2), 0.05, 0.0005)
     wrong = PosePair(good[0].phone_from_world, rigid_of(np.array([0.1, 0.0, 0.0, 0.02, 0.0, 0.0])) @ good[0].camera_from_world)
-    degrees, millimetres = off(calibrate_in_one_world([*good, wrong]))
+    degrees, millimetres = off(calibrate_rig([*good, wrong]))
     # The plain mean would be off by 5.7 / 21 degrees.
     assert degrees < 0.1 and millimetres < 2.0
 
@@ -86,12 +81,9 @@ def test_one_wrong_pair_does_little() -> None:
 def test_calibrations_that_cannot_be() -> None:
     rng = np.random.default_rng(3)
     with pytest.raises(InputError, match="5 pairs of poses or more, got 4"):
-        calibrate_in_one_world(pairs(4, rng))
+        calibrate_rig(pairs(4, rng))
     with pytest.raises(InputError, match="disagree by"):
-        calibrate_in_one_world(pairs(10, rng, 10.0, 0.05))
-    one_axis = [rigid_of(np.array([0.0, angle, 0.0, 0.0, 0.0, 0.7])) for angle in np.linspace(-0.5, 0.5, 8)]
-    with pytest.raises(InputError, match="one axis only"):
-        calibrate_across_worlds([PosePair(pose, CAMERA_FROM_PHONE @ pose) for pose in one_axis])
+        calibrate_rig(pairs(10, rng, 10.0, 0.05))
 
 
 def test_rig_file(tmp_path: Path) -> None:

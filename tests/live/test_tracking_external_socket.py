@@ -10,10 +10,11 @@ import pytest
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
+from tests.scenes.tracking_senders import encode_opentrackio, freed_message, opentrackio_document, packets, write_freed
 from viewfinder.focus.sources import TrackedLensFocus
 from viewfinder.frames import CameraFrame, LensState
-from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_message, write_freed
-from viewfinder.tracking.opentrackio import CBOR, JSON, encode_opentrackio, opentrackio_document, packets
+from viewfinder.tracking.freed import FreeDMessage, FreeDReading
+from viewfinder.tracking.opentrackio import CBOR, JSON
 from viewfinder.tracking.phone_rig import rigid_of
 from viewfinder.tracking.pose_history import PoseHistory, SenderClock, TrackingSample
 from viewfinder.tracking.socket_tracker import Decoder, SocketTracker, TrackingAddress, freed_decoder, opentrackio_decoder

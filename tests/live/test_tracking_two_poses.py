@@ -20,9 +20,10 @@ from mrbokeh.tracking.charuco.detector import Corners
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot
 from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
 from tests.live.test_tracking_charuco_pose import pose_from_plane
+from tests.scenes.immediate_detections import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, camera_frames
 from viewfinder.frames import CameraFrame
-from viewfinder.tracking.charuco_tracker import CharucoTracker, ImmediateDetections
+from viewfinder.tracking.charuco_tracker import CharucoTracker
 
 CAMERA = Camera(640, 360, (590.0, 590.0), (320.0, 180.0))
 SMALL = CharucoBoard((CharucoGrid((6, 5), 12.0, 9.0),))

@@ -1,1 +1,1 @@
-"""The running viewfinder: sources, tracking, focus, stage and outputs put together."""
+"""Running viewfinder: sources, tracking, focus, stage and outputs put together."""

@@ -31,7 +31,7 @@ class LensBook:
 
     @property
     def lens(self) -> Lens:
-        """The chosen lens as its file has it."""
+        """Chosen lens as its file has it."""
         return self._lenses[self.chosen]
 
     def choose(self, name: str) -> None:
@@ -41,7 +41,7 @@ class LensBook:
 
     @property
     def closest_m(self) -> float:
-        """The closest focus: nearer, a thin lens of that focal length would need more than three times its extension."""
+        """Closest focus: nearer, a thin lens of that focal length would need more than three times its extension."""
         return _CLOSEST_FOCAL_LENGTHS * self.lens.focal_length_mm / MM_PER_M
 
     @property

@@ -43,7 +43,7 @@ class LiveCompositor:
 
     @property
     def transfer(self) -> str:
-        """The curve of the codes of the source's frames."""
+        """Curve of the codes of the source's frames."""
         return self._source.transfer
 
     def __call__(self, frame: CameraFrame, dropped: int) -> OutputFrame:
@@ -109,7 +109,7 @@ class LiveCompositor:
 
 @dataclass(frozen=True, eq=False)
 class CompositedFrame:
-    """What one picture was made of. camera: with its pose, identity where the track was lost (pose None)."""
+    """Everything one picture was made of. camera: with its pose, identity where the track was lost (pose None)."""
 
     frame: CameraFrame
     output: OutputFrame

@@ -1,7 +1,4 @@
-"""LiveControls: what the page may ask for, carried out on the running viewfinder.
-
-Captures: moments of the viewfinder saved as bundles that `mrbokeh composite` renders at full quality.
-"""
+"""LiveControls: what the page may ask for, carried out on the running viewfinder; Captures: moments saved as bundles."""
 
 import math
 import time
@@ -31,13 +28,16 @@ _RECENT_S = 0.4  # less than the object takes to fade once the track is lost
 
 
 class Captures:
-    """folder: bundles go there, named by date and time. scene: the file whose text a bundle keeps."""
+    """Bundles of moments that `mrbokeh composite` renders at full quality.
+
+    folder: bundles go there, named by date and time. scene: the file whose text a bundle keeps.
+    """
 
     def __init__(self, folder: Path, compositor: LiveCompositor, renderer_name: str, scene: Path | None = None) -> None:
         self._folder, self._compositor, self.renderer_name, self._scene = folder, compositor, renderer_name, scene
 
     def capture(self) -> str:
-        """The newest picture with a pose, if it is recent; the name of its bundle. Raises InputError where there is none."""
+        """Save the newest picture with a pose, if it is recent; return the name of its bundle. InputError where there is none."""
         moment = self._compositor.last_tracked
         if self._compositor.last is None:
             raise InputError("there is nothing to capture yet: the camera has not given a picture")
@@ -75,12 +75,12 @@ class Captures:
 
 
 def full_picture(frame: CameraFrame) -> UInt8[np.ndarray, "full_height full_width 3"]:
-    """As large as the camera gave it."""
+    """Return the picture as large as the camera gave it."""
     return frame.bgr if frame.full_picture is None else frame.full_picture()
 
 
 def plate_png(bgr: Bgr, transfer: str) -> bytes:
-    """The camera's picture as an sRGB file: its codes as they came where they are sRGB, else their light in 16 bits.
+    """Encode the camera's picture as an sRGB file: its codes where they are sRGB, else their light in 16 bits.
 
     A bundle then composites in the same light as the stream did, whatever the camera's curve was.
     """
@@ -136,7 +136,7 @@ class LiveControls:
         self._compositor.view = name
 
     def move_object(self, name: str, xz_m: tuple[float, float]) -> None:
-        """By so much on the table, right and away in the upright world."""
+        """Move an object on the table, right and away in the upright world."""
         stage = self._staged()
         up = stage.up
         x, y, z = turned(next(each.position_m for each in stage.objects if each.name == name), up)

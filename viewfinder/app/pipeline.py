@@ -23,7 +23,7 @@ Compositor = Callable[[CameraFrame, int], OutputFrame]
 
 @runtime_checkable
 class FrameSink(Protocol):
-    """Where finished pictures go. Called in the compositing thread; must return at once (hand over through `Newest`)."""
+    """Receiver of finished pictures. Called in the compositing thread; must return at once (hand over through `Newest`)."""
 
     @property
     def wants_frame(self) -> bool:
@@ -33,12 +33,12 @@ class FrameSink(Protocol):
     def show(self, frame: OutputFrame) -> None: ...
 
     def fail(self, sentence: str) -> None:
-        """The source died."""
+        """Take the news that the source died."""
         ...
 
 
 class Pipeline:
-    """Runs while open (`with`). If the camera fails for good, sinks get a sentence, and the pipeline stands still.
+    """Pipeline that runs while open (`with`). If the camera fails for good, sinks get a sentence, and the pipeline stands still.
 
     failure: that sentence. problem: a sentence while frames come that cannot be composited.
     """

@@ -1,4 +1,4 @@
-"""A running viewfinder, from its options to the address of its page: parts put together, and their threads ended at the end."""
+"""Running viewfinder, from its options to the address of its page: parts put together, and their threads ended at the end."""
 
 import asyncio
 from collections.abc import Callable, Iterator
@@ -37,7 +37,7 @@ _MATTE_WIDTH_PX = 320
 
 @dataclass(frozen=True)
 class Viewfinder:
-    """`site` is what browsers see of it."""
+    """Running viewfinder. site: what browsers see of it."""
 
     pipeline: Pipeline
     compositor: LiveCompositor
@@ -129,7 +129,7 @@ def _blur_focus(parts: Parts, last: Callable[[], CompositedFrame | None]) -> Foc
 
 
 class OverlaySink:
-    """A FrameSink that gives the alpha stream the overlay of each frame."""
+    """FrameSink that gives the alpha stream the overlay of each frame."""
 
     def __init__(self, alpha: AlphaStream, compositor: LiveCompositor) -> None:
         self._alpha, self._compositor = alpha, compositor
@@ -139,7 +139,7 @@ class OverlaySink:
         return self._alpha.wants_frame
 
     def show(self, frame: OutputFrame) -> None:
-        """Called in the compositing thread, so that `last` is of this frame."""
+        """Show a frame in the compositing thread, so that `last` is of this frame."""
         if self._compositor.last is not None:
             self._alpha.show(self._compositor.last.overlay, frame)
 

@@ -1,1 +1,1 @@
-"""Where the lens is focused, frame by frame."""
+"""Focus of the lens, frame by frame."""

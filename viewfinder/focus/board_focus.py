@@ -1,6 +1,6 @@
 """BlurOfBoardFocus: the focus of a lens that tells nobody, solved about once a second from how blurred the tracked board is.
 
-FollowingOptics: the focus from the blur of the board, with the lens and the f-number that the page was told last.
+FollowingOptics gives it the lens and the f-number that the page was told last.
 """
 
 import logging
@@ -34,7 +34,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BlurSettings:
-    """every_s: between two answers. hold_s: an answer holds so long without a new one. sharpest_px: sigma of the blur that this camera
+    """Settings of BlurOfBoardFocus.
+
+    every_s: between two answers. hold_s: an answer holds so long without a new one. sharpest_px: sigma of the blur that this camera
     leaves at its best focus, in the pixels of its frames. least_quality: poses below it are not used.
     """
 
@@ -45,7 +47,7 @@ class BlurSettings:
 
 
 class BlurOfBoardFocus:
-    """A FocusSource. lens: the focal length, f-number and sensor; its focus is what is looked for. `follow` tells when one changes.
+    """FocusSource. lens: the focal length, f-number and sensor; its focus is what is looked for. `follow` tells when one changes.
 
     intrinsics: of the camera, in any size of its frames. answer: the last one, with its standard deviation; candidates: what it was
     chosen from (both sides of the board, where its tilt does not tell them apart).
@@ -67,7 +69,7 @@ class BlurOfBoardFocus:
         self._thread.start()
 
     def follow(self, lens: Lens, intrinsics: Camera) -> None:
-        """The lens and the camera as they are now. What was learned with others is forgotten: their blurs mean another focus."""
+        """Take the lens and the camera as they are now. What was learned with others is forgotten: their blurs mean another focus."""
         if _optics(lens, intrinsics) == _optics(self.lens, self._intrinsics):
             return
         with self._changing:
@@ -76,7 +78,7 @@ class BlurOfBoardFocus:
             self._before.clear()
 
     def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:
-        """Hands the frame to the thread now and then; says what it found last."""
+        """Hand the frame to the thread now and then; return what it found last."""
         usable = pose is not None and pose.captured_s == frame.captured_s and pose.quality >= self._settings.least_quality
         if pose is not None and usable and frame.captured_s - self._asked_s >= self._settings.every_s:
             self._asked_s = frame.captured_s
@@ -85,7 +87,7 @@ class BlurOfBoardFocus:
         return LensState(answer.focus_distance_m if answer is not None and age_s <= self._settings.hold_s else None)
 
     def solve(self, frame: CameraFrame, pose: TrackedPose) -> FocusCandidate | None:
-        """From one frame and those before, while the caller waits; the thread does the same."""
+        """Solve the focus from one frame and those before, while the caller waits; the thread does the same."""
         height_px, width_px = frame.bgr.shape[:2]
         with self._changing:
             lens, intrinsics, before = self.lens, self._intrinsics, tuple(self._before)
@@ -123,7 +125,7 @@ class BlurOfBoardFocus:
 
 
 def _optics(lens: Lens, intrinsics: Camera) -> tuple[float, ...]:
-    """What the size of a blur at a known focus depends on, whatever the size of the frames."""
+    """Return what the size of a blur at a known focus depends on, whatever the size of the frames."""
     (fx, fy), (cx, cy) = intrinsics.focal_px, intrinsics.principal_px
     width, height = intrinsics.width_px, intrinsics.height_px
     of_camera = (round(each, 6) for each in (fx / width, fy / height, cx / width, cy / height))
@@ -131,7 +133,7 @@ def _optics(lens: Lens, intrinsics: Camera) -> tuple[float, ...]:
 
 
 def _linear_green(bgr: np.ndarray) -> Float32[np.ndarray, "height width"]:
-    """One colour, for colours are focused and placed a little apart; green is most of what is seen."""
+    """Return linear green: one colour, because colours are focused and placed a little apart; green is most of what is seen."""
     return cv2.LUT(np.ascontiguousarray(bgr[..., _GREEN]), _LINEAR_OF_CODE).reshape(bgr.shape[:2])
 
 
@@ -139,7 +141,7 @@ _LINEAR_OF_CODE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0)
 
 
 class FollowingOptics:
-    """A FocusSource. optics: the lens and the intrinsics of the last picture, None before the first; asked with every frame."""
+    """FocusSource of the blur of the board with the lens that the page was told last; optics: None before the first picture."""
 
     def __init__(self, blur: BlurOfBoardFocus, optics: Callable[[], tuple[Lens, Camera] | None]) -> None:
         self.blur, self.name, self._optics = blur, blur.name, optics

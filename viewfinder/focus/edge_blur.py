@@ -1,8 +1,8 @@
-"""The straight edges between the black and white squares of a tracking board: where their blur can be measured.
+"""Blur of the edges of a tracking board: the diameter of the disc that spreads each, from the profile across it.
 
-The profile across each edge of a board in a picture: from the middle of a black square over its rim into the white one.
-
-How blurred the edges of a board are: the diameter of the disc that spreads each, from the profile across it.
+1. `board_edges`: the straight edges between black and white squares.
+2. `edge_profiles`: what a picture shows across each, from the middle of a black square over its rim into the white one.
+3. `edge_blurs`: the diameter that explains the profile.
 
 A step seen through a disc of the diameter c rises as the area of a circle up to a chord. Across an edge of a square there are two:
 up to the white of the next square, and down to the border of its marker. The profile (mean along the edge) is compared with
@@ -29,7 +29,7 @@ _USED = 0.4
 
 @dataclass(frozen=True)
 class BoardEdges:
-    """On the board, in metres, z = 0. starts, ends: of the part to be used. to_white: unit vectors across, towards the white square.
+    """Edges on the board, in metres, z = 0. starts, ends: of the part to be used. to_white: unit vectors across, to the white square.
 
     clear_m: how wide the white is, up to the marker; border_m: how wide the black border of the marker is behind it.
     """
@@ -42,7 +42,7 @@ class BoardEdges:
 
 
 def board_edges(board: CharucoBoard) -> BoardEdges:
-    """Of all grids, each inner edge once."""
+    """Return the inner edges of all grids, each once."""
     cells = int(board.opencv_dictionary().markerSize) + 2
     rows = np.array([row for grid in board.grids for row in _edges_mm(grid, cells)], np.float64)
     flat = np.pad(rows[:, :6].reshape(-1, 3, 2), ((0, 0), (0, 0), (0, 1)))
@@ -50,7 +50,7 @@ def board_edges(board: CharucoBoard) -> BoardEdges:
 
 
 def _edges_mm(grid: CharucoGrid, cells: int) -> Iterator[tuple[float, ...]]:
-    """(start x, y, end x, y, to white x, y, clear, border) of each; the square in column c, row r is black where c + r is even."""
+    """Yield (start x, y, end x, y, to white x, y, clear, border); the square in column c, row r is black where c + r is even."""
     columns, rows = grid.squares
     size, (left, top) = grid.square_mm, grid.offset_mm
     clear, border = (size - grid.marker_mm) / 2.0, grid.marker_mm / cells
@@ -76,7 +76,10 @@ Luminance = Float32[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class EdgeProfiles:
-    """mean: along each edge, at `offsets_px` across it, dark to light. weights: 1 where nothing but the edge is near."""
+    """Profiles across the edges in a picture.
+
+    mean: along each edge, at `offsets_px` across it, dark to light. weights: 1 where nothing but the edge is near.
+    """
 
     mean: Float64[np.ndarray, "edges offsets"]
     weights: Float64[np.ndarray, "edges offsets"]
@@ -90,7 +93,7 @@ def offsets_px() -> Float64[np.ndarray, " offsets"]:
 
 
 def edge_profiles(luminance: Luminance, camera: Camera, edges: BoardEdges) -> EdgeProfiles:
-    """Those that lie before the camera and within the picture, long and wide enough."""
+    """Sample the edges that lie before the camera and within the picture, long and wide enough."""
     height, width = luminance.shape
     (starts, _), (ends, _) = camera.project(edges.starts_m), camera.project(edges.ends_m)
     middles_m = (edges.starts_m + edges.ends_m) / 2.0
@@ -116,7 +119,7 @@ def _profiles(
     along: Float64[np.ndarray, "edges 2"],
     across: Float64[np.ndarray, "edges 2"],
 ) -> tuple[Float64[np.ndarray, "edges offsets"], Bool[np.ndarray, "edges offsets"]]:
-    """(mean over places along each edge, whether all of them lie in the picture)."""
+    """Return (mean over places along each edge, whether all of them lie in the picture)."""
     shares = np.linspace(0.0, 1.0, _ALONG)
     places = (
         starts[:, None, None]
@@ -139,7 +142,6 @@ _FINE_PX = 0.02
 _SHIFTS_PX = np.arange(-1.5, 1.51, 0.25)
 _LEAST_CONTRAST = 0.05
 _WORST_FIT = 0.1
-_SHARPEST_PX = np.arange(0.0, 2.01, 0.1)
 _INDEPENDENT = 0.4  # of the samples; neighbours at half a pixel share pixels
 _SMALLEST_SIGMA_PX = 0.1
 _LARGEST_SIGMA_PX = 2.0
@@ -147,7 +149,7 @@ _LARGEST_SIGMA_PX = 2.0
 
 @dataclass(frozen=True)
 class EdgeBlurs:
-    """For each edge that could be measured: depth along the camera's axis, diameter of the blur, and its standard deviation."""
+    """Measured edges: depth along the camera's axis, diameter of the blur, and its standard deviation."""
 
     depth_m: Float64[np.ndarray, " edges"]
     diameter_px: Float64[np.ndarray, " edges"]
@@ -158,7 +160,10 @@ class EdgeBlurs:
 
 
 def edge_blurs(luminance: Luminance, camera: Camera, edges: BoardEdges, sharpest_px: float = 0.5) -> EdgeBlurs:
-    """luminance: linear. camera: intrinsics of that picture and the pose over the board. sharpest_px: sigma of a focused edge's blur."""
+    """Measure the blur of each edge that can be measured.
+
+    luminance: linear. camera: intrinsics of that picture and the pose over the board. sharpest_px: sigma of a focused edge's blur.
+    """
     profiles = edge_profiles(luminance, camera, edges)
     costs, contrast = _costs(profiles, sharpest_px)
     diameter_px, sigma_px, misfit = _least(costs, profiles)
@@ -168,21 +173,8 @@ def edge_blurs(luminance: Luminance, camera: Camera, edges: BoardEdges, sharpest
     return EdgeBlurs(profiles.depth_m[good], diameter_px[good], sigma_px[good])
 
 
-def sharpest_blur_px(luminance: Luminance, camera: Camera, edges: BoardEdges) -> float | None:
-    """`sharpest_px` of a camera from a picture with the board in focus, measured once: the middle of all edges; None without edges."""
-    profiles = edge_profiles(luminance, camera, edges)
-    if not len(profiles.depth_m):
-        return None
-    focused = np.stack([_costs(profiles, float(sigma), 0.0)[0][:, 0] for sigma in _SHARPEST_PX], axis=1)
-    return float(np.median(_SHARPEST_PX[focused.argmin(axis=1)]))
-
-
-def _diameters_px(largest_px: float) -> Float64[np.ndarray, " diameters"]:
-    return np.arange(0.0, largest_px + DIAMETER_STEP_PX / 2, DIAMETER_STEP_PX)
-
-
 def edge_rise(x_px: Float64[np.ndarray, "*batch"], diameter_px: float, sigma_px: float) -> Float64[np.ndarray, "*batch"]:
-    """From 0 to 1 across a step at 0 that is blurred by a disc and then a Gaussian (sigma_px above 0).
+    """Return the rise from 0 to 1 across a step at 0 that is blurred by a disc and then a Gaussian (sigma_px above 0).
 
     The disc is cut into strips along the edge (Gauss-Chebyshev's nodes of the second kind), finer than the Gaussian is wide.
     """
@@ -194,16 +186,17 @@ def edge_rise(x_px: Float64[np.ndarray, "*batch"], diameter_px: float, sigma_px:
 
 
 @lru_cache(maxsize=4)
-def _rises(sharpest_px: float, largest_px: float) -> Float64[np.ndarray, "diameters places"]:
-    """Of all diameters, finely; pixels and bilinear samples widen the Gaussian: a pixel has the variance 1/12, interpolation 1/6."""
+def _rises(sharpest_px: float) -> Float64[np.ndarray, "diameters places"]:
+    """Tabulate the rises of all diameters; pixels and bilinear samples widen the Gaussian by variances of 1/12 and 1/6."""
     sigma_px = float(np.sqrt(sharpest_px**2 + 1.0 / 12.0 + 1.0 / 6.0))
     places = np.arange(-_FARTHEST_PX, _FARTHEST_PX + _FINE_PX / 2, _FINE_PX)
-    return np.stack([edge_rise(places, diameter, sigma_px) for diameter in _diameters_px(largest_px)])
+    diameters_px = np.arange(0.0, LARGEST_DIAMETER_PX + DIAMETER_STEP_PX / 2, DIAMETER_STEP_PX)
+    return np.stack([edge_rise(places, diameter, sigma_px) for diameter in diameters_px])
 
 
-def _shapes(profiles: EdgeProfiles, sharpest_px: float, largest_px: float) -> Float64[np.ndarray, "diameters edges shifts offsets"]:
-    """What each edge looks like with each diameter and place, from 0 for black to 1 for white."""
-    rises = _rises(sharpest_px, largest_px)
+def _shapes(profiles: EdgeProfiles, sharpest_px: float) -> Float64[np.ndarray, "diameters edges shifts offsets"]:
+    """Return what each edge looks like with each diameter and place, from 0 for black to 1 for white."""
+    rises = _rises(sharpest_px)
     places = np.broadcast_to(offsets_px()[None, :] - _SHIFTS_PX[:, None], (len(profiles.clear_px), len(_SHIFTS_PX), len(offsets_px())))
 
     def risen(x_px: np.ndarray) -> np.ndarray:
@@ -213,11 +206,9 @@ def _shapes(profiles: EdgeProfiles, sharpest_px: float, largest_px: float) -> Fl
     return risen(places) - risen(places - profiles.clear_px[:, None, None])
 
 
-def _costs(
-    profiles: EdgeProfiles, sharpest_px: float, largest_px: float = LARGEST_DIAMETER_PX
-) -> tuple[Float64[np.ndarray, "edges diameters"], Float64[np.ndarray, " edges"]]:
-    """(what is left of each profile's variance, relative, by the best shape of each diameter; contrast, 0 where it falls)."""
-    shapes = _shapes(profiles, sharpest_px, largest_px)
+def _costs(profiles: EdgeProfiles, sharpest_px: float) -> tuple[Float64[np.ndarray, "edges diameters"], Float64[np.ndarray, " edges"]]:
+    """Return (relative variance left by the best shape of each diameter; contrast, 0 where the profile falls)."""
+    shapes = _shapes(profiles, sharpest_px)
     weights = profiles.weights / np.maximum(profiles.weights.sum(axis=1, keepdims=True), 1e-9)
     deviation = profiles.mean - (weights * profiles.mean).sum(axis=1, keepdims=True)
     variance = np.maximum((weights * deviation**2).sum(axis=1), 1e-12)
@@ -231,7 +222,7 @@ def _costs(
 
 
 def _least(costs: Float64[np.ndarray, "edges diameters"], profiles: EdgeProfiles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(diameter of the least cost, its standard deviation from how the cost rises beside it, what is left there) of each edge."""
+    """Return (diameter of the least cost, its standard deviation from how the cost rises beside it, what is left there) of each edge."""
     edge = np.arange(len(costs))
     best = costs.argmin(axis=1).clip(1, costs.shape[1] - 2) if len(costs) else np.zeros(0, np.int64)
     before, here, after = (costs[edge, best + step] for step in (-1, 0, 1))

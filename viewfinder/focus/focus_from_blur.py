@@ -1,9 +1,7 @@
-"""Where a lens is focused, from how blurred things of known depth are: c = k |1/d_f - 1/z| (Lens.coc_px) fitted over many edges.
+"""Focus of a lens from how blurred things of known depth are: c = k |1/d_f - 1/z| (Lens.coc_px) fitted over many edges.
 
 One depth leaves two answers, one nearer and one farther than it. Edges at several depths tell them apart: towards the focus
-plane the blur shrinks. How surely is the difference of what the two leave unexplained.
-
-Which of two answers is right: the focus nearer or farther than a board that shows both the same blur.
+plane the blur shrinks. How surely is the difference of what the two leave unexplained; `settled` chooses.
 """
 
 from collections.abc import Sequence
@@ -27,7 +25,10 @@ _APART_PX = 0.5
 
 @dataclass(frozen=True)
 class FocusCandidate:
-    """cost: half the squares that are left, robust and in units of their variance. sigma_dioptres: standard deviation."""
+    """Focus that explains the blurs.
+
+    cost: half the squares that are left, robust and in units of their variance. sigma_dioptres: standard deviation.
+    """
 
     dioptres: float
     cost: float
@@ -39,7 +40,7 @@ class FocusCandidate:
 
 
 def focus_candidates(blurs: EdgeBlurs, lens: Lens, width_px: int) -> tuple[FocusCandidate, ...]:
-    """The best answer first, then the best one on the other side of the board, where there is one; none with too few edges.
+    """Return the best answer, then the best one on the other side of the board, where there is one; none with too few edges.
 
     lens: its focus distance is not looked at. width_px: of the picture in which the blurs were measured.
     """
@@ -77,7 +78,7 @@ def _losses(blurs: EdgeBlurs, lens: Lens, width_px: int, dioptres: float) -> Flo
 
 
 def _dioptres(lens: Lens, width_px: int) -> Float64[np.ndarray, " steps"]:
-    """From infinity to four focal lengths, finely enough for a fifth of a pixel."""
+    """Return steps from infinity to four focal lengths, finely enough for a fifth of a pixel."""
     nearest = MM_PER_M / (_CLOSEST_FOCAL_LENGTHS * lens.focal_length_mm)
     per_dioptre = lens.focused_at(np.inf).coc_px_per_dioptre(width_px)
     return np.linspace(0.0, nearest, int(np.clip(nearest * per_dioptre / _STEP_PX, 50, _MOST_STEPS)))
@@ -100,7 +101,9 @@ _SAME_PX = 2.0
 
 @dataclass(frozen=True)
 class FocusEvidence:
-    """now: the blurs of this frame, before: those of earlier ones with this focus, from which the camera may have moved.
+    """Blurs by which two answers are told apart.
+
+    now: the blurs of this frame, before: those of earlier ones with this focus, from which the camera may have moved.
 
     settled_dioptres: the last answer. width_px: of the pictures.
     """
@@ -113,7 +116,7 @@ class FocusEvidence:
 
 
 def settled(candidates: Sequence[FocusCandidate], evidence: FocusEvidence) -> FocusCandidate | None:
-    """By this frame's depths, else by what earlier frames showed, else by the answer before; None where nothing tells.
+    """Choose by this frame's depths, else by earlier frames, else by the answer before; None if nothing tells.
 
     Two answers within a pixel of the board's own depth need not be told apart: their middle is as good.
     """

@@ -1,13 +1,4 @@
-"""The protocol of everything that knows where the lens is focused.
-
-FirstKnown: several sources of the focus in order; each value comes from the first that knows it.
-
-FrameFocus: what came with the frame itself: Exif, gphoto2, the browser's focusDistance.
-
-ManualFocus: the focus that a person sets, with the slider or by a tap on something at a known depth.
-
-TrackedLensFocus: the lens as an external tracking system tells it (OpenTrackIO; FreeD through a lens table).
-"""
+"""Sources of the focus: a person, the frame, a tracking system; and FirstKnown, which asks them in order."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +13,7 @@ from viewfinder.tracking.tracker import TrackedPose, Tracker
 
 @runtime_checkable
 class FocusSource(Protocol):
-    """Called with every frame that is composited; says what it knows of the lens, None for the rest. Must be fast."""
+    """Source of the focus, called with every frame that is composited; tells what it knows of the lens, None for the rest. Must be fast."""
 
     name: str
 
@@ -32,7 +23,7 @@ class FocusSource(Protocol):
 
 
 class FirstKnown:
-    """A FocusSource over others (`focus.base.FocusSource`).
+    """FocusSource over others, in order; each value comes from the first that knows it.
 
     focus_from: the name of the source that the focus distance of the last frame came from, None if nobody knew.
     """
@@ -43,7 +34,7 @@ class FirstKnown:
         self.focus_from: str | None = None
 
     def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:
-        """All are asked, so that those which learn from every frame see it."""
+        """Ask all sources, so that those which learn from every frame see it."""
         known = LensState()
         focus_from = None
         for source in self._sources:
@@ -60,7 +51,7 @@ class FirstKnown:
 
 
 class FrameFocus:
-    """A FocusSource. hold_s: many cameras tell the focus with few frames; what was told last holds so long, then it is not known."""
+    """FocusSource of what came with the frame: Exif, gphoto2, the browser. hold_s: what was told last holds so long."""
 
     name = "the camera"
 
@@ -74,14 +65,14 @@ class FrameFocus:
         return self._held(frame)
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Close nothing: nothing runs."""
 
     def _held(self, frame: CameraFrame) -> LensState:
         return self._told if 0.0 <= frame.captured_s - self._told_s <= self._hold_s else LensState()
 
 
 class ManualFocus:
-    """A FocusSource. What nobody has set (None) is not known here, and comes from who else knows it."""
+    """FocusSource that a person sets. What nobody has set (None) comes from another source."""
 
     name = "by hand"
 
@@ -89,13 +80,13 @@ class ManualFocus:
         self._lens = lens or LensState()
 
     def focus(self, distance_m: float | None) -> None:
-        """Metres from the entrance pupil, inf is allowed; None hands the focus back to the other sources."""
+        """Set the metres from the entrance pupil, inf is allowed; None hands the focus back to the other sources."""
         if distance_m is not None and not distance_m > 0.0:
             raise InputError(f"expected a focus distance of more than 0 m, got {distance_m} m")
         self._lens = replace(self._lens, focus_distance_m=distance_m)
 
     def set_f_number(self, f_number: float | None) -> None:
-        """None hands it back to the other sources."""
+        """Set the f-number; None hands it back to the other sources."""
         if f_number is not None and not 0.3 <= f_number <= 256.0:
             raise InputError(f"expected an f-number between 0.3 and 256, got {f_number}")
         self._lens = replace(self._lens, f_number=f_number)
@@ -104,11 +95,11 @@ class ManualFocus:
         return self._lens
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Close nothing: nothing runs."""
 
 
 class TrackedLensFocus:
-    """A FocusSource; the time of the frame finds the state of the lens as it finds the pose. The tracker is closed as a tracker."""
+    """FocusSource of a tracking system; the time of the frame finds the lens as it finds the pose. It does not close the tracker."""
 
     def __init__(self, tracker: SocketTracker) -> None:
         self.name = f"lens of {tracker.name}"
@@ -118,7 +109,7 @@ class TrackedLensFocus:
         return self._tracker.lens(frame)
 
     def close(self) -> None:
-        """Nothing of its own to close."""
+        """Close nothing: the tracker is closed as a tracker."""
 
 
 def open_focus(manual: ManualFocus, tracker: Tracker | None, first: Sequence[str] = (), blur: FocusSource | None = None) -> FirstKnown:

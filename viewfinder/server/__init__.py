@@ -1,1 +1,1 @@
-"""The page's server: who may come in, and what they may ask for."""
+"""Server of the page: who may come in, and what they may ask for."""

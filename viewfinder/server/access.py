@@ -1,8 +1,7 @@
-"""Access: who may ask for what; the middleware that every request of the viewfinder passes, and the exchange of a token for a cookie.
+"""Access: the middleware that every request passes. Who may ask for what, for which names and from which pages, and how much at once.
 
-Who a request says it is for and from: against pages of other sites, and against names that turn into our address (DNS rebinding).
-
-Reading what a page sends: at most so many bytes, and JSON without the numbers that JSON does not have.
+The names in a request are checked against pages of other sites, and against names that turn into our address (DNS rebinding). A token
+is exchanged for a cookie. Bodies are read up to a limit, as JSON without the numbers that JSON does not have.
 """
 
 import json
@@ -31,7 +30,7 @@ def is_loopback(host: str) -> bool:
 
 
 def host_name(host_header: str | None) -> str | None:
-    """The name in a Host header, without port, in lower case; None if there is none or it is malformed."""
+    """Return the name in a Host header, without port, in lower case; None if there is none or it is malformed."""
     if host_header is None or not _HOST.fullmatch(host_header):
         return None
     try:
@@ -41,7 +40,7 @@ def host_name(host_header: str | None) -> str | None:
 
 
 def objection(headers: Mapping[str, str], names: frozenset[str], *, opens_page: bool) -> str | None:
-    """Why a request is refused, as a sentence; None if it is for us (`names`) and from our own page, or from no page at all.
+    """Return why a request is refused, as a sentence; None if it is for us (`names`) and from our own page, or from no page at all.
 
     opens_page: the request only loads the page, which a link of another site may do.
     """
@@ -70,7 +69,7 @@ LARGEST_BODY = 65536
 
 
 async def message_body(request: web.Request) -> bytes:
-    """The body of a request; one beyond LARGEST_MESSAGE is refused (413) before it is read whole."""
+    """Read the body of a request; one beyond LARGEST_MESSAGE is refused (413) before it is read whole."""
     if (request.content_length or 0) > LARGEST_MESSAGE:
         raise web.HTTPRequestEntityTooLarge(max_size=LARGEST_MESSAGE, actual_size=request.content_length or 0)
     body = bytearray()
@@ -82,7 +81,7 @@ async def message_body(request: web.Request) -> bytes:
 
 
 def json_value(text: str | bytes) -> Any:
-    """A JSON text of a page, None if it is none (or null). NaN and Infinity are no JSON; deep nesting is no message of ours."""
+    """Parse a JSON text of a page, None if it is none (or null). NaN and Infinity are no JSON; deep nesting is no message of ours."""
     try:
         return json.loads(text, parse_constant=_refuse)
     except (ValueError, RecursionError):
@@ -109,7 +108,9 @@ _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 @dataclass
 class Access:
-    """names: what a Host header may say. sessions: None lets in everybody who reaches the server, with the role control.
+    """Rules of access.
+
+    names: what a Host header may say. sessions: None lets in everybody who reaches the server, with the role control.
 
     secure: the server speaks TLS, and the cookie never travels without it. Requests and attempts to enter are limited per address.
     """
@@ -122,7 +123,7 @@ class Access:
 
     @web.middleware
     async def middleware(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
-        """Refuses with {"error": sentence}; nothing of a refused request has any effect."""
+        """Refuse with {"error": sentence}; nothing of a refused request has any effect."""
         path = _canonical(request)
         refusal = self._refusal(request, path)
         if refusal is not None:
@@ -150,13 +151,13 @@ class Access:
         return error("you may watch but not control: open the address for control that the viewfinder printed", 403)
 
     def role(self, request: web.Request) -> Role | None:
-        """Of the one who asks; None for a stranger, who gets to open routes only."""
+        """Return the role of the one who asks; None for a stranger, who gets to open routes only."""
         if self.sessions is None:
             return Role.CONTROL
         return self.sessions.role_of(request.cookies.get(cookie_name(request)), request.headers.get("Authorization"))
 
     async def enter(self, request: web.Request) -> web.Response:
-        """POST /enter {"token": text}: sets the cookie and answers {"role": "view" or "control"}."""
+        """Handle POST /enter {"token": text}: set the cookie and answer {"role": "view" or "control"}."""
         if self.sessions is None:
             return web.json_response({"role": Role.CONTROL.word})
         if not self.entries.allows(request.remote or ""):
@@ -172,7 +173,7 @@ class Access:
         return answer
 
     def _page_headers(self, request: web.Request, path: str) -> dict[str, str]:
-        """Of the page: it may load and reach nothing but this server, and no other page may frame it."""
+        """Return the headers of the page: it may load and reach nothing but this server, and no other page may frame it."""
         # Older Safari does not count the WebSocket of the same host as 'self'.
         socket = f"{'wss' if self.secure else 'ws'}://{request.headers['Host']}"
         policy = f"default-src 'self'; connect-src 'self' {socket}; img-src 'self' blob: data:; media-src 'self' blob:"
@@ -183,31 +184,31 @@ class Access:
 
 
 def needed_role(path: str) -> Role | None:
-    """For the path of a route; None is open to all (the page itself, which then enters). What is not listed needs control."""
+    """Return the role that the path of a route needs; None is open to all (the page itself, which then enters). The rest needs control."""
     if path in _PAGE_PATHS or path == "/enter":
         return None
     return Role.VIEW if path.split("/")[1:2] and path.split("/")[1] in _VIEW_PATHS else Role.CONTROL
 
 
 def cookie_name(request: web.Request) -> str:
-    """With the port in it, for browsers give a cookie to every port of a host and two viewfinders may run beside each other."""
+    """Return a name with the port in it: browsers give a cookie to every port of a host, and two viewfinders may run there."""
     port = request.headers.get("Host", "").rpartition(":")[2]
     return f"mrbokeh_{port}" if port.isdecimal() else "mrbokeh"
 
 
 def error(sentence: str, status: int) -> web.Response:
-    """{"error": sentence}."""
+    """Answer {"error": sentence}."""
     return web.json_response({"error": sentence}, status=status)
 
 
 def _canonical(request: web.Request) -> str:
-    """The path as its route was declared; what matches no route counts as needing control."""
+    """Return the path as its route was declared; what matches no route counts as needing control."""
     resource = request.match_info.route.resource
     return "" if resource is None else resource.canonical
 
 
 async def _answered(request: web.Request, handler: _Handler) -> web.StreamResponse:
-    """Errors of aiohttp (unknown path, wrong method, body too large) as JSON too."""
+    """Answer with JSON too where aiohttp refuses (unknown path, wrong method, body too large)."""
     try:
         return await handler(request)
     except web.HTTPException as problem:

@@ -1,4 +1,4 @@
-"""The messages with which a page controls the viewfinder: typed, and checked before anything changes.
+"""Messages with which a page controls the viewfinder: typed, and checked before anything changes.
 
 One JSON object with one verb: {"focus": {"distance_m": 2.5 or null}}, {"focus": {"at": [x, y]}}, {"f_number": 2.0}, {"lens": name},
 {"renderer": name}, {"view": name}, {"object": {"name": name, "move_m": [x, z]}}, {"object": {"name": name, "visible": true}},
@@ -35,7 +35,7 @@ class SetFNumber:
 
 @dataclass(frozen=True)
 class Choose:
-    """kind: "lens", "renderer" or "view"."""
+    """Choice by name. kind: "lens", "renderer" or "view"."""
 
     kind: str
     name: str
@@ -60,7 +60,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class Switch:
-    """kind: "record" or "smoothing"."""
+    """Something switched on or off. kind: "record" or "smoothing"."""
 
     kind: str
     on: bool
@@ -70,7 +70,7 @@ ControlMessage = FocusAtDistance | FocusAtPoint | SetFNumber | Choose | MoveObje
 
 
 def control_message(value: Any) -> ControlMessage:
-    """The message in a JSON value; InputError says what was expected where there is none."""
+    """Return the message in a JSON value; InputError says what was expected where there is none."""
     if not isinstance(value, dict) or len(value) != 1:
         raise InputError(f"expected a JSON object with one of {', '.join(_VERBS)}, got {_shown(value)}")
     [(verb, content)] = value.items()
@@ -107,7 +107,7 @@ def _capture(content: Any) -> ControlMessage:
 
 
 def _number(value: Any, what: str, lowest: float, highest: float) -> float:
-    """A finite number in a closed range; a truth value is none."""
+    """Return a finite number in a closed range; a truth value is none."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12 or not lowest <= value <= highest:
         raise InputError(f"expected {what} as a number from {lowest:g} to {highest:g}, got {_shown(value)}")
     return float(value)
@@ -126,7 +126,7 @@ def _truth(value: Any, what: str) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """What came, short enough for a sentence on a phone."""
+    """Return what came, short enough for a sentence on a phone."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 

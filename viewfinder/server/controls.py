@@ -1,7 +1,4 @@
-"""Controls: what a page may ask of the viewfinder; the pipeline implements it, the page's messages arrive here.
-
-Dispatcher: carries out control messages, whichever way they came (POST, WebSocket, data channel), one at a time.
-"""
+"""Controls: what a page may ask of the viewfinder; Dispatcher: carries it out, whichever way it came, one message at a time."""
 
 import asyncio
 import logging
@@ -29,14 +26,14 @@ VIEWS = ("final", "plate", "virtual", "matte", "depth", "coc")
 
 
 class ObjectState(TypedDict):
-    """An object of the scene, by the name under which messages call it."""
+    """Object of the scene, by the name under which messages call it."""
 
     name: str
     visible: bool
 
 
 class State(TypedDict, total=False):
-    """What the page shows; what is missing is not offered. Distances in metres, None is infinity.
+    """State that the page shows; what is missing is not offered. Distances in metres, None is infinity.
 
     dioptre_range: the ends of the focus slider, (far, near), 1/m. focus_from: who told the focus, None where nobody did and the lens's
     file holds. f_numbers: what may be set, ascending. lens, renderer, view: which of
@@ -70,13 +67,13 @@ class State(TypedDict, total=False):
 
 @runtime_checkable
 class Controls(Protocol):
-    """All but `state` are called one at a time in a thread of their own and may take their time; InputError says what cannot be."""
+    """Controls of a viewfinder. All but `state` are called one at a time in a thread of their own; InputError says what cannot be."""
 
     def focus_at_distance(self, metres: float) -> None:
-        """inf is allowed."""
+        """Focus at so many metres; inf is allowed."""
 
     def focus_at_point(self, x: float, y: float) -> float:
-        """Focus on what the picture shows at (x, y), right and down from 0 to 1; the metres found."""
+        """Focus on what the picture shows at (x, y), right and down from 0 to 1; return the metres found."""
         ...
 
     def set_f_number(self, f_number: float) -> None: ...
@@ -88,12 +85,12 @@ class Controls(Protocol):
     def set_view(self, name: str) -> None: ...
 
     def move_object(self, name: str, xz_m: tuple[float, float]) -> None:
-        """By so many metres on the ground plane."""
+        """Move an object by so many metres on the ground plane."""
 
     def show_object(self, name: str, visible: bool) -> None: ...
 
     def capture(self) -> str:
-        """Save what is seen now; the name of the bundle."""
+        """Save what is seen now; return the name of the bundle."""
         ...
 
     def record(self, on: bool) -> None: ...
@@ -101,7 +98,7 @@ class Controls(Protocol):
     def smooth(self, on: bool) -> None: ...
 
     def state(self) -> State:
-        """Must return at once, from any thread."""
+        """Return at once, from any thread."""
         ...
 
 
@@ -111,7 +108,7 @@ log = logging.getLogger(__name__)
 
 
 class Dispatcher:
-    """Lives in the event loop; the controls are called in one thread, so that a slow one holds up no picture."""
+    """Dispatcher in the event loop; the controls are called in one thread, so that a slow one holds up no picture."""
 
     def __init__(self, controls: Controls) -> None:
         self.controls = controls
@@ -120,7 +117,7 @@ class Dispatcher:
         self._limit = RateLimit(per_s=40.0, burst=80.0)
 
     async def answer(self, text: str | bytes, role: Role, address: str) -> dict[str, Any]:
-        """{"done": verb, ...} or {"error": sentence}, after which nothing has changed. address: of the sender, for the rate limit."""
+        """Answer {"done": verb, ...}, or {"error": sentence}, after which nothing has changed. address: of the sender, for its limit."""
         try:
             return await self._answer(text, role, address)
         except InputError as problem:
@@ -146,12 +143,12 @@ class Dispatcher:
             self._waiting -= 1
 
     def close(self) -> None:
-        """Does not wait for a control that hangs."""
+        """Close without waiting for a control that hangs."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
 
 def perform(message: ControlMessage, controls: Controls) -> dict[str, Any]:
-    """Call the control that a message asks for; the answer to it. Names must be among those that the state lists."""
+    """Call the control that a message asks for; return the answer. Names must be among those that the state lists."""
     state = controls.state()
     match message:
         case FocusAtDistance(metres):
@@ -186,7 +183,7 @@ def _object_names(state: State) -> list[str]:
 
 
 def _known(name: str, names: list[str], kind: str) -> str:
-    """No name that the viewfinder did not offer goes any further: a page cannot smuggle in a path."""
+    """Return a name that the viewfinder offered: a page cannot smuggle in a path."""
     if name not in names:
         raise InputError(f"there is no {kind} {name!r}: choose one of {', '.join(names) or 'none, for there is none'}")
     return name

@@ -32,14 +32,14 @@ _ELSEWHERE = ("198.51.100.1", 9)
 
 
 class Interface(NamedTuple):
-    """A network interface of this machine and one of its IPv4 addresses."""
+    """Network interface of this machine with one of its IPv4 addresses."""
 
     name: str
     address: str
 
 
 class Tls(NamedTuple):
-    """context: for the server. names: host names and addresses that the certificate covers, in lower case, without wildcards."""
+    """TLS of a server. names: host names and addresses that the certificate covers, in lower case, without wildcards."""
 
     context: ssl.SSLContext
     names: tuple[str, ...]
@@ -47,7 +47,7 @@ class Tls(NamedTuple):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An address with its certificate and rules of access, before anything listens there."""
+    """Address with its certificate and rules of access, before anything listens there."""
 
     options: ListeningOptions
     host: str
@@ -72,7 +72,7 @@ class Endpoint:
         sessions.renewed = lambda role: self._invite(url, sessions, role)
 
     def announce_camera(self, url: str) -> None:
-        """Print the page with which a browser sends its camera. Its token is never used up: a phone on a camera comes back without asking."""
+        """Print the page with which a browser sends its camera. Its token is never used up: a phone comes back without asking."""
         if self.sessions is None:
             typer.echo(f"to send a camera from a browser: {url}{_CAMERA_PAGE}")
             return
@@ -128,7 +128,7 @@ async def serving_site(site: Site, host: str, port: int, tls: Tls | None = None)
 
 
 def _spoken_name(host: str, tls: Tls | None) -> str:
-    """The name in the URL: browsers accept a certificate only under a name that it covers."""
+    """Return the name in the URL: browsers accept a certificate only under a name that it covers."""
     return host if tls is None or not tls.names or host.lower() in tls.names else tls.names[0]
 
 
@@ -140,12 +140,12 @@ async def _bind(runner: web.AppRunner, host: str, port: int, tls: Tls | None) ->
 
 
 def lan_address(wanted: str | None = None) -> str:
-    """The address of ONE interface: the one wanted (a name or an address), else the private one through which the way out leads."""
+    """Return the address of ONE interface: the one wanted (a name or an address), else the private one through which the way out leads."""
     return choose(interfaces(), wanted, _way_out())
 
 
 def choose(present: Sequence[Interface], wanted: str | None, way_out: str | None) -> str:
-    """The choice among interfaces; InputError where nothing or several fit."""
+    """Choose among interfaces; InputError where nothing or several fit."""
     offered = [each for each in present if not is_loopback(each.address)]
     listed = ", ".join(f"{each.name} ({each.address})" for each in offered) or "none"
     if wanted is not None:
@@ -162,7 +162,7 @@ def choose(present: Sequence[Interface], wanted: str | None, way_out: str | None
 
 
 def interfaces() -> list[Interface]:
-    """Those of this machine with an IPv4 address."""
+    """Return the interfaces of this machine with an IPv4 address."""
     try:
         import ifaddr
     except ImportError:
@@ -171,13 +171,13 @@ def interfaces() -> list[Interface]:
 
 
 def page_url(host: str, port: int, *, secure: bool, token: str | None = None, path: str = "/") -> str:
-    """Of the page; the token goes into the fragment, which browsers keep to themselves."""
+    """Return the URL of the page; the token goes into the fragment, which browsers keep to themselves."""
     name = f"[{host}]" if ":" in host else host
     return f"{'https' if secure else 'http'}://{name}:{port}{path}{f'#token={token}' if token else ''}"
 
 
 def qr_text(text: str, *, colored: bool = True) -> str:
-    """A QR code of half blocks for a terminal; colored: white on black also where the terminal is dark on light."""
+    """Draw a QR code of half blocks for a terminal; colored: white on black also where the terminal is dark on light."""
     try:
         import segno
     except ImportError:
@@ -194,7 +194,7 @@ def _is_private(address: str) -> bool:
 
 
 def _way_out() -> str | None:
-    """The address from which this machine would send to the internet; None without a way there."""
+    """Return the address from which this machine would send to the internet; None without a way there."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(_ELSEWHERE)
@@ -204,7 +204,7 @@ def _way_out() -> str | None:
 
 
 def load_tls(certificate: Path, key: Path | None = None) -> Tls:
-    """A certificate chain in PEM and its key, which may be in the same file; InputError says what is wrong with them."""
+    """Load a certificate chain in PEM and its key, which may be in the same file; InputError says what is wrong with them."""
     key = key or certificate
     for path, what in ((certificate, "certificate"), (key, "key")):
         if not path.is_file():

@@ -2,10 +2,6 @@
 
 A message of the stream is a 4-byte big-endian length, a JSON header of that length, and a JPEG.
 
-Broadcaster: where WebSockets wait for the next picture, and where a thread that has one hands it to all of them.
-
-The WebSocket that streams JPEG with one credit, answers the clock and takes control messages.
-
 The client sends {"ack": sequence} when it has shown a picture, and only then gets another one: the newest there is. {"clock": t} comes
 back as {"clock": t, "server_ms": now}, so that the client can tell how old a picture is in its own time. Everything else is a control
 message and answered as POST /control answers it.
@@ -30,7 +26,7 @@ from viewfinder.server.sessions import RateLimit, Role
 
 
 class Broadcaster:
-    """`open` binds it to the running event loop; `publish` and `fail` may be called from any thread, also before and after that."""
+    """Hand-over of messages to WebSockets. `open` binds it to the running event loop; `publish` and `fail` may come from any thread."""
 
     def __init__(self) -> None:
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -53,7 +49,7 @@ class Broadcaster:
         return bool(self._waiting)
 
     async def next_message(self) -> bytes:
-        """The next message that is published after this call."""
+        """Return the next message that is published after this call."""
         future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._waiting.add(future)
         try:
@@ -67,7 +63,7 @@ class Broadcaster:
         self._in_loop(self._publish, message)
 
     def fail(self, sentence: str) -> None:
-        """The source died: whoever is here is told, and whoever comes later."""
+        """Tell whoever is here, and whoever comes later, that the source died."""
         self.failure = sentence
         self._in_loop(self._fail, sentence)
 
@@ -100,7 +96,7 @@ log = logging.getLogger(__name__)
 
 
 class JpegStream:
-    """Runs until `close`, or the end of a `with`. broadcaster: where the sockets wait for messages and hear of failures."""
+    """FrameSink that runs until `close`, or the end of a `with`. broadcaster: hands messages and failures to the sockets."""
 
     def __init__(self, jpeg_quality: int = 85) -> None:
         self.broadcaster = Broadcaster()
@@ -158,7 +154,7 @@ class JpegStream:
 
 
 def jpeg_message(frame: OutputFrame, jpeg_quality: int) -> bytes:
-    """A message of the stream; the time of the encoding is the last of its stages."""
+    """Return a message of the stream; the time of the encoding is the last of its stages."""
     import cv2
 
     started_s = time.perf_counter()
@@ -169,7 +165,7 @@ def jpeg_message(frame: OutputFrame, jpeg_quality: int) -> bytes:
 
 
 def packed(header: dict[str, Any], jpeg: bytes) -> bytes:
-    """Length of the header, header, JPEG."""
+    """Return the length of the header, the header and the JPEG as bytes."""
     encoded = json.dumps(header).encode()
     return struct.pack(">I", len(encoded)) + encoded + jpeg
 
@@ -178,7 +174,7 @@ _MOST_SOCKETS = 16
 
 
 class JpegSocket:
-    """GET /stream. Sockets beyond 16 are refused; one that floods is closed."""
+    """Handler of GET /stream. Sockets beyond 16 are refused; one that floods is closed."""
 
     def __init__(self, broadcaster: Broadcaster, dispatcher: Dispatcher, access: Access) -> None:
         self._broadcaster, self._dispatcher, self._access = broadcaster, dispatcher, access
@@ -223,7 +219,7 @@ class JpegSocket:
         return await self._dispatcher.answer(text, self._access.role(request) or Role.VIEW, request.remote or "")
 
     async def _send(self, socket: web.WebSocketResponse, credit: asyncio.Event) -> None:
-        """One picture per credit, always the newest."""
+        """Send one picture per credit, always the newest."""
         while not socket.closed:
             await credit.wait()
             credit.clear()

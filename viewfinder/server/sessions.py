@@ -1,7 +1,4 @@
-"""Sessions: one-time invitations, which become cookies, and the two roles. Everything is kept in memory and ends with the server.
-
-RateLimit: so many events per second and address, a few at once.
-"""
+"""Sessions: one-time invitations, which become cookies, and the two roles; RateLimit. All is kept in memory and ends with the server."""
 
 import hashlib
 import secrets
@@ -15,7 +12,7 @@ _MOST_ADDRESSES = 1024
 
 
 class RateLimit:
-    """A bucket per address that holds `burst` events and fills with `per_s` of them each second. For one thread."""
+    """Bucket per address that holds `burst` events and fills with `per_s` of them each second. For one thread."""
 
     def __init__(self, per_s: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._per_s, self._burst, self._clock = per_s, burst, clock
@@ -38,23 +35,23 @@ _MOST_SESSIONS = 64
 
 
 class Role(IntEnum):
-    """What somebody may do; who may control may also view."""
+    """Role of a visitor; who may control may also view."""
 
     VIEW = 1
     CONTROL = 2
 
     @property
     def word(self) -> str:
-        """ "view" or "control"."""
+        """Word for the role: "view" or "control"."""
         return self.name.lower()
 
 
 def _ignore(_role: Role) -> None:
-    """Where nobody listens."""
+    """Ignore the news."""
 
 
 class Sessions:
-    """An invitation per role, each good for one entry; `renewed` is told the role when the next invitation is ready.
+    """Sessions with one invitation per role, good for one entry; `renewed` is told the role when the next invitation is ready.
 
     Programs such as OBS, which begin anew without asking anybody, use a standing token: to enter, or as a bearer (RFC 6750).
     """
@@ -66,11 +63,11 @@ class Sessions:
         self._standing = {role: secrets.token_urlsafe(_TOKEN_BYTES) for role in Role}
 
     def invitation(self, role: Role) -> str:
-        """The token that the next one who enters in this role must bring."""
+        """Return the token that the next one who enters in this role must bring."""
         return self._invitations[role]
 
     def standing_token(self, role: Role) -> str:
-        """The token of a role that is never used up."""
+        """Return the token of a role that is never used up."""
         return self._standing[role]
 
     def enter(self, token: str) -> tuple[str, Role] | None:
@@ -89,7 +86,7 @@ class Sessions:
         return cookie, role
 
     def role_of(self, cookie: str | None, authorization: str | None) -> Role | None:
-        """Of the value of a cookie, or of an Authorization header; None for a stranger."""
+        """Return the role of a cookie's value, or of an Authorization header; None for a stranger."""
         if authorization is not None:
             return _role_of(authorization.removeprefix("Bearer "), self._standing)
         return None if cookie is None else self._roles.get(_digest(cookie))
@@ -100,7 +97,7 @@ def _role_of(token: str, tokens: dict[Role, str]) -> Role | None:
 
 
 def _digest(secret: str) -> str:
-    """Looked up instead of the secret itself, so that the time a look-up takes tells nothing about it."""
+    """Hash a secret; looked up instead of it, so that the time a look-up takes tells nothing about it."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 

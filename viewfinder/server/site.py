@@ -1,7 +1,4 @@
-"""Site: everything that one viewfinder shows to browsers, and its routes; each part but the controls may be missing.
-
-The page: a few files of the package, read once; a request names one of them or nothing at all.
-"""
+"""Site: everything that one viewfinder shows to browsers: its page, its routes, and parts that may be missing."""
 
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
@@ -44,7 +41,7 @@ Matte = UInt8[np.ndarray, "height width"]
 
 @runtime_checkable
 class Part(Protocol):
-    """Something else with routes (WHEP, WHIP). Their role is what `access.needed_role` says of their path: whip needs control."""
+    """Part of a site with routes of its own (WHEP, WHIP). `access.needed_role` says by their path who may use them: whip needs control."""
 
     def routes(self) -> Sequence[web.AbstractRouteDef]: ...
 
@@ -52,12 +49,14 @@ class Part(Protocol):
 
 
 def _no_matte() -> None:
-    """Where the stage gives none."""
+    """Give no matte."""
 
 
 @dataclass
 class Site:
-    """dispatcher: of the controls; the data channel of a WebRTC part calls the same one.
+    """Site of one viewfinder.
+
+    dispatcher: of the controls; the data channel of a WebRTC part calls the same one.
 
     broadcaster: of the JPEG stream, None without it. parts: by name; "whep" tells the page to try it first, "whip" offers the camera page.
     matte: the newest coverage of the virtual layer, small and 8-bit, for the peaking of real and virtual things apart.
@@ -74,7 +73,7 @@ class Site:
         self.dispatcher = Dispatcher(self.controls)
 
     def application(self) -> web.Application:
-        """All routes behind the rules of access."""
+        """Return all routes behind the rules of access."""
         app = web.Application(middlewares=[self.access.middleware], client_max_size=LARGEST_BODY)
         app.add_routes(page_routes())
         app.add_routes([web.post("/enter", self.access.enter), web.get("/state", self._state), web.post("/control", self._control)])
@@ -91,19 +90,19 @@ class Site:
         return self.access.role(request) or Role.VIEW
 
     async def _state(self, request: web.Request) -> web.Response:
-        """GET /state: the State, the role of the one who asks, and the ways to watch, best first."""
+        """Handle GET /state: the State, the role of the one who asks, and the ways to watch, best first."""
         ways = [name for name, present in (("whep", "whep" in self.parts), ("jpeg", self.broadcaster is not None)) if present]
         own = {"role": self._role(request).word, "transports": ways, "matte": self.matte() is not None, "can_send": "whip" in self.parts}
         return web.json_response(self.controls.state() | own)
 
     async def _control(self, request: web.Request) -> web.Response:
-        """POST /control, a control message."""
+        """Handle POST /control, a control message."""
         body = await message_body(request)
         answer = await self.dispatcher.answer(body, self._role(request), request.remote or "")
         return web.json_response(answer, status=400 if "error" in answer else 200)
 
     async def _matte(self, _request: web.Request) -> web.Response:
-        """GET /matte: coverage as a grey PNG."""
+        """Handle GET /matte: coverage as a grey PNG."""
         import cv2
 
         matte = self.matte()

@@ -1,1 +1,1 @@
-"""Where camera frames come from."""
+"""Sources of camera frames."""

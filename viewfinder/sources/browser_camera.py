@@ -1,7 +1,4 @@
-"""A browser (a phone's, OBS) as the camera: WebRTC in through WHIP (RFC 9725).
-
-One browser camera's connection: a WebRTC peer that only receives.
-"""
+"""Browser (a phone's, OBS) as the camera: WebRTC in through WHIP (RFC 9725), one connection at a time."""
 
 import asyncio
 import contextlib
@@ -31,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class WhipSession:
-    """Lives in one asyncio loop.
+    """Connection of one browser camera, in one asyncio loop: a WebRTC peer that only receives.
 
     on_frame: gets every decoded PyAV frame as it comes. on_message: every message of the data channel "camera"; what it returns is
     the answer, None for none. on_end: called once the connection is over.
@@ -51,7 +48,7 @@ class WhipSession:
         self._peer.on("connectionstatechange", self._end_when_over)
 
     async def answer(self, offer: str) -> str:
-        """The SDP that answers an offer, with all candidates in it. Raises InputError for an offer that cannot be answered."""
+        """Return the SDP that answers an offer, with all candidates in it. Raises InputError for an offer that cannot be answered."""
         from aiortc import RTCSessionDescription
         from aiortc.exceptions import InvalidAccessError, InvalidStateError
 
@@ -102,7 +99,7 @@ class WhipSession:
         self._start(self._drain(track))
 
     async def _drain(self, track: Any) -> None:
-        """Sound too: aiortc queues without bound what nobody takes."""
+        """Take all frames, sound too: aiortc queues without bound what nobody takes."""
         from aiortc.mediastreams import MediaStreamError
 
         with contextlib.suppress(MediaStreamError):
@@ -136,7 +133,7 @@ def _release_on_marker(receiver: Any) -> None:
 
 
 def _first_video_codec(sdp: str) -> str | None:
-    """The codec that a sender takes: the first of the answer's video."""
+    """Return the codec that a sender takes: the first of the answer's video."""
     from aiortc.sdp import SessionDescription
 
     media = next((each for each in SessionDescription.parse(sdp).media if each.kind == "video"), None)
@@ -151,7 +148,7 @@ _BT601 = 6
 
 
 class BrowserCameraSource:
-    """A FrameSource that a web server feeds: add `routes` to its application, and `close` to what runs when it ends.
+    """FrameSource that a web server feeds: add `routes` to its application, and `close` to what runs when it ends.
 
     One camera at a time; a new one takes the place of the old one, for a page that was loaded anew says no good-bye. Frames have the
     size that came, which browsers change as they like, or are scaled down with their aspect to the largest size given here.
@@ -172,7 +169,7 @@ class BrowserCameraSource:
         self._changing = asyncio.Lock()
 
     def routes(self, path: str = "/whip") -> list[web.RouteDef]:
-        """POST an offer to the path; DELETE the address that came back to end."""
+        """Return the routes: POST an offer to the path; DELETE the address that came back to end."""
         return [web.post(path, self._offered), web.delete(path + "/{token}", self._deleted)]
 
     def frames(self, stopping: Event) -> Iterator[CameraFrame]:
@@ -186,7 +183,7 @@ class BrowserCameraSource:
                 self.status = _WAITING if self._session is None else "the browser camera is connected but sends no picture: waiting for it"
 
     async def close(self) -> None:
-        """Ends the connection; to be called in the loop of the server."""
+        """End the connection; to be called in the loop of the server."""
         session, self._session, self._token = self._session, None, None
         if session is not None:
             self.status = _WAITING

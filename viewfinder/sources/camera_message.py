@@ -1,4 +1,4 @@
-"""What a browser camera tells over its data channel: one JSON object per message, such as {"focusDistance": 0.8}.
+"""Messages of a browser camera over its data channel: one JSON object per message, such as {"focusDistance": 0.8}.
 
 * focusDistance: metres from the camera, "infinity", or null where it is not known (MediaTrackSettings.focusDistance).
 * pose: 16 numbers, WebXR's XRRigidTransform.matrix of the viewer (column after column; y up, the camera looks along -z).
@@ -26,13 +26,13 @@ _ROTATION_TOLERANCE = 1e-2
 
 @dataclass(frozen=True)
 class CameraKnowledge:
-    """camera_from_world: (4, 4), metres, or None."""
+    """Knowledge of a browser camera. camera_from_world: (4, 4), metres, or None."""
 
     lens: LensState = UNKNOWN_LENS
     camera_from_world: Pose | None = None
 
     def told(self, text: str) -> "CameraKnowledge":
-        """With what a message tells. Raises InputError with one sentence for what makes no sense."""
+        """Return the knowledge with what a message tells. Raises InputError with one sentence for what makes no sense."""
         message = _object(text)
         known = self
         if "focusDistance" in message:
@@ -67,7 +67,7 @@ def _distance_m(value: Any) -> float | None:
 
 
 def _from_pose(value: Any) -> Pose | None:
-    """XRRigidTransform.matrix is world from viewer; both have y up and z backward."""
+    """Convert XRRigidTransform.matrix, which is world from viewer; both have y up and z backward."""
     if value is None:
         return None
     matrix = _numbers(value, 16, "pose").reshape(4, 4).T
@@ -80,7 +80,7 @@ def _from_pose(value: Any) -> Pose | None:
 
 
 def _from_orientation(value: Any) -> Pose | None:
-    """The screen has x right, y up, z towards the person who looks at it; the camera looks the other way."""
+    """Convert an orientation: the screen has x right, y up, z towards its user; the camera looks the other way."""
     if value is None:
         return None
     x, y, z, w = quaternion = _numbers(value, 4, "orientation")

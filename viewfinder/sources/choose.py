@@ -1,4 +1,4 @@
-"""The source that a word on the command line stands for."""
+"""Choice of the source that a word on the command line stands for."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,7 +12,7 @@ _THROUGH_MEDIAMTX = ("srt", "rtmp", "rtmps")
 
 
 def open_source(text: str, max_width_px: int | None = None, max_height_px: int | None = None, fps: float | None = None) -> FrameSource:
-    """`test`, the number of a webcam, the path of a video, a URL, `folder:PATH`, `gphoto2`, `gphoto2:PORT` or `whip`.
+    """Open `test`, the number of a webcam, the path of a video, a URL, `folder:PATH`, `gphoto2`, `gphoto2:PORT` or `whip`.
 
     Frames come in the camera's own size, or scaled down with their aspect to the largest size that is given. fps: at most so
     many frames per second, where the source can do that. Raises InputError for anything else and for what is not there.

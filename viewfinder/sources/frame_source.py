@@ -1,13 +1,4 @@
-"""The protocol of everything that camera frames come from.
-
-How large frames may be: larger ones are scaled down, with their aspect.
-
-ExactSize: a source whose frames are scaled to one size, for what was made for pictures of that size.
-
-A decoded PyAV frame as the upright picture that the viewfinder shows.
-
-Cameras that go away and come back: opened again and again, with growing pauses.
-"""
+"""FrameSource: the protocol of cameras, and what they share: size limits, pictures the right way up, opening again what went away."""
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -26,7 +17,7 @@ from viewfinder.frames import Bgr, CameraFrame
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """A camera. `name` is for people to read.
+    """Camera. `name` is for people to read.
 
     transfer: the curve of its codes (see mrbokeh.video.color); a stream that comes over a network tells it with its first frame.
     status: one sentence while the camera is away or has trouble, None while all is well. Any thread may read both.
@@ -41,7 +32,7 @@ class FrameSource(Protocol):
     def status(self) -> str | None: ...
 
     def frames(self, stopping: Event) -> Iterator[CameraFrame]:
-        """Frames in the rhythm and the size in which the camera gives them, until `stopping` is set.
+        """Yield frames in the rhythm and the size in which the camera gives them, until `stopping` is set.
 
         A camera that went away is waited for. Raises InputError where waiting would not help.
         """
@@ -50,19 +41,19 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True)
 class SizeLimit:
-    """width_px, height_px: the most of each; None is no limit."""
+    """Largest size of frames, with their aspect; None is no limit."""
 
     width_px: int | None = None
     height_px: int | None = None
 
     def fit(self, width_px: int, height_px: int) -> tuple[int, int]:
-        """(width, height) with the same aspect, within the limits, never enlarged."""
+        """Return (width, height) with the same aspect, within the limits, never enlarged."""
         pairs = ((self.width_px, width_px), (self.height_px, height_px))
         scale = min([1.0, *(most / size for most, size in pairs if most is not None)])
         return max(1, round(width_px * scale)), max(1, round(height_px * scale))
 
     def applied(self, bgr: Bgr) -> UInt8[np.ndarray, "fitted_height fitted_width 3"]:
-        """The picture itself where it is small enough, else scaled down by areas."""
+        """Return the picture itself where it is small enough, else scaled down by areas."""
         import cv2
 
         size_px = self.fit(bgr.shape[1], bgr.shape[0])
@@ -74,7 +65,7 @@ _ASPECT_TOLERANCE = 0.01
 
 
 class ExactSize:
-    """A FrameSource over another. Its frames raise InputError where the camera's aspect ratio is another one."""
+    """FrameSource over another. Its frames raise InputError where the camera's aspect ratio is another one."""
 
     def __init__(self, source: FrameSource, width_px: int, height_px: int) -> None:
         self._source, self._size_px = source, (width_px, height_px)
@@ -107,7 +98,7 @@ class ExactSize:
 
 
 def upright_bgr(frame: Any, color: VideoColor, limit: SizeLimit) -> Bgr:
-    """(H, W, 3) display codes, blue first, turned as the stream says (to the nearest quarter turn), within the limit."""
+    """Return (H, W, 3) display codes, blue first, turned as the stream says (to the nearest quarter turn), within the limit."""
     turns = round(frame.rotation / 90) % 4
     if turns % 2:
         height_px, width_px = limit.fit(frame.height, frame.width)
@@ -122,7 +113,7 @@ Item = TypeVar("Item")
 
 
 class CameraAwayError(Exception):
-    """The camera is away and may come back; the message is the sentence that people read meanwhile."""
+    """Absence of a camera that may come back; the message is the sentence that people read meanwhile."""
 
 
 def reconnecting(
@@ -131,7 +122,7 @@ def reconnecting(
     tell: Callable[[str | None], None],
     first_pause_s: float = FIRST_PAUSE_S,
 ) -> Iterator[Item]:
-    """What a session gives, session after session, until `stopping` is set.
+    """Yield what a session gives, session after session, until `stopping` is set.
 
     session: opens the camera, yields, closes the camera at its end; raises CameraAwayError where the camera is away. Other errors
     are not caught. tell: gets that sentence, and None as soon as something comes again. Pauses double up to LONGEST_PAUSE_S.

@@ -1,4 +1,4 @@
-"""The live view of a DSLR or mirrorless camera on a cable, through libgphoto2.
+"""Live view of a DSLR or mirrorless camera on a cable, through libgphoto2, with what the camera tells of its lens.
 
 What a tethered camera tells about its lens, by libgphoto2's names.
 """
@@ -24,7 +24,9 @@ _FOCAL_LENGTH, _FOCUS_DISTANCE, _BEYOND = "5008", "5009", 0xFFFF
 
 
 def lens_state(camera: Any) -> LensState:
-    """camera: an initialised gphoto2.Camera. Most cameras tell the f-number; few the rest.
+    """Ask a camera for its lens.
+
+    camera: an initialised gphoto2.Camera. Most cameras tell the f-number; few the rest.
 
     PTP does not say where the distance counts from; it is taken as it is.
     """
@@ -36,7 +38,7 @@ def lens_state(camera: Any) -> LensState:
 
 
 def _number(camera: Any, name: str) -> float | None:
-    """The number above 0 in a setting such as "f/5.6"; None where the camera has no such setting or it says a word."""
+    """Return the number above 0 in a setting such as "f/5.6"; None where the camera has no such setting or it says a word."""
     gp = library()
     try:
         text = str(camera.get_single_config(name).get_value())
@@ -54,7 +56,7 @@ _LIVE_VIEW_SWITCH = ("viewfinder", "eosviewfinder")
 
 
 class Gphoto2PreviewSource:
-    """A FrameSource. port: such as usb:001,005, or None for the only camera. A camera that is switched off is waited for.
+    """FrameSource. port: such as usb:001,005, or None for the only camera. A camera that is switched off is waited for.
 
     max_width_px, max_height_px: larger pictures are scaled down with their aspect. open_camera: gives an initialised gphoto2.Camera.
     Frames carry what the camera tells of its lens. Raises InputError where there is no camera at the start, or no live view.
@@ -109,7 +111,7 @@ class Gphoto2PreviewSource:
                 camera.exit()
 
     def _preview(self, camera: Any, stopping: Event) -> Bgr:
-        """The next picture; asked for again while the camera is busy, as it is while the mirror goes up."""
+        """Return the next picture; asked for again while the camera is busy, as it is while the mirror goes up."""
         import cv2
 
         gp = library()
@@ -140,7 +142,7 @@ def _switch_live_view(camera: Any, on: int) -> None:
 
 
 def _open_camera(port: str | None) -> Any:
-    """The only camera, or the one at that port. Raises CameraAwayError where there is none."""
+    """Open the only camera, or the one at that port. Raises CameraAwayError where there is none."""
     gp = library()
     try:
         return opened(chosen_of(detected(), port, "--source")[1])

@@ -1,11 +1,8 @@
-"""aiortc's JitterBuffer with another rule of when a frame is whole: see marker_release, which decides whether it can be used.
-
-Video frames from aiortc without its wait for the next frame, and never torn ones.
+"""Video frames from aiortc without its wait for the next frame, and never torn ones.
 
 aiortc's JitterBuffer gives a frame away when the first packet of the next one comes: one frame of delay. RTP sets the marker bit in
-the last packet of a picture (RFC 6184, 5.1; RFC 7741, 4.1), so that the frame can go when all packets up to that one are there
-(viewfinder.sources.marker_buffer). This leans on parts of aiortc that are not public: they are tried first, and where they are
-others than known the stock buffer stays.
+the last packet of a picture (RFC 6184, 5.1; RFC 7741, 4.1), so that the frame can go when all packets up to that one are there. This
+leans on parts of aiortc that are not public: `works` tries them first, and where they are others than known the stock buffer stays.
 """
 
 import logging
@@ -24,7 +21,7 @@ _H264_SEQUENCE_PARAMETERS, _VP8_START_CODE = 7, b"\x9d\x01\x2a"
 
 
 class MarkerFrame(JitterFrame):
-    """followers: frames that became whole at the same moment, in order. sent_timestamp: that of RTP."""
+    """Frame with its last packet. followers: frames that became whole at the same moment, in order. sent_timestamp: that of RTP."""
 
     def __init__(self, data: bytes, timestamp: int) -> None:
         super().__init__(data=data, timestamp=timestamp)
@@ -33,7 +30,7 @@ class MarkerFrame(JitterFrame):
 
 
 class MarkerJitterBuffer(JitterBuffer):
-    """Gives a frame away with its last packet. A frame whose beginning or middle is lost is dropped, and a key frame asked for.
+    """JitterBuffer that gives a frame away with its last packet; a torn frame is dropped, and a key frame asked for.
 
     Stock gives away what is left of such a frame, and waits for a missing packet until the buffer is full. now_s: the clock.
     """
@@ -51,7 +48,7 @@ class MarkerJitterBuffer(JitterBuffer):
     _packets: list[Any]
 
     def add(self, packet: Any) -> tuple[bool, Any]:
-        """(whether a key frame is to be asked for, the frames that are whole now as a MarkerFrame, or None)."""
+        """Return (whether a key frame is to be asked for, the frames that are whole now as a MarkerFrame, or None)."""
         if packet.marker:
             self._marked[packet.sequence_number % self._capacity] = packet.sequence_number
         self._torn = False
@@ -80,7 +77,7 @@ class MarkerJitterBuffer(JitterBuffer):
         return self._now_s() - self._held_since_s > PATIENCE_S
 
     def _whole_frames(self) -> list[MarkerFrame]:
-        """All frames at the origin that are whole; they leave the buffer, and so does what is left of torn ones."""
+        """Take all whole frames at the origin out of the buffer, and what is left of torn ones."""
         frames: list[MarkerFrame] = []
         for _ in range(self._capacity):
             packets = self._first_frame()
@@ -108,7 +105,7 @@ class MarkerJitterBuffer(JitterBuffer):
         return []
 
     def _run(self) -> list[Any]:
-        """The packets from the origin up to the first that is missing."""
+        """Return the packets from the origin up to the first that is missing."""
         run: list[Any] = []
         for count in range(self._capacity):
             packet = self._packets[(self._origin + count) % self._capacity]
@@ -124,7 +121,7 @@ class MarkerJitterBuffer(JitterBuffer):
 
 
 def is_key_start(data: bytes) -> bool:
-    """H264 from its sequence parameters on, or the header of a VP8 key frame (RFC 6386, 9.1)."""
+    """Tell whether data begin with H264's sequence parameters or the header of a VP8 key frame (RFC 6386, 9.1)."""
     if data[:4] == b"\0\0\0\1":
         return len(data) > 4 and data[4] & 0x1F == _H264_SEQUENCE_PARAMETERS
     return len(data) > 5 and not data[0] & 1 and data[3:6] == _VP8_START_CODE
@@ -136,7 +133,7 @@ log = logging.getLogger(__name__)
 
 
 def release_on_marker(receiver: Any) -> bool:
-    """Give an RTCRtpReceiver of video, through which nothing came yet, the other buffer; False where aiortc is another than expected."""
+    """Give a video receiver, through which nothing came yet, the other buffer; False where aiortc is another than expected."""
     stock: Any = getattr(receiver, _BUFFER, None)
     known = type(stock).__name__ == "JitterBuffer" and getattr(stock, "_origin", 0) is None
     known = known and type(getattr(receiver, _QUEUE, None)) is queue.Queue and getattr(receiver, _THREAD, 0) is None
@@ -150,7 +147,7 @@ def release_on_marker(receiver: Any) -> bool:
 
 
 class BurstQueue(queue.Queue[Any]):
-    """The queue of a receiver's decoder: takes (codec, frame) and puts the frame's followers in behind it.
+    """Queue of a receiver's decoder: takes (codec, frame) and puts the frame's followers in behind it.
 
     A receiver asks its buffer for one frame per packet and maps that one's timestamp; the followers get the same shift.
     """
@@ -167,7 +164,7 @@ class BurstQueue(queue.Queue[Any]):
 
 @cache
 def works() -> bool:
-    """Tried out on the installed aiortc: frames of two packets, one of them in the wrong order; then one that held up two others."""
+    """Try the buffer on the installed aiortc: frames of two packets, one in the wrong order; then one that held up two others."""
     try:
         from aiortc.rtp import RtpPacket
 

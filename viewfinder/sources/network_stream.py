@@ -1,7 +1,4 @@
-"""A stream over the network (RTSP, HTTP, MPEG-TS over UDP) through FFmpeg, with as little delay as it allows.
-
-A thread that empties a stream as fast as it comes, and hands over only the newest of it.
-"""
+"""Stream over the network (RTSP, HTTP, MPEG-TS over UDP) through FFmpeg, with as little delay as it allows: always its newest frame."""
 
 import itertools
 import time
@@ -22,7 +19,7 @@ Item = TypeVar("Item")
 
 
 def newest_of(produce: Callable[[Event], Iterator[Item]], stopping: Event, *, name: str, leave_s: float = 5.0) -> Iterator[Item]:
-    """The newest item each time one is asked for; what came in between is dropped, so that no queue grows anywhere.
+    """Yield the newest item each time one is asked for; what came in between is dropped, so that no queue grows anywhere.
 
     produce: runs in the thread until the event that it gets is set, which is when `stopping` is, or when nobody asks any more. Its
     exception is raised here. leave_s: how long the end waits for the thread.
@@ -69,7 +66,7 @@ _OF_SCHEME = {
 
 
 class NetworkStreamSource:
-    """A FrameSource. A thread decodes all that comes, the newest frame is taken; a stream that dies is opened again.
+    """FrameSource. A thread decodes all that comes, the newest frame is taken; a stream that dies is opened again.
 
     url: of one of SCHEMES; `udp://@:5000` listens. A recording behind a URL is played in its own rhythm, again and again.
     max_width_px, max_height_px: larger pictures are scaled down with their aspect.
@@ -92,7 +89,7 @@ class NetworkStreamSource:
         self.status = sentence
 
     def _decoded(self, stopping: Event) -> Iterator[tuple[int, Any, float]]:
-        """(number, PyAV frame, when it came), connection after connection."""
+        """Yield (number, PyAV frame, when it came), connection after connection."""
         return reconnecting(partial(self._connection, stopping, itertools.count()), stopping, self._tell)
 
     def _connection(self, stopping: Event, sequence: Iterator[int]) -> Generator[tuple[int, Any, float], None, None]:
@@ -122,7 +119,7 @@ class NetworkStreamSource:
 
 
 def _frames_of(container: Any) -> Iterator[Any]:
-    """Whole pictures as they come; what cannot be decoded, as before the first key frame, is left out."""
+    """Yield whole pictures as they come; what cannot be decoded, as before the first key frame, is left out."""
     import av
 
     stream = container.streams.video[0]

@@ -1,4 +1,4 @@
-"""Rhythm: the times of a recording as they pass in reality.
+"""Sources without a camera: a moving test pattern and a video file, in their own rhythm.
 
 A moving test pattern, to look at a stream without a camera.
 
@@ -19,7 +19,7 @@ from viewfinder.sources.frame_source import SizeLimit
 
 
 class Rhythm:
-    """Waits for the times of a recording; what is late is not hurried after."""
+    """Rhythm of a recording as its times pass in reality; what is late is not hurried after."""
 
     def __init__(self, stopping: Event, now_s: Callable[[], float] = time.monotonic) -> None:
         self._stopping, self._now_s = stopping, now_s
@@ -27,12 +27,12 @@ class Rhythm:
         self._due_s = now_s()
 
     def restart(self, pause_s: float) -> None:
-        """The recording begins again, `pause_s` after the last time waited for."""
+        """Begin the recording again, `pause_s` after the last time waited for."""
         self._start_s = None
         self._due_s += pause_s
 
     def wait_for(self, time_s: float) -> bool:
-        """False if the stop came first."""
+        """Wait for a time; False if the stop came first."""
         if self._start_s is None:
             self._start_s = self._due_s - time_s
         self._due_s = self._start_s + time_s
@@ -47,7 +47,7 @@ DEFAULT_FPS = 30.0
 
 
 class PatternSource:
-    """Colour bars that move to the left, with the number of the frame. A FrameSource."""
+    """FrameSource of colour bars that move to the left, with the number of the frame."""
 
     name, transfer = "test pattern", "srgb"
     status: str | None = None
@@ -68,7 +68,7 @@ class PatternSource:
             yield CameraFrame(bgr, time.monotonic(), sequence)
 
     def picture(self, sequence: int) -> Bgr:
-        """The frame of that number (H, W, 3), blue first."""
+        """Return the frame of that number (H, W, 3), blue first."""
         import cv2
 
         bgr = np.roll(self._background, -4 * sequence, axis=1)
@@ -77,7 +77,7 @@ class PatternSource:
 
 
 class VideoFileSource:
-    """Played in its own rhythm, from the start again when it ends. A FrameSource.
+    """FrameSource of a video file, played in its own rhythm, from the start again when it ends.
 
     max_width_px, max_height_px: larger pictures are scaled down with their aspect. fps: at most so many frames per second.
     """

@@ -1,7 +1,4 @@
-"""A folder into which a tethering tool writes photographs, as a camera that shows the newest.
-
-A photograph that another program writes: read when it is whole, with what its Exif tells of the lens.
-"""
+"""Folder into which a tethering tool writes photographs, as a camera that shows the newest whole one, with its Exif."""
 
 import itertools
 import time
@@ -23,12 +20,15 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
 class NotWholeError(Exception):
-    """The file is still being written, damaged, or no picture."""
+    """File that is still being written, damaged, or no picture."""
 
 
 @dataclass(frozen=True)
 class TetheredPicture:
-    """bgr: upright 8-bit codes (H, W, 3), blue first. full: reads the file once more, at its own size."""
+    """Photograph with what its Exif tells of the lens.
+
+    bgr: upright 8-bit codes (H, W, 3), blue first. full: reads the file once more, at its own size.
+    """
 
     bgr: Bgr
     lens: LensState
@@ -36,7 +36,7 @@ class TetheredPicture:
 
 
 def read_tethered(path: Path, limit: SizeLimit) -> TetheredPicture:
-    """Decodes to the last byte, so that a file cut short raises NotWholeError."""
+    """Decode a file to the last byte, so that one cut short raises NotWholeError."""
     from PIL import Image
 
     try:
@@ -72,7 +72,7 @@ Stamp = tuple[int, int]
 
 
 class WatchedFolderSource:
-    """A FrameSource. The newest whole JPEG, PNG or TIFF, `fps` times a second, so that the stream goes on between two photographs.
+    """FrameSource of the newest whole JPEG, PNG or TIFF, `fps` times a second, so that the stream goes on between two photographs.
 
     captured_s of its frames is when they are shown again. Frames carry the Exif's focus distance, f-number and focal length. A file
     counts once it has kept its size and date for one look and can be decoded to its end. max_width_px, max_height_px: larger
@@ -103,7 +103,7 @@ class WatchedFolderSource:
             stopping.wait(self._pause_s)
 
     def _newer(self) -> TetheredPicture | None:
-        """The newest whole photograph if it is not the one that is shown already."""
+        """Return the newest whole photograph if it is not the one that is shown already."""
         try:
             before, self._seen = self._seen, self._look()
         except OSError:
@@ -130,7 +130,7 @@ class WatchedFolderSource:
         return picture
 
     def _look(self) -> dict[Path, tuple[Stamp, int]]:
-        """Every photograph with its stamp and the number of its arrival, a new one where the stamp is another than before.
+        """Return every photograph with its stamp and the number of its arrival, a new one where the stamp is another than before.
 
         Not its date alone: tools that copy from a card keep the date of the shot.
         """

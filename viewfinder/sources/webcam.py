@@ -1,4 +1,4 @@
-"""A UVC webcam through OpenCV."""
+"""UVC webcam through OpenCV."""
 
 import itertools
 import sys
@@ -14,7 +14,7 @@ from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnec
 
 
 class WebcamSource:
-    """A webcam (or any camera that OpenCV opens by number). A FrameSource; one that is pulled out is waited for.
+    """FrameSource of a webcam (any camera that OpenCV opens by number); one that is pulled out is waited for.
 
     max_width_px, max_height_px: asked of the camera; what it gives in place of that is scaled down with its aspect.
     open_camera: gives an open cv2.VideoCapture. Raises InputError where there is no such camera at the start.
@@ -61,7 +61,7 @@ class WebcamSource:
             camera.release()
 
     def _open(self) -> Any:
-        """An open camera, set to what is wanted; None where it is not there."""
+        """Return an open camera, set to what is wanted; None where it is not there."""
         import cv2
 
         camera = self._open_camera(self._index)

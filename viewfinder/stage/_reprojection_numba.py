@@ -1,4 +1,4 @@
-"""The loops of late reprojection, compiled; they run without the GIL.
+"""Loops of late reprojection, compiled; they run without the GIL.
 
 `view` is fx, fy, cx, cy of the camera that drew, then of the new one; rotation and shift take a point from the first to the second.
 """
@@ -10,7 +10,7 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True, inline="always")
 def _source(x, y, dioptres, view, rotation, shift):  # type: ignore[no-untyped-def]
-    """Where the layer shows what the new camera sees at (x, y), if that has this 1 / depth in the layer; far away if behind."""
+    """Return the place in the layer of what the new camera sees at (x, y), if it has this 1 / depth; far away if behind."""
     ray_x, ray_y = (x - view[6]) / view[4], (y - view[7]) / view[5]
     depth = rotation[0, 2] * ray_x + rotation[1, 2] * ray_y + rotation[2, 2]
     if depth <= 1e-6:
@@ -25,7 +25,7 @@ def _source(x, y, dioptres, view, rotation, shift):  # type: ignore[no-untyped-d
 
 @njit(cache=True, nogil=True, inline="always")
 def _at(grid, x, y):  # type: ignore[no-untyped-def]
-    """A grid whose cells' centres lie at +0.5, bilinearly, continued beyond its border."""
+    """Return a grid's value, bilinearly; cells' centres lie at +0.5, and it is continued beyond its border."""
     height, width = grid.shape
     x, y = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
     i, j = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
@@ -38,7 +38,7 @@ def _at(grid, x, y):  # type: ignore[no-untyped-def]
 def source_nodes(  # type: ignore[no-untyped-def]
     nodes, left, top, step, dioptres, cell, first_dioptres, rounds, view, rotation, shift
 ) -> None:
-    """nodes (N, M, 2): where in the layer pixel (left + step j, top + step i) comes from, by fixed-point iteration over its 1 / depth."""
+    """Fill nodes (N, M, 2): the place in the layer of pixel (left + step j, top + step i), by fixed-point iteration over 1 / depth."""
     for i in range(nodes.shape[0]):
         for j in range(nodes.shape[1]):
             x, y = left + step * j + 0.5, top + step * i + 0.5
@@ -50,7 +50,7 @@ def source_nodes(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def sample(rgb, shines_through, rgba, nodes, step, opacity) -> None:  # type: ignore[no-untyped-def]
-    """The layer at the places between the nodes, bilinearly; nothing beyond its border. Writes rgb (H, W, 3) and shines_through (H, W)."""
+    """Sample the layer between the nodes, bilinearly; nothing beyond its border. Writes rgb (H, W, 3) and shines_through (H, W)."""
     height, width = shines_through.shape
     rows, columns = rgba.shape[0], rgba.shape[1]
     for i in range(height):
@@ -82,7 +82,7 @@ def sample(rgb, shines_through, rgba, nodes, step, opacity) -> None:  # type: ig
 
 @njit(cache=True, nogil=True)
 def _at_border(rgba, u, v):  # type: ignore[no-untyped-def]
-    """The same where some of the four neighbours do not exist."""
+    """Sample where some of the four neighbours do not exist."""
     left, top = int(np.floor(u)), int(np.floor(v))
     red = green = blue = alpha = np.float32(0.0)
     for y in range(max(top, 0), min(top + 2, rgba.shape[0])):

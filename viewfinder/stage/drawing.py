@@ -1,6 +1,6 @@
 """Drawing: the virtual scene as a lens shows it for one pose, drawn only where it is in the picture, ready to be moved to other poses.
 
-When a drawing is too old: once moving it to the wanted pose would no longer show what a new drawing shows.
+`is_outdated` tells when moving a drawing to the wanted pose would no longer show what a new drawing shows.
 """
 
 import functools
@@ -29,7 +29,7 @@ _INVISIBLE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class DrawRequest:
-    """What is to be drawn. camera: of the whole frame, in the tracker's world. time_s: since the scene began."""
+    """Request to draw. camera: of the whole frame, in the tracker's world. time_s: since the scene began."""
 
     camera: Camera
     lens: Lens
@@ -39,7 +39,7 @@ class DrawRequest:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """What was drawn, ready to be moved. None of all: nothing of the scene is in the picture.
+    """Drawing, ready to be moved. None of all: nothing of the scene is in the picture.
 
     layer: blurred; its camera is upright, that of the request is not. sharp: object and shadow in focus, in the whole box.
     depth_m: of what is sharp; inf where nothing is. lens: of the box's part of the sensor.
@@ -56,7 +56,7 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class RenderSetup:
-    """What draws: a backend for the objects, a renderer for the lens, and what real things hide.
+    """Set-up of a drawing: a backend for the objects, a renderer for the lens, and what real things hide.
 
     live: a faster backend for what is drawn again and again; None takes `backend` for that too.
     """
@@ -93,7 +93,7 @@ def _depth_range_m(points_m: Float[np.ndarray, "points 3"], camera: Camera) -> t
 
 
 def sharp_layers(staged: StagedScene, time_s: float, camera: Camera, render_setup: RenderSetup) -> list[Layer]:
-    """Object, then shadow, as `render_setup.backend` draws them."""
+    """Return object, then shadow, as `render_setup.backend` draws them."""
     scene, shadow, catcher = staged.scene_at(time_s), staged.description.shadow, staged.catcher
     layers = [render_setup.backend.render(scene, camera)]
     if shadow is not None and catcher is not None and scene.lighting[0] and shadow.strength > 0:
@@ -106,7 +106,7 @@ def _rgba(layer: Layer) -> Float32[np.ndarray, "height width 4"]:
 
 
 def _padded(layers: Sequence[Layer]) -> Sequence[Layer]:
-    """Sizes that are multiples of the grid of depths; whole frames need not be."""
+    """Pad layers to sizes that are multiples of the grid of depths; whole frames need not be."""
     height, width = layers[0].alpha.shape
     below, right = -height % GRID_PX, -width % GRID_PX
     if not below and not right:
@@ -119,7 +119,7 @@ def _padded(layers: Sequence[Layer]) -> Sequence[Layer]:
 
 
 def _trimmed(layer: MovableLayer) -> MovableLayer | None:
-    """Cut to the pixels that it touches, in whole cells of the grid of depths and whole pixels of the frame; None if there are none."""
+    """Cut to the touched pixels, in whole cells of the grid of depths and whole pixels of the frame; None if there are none."""
     touched = functools.reduce(np.maximum, [np.abs(layer.rgba[..., channel]) for channel in range(4)]) > _INVISIBLE
     rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
     if not len(rows):
@@ -146,7 +146,7 @@ _MOMENT_S = 1 / 120
 
 
 def is_outdated(drawing: Drawing, wanted: DrawRequest, is_animated: bool) -> bool:
-    """Whether to draw again for what is wanted. The resolution of neither counts."""
+    """Tell whether to draw again for what is wanted. The resolution of neither counts."""
     drawn = drawing.request
     if is_animated and abs(wanted.time_s - drawn.time_s) >= _MOMENT_S:
         return True
@@ -163,7 +163,7 @@ def is_same_view(one: Camera, other: Camera) -> bool:
 
 
 def moved_px(drawing: Drawing, camera: Camera) -> float:
-    """How far anything of the drawing moves in the picture at most, when it is moved to a camera of the same world as the request's."""
+    """Return how far anything of the drawing moves at most, when it is moved to a camera of the same world as the request's."""
     drawn, layer = drawing.request.camera, drawing.layer
     if layer is None:
         return 0.0
@@ -178,7 +178,7 @@ def _farthest_px(corners_px: Float[np.ndarray, "4 2"], depth_m: float, drawn: Ca
 
 
 def blur_changed(drawn: Lens, wanted: Lens, drawing: Drawing) -> bool:
-    """Whether circles of confusion differ by a quarter of a pixel, or their shape at all."""
+    """Tell whether circles of confusion differ by a quarter of a pixel, or their shape at all."""
     if drawn == wanted:
         return False
     same_optics = replace(

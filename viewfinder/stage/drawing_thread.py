@@ -1,7 +1,4 @@
-"""DrawingThread: draws the newest request at its own rate, beside the stream, and reloads the scene when its files change.
-
-How finely to draw: coarser where a drawing takes too long, finer again where there is time.
-"""
+"""DrawingThread: draws the newest request beside the stream, as finely as time allows, and reloads the scene when its files change."""
 
 import logging
 import time
@@ -21,13 +18,13 @@ _SPARE = 0.8
 
 
 class AdaptiveResolution:
-    """now: what the next drawing should have. The time of a drawing grows with its pixels."""
+    """Resolution of the next drawing (`now`). The time of a drawing grows with its pixels."""
 
     def __init__(self) -> None:
         self.now = 1.0
 
     def took(self, resolution: float, seconds: float) -> None:
-        """A drawing at this resolution took so long."""
+        """Learn that a drawing at this resolution took so long."""
         place = RESOLUTIONS.index(resolution)
         if seconds > LONGEST_S:
             self.now = RESOLUTIONS[min(place + 1, len(RESOLUTIONS) - 1)]
@@ -48,7 +45,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A drawing with what it was drawn from; started_s, finished_s: by `time.monotonic`."""
+    """Drawing with what it was drawn from; started_s, finished_s: by `time.monotonic`."""
 
     drawing: Drawing
     setup: StageSetup
@@ -57,7 +54,7 @@ class Drawn:
 
 
 class DrawingThread:
-    """newest: the last drawing that was finished. Requests that come while one is drawn replace one another.
+    """Thread that draws. newest: the last drawing that was finished. Requests that come while one is drawn replace one another.
 
     problem: a sentence about what keeps the scene file from being read or the scene from being drawn; None if nothing does.
     """
@@ -87,7 +84,7 @@ class DrawingThread:
 
     @property
     def draws_per_s(self) -> float:
-        """Over the last two seconds."""
+        """Rate of drawings over the last two seconds."""
         since_s = time.monotonic() - _RATE_OVER_S
         return sum(end_s > since_s for end_s in tuple(self._ends_s)) / _RATE_OVER_S
 
@@ -118,7 +115,7 @@ class DrawingThread:
             self._busy.clear()
 
     def _is_drawn(self, request: DrawRequest) -> bool:
-        """Whether what was drawn since it was asked for will do: while one view is drawn, every frame asks for it again."""
+        """Tell whether what was drawn since it was asked for will do: while one view is drawn, every frame asks for it again."""
         newest, setup = self.newest, self._setup
         if newest is None or newest.setup is not setup or newest.drawing.request.resolution < request.resolution:
             return False

@@ -27,17 +27,17 @@ _SAME_SIZE = 0.02
 @runtime_checkable
 class Occlusion(Protocol):
     def matte(self, depth_m: Plane, camera: Camera, frame: Camera) -> Plane:
-        """How much of virtual things at these depths stays visible, 1 is all. camera: cut out of `frame`, both upright."""
+        """Return how much of virtual things at these depths stays visible, 1 is all. camera: cut out of `frame`, both upright."""
         ...
 
     def depth_m(self, camera: Camera) -> Plane | None:
-        """Depth of the real things as a camera sees them, inf where it is not known; None where depth is never known."""
+        """Return the depth of the real things as a camera sees them, inf where unknown; None where depth is never known."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class RealDepth:
-    """The depth (metres, inf is not known) that `view`, an upright camera, saw. Everything stands still."""
+    """Depth (metres, inf is not known) that `view`, an upright camera, saw. Everything stands still."""
 
     seen_m: Plane
     view: Camera
@@ -63,7 +63,7 @@ class RealDepth:
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """hides: (H, W) over the whole frame, 1 where something real is always in front."""
+    """Mask of a camera that stands still. hides: (H, W) over the whole frame, 1 where something real is always in front."""
 
     hides: Plane
 
@@ -85,7 +85,7 @@ class Mask:
 
 
 def read_occlusion(real: RealThings | None, up: str) -> Occlusion | None:
-    """What the scene file's [occlusion] names; InputError where a file is not what it should be."""
+    """Read what the scene file's [occlusion] names; InputError where a file is not what it should be."""
     if real is None:
         return None
     if real.mask is not None:

@@ -1,7 +1,4 @@
-"""How a stage is doing: what the page shows beside the picture.
-
-The protocol of what lies over the camera's picture.
-"""
+"""OverlaySource: the protocol of what lies over the camera's picture, and the status that the page shows of it."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -17,7 +14,9 @@ from viewfinder.tracking.tracker import TrackedPose
 
 @dataclass(frozen=True)
 class StageStatus:
-    """layer_age_ms: since the drawing that is shown was begun, None before the first. lens: that blurred it.
+    """Status that the page shows beside the picture.
+
+    layer_age_ms: since the drawing that is shown was begun, None before the first. lens: that blurred it.
 
     focus_pending: another blur was asked for and is not shown yet. draws_per_s: over the last two seconds. busy: drawing now.
     resolution: of the drawing, 1 is every pixel. opacity: 0 where the track is lost. problem: a sentence for the page, or None.
@@ -37,7 +36,7 @@ class StageStatus:
 
 @runtime_checkable
 class OverlaySource(Protocol):
-    """`overlay` and `picture` belong to the compositing thread; everything else may be called from any. Points are in pixels of the frame.
+    """Source of what lies over the camera's picture. `overlay` and `picture` belong to the compositing thread. Points: px of the frame.
 
     views: that `picture` can show.
     """
@@ -48,19 +47,19 @@ class OverlaySource(Protocol):
     def status(self) -> StageStatus: ...
 
     def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:
-        """What lies over the frame now; must be fast, the drawing of it happens elsewhere."""
+        """Return what lies over the frame now; must be fast, the drawing of it happens elsewhere."""
         ...
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
-        """One of `views`, of the frame for which `overlay` was asked last."""
+        """Return one of `views`, of the frame for which `overlay` was asked last."""
         ...
 
     def depth_at_m(self, x_px: float, y_px: float) -> float:
-        """What is seen there; InputError where nothing is known."""
+        """Return the depth seen there; InputError where nothing is known."""
         ...
 
     def sharp_layers(self, camera: Camera) -> list[Layer]:
-        """Everything virtual in focus as a camera (with pose) sees it now, front first; may take its time."""
+        """Return everything virtual in focus as a camera (with pose) sees it now, front first; may take its time."""
         ...
 
     def set_renderer(self, name: str, renderer: Renderer) -> None: ...

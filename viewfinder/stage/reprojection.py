@@ -4,7 +4,7 @@ Not the sharp picture is moved and blurred again, which would cost a drawing, bu
 what it shows (mrbokeh's circles of confusion change little while the camera moves by a few pixels). The map is the inverse one, from new
 pixels to old: a fixed point, for the depth is known in the old picture. It is solved on every 4th pixel and bilinear between.
 
-The depth by which a blurred layer is moved: of all that a blurred pixel shows, the mean, filled outwards where it shows nothing.
+LayerDepth gives that depth: of all that a blurred pixel shows, the mean, filled outwards where it shows nothing.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ Plane = Float32[np.ndarray, "height width"]
 
 
 class LayerDepth:
-    """Spreads 1 / depth as the lens spreads light, at a quarter of the resolution.
+    """Depth by which a blurred layer moves: 1 / depth spread as the lens spreads light, at a quarter of the resolution.
 
     A pixel of a bokeh disc moves as the point does that it comes from, and that may lie half a disc away: so the depth has to be
     spread with the weights of the light. 1 / depth and not depth is averaged, because parallax is linear in it. An octagon stands for any
@@ -44,7 +44,7 @@ class LayerDepth:
         self._renderer: Renderer = make_renderer("polygon", threads=1, layering=Layering(slices=8))
 
     def seen_dioptres(self, layers: Sequence[Layer], lens: Lens) -> Float32[np.ndarray, "rows columns"]:
-        """1 / depth on a grid of every 4th pixel of sharp layers, front first; their sizes are multiples of 4. lens: of these pixels."""
+        """Return 1 / depth on a grid of every 4th pixel of sharp layers, front first, whose sizes are multiples of 4. lens: theirs."""
         plain = replace(lens, aperture=_OCTAGON, tilt_rad=(0.0, 0.0), petzval_radius_mm=float("inf"))
         small = _as_light(layers)
         spread = self._renderer.render([small], plain)
@@ -54,7 +54,7 @@ class LayerDepth:
 
 
 def _as_light(layers: Sequence[Layer]) -> Layer:
-    """All layers as a small one whose light is 1 / depth."""
+    """Return all layers as a small one whose light is 1 / depth."""
     size = (layers[0].width_px // GRID_PX, layers[0].height_px // GRID_PX)
     covered, dioptres = np.zeros_like(layers[0].alpha), np.zeros_like(layers[0].alpha)
     for layer in layers:
@@ -83,7 +83,7 @@ def filled_outwards(weighted: Plane, weight: Plane) -> Plane:
 
 
 def _grown(level: tuple[Plane, Plane]) -> tuple[Plane, Plane]:
-    """Unknown pixels beside known ones take the sum of these; the known ones stay."""
+    """Give unknown pixels beside known ones the sum of these; the known ones stay."""
     values, known = level
     around = [cv2.boxFilter(plane, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT) for plane in level]
     # A sliding sum leaves crumbs of what it has passed: they are not known.
@@ -108,7 +108,7 @@ _PAD_PX = 1
 
 @dataclass(frozen=True, eq=False)
 class MovableLayer:
-    """A picture with the depth by which it moves.
+    """Picture with the depth by which it moves.
 
     rgba: (H, W, 4) premultiplied. dioptres: 1 / depth on a grid of every 4th pixel. camera: cut to this picture, with its pose.
     left_px, top_px: of the picture in the frame for which it was drawn, at full resolution.
@@ -122,7 +122,7 @@ class MovableLayer:
     resolution: float = 1.0
 
     def moved_to(self, camera: Camera, opacity: float = 1.0) -> Overlay:
-        """What a camera with any pose, size and focal length sees of it. In the pose of the drawing it is the drawing, bit for bit."""
+        """Return what a camera of any pose, size and focal length sees of it; in the pose of the drawing it is the drawing itself."""
         if self._is_drawn_for(camera):
             return _cut_to_frame(self.rgba, self.left_px, self.top_px, camera, opacity)
         from_drawn = camera.camera_from_world @ self.camera.world_from_camera
@@ -144,7 +144,7 @@ class MovableLayer:
         return same_view and np.array_equal(camera.camera_from_world, self.camera.camera_from_world)
 
     def _lands_in(self, camera: Camera, from_drawn: Float[np.ndarray, "4 4"]) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom of where the picture lands in the frame: of its grid of depths, corners and all."""
+        """Return left, top, right, bottom of where the picture lands in the frame: of its grid of depths, corners and all."""
         rows, columns = self.dioptres.shape
         x = np.minimum(np.linspace(0.0, self.rgba.shape[1], columns + 1), self.rgba.shape[1])
         y = np.minimum(np.linspace(0.0, self.rgba.shape[0], rows + 1), self.rgba.shape[0])

@@ -1,11 +1,4 @@
-"""ShownScene: what the newest frame shows of the scene, for those who ask about it: picking and views.
-
-The views of the page: plate, virtual, matte, depth, coc and final, as pictures of the size of the plate.
-
-What lies under a point of the picture: which object, which place of the table, at which depth.
-
-Where a point of the picture lies on the ground: the homography that the page drags objects with.
-"""
+"""ShownScene: what the newest frame shows of the scene: the views of the page, what lies under a point, and the ground for dragging."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,10 +10,9 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from mrbokeh.compositing.overlay import CodeTables, Overlay
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene
-from mrbokeh.scene.staging.scene_description import Triple
 from mrbokeh.scene.staging.staged_scene import StagedScene
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.world_axes import rays, turned_back, upright_camera
+from mrbokeh.tracking.world_axes import rays, upright_camera
 from viewfinder.frames import Bgr
 from viewfinder.stage.drawing import Drawing
 from viewfinder.stage.occlusion import Occlusion
@@ -28,7 +20,7 @@ from viewfinder.stage.occlusion import Occlusion
 
 @dataclass(frozen=True, eq=False)
 class ShownScene:
-    """camera: of the newest frame, upright. drawing: the one that was moved to it to become the overlay."""
+    """Scene as the newest frame shows it. camera: upright. drawing: the one that was moved to it to become the overlay."""
 
     overlay: Overlay
     camera: Camera
@@ -43,7 +35,7 @@ _SAME_DIOPTRES = 1e-3
 
 
 def view_picture(view: str, plate_bgr: Bgr, seen: ShownScene | None, tables: CodeTables) -> Bgr:
-    """One of VIEWS. seen: None before the first drawing, when only the plate shows anything. InputError for an unknown name.
+    """Paint one of VIEWS. seen: None before the first drawing, when only the plate shows anything. InputError for an unknown name.
 
     matte: white is all virtual, a shadow counts by how dark it is. depth: red is near, blue far, by 1 / depth over what is seen.
     coc: white is in focus, red behind, blue in front; full colour is the largest circle of confusion that is seen, 1 px at least.
@@ -96,7 +88,7 @@ def _coc(plate_bgr: Bgr, seen: ShownScene, tables: CodeTables) -> Bgr:  # noqa: 
 
 
 def _moved(values: Plane, seen: ShownScene) -> tuple[Overlay, Float32[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
-    """Values of the sharp picture in the newest one: (where, the values, whether there is anything)."""
+    """Move values of the sharp picture to the newest one: (where, the values, whether there is anything)."""
     sharp = seen.drawing.sharp
     assert sharp is not None, "a drawing with depth has a sharp layer"
     alpha = sharp.rgba[..., 3]
@@ -110,7 +102,7 @@ def _moved(values: Plane, seen: ShownScene) -> tuple[Overlay, Float32[np.ndarray
 
 
 def _placed(colours: UInt8[np.ndarray, "rows columns 3"], overlay: Overlay, plate_bgr: Bgr) -> Bgr:
-    """A picture as large as the plate, black outside the overlay's box."""
+    """Return a picture as large as the plate, black outside the overlay's box."""
     result = np.zeros_like(plate_bgr)
     height, width = overlay.shines_through.shape
     result[overlay.top_px : overlay.top_px + height, overlay.left_px : overlay.left_px + width] = colours
@@ -133,7 +125,7 @@ _PARALLEL = 1e-12
 
 
 def object_at(seen: ShownScene, x_px: float, y_px: float) -> tuple[str, float] | None:
-    """Name and depth (metres, along the optical axis) of the virtual object at a point of the newest picture; None where there is none."""
+    """Return name and depth (metres, along the axis) of the virtual object at a point of the newest picture; None where there is none."""
     eye_m, ray = _ray(seen.camera, x_px, y_px)
     parts = seen.staged.parts_at(seen.drawing.request.time_s)
     met = [(_nearest_m(scene, eye_m, ray), name) for name, scene in parts.items()]
@@ -142,21 +134,8 @@ def object_at(seen: ShownScene, x_px: float, y_px: float) -> tuple[str, float] |
     return (name, depth_m) if depth_m < min(real_m, _FARTHEST_M) else None
 
 
-def table_point_m(seen: ShownScene, x_px: float, y_px: float, height_m: float = 0.0) -> Triple | None:
-    """Where the ray through a point of the picture meets the table, in the tracker's world; None where it does not within 100 m.
-
-    height_m: of the plane above the table: dragging an object that floats moves it in the plane in which it is.
-    """
-    eye_m, ray = _ray(seen.camera, x_px, y_px)
-    depth_m = _table_depth_m(eye_m, ray, height_m)
-    if not depth_m < _FARTHEST_M:
-        return None
-    x, y, z = (eye_m + depth_m * ray).tolist()
-    return turned_back((x, y, z), seen.staged.description.up)
-
-
 def depth_at_m(seen: ShownScene, x_px: float, y_px: float) -> float:
-    """What a tap there focuses on: the virtual object, else the depth that was measured, else the table. InputError for none of them."""
+    """Return the depth a tap focuses on: of the virtual object, else as measured, else of the table. InputError for none of them."""
     picked = object_at(seen, x_px, y_px)
     if picked is not None:
         return picked[1]
@@ -174,16 +153,16 @@ def _ray(camera: Camera, x_px: float, y_px: float) -> tuple[Float[np.ndarray, "3
     return camera.world_from_camera[:3, 3], rays(camera, np.array([[x_px, y_px]]))[0]
 
 
-def _table_depth_m(eye_m: Float[np.ndarray, "3"], ray: Float[np.ndarray, "3"], height_m: float = 0.0) -> float:
-    """inf where the ray does not fall onto the level plane (up is -y)."""
+def _table_depth_m(eye_m: Float[np.ndarray, "3"], ray: Float[np.ndarray, "3"]) -> float:
+    """Return the depth of the level plane (up is -y); inf where the ray does not fall onto it."""
     if abs(ray[1]) < _PARALLEL:
         return float("inf")
-    depth_m = float((-height_m - eye_m[1]) / ray[1])
+    depth_m = float(-eye_m[1] / ray[1])
     return depth_m if depth_m > 0 else float("inf")
 
 
 def _real_depth_m(occlusion: Occlusion | None, camera: Camera, x_px: float, y_px: float) -> float:
-    """Depth measured at the pixel; inf where nothing was."""
+    """Return the depth measured at the pixel; inf where nothing was."""
     column, row = min(int(x_px), camera.width_px - 1), min(int(y_px), camera.height_px - 1)
     one_pixel = Camera(1, 1, camera.focal_px, (camera.principal_px[0] - column, camera.principal_px[1] - row), camera.camera_from_world)
     depth_m = None if occlusion is None else occlusion.depth_m(one_pixel)
@@ -191,7 +170,7 @@ def _real_depth_m(occlusion: Occlusion | None, camera: Camera, x_px: float, y_px
 
 
 def _nearest_m(scene: Scene, eye_m: Float[np.ndarray, "3"], ray: Float[np.ndarray, "3"]) -> float:
-    """First crossing of a ray with any triangle, from either side (Moeller and Trumbore 1997); in units of the ray's length."""
+    """Return the first crossing of a ray with any triangle, from either side (Moeller and Trumbore 1997), in lengths of the ray."""
     corners = [mesh.positions_m[mesh.triangles] for mesh in scene.meshes if len(mesh.triangles)]
     if not corners:
         return float("inf")
@@ -211,7 +190,7 @@ _LEAST_DETERMINANT = 1e-12
 
 
 def ground_from_picture(camera: Camera, up: str) -> Float[np.ndarray, "3 3"] | None:
-    """(x, y, 1), right and down from 0 to 1 in the picture, to (x, z) in metres on the table, times their third component.
+    """Return the homography from (x, y, 1), 0 to 1 right and down in the picture, to (x, z) in metres on the table.
 
     camera: with its pose in the tracker's world; up: which of its directions is up. A ground point (x, 0, z) is seen at
     K [r_1 r_3 t] (x, z, 1) for a camera with the pose [r_1 r_2 r_3 | t] (Hartley and Zisserman 2004, 8.1.1). None where the eye is

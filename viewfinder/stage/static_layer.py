@@ -32,7 +32,7 @@ class Blurred:
 
 
 class StaticLayer:
-    """A OverlaySource. Lenses that come while a blur is under way replace one another, so that the last one wins.
+    """OverlaySource of a finished layer. Lenses that come while a blur is under way replace one another, so that the last one wins.
 
     sharp: the all-in-focus layer, in the size of the frames. `shown` is the newest finished blur. Picture and status are of the blur
     that `overlay` gave last, so that a blur finished while a frame is composited is told of with the next frame.
@@ -63,7 +63,7 @@ class StaticLayer:
         return StageStatus(age_ms, given.lens, self.pending, 0.0, self._busy.is_set(), 1.0, 1.0, 0, self._renderer_name, self._problem)
 
     def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:  # noqa: ARG002
-        """InputError where the frames are not of the layer's size."""
+        """Return the newest blur; InputError where the frames are not of the layer's size."""
         if (intrinsics.height_px, intrinsics.width_px) != self.sharp.alpha.shape:
             raise InputError(
                 f"the layer is {self.sharp.width_px}x{self.sharp.height_px} px, the camera gives {intrinsics.width_px}x"

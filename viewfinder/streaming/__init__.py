@@ -1,1 +1,1 @@
-"""Encoded once, sent to many: WebRTC and recordings."""
+"""Streams that are encoded once and sent to many: WebRTC, recordings, webcam."""

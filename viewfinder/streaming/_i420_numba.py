@@ -1,4 +1,4 @@
-"""The loop over 2x2 pixels from 8-bit BGR to I420, compiled; it runs without the GIL."""
+"""Loop over 2x2 pixels from 8-bit BGR to I420, compiled; it runs without the GIL."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ SHIFT = 16
 
 @njit(cache=True, nogil=True)
 def i420_from_bgr(bgr: np.ndarray, y: np.ndarray, u: np.ndarray, v: np.ndarray, coefficients: np.ndarray, floor: int) -> None:
-    """Fills y (H, >= W), u and v (H/2, >= W/2) from bgr (H, W, 3), whose last odd row and column are left out.
+    """Fill y (H, >= W), u and v (H/2, >= W/2) from bgr (H, W, 3), whose last odd row and column are left out.
 
     coefficients: (3, 3) integers, rows for y, u and v, columns for blue, green and red, in units of 2**-SHIFT. floor: the code of black.
     Chroma is that of the mean of 2x2 pixels. Sums are rounded to nearest, halves up.

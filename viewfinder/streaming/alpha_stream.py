@@ -28,7 +28,7 @@ class _Shown:
 
 
 class AlphaStream:
-    """Feeds an EncodedStream of its own, in a thread of its own. transfer: of the camera's codes, which OBS gets from elsewhere."""
+    """Feeder of an EncodedStream of its own, in a thread of its own. transfer: of the camera's codes, which OBS gets from elsewhere."""
 
     def __init__(self, stream: EncodedStream, transfer: str) -> None:
         self._stream, self._transfer = stream, transfer
@@ -42,7 +42,7 @@ class AlphaStream:
         return self._stream.wants_frame
 
     def show(self, overlay: Overlay, frame: OutputFrame) -> None:
-        """The overlay that lies in that frame; returns at once."""
+        """Take the overlay that lies in that frame; returns at once."""
         self._newest.put(_Shown(overlay, frame))
 
     def fail(self, sentence: str) -> None:
@@ -63,7 +63,7 @@ class AlphaStream:
 
 
 def color_over_alpha(overlay: Overlay, width_px: int, height_px: int, transfer: str) -> UInt8[np.ndarray, "double width 3"]:
-    """(2 H, W, 3) 8-bit codes, blue first: above premultiplied colour, below alpha as grey. A last odd row is left out."""
+    """Return (2 H, W, 3) 8-bit codes, blue first: above premultiplied colour, below alpha as grey. A last odd row is left out."""
     height_px &= ~1
     picture = np.zeros((2 * height_px, width_px, 3), np.uint8)
     rows, columns = overlay.shines_through.shape
@@ -79,7 +79,7 @@ def color_over_alpha(overlay: Overlay, width_px: int, height_px: int, transfer: 
 def _premultiplied_codes(
     light: Float32[np.ndarray, "rows columns 3"], alpha: Float32[np.ndarray, "rows columns 1"], transfer: str
 ) -> Float32[np.ndarray, "rows columns 3"]:
-    """What is to be added to codes of the camera times one minus alpha: alpha times the code of the surface.
+    """Return what is to be added to codes of the camera times one minus alpha: alpha times the code of the surface.
 
     Light beyond what the coverage can reflect (a glow) is added as its own code, so that it does not vanish where alpha is 0.
     """
@@ -90,7 +90,7 @@ def _premultiplied_codes(
 
 
 class ObsPart:
-    """The page for OBS and its stream as one part of a site. whep: of AlphaStream's EncodedStream."""
+    """Page for OBS and its stream as one part of a site. whep: of AlphaStream's EncodedStream."""
 
     def __init__(self, whep: Whep) -> None:
         self._whep = whep
@@ -103,7 +103,7 @@ class ObsPart:
 
 
 def obs_routes(whep: Whep) -> list[web.RouteDef]:
-    """/obs, the page for OBS's browser source, and /obs/whep, where it gets its stream (a Whep of AlphaStream's EncodedStream)."""
+    """Return the routes /obs, the page for OBS's browser source, and /obs/whep, where it gets its stream."""
     text = files("viewfinder.streaming").joinpath("obs.html").read_text(encoding="utf-8")
 
     async def page(_request: web.Request) -> web.Response:

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class EncodedStream:
-    """A FrameSink with one thread: the newest picture is encoded, older ones that waited are dropped before they cost anything.
+    """FrameSink with one thread: the newest picture is encoded, older ones that waited are dropped before they cost anything.
 
     capacity: packets that may wait for one viewer before it counts as fallen behind. keyframe_gap_s: keyframes that viewers ask
     for come at least so far apart. keyframe_every_s: one is made at least so often, for receivers that cannot ask.
@@ -57,7 +57,7 @@ class EncodedStream:
 
     @property
     def failure(self) -> str | None:
-        """Why there are no pictures; None where there are."""
+        """Reason why there are no pictures; None where there are."""
         return self._audience.failure
 
     def show(self, frame: OutputFrame) -> None:
@@ -69,7 +69,7 @@ class EncodedStream:
         self._audience.tell(sentence)
 
     def watch(self, codec: str, wake: Callable[[], None]) -> ViewerQueue:
-        """A new viewer's queue, which begins with a keyframe. codec: of ENCODERS. wake: called in the encoder's thread."""
+        """Return a new viewer's queue, which begins with a keyframe. codec: of ENCODERS. wake: called in the encoder's thread."""
         if codec not in ENCODERS:
             raise ValueError(f"expected a codec of {list(ENCODERS)}, got {codec!r}")
         return self._audience.join(codec, wake)
@@ -125,7 +125,7 @@ class EncodedStream:
         return header
 
     def _encoder(self, codec: str, size_px: tuple[int, int]) -> VideoEncoder:
-        """The encoder in use, or a new one where the size changed; a new one begins with a keyframe."""
+        """Return the encoder in use, or a new one where the size changed; a new one begins with a keyframe."""
         if codec in self._encoders and self._encoders[codec].size_px != size_px:
             self._close_encoders({codec})
         if codec not in self._encoders:

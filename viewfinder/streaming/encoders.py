@@ -1,12 +1,7 @@
-"""VideoEncoder: pictures in, one packet for each out, at once; what H.264 and VP8 have in common.
+"""Encoders of the stream: finished pictures to I420 with an explicit matrix and range, and H.264 or VP8 of them, a packet for each at once.
 
-From finished pictures to what video encoders take: luma, and chroma at half the resolution, of an explicit matrix and range.
-
-H.264 as every browser takes it: x264, constrained baseline, no delay, parameter sets with every IDR, colour tags in the stream.
-
-VP8 for browsers that cannot play H.264 (Chromium without proprietary codecs). It has no colour tags: BT.601 limited is what it means.
-
-Capture times on the clock of RTP.
+H.264 is x264's constrained baseline as every browser takes it: no delay, parameter sets with every IDR, colour tags in the stream. VP8 is
+for browsers that cannot play it (Chromium without proprietary codecs); it has no colour tags: BT.601 limited is what it means.
 """
 
 import time
@@ -32,7 +27,10 @@ _BITS_PER_PIXEL, _LEAST_BPS, _MOST_BPS = 0.2, 1_500_000, 12_000_000
 
 @dataclass(frozen=True)
 class StreamQuality:
-    """fps: what the rate control expects; frames may come at any time. bitrate_bps: None follows the size of the picture."""
+    """Quality of a stream.
+
+    fps: what the rate control expects; frames may come at any time. bitrate_bps: None follows the size of the picture.
+    """
 
     fps: float = 30.0
     bitrate_bps: int | None = None
@@ -47,7 +45,7 @@ OpenContext = Callable[[int, int, StreamQuality], Any]
 
 
 class VideoEncoder:
-    """Encodes PyAV frames of one size (see `i420_frame`); `keyframes` and `encode_ms` (of the last frame) are measured.
+    """Encoder of PyAV frames of one size (see `i420_frame`); `keyframes` and `encode_ms` (of the last frame) are measured.
 
     The first packet is a picture that stands alone (IDR), and so is the next one after `force_keyframe`; all others refer to
     the one before, so that none may be left out.
@@ -63,7 +61,7 @@ class VideoEncoder:
         self._forced = True
 
     def encode(self, frame: Any, ticks: int) -> Any:
-        """The packet (`av.Packet`) of a frame. ticks: its time in units of TIME_BASE; must grow."""
+        """Return the packet (`av.Packet`) of a frame. ticks: its time in units of TIME_BASE; must grow."""
         from av.video.frame import PictureType
 
         started_s = time.perf_counter()
@@ -80,7 +78,7 @@ class VideoEncoder:
 
 
 def tagged_context(codec: str, width_px: int, height_px: int, quality: StreamQuality) -> Any:
-    """A PyAV encoder of that name for frames of `i420_frame`, with nothing but size, rate and colour set."""
+    """Return a PyAV encoder of that name for frames of `i420_frame`, with nothing but size, rate and colour set."""
     import av
 
     context: Any = av.CodecContext.create(codec, "w")
@@ -102,12 +100,12 @@ STREAM_COLOR = VideoColor(matrix=6, code_range=LIMITED, transfer=1, primaries=1)
 
 
 def even_size(bgr: Bgr) -> tuple[int, int]:
-    """(width, height) in px of the stream of a picture; a last odd column or row is left out, for chroma is halved."""
+    """Return (width, height) in px of the stream of a picture; a last odd column or row is left out, for chroma is halved."""
     return bgr.shape[1] & ~1, bgr.shape[0] & ~1
 
 
 def i420_frame(bgr: Bgr, color: VideoColor = STREAM_COLOR) -> Any:
-    """A tagged PyAV frame (yuv420p) of 8-bit display codes. Chroma belongs to the middle of 2x2 pixels, as browsers show it.
+    """Return a tagged PyAV frame (yuv420p) of 8-bit display codes. Chroma belongs to the middle of 2x2 pixels, as browsers show it.
 
     FFmpeg's own conversion is half a code too dark in the mean (see mrbokeh.video.frames); OpenCV's takes the chroma of one pixel
     in four, so that coloured edges flicker.
@@ -124,13 +122,13 @@ def i420_frame(bgr: Bgr, color: VideoColor = STREAM_COLOR) -> Any:
 
 
 def _lines(plane: Any) -> UInt8[np.ndarray, "rows columns"]:
-    """The numbers of a plane, padded lines whole; they live as long as the frame."""
+    """Return the numbers of a plane, padded lines whole; they live as long as the frame."""
     return np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
 
 
 @lru_cache(maxsize=8)
 def coefficients(color: VideoColor) -> Int64[np.ndarray, "3 3"]:
-    """Rows y, u, v; columns blue, green, red; in units of 2**-16 (H.273, 8.3). Grey has no chroma, and white is exact."""
+    """Return rows y, u, v; columns blue, green, red; in units of 2**-16 (H.273, 8.3). Grey has no chroma, and white is exact."""
     red, blue = color.luma_weights
     green = 1.0 - red - blue
     luma_span, chroma_span = (219 / 255, 224 / 255) if color.code_range == LIMITED else (1.0, 1.0)
@@ -147,7 +145,7 @@ _BUFFER_S = 0.5
 
 
 def h264_encoder(width_px: int, height_px: int, quality: StreamQuality | None = None) -> VideoEncoder:
-    """Even sizes. The level in the stream is the lowest that fits size, rate and bitrate (x264 finds it)."""
+    """Make an encoder of H.264 for even sizes. Its level is the lowest that fits size, rate and bitrate (x264 finds it)."""
     return VideoEncoder(_h264_context, width_px, height_px, quality or StreamQuality())
 
 
@@ -194,14 +192,14 @@ ENCODERS: dict[str, Callable[[int, int, StreamQuality], VideoEncoder]] = {"H264"
 
 
 class RtpClock:
-    """Counts from the first picture; grows also where a picture is shown twice or a camera's clock steps back."""
+    """Clock of capture times in RTP's ticks; it grows also where a picture is shown twice or a camera's clock steps back."""
 
     def __init__(self) -> None:
         self._origin_s: float | None = None
         self._last_ticks = -1
 
     def ticks(self, captured_s: float) -> int:
-        """In units of `encoder.TIME_BASE`."""
+        """Return the time since the first picture in units of TIME_BASE."""
         if self._origin_s is None:
             self._origin_s = captured_s
         self._last_ticks = max(self._last_ticks + 1, round((captured_s - self._origin_s) * TICKS_PER_S))

@@ -1,9 +1,8 @@
-"""The addresses that browsers hide behind names: candidates such as 0500-30d8.local (draft-ietf-mmusic-mdns-ice-candidates).
+"""Session descriptions (SDP) of browsers: what an offer has to be, which codec comes out of it, and addresses hidden behind names.
 
-Whoever may not use the camera gets a made-up name for the own address, which only multicast DNS resolves. Many networks and all
-containers swallow that, and aioice waits a second for it before it answers. But the offer came from that address.
-
-What a viewer's SDP offer has to be, and which codec comes out of it.
+Browsers that may not use the camera get a made-up name for their address (candidates such as 0500-30d8.local, draft-ietf-mmusic-mdns-
+ice-candidates), which only multicast DNS resolves. Many networks and all containers swallow that, and aioice waits a second for it
+before it answers. But the offer came from that address.
 """
 
 import ipaddress
@@ -20,7 +19,7 @@ _NAMED = re.compile(r"^(a=candidate:(?:\S+ ){4})\S+\.local(?= \d+ typ )", re.MUL
 
 
 def with_address(sdp: str, remote: str | None) -> str:
-    """The description with `remote`, the address that it came from, in place of all .local names of its candidates.
+    """Return the description with `remote`, the address that it came from, in place of all .local names of its candidates.
 
     It stays as it is where `remote` is no literal IP (as on a socket of the file system) or means something only here (a zone).
     Behind a proxy the address is wrong, as a name that does not resolve is; the viewer then finds us, as ICE allows.
@@ -47,7 +46,7 @@ _MOST_SECTIONS = 4
 
 
 def require_offer(sdp: str) -> None:
-    """InputError unless it asks for video, and with all that a connection needs."""
+    """Raise InputError unless an offer asks for video, and with all that a connection needs."""
     try:
         media = SessionDescription.parse(sdp).media
     except Exception as error:
@@ -62,14 +61,14 @@ def require_offer(sdp: str) -> None:
 
 
 def codec_preferences() -> list[Any]:
-    """aiortc's codecs in the order of ENCODERS, and retransmission of each."""
+    """Return aiortc's codecs in the order of ENCODERS, and retransmission of each."""
     known = RTCRtpSender.getCapabilities("video").codecs
     ordered = [each for codec in ENCODERS for each in known if each.mimeType == f"video/{codec}"]
     return ordered + [each for each in known if each.mimeType == "video/rtx"]
 
 
 def negotiated_codec(answer_sdp: str) -> str:
-    """The first codec of the answer's video section, which is what the sender uses."""
+    """Return the first codec of the answer's video section, which is what the sender uses."""
     (video,) = (each for each in SessionDescription.parse(answer_sdp).media if each.kind == "video")
     codec = str(video.rtp.codecs[0].name).upper()
     if codec not in ENCODERS:

@@ -1,12 +1,9 @@
-"""One viewer over WebRTC: packets that are encoded already, and beside them what is known of each picture.
+"""ViewerConnection: one viewer over WebRTC; packets that are encoded already, and beside them what is known of each picture.
 
-PacketTrack: the stream as aiortc sees it, packet by packet; aiortc only cuts them up and sends them.
-
-The data channel "status": beside the pictures what is known of each, and a clock.
-
-The page gets a JSON object for each picture (see `frame_header`) with the RTP timestamp by which `requestVideoFrameCallback` names
-the picture on the screen, and {"failure": sentence} when the camera fails; it may ask {"clock": t} and gets
-{"clock": t, "server_ms": now} for the age of what it shows.
+PacketTrack is the stream as aiortc sees it, packet by packet; aiortc only cuts them up and sends them. The data channel "status" sends
+the page a JSON object for each picture (see `frame_header`) with the RTP timestamp by which `requestVideoFrameCallback` names the picture
+on the screen, and {"failure": sentence} when the camera fails; the page may ask {"clock": t} and gets {"clock": t, "server_ms": now} for
+the age of what it shows.
 """
 
 import asyncio
@@ -32,7 +29,7 @@ _REMIND_S = 1.0
 
 
 class PacketTrack(MediaStreamTrack):
-    """Begins to watch the stream with the first `recv`, which is when the connection stands, so that nobody encodes for nobody.
+    """Track that watches the stream from the first `recv` on, which is when the connection stands, so that nobody encodes for nobody.
 
     sent(frame, rtp_timestamp): called when a packet is on its way, None where this aiortc does not tell the timestamp.
     failed(sentence): the camera failed, again and again while it does; None when it is back. Both in the event loop.
@@ -54,7 +51,7 @@ class PacketTrack(MediaStreamTrack):
         self.sender: Any = None
 
     async def recv(self) -> Any:
-        """The next packet, an `av.Packet`. aiortc comes back when it has sent the last one."""
+        """Return the next packet, an `av.Packet`. aiortc comes back when it has sent the last one."""
         if self._on_its_way is not None:
             self._sent(self._on_its_way, getattr(self.sender, _RTP_TIMESTAMP, None))
         self._on_its_way = await self._next()
@@ -97,7 +94,7 @@ class PacketTrack(MediaStreamTrack):
 
 
 def _wake(loop: asyncio.AbstractEventLoop, news: asyncio.Event) -> None:
-    """From the encoder's thread; a loop that closed meanwhile has no viewers any more."""
+    """Wake the loop from the encoder's thread; a loop that closed meanwhile has no viewers any more."""
     try:
         loop.call_soon_threadsafe(news.set)
     except RuntimeError:
@@ -112,13 +109,13 @@ _LARGEST_MESSAGE = 1024
 
 
 class StatusChannel:
-    """Says nothing until the page has opened its channel."""
+    """Channel that says nothing until the page has opened it."""
 
     def __init__(self) -> None:
         self._channel: RTCDataChannel | None = None
 
     def open(self, channel: RTCDataChannel, failure: str | None) -> None:
-        """failure: what the camera suffers from now."""
+        """Take the page's channel. failure: what the camera suffers from now."""
         self._channel = channel
         channel.on("message", self._answer)
         if failure:
@@ -130,7 +127,7 @@ class StatusChannel:
             channel.send(json.dumps(message))
 
     def _answer(self, text: str | bytes) -> None:
-        """A message that is not understood changes nothing."""
+        """Answer the clock; a message that is not understood changes nothing."""
         try:
             message = json.loads(text) if len(text) <= _LARGEST_MESSAGE else None
         except (ValueError, RecursionError):
@@ -148,7 +145,7 @@ log = logging.getLogger(__name__)
 
 
 class ViewerConnection:
-    """A peer connection that sends the stream; `on_closed` is called once, when it is over for whatever reason."""
+    """Peer connection that sends the stream; `on_closed` is called once, when it is over for whatever reason."""
 
     def __init__(self, stream: EncodedStream, on_closed: Callable[["ViewerConnection"], None]) -> None:
         self._stream, self._on_closed = stream, on_closed
@@ -163,7 +160,7 @@ class ViewerConnection:
         self.peer.on("datachannel", self._channel_opened)
 
     async def answer(self, offer_sdp: str, connect_within_s: float) -> str:
-        """The SDP answer to a viewer's offer; InputError where it is none that this side can serve."""
+        """Return the SDP answer to a viewer's offer; InputError where it is none that this side can serve."""
         require_offer(offer_sdp)
         # Both before the offer is looked at: aiortc chooses the codec then, and without preferences it is VP8.
         transceiver = self.peer.addTransceiver(self.track, "sendonly")
@@ -209,7 +206,7 @@ class ViewerConnection:
             self._begin_closing()
 
     def _route_keyframe_requests(self, sender: RTCRtpSender) -> None:
-        """PLI and FIR of this viewer to the encoder of all; aiortc itself would ask the encoder that it does not use."""
+        """Route PLI and FIR of this viewer to the encoder of all; aiortc itself would ask the encoder that it does not use."""
         self.track.sender = sender
         if keyframe_requests_arrive():
             setattr(sender, _KEYFRAME_REQUEST, self.track.ask_keyframe)
@@ -229,5 +226,5 @@ class ViewerConnection:
 
 
 def keyframe_requests_arrive() -> bool:
-    """Whether this aiortc has the (private) place where PLI and FIR arrive; without it keyframes must come at intervals."""
+    """Tell whether this aiortc has the (private) place where PLI and FIR arrive; without it keyframes must come at intervals."""
     return callable(getattr(RTCRtpSender, _KEYFRAME_REQUEST, None))

@@ -1,7 +1,4 @@
-"""What waits for one viewer between the encoder and the network: a few packets, or nothing until a keyframe.
-
-Who watches a stream, and what all of them are told when it fails.
-"""
+"""ViewerQueue: what waits for one viewer between encoder and network, a few packets or nothing until a keyframe; Audience: all viewers."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -13,7 +10,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """packet: an `av.Packet`, shared by all viewers, not to be changed; its times are in units of `encoder.TIME_BASE`.
+    """Encoded picture.
+
+    packet: an `av.Packet`, shared by all viewers, not to be changed; its times are in units of `encoder.TIME_BASE`.
 
     captured_s: of the OutputFrame. header: what the page is told of it (see `frame_header`); stages_ms ends with the encoding.
     """
@@ -36,7 +35,7 @@ class _State(Enum):
 
 
 class ViewerQueue:
-    """Filled by the encoder's thread (`put`), emptied by one consumer (`take`); `wake` is called when there is something new.
+    """Queue filled by the encoder's thread (`put`), emptied by one consumer (`take`); `wake` is called when there is something new.
 
     A viewer that lets the queue overflow loses all of it: a packet left out spoils all up to the next keyframe. When it comes
     back for more it gets a keyframe.
@@ -53,7 +52,7 @@ class ViewerQueue:
 
     @property
     def waiting(self) -> int:
-        """How many packets wait to be taken."""
+        """Count of packets that wait to be taken."""
         return len(self._frames)
 
     @property
@@ -66,7 +65,7 @@ class ViewerQueue:
             return self._state is _State.AWAITING_KEYFRAME or (self._asked and self._state is _State.FLOWING)
 
     def ask_keyframe(self) -> None:
-        """The viewer lost something on the way; packets go on until the keyframe comes."""
+        """Ask for a keyframe: the viewer lost something on the way; packets go on until it comes."""
         with self._lock:
             self._asked = True
 
@@ -86,7 +85,7 @@ class ViewerQueue:
         self._wake()
 
     def take(self) -> EncodedFrame | None:
-        """The oldest packet, which leaves the queue; None where there is none (yet)."""
+        """Return the oldest packet, which leaves the queue; None where there is none (yet)."""
         with self._lock:
             if self._frames:
                 return self._frames.popleft()
@@ -101,10 +100,10 @@ class ViewerQueue:
 
 
 class Audience:
-    """Viewers come and go in any thread. failure: why there are no pictures; None where there are."""
+    """Viewers of a stream, who come and go in any thread. failure: why there are no pictures; None where there are."""
 
     def __init__(self, capacity: int) -> None:
-        """capacity: packets that may wait for one viewer."""
+        """Begin without viewers. capacity: packets that may wait for one viewer."""
         self._capacity, self._lock = capacity, Lock()
         self.viewers: tuple[ViewerQueue, ...] = ()
         self.failure: str | None = None
@@ -114,7 +113,7 @@ class Audience:
         return any(viewer.wants_frames for viewer in self.viewers)
 
     def join(self, codec: str, wake: Callable[[], None]) -> ViewerQueue:
-        """A new viewer's queue; who comes while the stream fails is told."""
+        """Return a new viewer's queue; who comes while the stream fails is told."""
         viewer = ViewerQueue(codec, self._capacity, wake)
         viewer.failure = self.failure
         with self._lock:

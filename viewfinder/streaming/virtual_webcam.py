@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @runtime_checkable
 class Device(Protocol):
-    """What is used of pyvirtualcam.Camera. device: its name."""
+    """Device as pyvirtualcam.Camera has it. device: its name."""
 
     device: str
     width: int
@@ -38,7 +38,7 @@ class Device(Protocol):
 
 
 class VirtualWebcam:
-    """A FrameSink. device: a name such as /dev/video9 or "OBS Virtual Camera"; "auto" takes the first that is free.
+    """FrameSink. device: a name such as /dev/video9 or "OBS Virtual Camera"; "auto" takes the first that is free.
 
     The device has the size of the first picture; later ones of another size are fitted into it, for programs that look at it cannot
     follow. InputError where there is no such device. failure: a sentence once it does not take pictures any more.
@@ -58,14 +58,14 @@ class VirtualWebcam:
 
     @property
     def wants_frame(self) -> bool:
-        """Always: whether somebody looks at the device is not told."""
+        """True until it fails: whether somebody looks at the device is not told."""
         return self.failure is None
 
     def show(self, frame: OutputFrame) -> None:
         self._frames.put(frame)
 
     def fail(self, _sentence: str) -> None:
-        """The camera may come back; until then the last picture stands."""
+        """Keep the last picture: the camera may come back."""
 
     def close(self) -> None:
         self._stopping.set()
@@ -91,7 +91,7 @@ class VirtualWebcam:
 
 
 def open_device(name: str | None, width_px: int, height_px: int) -> Device:
-    """InputError without pyvirtualcam, and where no device is there or it is in use."""
+    """Open a device; InputError without pyvirtualcam, and where no device is there or it is in use."""
     try:
         pyvirtualcam: Any = import_module("pyvirtualcam")
     except ImportError:
@@ -111,7 +111,7 @@ def open_device(name: str | None, width_px: int, height_px: int) -> Device:
 
 
 def fitted(bgr: Bgr, width_px: int, height_px: int) -> UInt8[np.ndarray, "fitted_height fitted_width 3"]:
-    """As large as fits in, black around."""
+    """Scale a picture to as large as fits in, black around."""
     height, width = bgr.shape[:2]
     if (width, height) == (width_px, height_px):
         return np.ascontiguousarray(bgr)

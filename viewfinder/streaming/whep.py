@@ -22,7 +22,7 @@ _MOST_CANDIDATES = 32
 
 
 class Whep:
-    """Who may come is decided before these routes; here only how many (viewers_limit) and how large.
+    """WHEP of a stream. Who may come is decided before these routes; here only how many (viewers_limit) and how large.
 
     connect_within_s: a viewer whose connection does not stand by then is removed.
     """
@@ -82,7 +82,7 @@ class Whep:
         self._viewers.pop(name, None)
 
     async def _trickle(self, request: web.Request) -> web.Response:
-        """Further addresses of the viewer (RFC 8840); a restart of ICE is not offered."""
+        """Take further addresses of the viewer (RFC 8840); a restart of ICE is not offered."""
         viewer = self._viewers.get(request.match_info["viewer"])
         if viewer is None:
             return _refusal(404, "there is no such viewer (any more): post a new offer")
@@ -110,7 +110,7 @@ def _refusal(status: int, sentence: str) -> web.Response:
 
 
 async def _text(request: web.Request) -> str:
-    """The body, refused (InputError) as soon as it is larger than a description can be; the limit of the application does not apply."""
+    """Read the body; InputError as soon as it is larger than a description can be. The limit of the application does not apply."""
     body = bytearray()
     async for chunk in request.content.iter_any():
         body += chunk

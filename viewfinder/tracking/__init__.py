@@ -1,1 +1,1 @@
-"""Where the camera is, frame by frame."""
+"""Pose of the camera, frame by frame."""

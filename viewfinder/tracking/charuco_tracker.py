@@ -1,7 +1,4 @@
-"""Tracks a printed board: detected now and then in a thread, carried by flow in every frame, a pose from each.
-
-Detection beside the stream: the newest frame is searched in a thread of its own, at most so often.
-"""
+"""CharucoTracker: a printed board, detected now and then in a thread, carried by flow in every frame, a pose from each."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -34,7 +31,7 @@ class Detector(Protocol):
 
 @dataclass(frozen=True)
 class Detection:
-    """corners of the frame of that number; took_s: how long the search took."""
+    """Corners of the frame of that number; took_s: how long the search took."""
 
     sequence: int
     corners: Corners
@@ -43,7 +40,7 @@ class Detection:
 
 @runtime_checkable
 class Detections(Protocol):
-    """Takes frames and gives, later or at once, what was found in some of them."""
+    """Detection that takes frames and gives, later or at once, what was found in some of them."""
 
     def offer(self, sequence: int, grey: Grey, hurry: bool) -> None: ...
 
@@ -52,29 +49,8 @@ class Detections(Protocol):
     def close(self) -> None: ...
 
 
-class ImmediateDetections:
-    """Searches every nth frame offered while the caller waits: for measuring, and where every run must give the same."""
-
-    def __init__(self, detector: Detector, every: int = 1) -> None:
-        self._detector, self._every, self._offered = detector, every, 0
-        self._found: Detection | None = None
-
-    def offer(self, sequence: int, grey: Grey, hurry: bool) -> None:
-        self._offered += 1
-        if hurry or (self._offered - 1) % self._every == 0:
-            started_s = monotonic()
-            self._found = Detection(sequence, self._detector.detect(grey), monotonic() - started_s)
-
-    def take(self) -> Detection | None:
-        found, self._found = self._found, None
-        return found
-
-    def close(self) -> None:
-        """Nothing runs."""
-
-
 class DetectionThread:
-    """every_s: the pause between the beginnings of two searches while all is well; `hurry` (the track is lost) leaves it out."""
+    """Detections in a thread. every_s: between the beginnings of two searches; `hurry` (the track is lost) leaves the pause out."""
 
     def __init__(self, detector: Detector, every_s: float = 0.12) -> None:
         self._detector, self._every_s = detector, every_s
@@ -118,7 +94,7 @@ _GOOD_RESIDUAL_PX = 1.0
 
 
 class CharucoTracker:
-    """grace_s: for so long after the board is lost the last pose is given again, with its own time and falling quality.
+    """Tracker. grace_s: for so long after the board is lost the last pose is given again, with its own time and falling quality.
 
     detections: who searches frames; a DetectionThread unless given. corners: those that made the last pose.
     """
@@ -154,7 +130,7 @@ class CharucoTracker:
         self._detections.close()
 
     def _newest_corners(self) -> Corners:
-        """A detection, carried to this frame, goes before flow, which may have slipped by a square."""
+        """Return a detection, carried to this frame, before flow, which may have slipped by a square."""
         flowed = self._history.from_before(self.corners)
         detection = self._detections.take()
         if detection is None:
@@ -172,7 +148,7 @@ class CharucoTracker:
         return replace(self._last, quality=self._last.quality * share)
 
     def _quality(self, fit: PoseFit, camera: Camera) -> float:
-        """1 for 16 corners that fit to the pixel, span 15 % of the picture's diagonal both ways and leave no doubt; a product of shares."""
+        """Return 1 for 16 corners that fit to the pixel, span 15 % of the picture's diagonal both ways and leave no doubt."""
         xy_px = self.corners.xy_px
         spread = np.linalg.svd(xy_px - xy_px.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(xy_px))
         across = 2.0 * spread / np.hypot(camera.width_px, camera.height_px) / _ENOUGH_SPREAD

@@ -6,7 +6,7 @@
 z is up; with all angles 0 the camera looks along y with x to its right. Pan counts to the right, tilt up, roll clockwise as seen
 from behind. Senders differ in this more than in anything else: `FreeDReading.signs` turns it round.
 
-EncoderTable: what the raw counts of a lens's encoders mean, from a CSV that somebody measured on that lens.
+EncoderTable tells what the counts mean, from a CSV that somebody measured on that lens:
 
     axis,count,value
     focus_m,0,inf
@@ -22,7 +22,6 @@ beyond the ends it stays. An axis may be missing, or have one row: then it does 
 """
 
 import csv
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +30,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.world_axes import CAMERA_FROM_STAGE_CAMERA, inverted, pan_tilt_roll_deg, rigid, stage_rotation
+from mrbokeh.tracking.world_axes import CAMERA_FROM_STAGE_CAMERA, inverted, rigid, stage_rotation
 from viewfinder.frames import UNKNOWN_LENS, LensState, Pose
 from viewfinder.tracking.pose_history import STAGE_FROM_BOARD, MalformedMessageError, TrackingSample
 
@@ -44,12 +43,15 @@ Count = int | float | None
 
 @dataclass(frozen=True)
 class EncoderTable:
-    """axes: for each name of AXES (counts ascending, the values in which it is interpolated: dioptres, millimetres, logarithms)."""
+    """Meaning of the counts of a lens's encoders.
+
+    axes: for each name of AXES (counts ascending, the values in which it is interpolated: dioptres, millimetres, logarithms).
+    """
 
     axes: Mapping[str, Axis]
 
     def lens(self, focus: Count = None, zoom: Count = None, iris: Count = None) -> LensState:
-        """What the counts say; None where there is no count or no axis for it."""
+        """Return what the counts say; None where there is no count or no axis for it."""
         dioptres, millimetres, stops = (self._at(name, count) for name, count in zip(AXES, (focus, zoom, iris), strict=True))
         return LensState(
             None if dioptres is None else (1.0 / dioptres if dioptres > 0.0 else np.inf),
@@ -64,7 +66,7 @@ class EncoderTable:
 
 
 def read_encoder_table(path: Path | str) -> EncoderTable:
-    """Raises InputError naming the line that is wrong."""
+    """Read a table; InputError names the line that is wrong."""
     path = Path(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -125,7 +127,7 @@ _FIELD_BYTES = 3
 
 @dataclass(frozen=True)
 class FreeDMessage:
-    """pan_tilt_roll_deg, xyz_m: as sent. zoom, focus: counts of the encoders, 0 to 2**24 - 1."""
+    """Message. pan_tilt_roll_deg, xyz_m: as sent. zoom, focus: counts of the encoders, 0 to 2**24 - 1."""
 
     camera: int
     pan_tilt_roll_deg: tuple[float, float, float]
@@ -136,7 +138,7 @@ class FreeDMessage:
 
 @dataclass(frozen=True)
 class FreeDReading:
-    """How a sender's numbers are meant: signs of (pan, tilt, roll, x, y, z); where our world lies on its stage; its lens.
+    """Meaning of a sender's numbers: signs of (pan, tilt, roll, x, y, z); where our world lies on its stage; its lens.
 
     pupil_before_m: how far the entrance pupil lies before the point whose place is sent (often the head of the tripod).
     """
@@ -148,10 +150,10 @@ class FreeDReading:
 
 
 def read_freed(datagram: bytes) -> FreeDMessage:
-    """Raises MalformedMessageError where length, type or checksum are wrong."""
+    """Decode a message; MalformedMessageError where length, type or checksum are wrong."""
     if len(datagram) != MESSAGE_BYTES or datagram[0] != _TYPE:
         raise MalformedMessageError("not a D1 message of FreeD")
-    if datagram[-1] != _checksum(datagram[:-1]):
+    if datagram[-1] != checksum(datagram[:-1]):
         raise MalformedMessageError("the checksum of a FreeD message is wrong")
     numbers = [datagram[first : first + _FIELD_BYTES] for first in range(2, 26, _FIELD_BYTES)]
     pan, tilt, roll = (int.from_bytes(each, "big", signed=True) / _PER_DEGREE for each in numbers[:3])
@@ -160,16 +162,8 @@ def read_freed(datagram: bytes) -> FreeDMessage:
     return FreeDMessage(datagram[1], (pan, tilt, roll), (x, y, z), zoom, focus)
 
 
-def write_freed(message: FreeDMessage) -> bytes:
-    """Raises OverflowError where a number does not fit: angles to 256 degrees, places to 131 m."""
-    signed = [round(angle * _PER_DEGREE) for angle in message.pan_tilt_roll_deg] + [round(place * _PER_M) for place in message.xyz_m]
-    body = bytes([_TYPE, message.camera]) + b"".join(number.to_bytes(_FIELD_BYTES, "big", signed=True) for number in signed)
-    body += b"".join(count.to_bytes(_FIELD_BYTES, "big") for count in (message.zoom, message.focus)) + struct.pack(">H", 0)
-    return body + bytes([_checksum(body)])
-
-
 def freed_sample(message: FreeDMessage, reading: FreeDReading) -> TrackingSample:
-    """In our conventions; without a table the counts of the lens say nothing and are told as ignored."""
+    """Convert a message to our conventions; without a table the counts of the lens say nothing and are told as ignored."""
     numbers = np.array([*message.pan_tilt_roll_deg, *message.xyz_m]) * reading.signs
     pan, tilt, roll = numbers[:3]
     stage_from_camera = rigid(stage_rotation(-pan, tilt, roll), numbers[3:])
@@ -180,13 +174,6 @@ def freed_sample(message: FreeDMessage, reading: FreeDReading) -> TrackingSample
     return TrackingSample(camera_from_world, reading.table.lens(focus=message.focus, zoom=message.zoom))
 
 
-def freed_message(sample: TrackingSample, camera: int = 1, zoom: int = 0, focus: int = 0) -> FreeDMessage:
-    """As a sender with the usual signs would write it, whose stage has our world for its ground; the counts are not looked up."""
-    stage_from_camera = STAGE_FROM_BOARD @ inverted(sample.camera_from_world) @ CAMERA_FROM_STAGE_CAMERA
-    pan, tilt, roll = pan_tilt_roll_deg(stage_from_camera[:3, :3])
-    x, y, z = stage_from_camera[:3, 3].tolist()
-    return FreeDMessage(camera, (-pan, tilt, roll), (x, y, z), zoom, focus)
-
-
-def _checksum(body: bytes) -> int:
+def checksum(body: bytes) -> int:
+    """Return the last byte of a message."""
     return (_CHECKSUM_START - sum(body)) % 256

@@ -1,6 +1,6 @@
-"""Finds a camera in a map: SIFT of a frame matched with what the map's points look like, verified by pycolmap's absolute pose.
+"""MapLocaliser: a camera found in a map; SIFT of a frame matched with what the map's points look like, verified by pycolmap.
 
-The pose of a camera from points of a map that lie anywhere, by pycolmap: LO-RANSAC without a pose before, robust refinement with.
+`pose_in_map` solves a pose from nothing (LO-RANSAC), `pose_refined` from the pose of the frame before (robust refinement).
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ PointsPx = Float64[np.ndarray, "points 2"]
 
 @dataclass(frozen=True)
 class MapPose:
-    """residual_px: RMS distance over the inliers."""
+    """Pose in a map. residual_px: RMS distance over the inliers."""
 
     camera_from_world: Pose
     residual_px: float
@@ -34,7 +34,7 @@ class MapPose:
 
 
 def pose_in_map(points_m: PointsM, xy_px: PointsPx, camera: Camera) -> MapPose | None:
-    """From nothing; None if fewer than 12 points agree."""
+    """Solve a pose from nothing; None if fewer than 12 points agree."""
     if len(points_m) < FEWEST_POINTS:
         return None
     pycolmap = require_pycolmap()
@@ -46,7 +46,7 @@ def pose_in_map(points_m: PointsM, xy_px: PointsPx, camera: Camera) -> MapPose |
 
 
 def pose_refined(points_m: PointsM, xy_px: PointsPx, camera: Camera, before: Pose) -> MapPose | None:
-    """From the pose of the frame before, with Cauchy's loss; None if fewer than 12 points agree with it."""
+    """Refine the pose of the frame before, with Cauchy's loss; None if fewer than 12 points agree with it."""
     pycolmap = require_pycolmap()
     pose = pycolmap.Rigid3d(before[:3])
     off_px = _off_px(points_m, xy_px, camera, before)
@@ -73,12 +73,12 @@ def _judged(pose: Any, points_m: PointsM, xy_px: PointsPx, camera: Camera) -> Ma
 
 
 def _wrong_px(camera: Camera) -> float:
-    """4 px in a picture whose longer side is 1280 px; never below 1.5."""
+    """Return the limit of inliers: 4 px in a picture whose longer side is 1280 px; never below 1.5."""
     return max(1.5, _WRONG_PX * max(camera.width_px, camera.height_px) / 1280)
 
 
 def _colmap_camera(camera: Camera) -> Any:
-    """COLMAP's pixels are ours."""
+    """Return the camera for pycolmap, whose pixels are ours."""
     return require_pycolmap().Camera(
         model="PINHOLE", width=camera.width_px, height=camera.height_px, params=[*camera.focal_px, *camera.principal_px]
     )
@@ -89,7 +89,7 @@ def _matrix(pose: Any) -> Pose:
 
 
 def _off_px(points_m: PointsM, xy_px: PointsPx, camera: Camera, pose: Pose) -> Float64[np.ndarray, " points"]:
-    """inf for what lies behind the camera."""
+    """Return distances in px; inf for what lies behind the camera."""
     in_camera = points_m @ pose[:3, :3].T + pose[:3, 3]
     depth_m = np.where(in_camera[:, 2] > 0.0, in_camera[:, 2], np.nan)
     seen = in_camera[:, :2] / depth_m[:, None] * camera.focal_px + camera.principal_px
@@ -103,7 +103,10 @@ _LOWES_RATIO = 0.85
 
 @dataclass(frozen=True)
 class Localisation:
-    """camera_from_map: metres. points: those of the map that were found, and where. matches: how many there were before verification."""
+    """Camera found in a map.
+
+    camera_from_map: metres. points: those of the map that were found, and where. matches: how many there were before verification.
+    """
 
     camera_from_map: Pose
     points: Corners
@@ -111,7 +114,7 @@ class Localisation:
 
 
 class MapLocaliser:
-    """`detect` fits in a DetectionThread. camera: intrinsics, which follow the size of the frame; may be replaced at any time."""
+    """Detector for a DetectionThread. camera: intrinsics, which follow the size of the frame; may be replaced at any time."""
 
     def __init__(self, sparse_map: SparseMap, camera: Camera) -> None:
         self.map, self.camera = sparse_map, camera
@@ -121,7 +124,7 @@ class MapLocaliser:
         return NO_CORNERS if found is None else found.points
 
     def localise(self, grey: Grey) -> Localisation | None:
-        """None where too few points agree on a pose."""
+        """Find the camera; None where too few points agree on a pose."""
         camera = self.camera.resized(grey.shape[1], grey.shape[0])
         features = find_features(grey, _FEATURES)
         if not len(features.xy_px):
@@ -138,7 +141,7 @@ Numbers = Int64[np.ndarray, " matches"]
 
 
 def matches(descriptors: Float32[np.ndarray, "features 128"], sparse_map: SparseMap) -> tuple[Numbers, Numbers]:
-    """(features, points): each feature's nearest point, by its nearest look, where the next point is clearly farther (Lowe's ratio);
+    """Match (features, points): each feature's nearest point, by its nearest look, where the next point is clearly farther (Lowe's ratio);
     of several features that claim one point the nearest.
     """
     starts = np.flatnonzero(np.diff(sparse_map.point_of, prepend=-1))
@@ -154,7 +157,7 @@ def matches(descriptors: Float32[np.ndarray, "features 128"], sparse_map: Sparse
 def _nearest(
     descriptors: Float32[np.ndarray, "features 128"], sparse_map: SparseMap, starts: Int64[np.ndarray, " points"]
 ) -> tuple[Int64[np.ndarray, " features"], Float64[np.ndarray, "features 2"]]:
-    """(nearest point, distances to it and to the next point); vectors of length 1 are the nearer the larger their product."""
+    """Return (nearest point, distances to it and to the next point); vectors of length 1 are the nearer the larger their product."""
     nearest, products = [], []
     for first in range(0, len(descriptors), _AT_ONCE):
         alike = np.maximum.reduceat(descriptors[first : first + _AT_ONCE] @ sparse_map.descriptors.T, starts, axis=1)

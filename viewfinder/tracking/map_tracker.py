@@ -22,7 +22,7 @@ _GOOD_RESIDUAL_PX = 1.5
 
 
 class MapTracker:
-    """A Tracker. map_from_world: where our world lies in the map, in metres.
+    """Tracker in a map. map_from_world: where our world lies in the map, in metres.
 
     detections: who localises, on which frames; a DetectionThread unless given. points: those that made the last pose. grace_s: for
     so long after the track is lost the last pose is given again, with its own time and falling quality.
@@ -70,7 +70,7 @@ class MapTracker:
         return self._localiser.map
 
     def _newest_points(self) -> Corners:
-        """What was localised, carried to this frame, goes before what flowed here; no more than are needed."""
+        """Return what was localised, carried to this frame, before what flowed here; no more than are needed."""
         flowed = self._history.from_before(self.points)
         detection = self._detections.take()
         if detection is None:
@@ -80,7 +80,7 @@ class MapTracker:
         return flowed if found is None or len(found) < len(flowed) // 2 else _spread(found.with_more(flowed))
 
     def _pose(self, points: Corners, intrinsics: Camera) -> MapPose | None:
-        """From the pose before where that holds, else from nothing."""
+        """Solve from the pose before where that holds, else from nothing."""
         points_m = self._map.points_m[points.ids]
         if self._pose_in_map is not None:
             refined = pose_refined(points_m, points.xy_px, intrinsics, self._pose_in_map)
@@ -96,13 +96,13 @@ class MapTracker:
         return replace(self._last, quality=self._last.quality * share)
 
     def _quality(self, fit: MapPose) -> float:
-        """1 for 60 points that fit to the pixel."""
+        """Return 1 for 60 points that fit to the pixel."""
         exact = 1.0 / (1.0 + (fit.residual_px / _GOOD_RESIDUAL_PX) ** 2)
         return float(min(len(self.points) / _ENOUGH_POINTS, 1.0) * exact)
 
 
 def _spread(points: Corners) -> Corners:
-    """At most 150, every nth: their numbers come from many pictures, so that these lie all over the frame."""
+    """Keep at most 150, every nth: their numbers come from many pictures, so that these lie all over the frame."""
     if len(points) <= _MOST_POINTS:
         return points
     keep = np.zeros(len(points), bool)

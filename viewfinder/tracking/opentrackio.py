@@ -1,19 +1,16 @@
-"""OpenTrackIO 1.0.1 (SMPTE RIS, opentrackio.org): the payload, JSON or CBOR, to and from a TrackingSample.
-
-What a sample says is read by `camera_track.opentrackio_sample`, as it is from files. Our world has the stage's ground for its
-board: x along X, y along -Y, z along -Z, so that what stands on the board stands on the stage.
-
-OpenTrackIO over UDP: the 16-byte header, Fletcher's checksum, and payloads in segments (SMPTE RIS OpenTrackIO 1.0.1, network part).
+"""OpenTrackIO 1.0.1 (SMPTE RIS, opentrackio.org) over UDP: packets, segments, and the payload, JSON or CBOR, as a TrackingSample.
 
  0  "OTrk"      4  reserved      5  encoding (1 JSON, 2 CBOR)      6  sequence number, 16 bits
  8  offset of this segment in the payload, 32 bits                12  last segment (1 bit), length of this segment (15 bits)
 14  checksum over the first 14 bytes and the segment, 16 bits      all big-endian
+
+A sample is read by `camera_track.opentrackio_file`, as it is from files. Our world has the stage's ground for its board: x along X,
+y along -Y, z along -Z, so that what stands on the board stands on the stage.
 """
 
 import json
 import struct
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,12 +22,9 @@ from mrbokeh.tracking.camera_track.opentrackio_file import (
     is_sample,
     is_scaled,
     known,
-    lens_numbers,
     number,
-    pose_document,
     sampled_s,
 )
-from mrbokeh.tracking.world_axes import inverted
 from viewfinder.frames import LensState, Pose
 from viewfinder.tracking.pose_history import STAGE_FROM_BOARD, MalformedMessageError, TrackingSample
 
@@ -42,13 +36,12 @@ _IDENTIFIER = b"OTrk"
 _CHECKSUM_BYTES = 2
 HEADER_BYTES = _HEADER.size + _CHECKSUM_BYTES
 _LAST = 0x8000
-_LARGEST_SEGMENT = 1400
 _LARGEST_PAYLOAD = 1 << 20
 _UNFINISHED_AT_ONCE = 8
 
 
 def fletcher16(data: bytes) -> int:
-    """Fletcher's checksum (1982) with sums modulo 256, the second sum in the high byte.
+    """Return Fletcher's checksum (1982) with sums modulo 256, the second sum in the high byte.
 
     The second sum adds the first after every byte, so that byte i of n counts n - i times.
     """
@@ -56,15 +49,6 @@ def fletcher16(data: bytes) -> int:
     first = int(values.sum()) % 256
     second = int((values * np.arange(len(values), 0, -1, dtype=np.uint64)).sum()) % 256
     return second << 8 | first
-
-
-def packets(payload: bytes, encoding: int, sequence_number: int, segment_bytes: int = _LARGEST_SEGMENT) -> Iterator[bytes]:
-    """The datagrams that carry a payload."""
-    for offset in range(0, max(len(payload), 1), segment_bytes):
-        segment = payload[offset : offset + segment_bytes]
-        last = _LAST if offset + segment_bytes >= len(payload) else 0
-        head = _HEADER.pack(_IDENTIFIER, 0, encoding, sequence_number & 0xFFFF, offset, last | len(segment))
-        yield head + struct.pack(">H", fletcher16(head + segment)) + segment
 
 
 @dataclass(frozen=True)
@@ -77,7 +61,7 @@ class Segment:
 
 
 def read_packet(datagram: bytes) -> Segment:
-    """Raises MalformedMessageError where length, identifier, encoding or checksum are wrong."""
+    """Decode a packet; MalformedMessageError where length, identifier, encoding or checksum are wrong."""
     if len(datagram) < HEADER_BYTES or not datagram.startswith(_IDENTIFIER):
         raise MalformedMessageError("not an OpenTrackIO packet")
     _, _, encoding, sequence_number, offset, length = _HEADER.unpack_from(datagram)
@@ -96,7 +80,7 @@ class _Unfinished:
     size: int | None = None
 
     def whole(self) -> bytes | None:
-        """The payload, once no byte of it is missing."""
+        """Return the payload, once no byte of it is missing."""
         if self.size is None or sum(map(len, self.parts.values())) < self.size:
             return None
         joined = b"".join(self.parts[offset] for offset in sorted(self.parts))
@@ -107,13 +91,13 @@ class _Unfinished:
 
 
 class Reassembly:
-    """Puts segments together, in whatever order they come; payloads that stay incomplete are forgotten, the oldest first."""
+    """Reassembly of segments, in whatever order they come; payloads that stay incomplete are forgotten, the oldest first."""
 
     def __init__(self) -> None:
         self._unfinished: OrderedDict[tuple[object, int, int], _Unfinished] = OrderedDict()
 
     def add(self, sender: object, segment: Segment) -> bytes | None:
-        """The payload that this segment completes."""
+        """Return the payload that this segment completes."""
         if segment.offset == 0 and segment.last:
             return segment.content
         key = sender, segment.sequence_number, segment.encoding
@@ -138,7 +122,7 @@ _UNUSED_OF_LENS = ("distortion", "distortionOffset", "projectionOffset", "exposu
 
 @dataclass(frozen=True)
 class StageReading:
-    """How a sender's numbers are meant. stage_from_world: where our world lies on its stage.
+    """Meaning of a sender's numbers. stage_from_world: where our world lies on its stage.
 
     pose_at_sensor: the sender tells where the sensor is, and the entrance pupil lies entrancePupilOffset before it; else its
       transform is that of the entrance pupil.
@@ -149,24 +133,12 @@ class StageReading:
 
 
 def decode_opentrackio(payload: bytes, encoding: int, reading: StageReading | None = None) -> TrackingSample:
-    """Raises MalformedMessageError where it is no sample with a pose."""
+    """Decode a sample; MalformedMessageError where it is no sample with a pose."""
     try:
         return _sample(_document(payload, encoding), reading or StageReading())
     except Exception as error:
         # What strangers send ends in whatever the decoders and conversions raise; none of it is worth more than being counted.
         raise MalformedMessageError(f"not an OpenTrackIO sample: {error!r}") from None
-
-
-def encode_opentrackio(document: Mapping[str, Any], encoding: int) -> bytes:
-    return require_cbor().dumps(dict(document)) if encoding == CBOR else json.dumps(document).encode()
-
-
-def opentrackio_document(sample: TrackingSample, reading: StageReading | None = None) -> dict[str, Any]:
-    """The sample as OpenTrackIO writes it, with the pose of the entrance pupil; what the lens does not know is left out."""
-    camera_from_stage = sample.camera_from_world @ inverted((reading or StageReading()).stage_from_world)
-    lens = sample.lens
-    told = lens_numbers(focusDistance=lens.focus_distance_m, fStop=lens.f_number, pinholeFocalLength=lens.focal_length_mm)
-    return pose_document(camera_from_stage, sample.sender_s) | {"lens": told}
 
 
 def _document(payload: bytes, encoding: int) -> dict[str, Any]:
@@ -177,7 +149,7 @@ def _document(payload: bytes, encoding: int) -> dict[str, Any]:
 
 
 def require_cbor() -> Any:
-    """The package that reads CBOR; raises MissingExtraError where it is not installed."""
+    """Return the package that reads CBOR; MissingExtraError where it is not installed."""
     try:
         import cbor2
     except ImportError:

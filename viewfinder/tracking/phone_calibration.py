@@ -1,9 +1,7 @@
-"""Calibrating a phone on the hot shoe while both it and the camera see one board: pairs of poses, then the rig.
-
-StillPairs: moments at which a camera and the phone on it both stand still, as pairs of poses to calibrate with.
+"""Calibration of a phone on the hot shoe while both it and the camera see one board: pairs of poses, then the rig.
 
 Two streams come with delays of their own, which nobody knows; where both have stood still for longer than the delays differ, the
-poses are of one place. Over such a moment they are averaged.
+poses are of one place. Over such a moment they are averaged (StillPairs).
 """
 
 from collections import deque
@@ -19,7 +17,7 @@ from mrbokeh.optics.lens import MM_PER_M
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import inverted, rigid
 from viewfinder.frames import CameraFrame, Pose
-from viewfinder.tracking.phone_rig import FEWEST_PAIRS, PhoneRig, PosePair, angle_deg, calibrate_in_one_world
+from viewfinder.tracking.phone_rig import FEWEST_PAIRS, PhoneRig, PosePair, angle_deg, calibrate_rig
 from viewfinder.tracking.phone_tracker import PhoneFrames, PhoneTracker
 from viewfinder.tracking.tracker import Tracker
 
@@ -28,7 +26,9 @@ _FEWEST = 4
 
 @dataclass(frozen=True)
 class Stillness:
-    """still_s: how long both must stand still, within moved_deg and moved_mm of the mean. apart_deg, apart_mm: two pairs differ by one
+    """Limits of a moment that makes a pair.
+
+    still_s: how long both must stand still, within moved_deg and moved_mm of the mean. apart_deg, apart_mm: two pairs differ by one
     of them at least. late_s: how long a pose of the camera waits for that of the phone.
     """
 
@@ -41,17 +41,17 @@ class Stillness:
 
 
 class StillPairs:
-    """`take` gets every pose of the camera, in order. pairs: those found so far."""
+    """Pairs of moments at which both stand still; `take` gets every pose of the camera, in order. pairs: those found so far."""
 
     def __init__(self, phone_pose: Callable[[float], Pose | None], stillness: Stillness | None = None) -> None:
-        """phone_pose: phone_from_world at a time of the camera's frames, None where it is not known (yet)."""
+        """Begin without pairs. phone_pose: phone_from_world at a time of the camera's frames, None where it is not known (yet)."""
         self.pairs: list[PosePair] = []
         self._phone_pose, self._limits = phone_pose, stillness or Stillness()
         self._waiting: deque[tuple[float, Pose]] = deque()
         self._moment: deque[tuple[float, PosePair]] = deque()
 
     def take(self, time_s: float, camera_from_world: Pose | None) -> bool:
-        """Whether that made a new pair. None: the camera does not see the board, which ends the moment."""
+        """Return True if that made a new pair. None: the camera does not see the board, which ends the moment."""
         if camera_from_world is None:
             self._waiting.clear()
             self._moment.clear()
@@ -81,13 +81,13 @@ class StillPairs:
 
     @staticmethod
     def _is_near(a: PosePair, b: PosePair, degrees: float, millimetres: float, by_both: bool = True) -> bool:
-        """Of the camera's poses, and of the phone's too if by_both."""
+        """Compare the camera's poses, and the phone's too if by_both."""
         poses = [(a.camera_from_world, b.camera_from_world)] + ([(a.phone_from_world, b.phone_from_world)] if by_both else [])
         return all(angle_deg(one @ inverted(other)) <= degrees and _apart_mm(one, other) <= millimetres for one, other in poses)
 
 
 def _apart_mm(one: Pose, other: Pose) -> float:
-    """Between the two places, not between the last columns, which turn with the camera."""
+    """Return the distance of the two places, not of the last columns, which turn with the camera."""
     return float(np.linalg.norm(inverted(one)[:3, 3] - inverted(other)[:3, 3])) * MM_PER_M
 
 
@@ -96,7 +96,7 @@ def _mean_pair(pairs: Sequence[PosePair]) -> PosePair:
 
 
 def _mean(poses: Sequence[Pose]) -> Pose:
-    """Of poses that hardly differ: the mean rotation, and the median of the places."""
+    """Average poses that hardly differ: the mean rotation, and the median of the places."""
     turn = Rotation.from_matrix(np.array([each[:3, :3] for each in poses])).mean().as_matrix()
     place = np.median([inverted(each)[:3, 3] for each in poses], axis=0)
     return rigid(turn, -turn @ place)
@@ -107,7 +107,9 @@ _UNSEEN_S = 2.0
 
 @dataclass(frozen=True)
 class Calibration:
-    """source, tracker: of the camera; intrinsics: for a size in pixels. phone: a PhoneTracker without a rig. say: gets sentences
+    """Calibration of a phone.
+
+    source, tracker: of the camera; intrinsics: for a size in pixels. phone: a PhoneTracker without a rig. say: gets sentences
     for people. pairs: after so many it ends; after longest_s it ends with those that there are.
     """
 
@@ -120,7 +122,7 @@ class Calibration:
     longest_s: float = 300.0
 
     def run(self, stopping: Event) -> PhoneRig:
-        """Takes its time, in the thread of the caller. InputError where there are too few pairs, or where they contradict one another."""
+        """Collect pairs in the thread of the caller. InputError where there are too few pairs, or where they contradict one another."""
         found, told = StillPairs(self.phone.phone_pose), _Unseen(self)
         started_s: float | None = None
         for frame in self.source.frames(stopping):
@@ -135,21 +137,21 @@ class Calibration:
                 raise InputError(f"the phone on the camera: {self.phone.failure}")
             if len(found.pairs) >= self.pairs or frame.captured_s - started_s > self.longest_s:
                 break
-        return calibrate_in_one_world(found.pairs)
+        return calibrate_rig(found.pairs)
 
     def _progress(self, found: StillPairs) -> str:
         counted = f"pair {len(found.pairs)} of {self.pairs}"
         if len(found.pairs) < FEWEST_PAIRS:
             return f"{counted}: move the camera to another view of the board, and hold still"
         try:
-            rig = calibrate_in_one_world(found.pairs)
+            rig = calibrate_rig(found.pairs)
         except InputError as error:
             return f"{counted}: {error}"
         return f"{counted}: phone and camera agree within {rig.residual_deg:.2f} degrees and {rig.residual_mm:.1f} mm"
 
 
 class _Unseen:
-    """Says, once each time, which of the two does not see the board."""
+    """Report, once each time, of which of the two does not see the board."""
 
     def __init__(self, calibration: Calibration) -> None:
         self._of, self._seen_s, self._said = calibration, -1.0, ""

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 @runtime_checkable
 class PhoneFrames(Protocol):
-    """The frames of the phone: any FrameSource of viewfinder/sources."""
+    """Frames of the phone: any FrameSource of viewfinder/sources."""
 
     name: str
 
@@ -31,7 +31,7 @@ class PhoneFrames(Protocol):
 
 
 class PhoneTracker:
-    """A Tracker. phone_tracker: any Tracker, which gets the phone's frames (in a thread of its own) and `phone_intrinsics` in their size.
+    """Tracker by a phone. phone_tracker: any Tracker, which gets the phone's frames in a thread of its own and `phone_intrinsics`.
 
     rig: None while it is being calibrated; nothing is tracked then, `phone_pose` serves. video_delay_s: how much later the camera's
     picture of a moment comes than the phone's; may be set at any time. failure: one sentence if the phone's frames ended in an error.
@@ -62,7 +62,7 @@ class PhoneTracker:
 
     @property
     def remark(self) -> str | None:
-        """One sentence where something is wrong: the phone's camera is away or failed, is held otherwise, or does not see the board."""
+        """Sentence where something is wrong: the phone's camera is away or failed, is held otherwise, or does not see the board."""
         trouble = self.failure or self.source.status or self._wrong_size
         if trouble is not None:
             return f"the phone on the camera: {trouble}"
@@ -72,7 +72,7 @@ class PhoneTracker:
         return "the phone on the camera does not see what it tracks" if unseen else None
 
     def phone_pose(self, captured_s: float) -> Pose | None:
-        """phone_from_world at the time of a frame of the camera, for pairs to calibrate with; None where it is not known."""
+        """Return phone_from_world at the time of a frame of the camera, for pairs to calibrate with; None where it is not known."""
         found = self._history.at(captured_s - self.video_delay_s)
         return None if found is None or found.beyond_s > 0.0 else found.camera_from_world
 
@@ -105,7 +105,7 @@ class PhoneTracker:
         self._looked_s = frame.captured_s
 
     def _objection(self, width_px: int, height_px: int) -> str | None:
-        """Intrinsics follow the size of the frames, but not their shape: a phone that is turned shows another part of its sensor."""
+        """Refuse another shape of frames: a phone that is turned shows another part of its sensor. Intrinsics follow the size alone."""
         known = self._intrinsics
         if abs(width_px * known.height_px / (height_px * known.width_px) - 1.0) <= _ASPECT_TOLERANCE:
             return None

@@ -1,9 +1,4 @@
-"""PoseHistory: the last poses of a tracking system with their times, and the pose at any time among them.
-
-What one message of an external tracking system says, in our conventions.
-
-SenderClock: the sender's time in ours, freed of the network's jitter.
-"""
+"""PoseHistory: the last samples of a tracking system with their times, and the pose at any time among them; SenderClock."""
 
 from bisect import bisect_right, insort
 from collections import deque
@@ -20,12 +15,14 @@ STAGE_FROM_BOARD = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class MalformedMessageError(ValueError):
-    """A message from the network that is not what its format says; it is counted and otherwise ignored."""
+    """Message from the network that is not what its format says; it is counted and otherwise ignored."""
 
 
 @dataclass(frozen=True)
 class TrackingSample:
-    """camera_from_world: at the entrance pupil, our axes, metres. sender_s: when it was taken, by the sender's clock; None: not said.
+    """Message of an external tracking system, in our conventions.
+
+    camera_from_world: at the entrance pupil, our axes, metres. sender_s: when it was taken, by the sender's clock; None: not said.
 
     ignored: what the message says and nothing here makes use of.
     """
@@ -37,7 +34,7 @@ class TrackingSample:
 
 
 def lens_between(a: LensState, b: LensState, share: float) -> LensState:
-    """Focus in dioptres, f-numbers in stops: as the rings of a lens turn; what only one knows is taken from it."""
+    """Interpolate focus in dioptres and f-numbers in stops, as the rings of a lens turn; what only one knows is taken from it."""
     a, b = a.completed_by(b), b.completed_by(a)
     both_mm = a.focal_length_mm, b.focal_length_mm
     return LensState(
@@ -49,7 +46,10 @@ def lens_between(a: LensState, b: LensState, share: float) -> LensState:
 
 @dataclass(frozen=True)
 class PoseAtTime:
-    """beyond_s: by how much the time asked for lies after the sample before it, which then stands still; 0 between two samples."""
+    """Pose at a time.
+
+    beyond_s: by how much the time asked for lies after the sample before it, which then stands still; 0 between two samples.
+    """
 
     camera_from_world: Pose
     lens: LensState
@@ -57,7 +57,7 @@ class PoseAtTime:
 
 
 class PoseHistory:
-    """Bounded and safe between threads. Times are those of `time.monotonic`; samples may come a little out of order.
+    """History, bounded and safe between threads. Times are those of `time.monotonic`; samples may come a little out of order.
 
     joined_s: samples farther apart have nothing known between them; the one before then stands still.
     """
@@ -81,7 +81,7 @@ class PoseHistory:
             return self._times[-1] if self._times else None
 
     def at(self, time_s: float) -> PoseAtTime | None:
-        """Interpolated; None before the first sample."""
+        """Interpolate the pose; None before the first sample."""
         with self._lock:
             after = bisect_right(self._times, time_s)
             if after == 0:
@@ -98,15 +98,17 @@ class PoseHistory:
 
 
 class SenderClock:
-    """A packet is never early: of the last arrivals the least delayed one tells how the clocks differ (as in NTP's clock filter,
-    RFC 5905). What all packets are late by stays in; the delay between video and pose, which the user sets, contains it.
+    """Clock of a sender in our time.
+
+    No packet is early: the least delayed of the last arrivals tells how the clocks differ (as in NTP's clock filter, RFC 5905). What all
+    packets are late by stays in; the delay between video and pose, which the user sets, contains it.
     """
 
     def __init__(self, window: int = 128) -> None:
         self._differences_s: deque[float] = deque(maxlen=window)
 
     def ours_s(self, sender_s: float | None, arrived_s: float) -> float:
-        """When it was sent, by our clock; a sender that says no time is taken at the arrival."""
+        """Return when it was sent, by our clock; a sender that says no time is taken at the arrival."""
         if sender_s is None:
             return arrived_s
         self._differences_s.append(arrived_s - sender_s)

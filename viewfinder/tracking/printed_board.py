@@ -1,6 +1,4 @@
-"""A board as a PDF of vectors at true size, with a ruler that shows whether the printer kept it.
-
-Which board to print for a lens, a distance and a picture size, so that its markers are read through the blur.
+"""Printed boards: which one to print for a lens, a distance and a picture size, and its PDF at true size with a ruler.
 
 The rule: a marker of the 4x4 dictionary (6 cells with its border) must span 6 diameters of the blur on the screen. On traced
 pictures with discs of 4 to 12 px, 62 to 100 % of the corners were found at 6 diameters, 0 to 58 % at 4.5, none at 4.
@@ -29,14 +27,14 @@ _POINTS_PER_MM = 72.0 / 25.4
 
 @dataclass(frozen=True)
 class Page:
-    """width_mm, height_mm of the paper, in the direction in which it is used."""
+    """Page with the width and height of the paper, in the direction in which it is used."""
 
     width_mm: float
     height_mm: float
 
     @property
     def room_mm(self) -> tuple[float, float]:
-        """What is left for a board between the margins and above ruler and text."""
+        """Room for a board between the margins and above ruler and text."""
         return self.width_mm - 2 * MARGIN_MM, self.height_mm - 2 * MARGIN_MM - _FOOT_MM
 
     def holds(self, size_mm: tuple[float, float]) -> bool:
@@ -48,14 +46,14 @@ class Page:
 
 
 def page_of(paper: str) -> Page:
-    """Upright."""
+    """Return an upright page."""
     if paper.lower() not in PAPERS_MM:
         raise InputError(f"expected a paper of {', '.join(PAPERS_MM)} or the word board (a page of its size), got {paper!r}")
     return Page(*PAPERS_MM[paper.lower()])
 
 
 def page_for(board: CharucoBoard, paper: str) -> Page:
-    """The paper turned so that the board fits; paper: a4, a3, letter, or board (a page made for it)."""
+    """Turn the paper so that the board fits; paper: a4, a3, letter, or board (a page made for it)."""
     size_mm = board.size_mm
     if paper.lower() == "board":
         return Page(max(size_mm[0], RULER_MM) + 2 * MARGIN_MM, size_mm[1] + 2 * MARGIN_MM + _FOOT_MM)
@@ -71,7 +69,7 @@ def page_for(board: CharucoBoard, paper: str) -> Page:
 
 
 def write_board_pdf(path: Path, board: CharucoBoard, paper: str = "a4", *, overwrite: bool = False) -> None:
-    """Refuses a board that does not fit, and an existing file without `overwrite`."""
+    """Write a board; refuse one that does not fit, and an existing file without `overwrite`."""
     page = page_for(board, paper)
     refuse_existing(path, overwrite)
     try:
@@ -89,7 +87,7 @@ def write_board_pdf(path: Path, board: CharucoBoard, paper: str = "a4", *, overw
 
 
 def _draw_board(canvas: Any, board: CharucoBoard, page: Page) -> None:
-    """All rectangles in one path: filled one by one, neighbours would show hairlines where they touch."""
+    """Draw all rectangles in one path: filled one by one, neighbours would show hairlines where they touch."""
     left_mm = (page.width_mm - board.size_mm[0]) / 2
     top_mm = page.height_mm - MARGIN_MM
     path = canvas.beginPath()
@@ -116,7 +114,7 @@ def _draw_foot(canvas: Any, board: CharucoBoard) -> None:
 
 
 def describe(board: CharucoBoard) -> list[str]:
-    """A line for the board and one for its origin."""
+    """Return a line for the board and one for its origin."""
     grids = [
         f"{grid.squares[0]}x{grid.squares[1]} squares of {grid.square_mm:g} mm, markers of {grid.marker_mm:g} mm" for grid in board.grids
     ]
@@ -137,7 +135,7 @@ _STEPS = 33
 
 @dataclass(frozen=True)
 class BoardView:
-    """How a board is going to be seen: from nearest_m to farthest_m, in pictures width_px wide, elevation_deg above its plane."""
+    """View of a board: from nearest_m to farthest_m, in pictures width_px wide, elevation_deg above its plane."""
 
     lens: Lens
     nearest_m: float
@@ -153,7 +151,7 @@ class BoardView:
             )
 
     def needed_marker_mm(self, distance_m: float) -> float:
-        """The least marker at that distance; its shorter side on the screen counts, which the elevation foreshortens."""
+        """Return the least marker at that distance; its shorter side on the screen counts, which the elevation foreshortens."""
         needed_px = max(BLURS_PER_MARKER * abs(float(self.lens.coc_px(distance_m, self.width_px))), SHARP_MARKER_PX)
         return needed_px / self.px_per_mm(distance_m) / float(np.sin(np.deg2rad(self.elevation_deg)))
 
@@ -163,7 +161,9 @@ class BoardView:
 
 @dataclass(frozen=True)
 class BoardPlan:
-    """marker_mm: the least that is read at every distance. blur_px: the largest blur. board: None where no paper holds one.
+    """Plan of a board.
+
+    marker_mm: the least that is read at every distance. blur_px: the largest blur. board: None where no paper holds one.
 
     paper: the one to print on. sentence: all of it, for people.
     """
@@ -176,7 +176,7 @@ class BoardPlan:
 
 
 def plan_board(view: BoardView, paper: str = "a4") -> BoardPlan:
-    """A board for that paper; for the next larger one where its markers would be too small."""
+    """Plan a board for that paper, or for the next larger one where its markers would be too small."""
     distances_m = [1.0 / float(each) for each in np.linspace(1.0 / view.farthest_m, 1.0 / view.nearest_m, _STEPS)]
     markers_mm = [view.needed_marker_mm(each) for each in distances_m]
     blur_px = max(abs(float(view.lens.coc_px(each, view.width_px))) for each in distances_m)
@@ -195,7 +195,7 @@ def plan_board(view: BoardView, paper: str = "a4") -> BoardPlan:
 
 
 def _calibrating(board: CharucoBoard) -> str:
-    """That a clip of the board cannot tell the camera's intrinsics; empty if it can at every distance."""
+    """Return the warning that a clip of the board cannot tell the camera's intrinsics; empty if it can at every distance."""
     corners = _coarse_corners(board)
     if corners >= FEWEST_CORNERS:
         return ""
@@ -204,25 +204,25 @@ def _calibrating(board: CharucoBoard) -> str:
 
 
 def _coarse_corners(board: CharucoBoard) -> int:
-    """What is read at every distance."""
+    """Count the corners that are read at every distance."""
     return int(np.count_nonzero(board.grid_of_corner == 0))
 
 
 def _from(paper: str) -> list[str]:
-    """That paper and larger ones."""
+    """Return that paper and larger ones."""
     wanted = page_of(paper)
     larger = [name for name, (width, height) in PAPERS_MM.items() if width * height > wanted.width_mm * wanted.height_mm]
     return [paper.lower(), *sorted(larger, key=lambda name: PAPERS_MM[name])]
 
 
 def _board_on(page: Page, coarse_mm: float, fine_mm: float) -> CharucoBoard | None:
-    """Of both directions of the paper the one with more corners."""
+    """Return the board of the paper's direction with more corners."""
     boards = [board for each in (page, page.turned) if (board := _board_in(each.room_mm, coarse_mm, fine_mm)) is not None]
     return max(boards, key=lambda board: len(board.corners_m), default=None)
 
 
 def _board_in(room_mm: tuple[float, float], coarse_mm: float, fine_mm: float) -> CharucoBoard | None:
-    """One grid, and a fine one below it where the distances differ so much that small markers are read at some of them.
+    """Return one grid, and a fine one below it where the distances differ so much that small markers are read at some of them.
 
     Enough corners at every distance go before a second scale.
     """
@@ -244,7 +244,7 @@ def _board_in(room_mm: tuple[float, float], coarse_mm: float, fine_mm: float) ->
 
 
 def _below(coarse: CharucoGrid, room_mm: tuple[float, float], square_mm: float) -> CharucoGrid | None:
-    """A fine grid in what is left of the room; None where that is too little, or its squares are hardly smaller."""
+    """Return a fine grid in what is left of the room; None where that is too little, or its squares are hardly smaller."""
     top_mm = coarse.size_mm[1] + _GAP_SQUARES * coarse.square_mm
     columns = min(int(room_mm[0] / square_mm), _MOST_COLUMNS)
     rows = min(int((room_mm[1] - top_mm) / square_mm), _MOST_ROWS)
@@ -259,7 +259,7 @@ def _grid(columns: int, rows: int, square_mm: float) -> CharucoGrid:
 
 
 def _within_dictionary(grids: tuple[CharucoGrid, ...]) -> CharucoBoard:
-    """The smallest dictionary has the markers that differ most."""
+    """Choose the smallest dictionary, whose markers differ most."""
     needed = max(grid.marker_ids.stop for grid in grids)
     return CharucoBoard(grids, DICTIONARY if needed <= 50 else "DICT_4X4_100")
 

@@ -1,10 +1,10 @@
-"""The 1-Euro filter (Casiez, Roussel and Vogel, CHI 2012) for poses: steady while the camera rests, quick while it moves.
+"""1-Euro filter (Casiez, Roussel and Vogel, CHI 2012) for poses: steady while the camera rests, quick while it moves.
 
 Angles and speeds are in degrees and degrees per second. A shift of the board counts as the angle under which the camera sees it,
 so that one cutoff serves turn and shift: filtered apart, they would let the object swim on the board.
 
-Any tracker, with its poses smoothed if that is switched on. Off, they pass as they are: a pose solved from the frame it is
-shown over needs no smoothing, and any smoothing makes the object lag behind the plate.
+SmoothedTracker can be switched off, and then poses pass as they are: a pose solved from the frame it is shown over needs no smoothing,
+and any smoothing makes the object lag behind the plate.
 """
 
 from dataclasses import replace
@@ -25,7 +25,10 @@ Six = Float64[np.ndarray, "6"]
 
 
 class OneEuroPose:
-    """slowest_hz: cutoff at rest. quickening: Hz that each degree per second adds. pivot_m: the world point whose shift is filtered."""
+    """Filter of poses.
+
+    slowest_hz: cutoff at rest. quickening: Hz that each degree per second adds. pivot_m: the world point whose shift is filtered.
+    """
 
     def __init__(
         self, slowest_hz: float = SLOWEST_HZ, quickening: float = QUICKENING, pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -34,14 +37,14 @@ class OneEuroPose:
         self.reset()
 
     def reset(self) -> None:
-        """The next pose is given as it comes."""
+        """Forget: the next pose is given as it comes."""
         self._turn: Rotation | None = None
         self._raw_turn, self._place, self._raw_place = Rotation.identity(), np.zeros(3), np.zeros(3)
         self._speed: Six = np.zeros(6)
         self._time_s = 0.0
 
     def __call__(self, camera_from_world: Pose, time_s: float) -> Pose:
-        """time_s must grow; a pose of the same time as the one before, or an older one, is not filtered in."""
+        """Filter a pose in; time_s must grow: one of the same time as the one before, or an older one, is not filtered in."""
         turn = Rotation.from_matrix(camera_from_world[:3, :3])
         place = turn.apply(self._pivot_m) + camera_from_world[:3, 3]
         step_s = time_s - self._time_s
@@ -73,13 +76,13 @@ class OneEuroPose:
 
 
 def _share(cutoff_hz: float, step_s: float) -> float:
-    """Of the new value in an exponential average with that cutoff (eq. 4 and 5 of the paper)."""
+    """Return the share of the new value in an exponential average with that cutoff (eq. 4 and 5 of the paper)."""
     rate = 2.0 * np.pi * cutoff_hz * step_s
     return float(rate / (rate + 1.0))
 
 
 class SmoothedTracker:
-    """smoothing: may be switched at any time, from another thread."""
+    """Tracker over another. smoothing: may be switched at any time, from another thread."""
 
     def __init__(self, tracker: Tracker, smoothing: bool = False, pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         self.tracker, self.smoothing, self.name = tracker, smoothing, tracker.name

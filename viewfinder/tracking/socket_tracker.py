@@ -25,7 +25,7 @@ Decoder = Callable[[bytes, object], TrackingSample | None]
 
 @dataclass(frozen=True)
 class TrackingAddress:
-    """Where to listen. port 0 takes a free one. group: of a multicast, to be joined on the interface with the address `host`."""
+    """Address to listen on. port 0 takes a free one. group: of a multicast, to be joined on the interface with the address `host`."""
 
     port: int
     host: str = "127.0.0.1"
@@ -33,7 +33,7 @@ class TrackingAddress:
 
 
 def opentrackio_decoder(reading: StageReading | None = None) -> Decoder:
-    """For both encodings; raises MissingExtraError where the package for CBOR is not installed."""
+    """Return a decoder of both encodings; MissingExtraError where the package for CBOR is not installed."""
     require_cbor()
     reassembly = Reassembly()
 
@@ -46,7 +46,7 @@ def opentrackio_decoder(reading: StageReading | None = None) -> Decoder:
 
 
 def freed_decoder(reading: FreeDReading | None = None, camera: int | None = None) -> Decoder:
-    """camera: the number of the one to follow; None follows all, for a port with one camera."""
+    """Return a decoder. camera: the number of the one to follow; None follows all, for a port with one camera."""
 
     def decode(datagram: bytes, _sender: object) -> TrackingSample | None:
         message = read_freed(datagram)
@@ -56,7 +56,7 @@ def freed_decoder(reading: FreeDReading | None = None, camera: int | None = None
 
 
 class SocketTracker:
-    """A Tracker. video_delay_s may be set at any time: how much later the picture of a moment comes than the pose of that moment.
+    """Tracker. video_delay_s may be set at any time: how much later the picture of a moment comes than the pose of that moment.
 
     malformed: datagrams that were thrown away. ignored: what the sender tells and nothing here makes use of.
     """
@@ -74,20 +74,20 @@ class SocketTracker:
         self._thread.start()
 
     def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:  # noqa: ARG002
-        """Between the two samples around the frame; a little beyond the newest one it stands still and loses quality."""
+        """Interpolate between the two samples around the frame; a little beyond the newest one it stands still and loses quality."""
         found = self._at(frame)
         if found is None or found.beyond_s >= self._hold_s:
             return None
         return TrackedPose(found.camera_from_world, 1.0 - found.beyond_s / self._hold_s, frame.captured_s)
 
     def lens(self, frame: CameraFrame) -> LensState:
-        """What the sender says of the lens at the time of the frame; nothing where it has fallen silent."""
+        """Return what the sender says of the lens at the time of the frame; nothing where it has fallen silent."""
         found = self._at(frame)
         return UNKNOWN_LENS if found is None or found.beyond_s >= self._hold_s else found.lens
 
     @property
     def remark(self) -> str | None:
-        """One sentence where something is wrong: nothing comes, or what comes is not understood."""
+        """Sentence where something is wrong: nothing comes, or what comes is not understood."""
         silent_s = None if self._arrived_s is None else time.monotonic() - self._arrived_s
         if silent_s is None:
             other = f", only {self.malformed} that were not understood" if self.malformed else ""

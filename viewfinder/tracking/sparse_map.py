@@ -1,9 +1,8 @@
-"""A COLMAP model as a map to find a camera in: its points in metres, each with how it looked in the pictures that saw it.
+"""SparseMap: a COLMAP model as a map to find a camera in; its points in metres, each with how it looked in the pictures that saw it.
 
 The folder is what `mrbokeh capture poses` and `scale` write (SCENE/reconstruction: sparse/, images/, scale.json), or what COLMAP
-does (sparse/0/, images/) with the scale given by hand. Looking at all pictures takes a while, once: localisation.npz keeps it.
-
-SIFT features (Lowe 2004) of a grey picture as RootSIFT (Arandjelovic and Zisserman 2012), at places in our convention.
+does (sparse/0/, images/) with the scale given by hand. Looking at all pictures takes a while, once: localisation.npz keeps it. Looks are
+SIFT (Lowe 2004) as RootSIFT (Arandjelovic and Zisserman 2012).
 """
 
 import hashlib
@@ -30,14 +29,14 @@ Grey = UInt8[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Features:
-    """xy_px: the centre of the first pixel is at (0.5, 0.5). descriptors: of length 1."""
+    """Features of a picture. xy_px: the centre of the first pixel is at (0.5, 0.5). descriptors: of length 1."""
 
     xy_px: Float64[np.ndarray, "features 2"]
     descriptors: Float32[np.ndarray, "features 128"]
 
 
 def find_features(grey: Grey, most: int) -> Features:
-    """The strongest ones."""
+    """Return the strongest features."""
     keypoints, descriptors = cv2.SIFT.create(nfeatures=most).detectAndCompute(grey, None)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, _LENGTH), np.float32))
@@ -66,7 +65,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SparseMap:
-    """points_m: map axes. descriptors: RootSIFT, sorted by point; point_of: which point each belongs to, every point has one at least."""
+    """Map to find a camera in.
+
+    points_m: map axes. descriptors: RootSIFT, sorted by point; point_of: which point each belongs to, every point has one at least.
+    """
 
     points_m: Float64[np.ndarray, "points 3"]
     descriptors: Float32[np.ndarray, "looks 128"]
@@ -74,7 +76,10 @@ class SparseMap:
 
 
 def read_sparse_map(folder: Path | str, metres_per_unit: float | None = None) -> SparseMap:
-    """metres_per_unit: of the model; None takes that of scale.json. Raises InputError where model, pictures or scale are missing."""
+    """Read a map.
+
+    metres_per_unit: of the model; None takes that of scale.json. Raises InputError where model, pictures or scale are missing.
+    """
     folder = Path(folder)
     scale = _metres_per_unit(folder, metres_per_unit)
     model_folder = _model_folder(folder)
@@ -105,7 +110,7 @@ def _model_folder(folder: Path) -> Path:
 
 
 def _pictures_folder(folder: Path) -> Path:
-    """images/ beside the model, or where the job of `capture poses` says that they lie."""
+    """Return images/ beside the model, or where the job of `capture poses` says that they lie."""
     job = folder / JOB_NAME
     stated = read_json(job, "a job for COLMAP").get("pictures_folder", "images") if job.exists() else "images"
     pictures = folder / stated
@@ -126,7 +131,7 @@ def _model(folder: Path) -> Any:
 
 
 def _require_whole(folder: Path) -> None:
-    """COLMAP believes the counts in its files: half a file makes it ask for all memory there is."""
+    """Refuse half a file: COLMAP believes its counts and asks for all memory there is."""
     for name, least_bytes in _BYTES_PER_ENTRY.items():
         path = folder / f"{name}.bin"
         if path.exists():
@@ -155,7 +160,7 @@ def _cached(path: Path, key: str) -> Arrays | None:
 
 
 def _keep(path: Path, key: str, arrays: Arrays) -> None:
-    """A folder that cannot be written to costs time at every start, no more."""
+    """Keep the looks; a folder that cannot be written to costs time at every start, no more."""
     points, codes, point_of = arrays
     try:
         with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -180,7 +185,7 @@ def _looked_at(model: Any, pictures: Path) -> Arrays:
 
 
 def _looks(model: Any, pictures: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Of each picture: (numbers of the points seen in it, codes of what it looks like there)."""
+    """Yield (numbers of the points seen, codes of what they look like) of each picture."""
     for image in track(sorted(model.images.values(), key=lambda each: each.name), "map"):
         observed = image.get_observation_points2D() if image.has_pose else []
         grey = cv2.imread(str(pictures / image.name), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -1,7 +1,4 @@
-"""The protocol of everything that knows where the camera is.
-
-A camera on a tripod: its pose, measured once, holds for every frame.
-"""
+"""Tracker: the protocol of everything that knows where the camera is, its poses, and the camera on a tripod."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +13,9 @@ from viewfinder.frames import CameraFrame, Pose
 
 @dataclass(frozen=True)
 class TrackedPose:
-    """camera_from_world: (4, 4), metres. quality: 0 (a guess) to 1. residual_px: RMS of the reprojected points; points: how many.
+    """Pose of a frame.
+
+    camera_from_world: (4, 4), metres. quality: 0 (a guess) to 1. residual_px: RMS of the reprojected points; points: how many.
 
     captured_s: of the frame that it belongs to, so that a late pose is not taken for a new one. is_certain: False where another pose fits
       as well, as for a board that is small in the picture; nothing should be shown or measured by it then.
@@ -32,7 +31,7 @@ class TrackedPose:
 
 @runtime_checkable
 class Tracker(Protocol):
-    """Called with every frame that is composited, in order; frames between may be missing.
+    """Tracker, called with every frame that is composited, in order; frames between may be missing.
 
     intrinsics: of the size of the frame; its pose is not looked at. None where the track is lost. Must be fast (a few ms): what is
     slow (detection, localisation) runs in a thread of its own, on the newest frame.
@@ -46,7 +45,7 @@ class Tracker(Protocol):
 
 
 class FixedPose:
-    """camera: pose and intrinsics; who composites takes `camera.resized` to the size of its frames for intrinsics."""
+    """Tracker on a tripod. camera: pose and intrinsics, measured once."""
 
     name = "fixed pose"
 
@@ -57,11 +56,11 @@ class FixedPose:
         return TrackedPose(self.camera.camera_from_world, 1.0, frame.captured_s)
 
     def close(self) -> None:
-        """Nothing runs."""
+        """Close nothing: nothing runs."""
 
 
 def read_fixed_pose(path: Path | str) -> FixedPose:
-    """From the JSON of `mrbokeh.optics.camera`."""
+    """Read the JSON of `mrbokeh.optics.camera`."""
     document = read_json(path, "a camera with its pose")
     camera = camera_from_json(document if isinstance(document, dict) else {}, str(path))
     if not is_rigid(camera.camera_from_world):
