@@ -9,7 +9,7 @@ _UNSEEN = -2.0  # as plane_sweep.UNSEEN
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _positions(rays: np.ndarray, dioptres: np.ndarray, offset: np.float32, view: np.ndarray, u: np.ndarray, v: np.ndarray) -> None:
-    """Where the points of one row appear in the neighbour, in samples of its array; view holds what `packed_view` says."""
+    """Project the points of one row into the neighbour, in samples of its array; view is laid out as in `packed_view`."""
     for x in range(rays.shape[0]):
         a, b, d = rays[x, 0], rays[x, 1], dioptres[x] + offset
         z = view[6] * a + view[7] * b + view[8] + view[11] * d
@@ -24,7 +24,7 @@ def _positions(rays: np.ndarray, dioptres: np.ndarray, offset: np.float32, view:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sampled(picture: np.ndarray, u: np.ndarray, v: np.ndarray, row: np.ndarray, seen: np.ndarray) -> None:
-    """Bilinear samples; what lies outside takes the border's value and is not seen."""
+    """Sample bilinearly; positions outside take the border's value and are not seen."""
     height, width = picture.shape
     for x in range(u.shape[0]):
         seen[x] = u[x] >= 0.0 and v[x] >= 0.0 and u[x] <= width - 1 and v[x] <= height - 1
@@ -49,7 +49,7 @@ def _add_row(sums: np.ndarray, reference: np.ndarray, row: np.ndarray, sign: flo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _correlations(sums: np.ndarray, rows: int, radius: int, mean: np.ndarray, variance: np.ndarray, noise: float, out: np.ndarray) -> None:
-    """Zero-mean normalised correlation of the windows around one row from the sums of their columns."""
+    """Compute the zero-mean normalised correlation of the windows around one row from the sums of their columns."""
     width = sums.shape[1]
     w, ww, rw = 0.0, 0.0, 0.0
     for x in range(min(radius, width)):
@@ -86,7 +86,7 @@ def score_neighbour(
     noise: float,
     out: np.ndarray,
 ) -> None:
-    """Scores (rows, W) of the rows first <= y < end; see `plane_sweep_plainly.scores_of_plane`, the twin."""
+    """Compute the scores (rows, W) of the rows first <= y < end against one neighbour."""
     height, width = reference.shape
     first, end = rows
     offset32 = np.float32(offset)
@@ -113,7 +113,7 @@ def score_neighbour(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mean_of_best(scores: np.ndarray, best: int, out: np.ndarray) -> None:
-    """(N, rows, W) scores to the mean of the best few of those that see the point (rows, W); _UNSEEN where none does."""
+    """Average the best few of (N, rows, W) scores among the neighbours that see the point; _UNSEEN if none does."""
     count, rows, width = scores.shape
     kept = np.empty(best, np.float32)
     for y in range(rows):

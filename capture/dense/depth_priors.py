@@ -1,11 +1,10 @@
-"""What focus says about depth, and where it may: a vote on the planes of a sweep.
+"""Priors on a viewpoint's depth beside its neighbours' pictures: focus, depths at single points, and finished depths of other views.
 
-Focus is metric and sees what only one view sees, but it is coarse, and wrong around lights: there the rim of a light's disc
-outshouts the scene. So it votes only where its peak lies between slices, is sharp, stands above the noise, and no light is near.
+Focus votes on the planes of a sweep. It is metric and sees what only one view sees, but it is coarse, and wrong around highlights,
+where the rim of a highlight's disc outweighs the scene. So it votes only if its peak lies between slices, is sharp and above the
+noise, and no highlight is near.
 
-Do the depths of several views tell of the same surfaces? A surface that one view has, the others must see or have hidden.
-
-What is known of a viewpoint's depth beside the pictures of its neighbours.
+Finished depths of other views are checked for consistency: a surface seen by one view must be seen by the others, or be hidden.
 """
 
 from collections.abc import Sequence
@@ -28,12 +27,17 @@ _USUAL_CURVATURE = 0.36  # the median where focus is trusted, on a traced desk i
 _E_FOLDS_OF_FULL_COST = 2.0
 _MOST_CONFIDENCE = 0.5  # of the pixels that focus trusts most, one in seven of a traced desk is off by 0.05 dioptre
 _BAND_ROWS = 64
+Count = Int[np.ndarray, "height width"]
+_TRUSTED = 0.5
 
 
 @dataclass(frozen=True)
 class FocusVote:
-    """dioptre (H, W): where each pixel is sharpest; trust (H, W) in [0, 1]; curvature (H, W): e-folds of energy lost one slice away,
-    twice; step_dioptre: between two slices."""
+    """Depth from focus as a vote.
+
+    dioptre (H, W): where each pixel is sharpest. trust (H, W) in [0, 1]. curvature (H, W): twice the e-folds of energy lost one slice
+    away. step_dioptre: between two slices.
+    """
 
     dioptre: Plane
     trust: Plane
@@ -41,7 +45,7 @@ class FocusVote:
     step_dioptre: float
 
     def resized(self, width_px: int, height_px: int) -> "FocusVote":
-        """The vote of a smaller picture; the nearest pixel's, for depths are not averaged over an edge."""
+        """Resize by nearest neighbour, so that depths are not averaged over an edge."""
         if self.dioptre.shape == (height_px, width_px):
             return self
 
@@ -52,7 +56,7 @@ class FocusVote:
 
 
 def focus_vote_of_map(focus_index: Plane, confidence: Plane, slice_dioptres: Float[np.ndarray, " slices"]) -> FocusVote:
-    """The vote of a finished depth from focus, as a merged stack keeps it: confidence stands for the trust, ends have none."""
+    """Return the vote of a merged stack's depth from focus: its confidence is the trust, which is 0 at the ends of the stack."""
     interior = (focus_index > 0.5) & (focus_index < len(slice_dioptres) - 1.5)
     curvature = np.full_like(focus_index, _USUAL_CURVATURE)
     trust = np.where(interior, confidence, 0.0).astype(np.float32)
@@ -67,17 +71,17 @@ def _step(slice_dioptres: Float[np.ndarray, " slices"]) -> float:
     return float(np.abs(np.diff(slice_dioptres)).mean())
 
 
-def near_lights(rgb: Float32[np.ndarray, "height width 3"], largest_coc_px: float) -> Mask:
-    """Pixels of an all-in-focus picture within the largest blur (a diameter, so half of it) of anything over range."""
+def near_highlights(rgb: Float32[np.ndarray, "height width 3"], largest_coc_px: float) -> Mask:
+    """Mark pixels of an all-in-focus picture within the largest blur (a diameter, so half of it) of anything over range."""
     over = (rgb.max(axis=2) > OVER_RANGE).astype(np.uint8)
     radius = int(np.ceil(0.5 * largest_coc_px)) + 1
     return cv2.dilate(over, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))).astype(bool)
 
 
 def add_focus_votes(costs: UInt8[np.ndarray, "height width planes"], planes: Float[np.ndarray, " planes"], vote: FocusVote) -> None:
-    """Blend into the costs of a sweep, in place: everywhere they keep 1 - SHARE_OF_FOCUS, and focus adds the rest where it is trusted.
+    """Blend the vote into the costs of a sweep in place: they keep 1 - SHARE_OF_FOCUS, and trusted focus adds the rest.
 
-    Its cost grows with the square of the distance from its peak, as the parabola through its log energy says.
+    Its cost grows with the square of the distance from its peak, like the parabola through its log energy.
     """
     for first in range(0, len(costs), _BAND_ROWS):
         rows = np.s_[first : first + _BAND_ROWS]
@@ -88,14 +92,9 @@ def add_focus_votes(costs: UInt8[np.ndarray, "height width planes"], planes: Flo
 
 
 def agreement(vote: FocusVote, dioptre: Plane) -> Plane:
-    """From 0 to 1: how far focus vouches for a depth: its trust, less what its energy lost there."""
+    """Return how far focus supports a depth, 0 to 1: its trust less the energy it loses there."""
     steps = (dioptre - vote.dioptre) / np.float32(vote.step_dioptre)
     return (_MOST_CONFIDENCE * vote.trust * np.exp(-0.5 * np.maximum(vote.curvature, _SHARP_CURVATURE) * steps**2)).astype(np.float32)
-
-
-Count = Int[np.ndarray, "height width"]
-
-_TRUSTED = 0.5
 
 
 @dataclass(frozen=True)
@@ -109,9 +108,9 @@ class ViewDepth:
 
 @dataclass(frozen=True)
 class Consistency:
-    """supports (H, W): neighbours with the same surface; contradictions: those that see through it to something farther off.
+    """Agreement with other views. supports (H, W): neighbours with the same surface; contradictions: those that see something farther.
 
-    A neighbour with something nearer in the way has it hidden: neither of the two.
+    A neighbour with something nearer in the way counts as neither.
     """
 
     supports: Count
@@ -119,7 +118,7 @@ class Consistency:
 
 
 def consistency(reference: SweepView, dioptre: Plane, neighbours: Sequence[ViewDepth], tolerance_dioptre: float) -> Consistency:
-    """Compares 1 / depth along each neighbour's own axis; only confident pixels of a neighbour have a say."""
+    """Compare 1 / depth along each neighbour's own axis; only confident pixels of a neighbour count."""
     supports, contradictions = np.zeros(dioptre.shape, np.int64), np.zeros(dioptre.shape, np.int64)
     rays = rays_of(reference)
     for first in range(0, len(rays), _BAND_ROWS):
@@ -133,7 +132,7 @@ def consistency(reference: SweepView, dioptre: Plane, neighbours: Sequence[ViewD
 
 
 def _seen_by(reference: SweepView, points: np.ndarray, neighbour: ViewDepth) -> tuple[np.ndarray, np.ndarray]:
-    """(dioptre that the neighbour has where it sees the points, NaN where it has none; dioptre that they have for it)."""
+    """Return (the neighbour's dioptre where it sees the points, NaN if it has none; the dioptre expected there)."""
     camera = neighbour.view.camera
     pose = neighbour_from_reference(reference.camera, camera)
     in_camera = points @ pose[:3, :3].T + pose[:3, 3]
@@ -147,13 +146,13 @@ def _seen_by(reference: SweepView, points: np.ndarray, neighbour: ViewDepth) -> 
 
 @dataclass(frozen=True)
 class SparseDepths:
-    """Depths known at single places: xy_px (K, 2) in the picture, depth_m (K,) along the axis."""
+    """Depths known at single points: xy_px (K, 2) in the picture, depth_m (K,) along the axis."""
 
     xy_px: Float[np.ndarray, "points 2"]
     depth_m: Float[np.ndarray, " points"]
 
     def dioptre_range(self, margin: float = 0.15) -> tuple[float, float]:
-        """(farthest, nearest) of all but the outermost percent, widened by a share of itself on either side."""
+        """Return (farthest, nearest) without the outermost percent, widened by a fraction of itself on either side."""
         farthest, nearest = np.percentile(1.0 / self.depth_m, [1.0, 99.0])
         spare = margin * (nearest - farthest)
         return max(float(farthest - spare), 0.0), float(nearest + spare)
@@ -162,21 +161,21 @@ class SparseDepths:
         return SparseDepths(np.concatenate([self.xy_px, other.xy_px]), np.concatenate([self.depth_m, other.depth_m]))
 
     def pixels(self, shape: tuple[int, int], scale: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(row, column, number) of the points inside a picture (height, width) at that scale."""
+        """Return (row, column, number) of the points inside a picture (height, width) at that scale."""
         column, row = np.floor(self.xy_px * scale).astype(int).T
         chosen = np.flatnonzero((column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0]))
         return row[chosen], column[chosen], chosen
 
     def add_anchors(self, costs: UInt8[np.ndarray, "height width planes"], planes: Float[np.ndarray, " planes"], scale: float) -> None:
-        """In place: a known depth rules out, at its pixel, all planes but the few around it. scale: of the costs' picture."""
+        """Rule out in place all planes but the few around a known depth at its pixel. scale: of the costs' picture."""
         row, column, chosen = self.pixels(costs.shape[:2], scale)
         apart = np.abs(planes[None, :] - 1.0 / self.depth_m[chosen, None]) / (planes[1] - planes[0])
         costs[row, column] = np.where(apart > 2.0, 255, costs[row, column] // 2)
 
 
 @dataclass(frozen=True)
-class Clues:
-    """What is known beside the pictures: focus, depths at single places, finished depths of neighbours (a second round)."""
+class DepthPriors:
+    """Everything known beside the pictures: focus, depths at single points, finished depths of neighbours (a second round)."""
 
     focus: FocusVote | None = None
     sparse: SparseDepths | None = None

@@ -1,10 +1,10 @@
 """COLMAP's PatchMatch stereo as an optional source of depth: it needs the package pycolmap-cuda12 and an NVIDIA GPU.
 
 The packages pycolmap and pycolmap-cuda12 hold one module of the same name: never install both. `pycolmap.has_cuda` tells how the
-module was built, not whether a GPU is there, and COLMAP ends the whole process where none is: so the driver is asked first.
-Not run in the project's own tests, for want of such a machine; what surrounds the call is.
+module was built, not whether a GPU is there, and COLMAP ends the whole process without one: so the driver is asked first.
+The project's own tests do not run PatchMatch, for want of such a machine; they cover the code around it.
 
-PatchMatch depths of a whole scene as clues for its dense depth; run once, in SCENE/reconstruction/patch_match.
+It runs once for a whole scene, in SCENE/reconstruction/patch_match, and its depths become priors of the dense depth.
 """
 
 import ctypes
@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.dense.depth_priors import SparseDepths
-from capture.poses.colmap import JOB_NAME, RECONSTRUCTION_FOLDER
-from capture.poses.colmap_job import job_from_json
+from capture.poses.colmap_job import JOB_NAME, MODEL_FOLDER, RECONSTRUCTION_FOLDER, job_from_json
 from capture.poses.sparse_model import Distortion, SparseModel, undistorted_px
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import read_json
@@ -25,10 +24,12 @@ from mrbokeh.system.errors import InputError
 Plane = Float32[np.ndarray, "height width"]
 
 _MAPS = Path("stereo") / "depth_maps"
+WORKSPACE = "patch_match"
+_FINISHED = "finished"
 
 
 def patch_match_obstacle() -> str | None:
-    """Why PatchMatch cannot run here, as a sentence; None where it can."""
+    """Return why PatchMatch cannot run here, as a sentence; None if it can."""
     try:
         import pycolmap
     except ImportError:
@@ -44,7 +45,7 @@ def patch_match_obstacle() -> str | None:
 
 
 def nvidia_gpus() -> int:
-    """How many the driver sees; 0 without a driver."""
+    """Count the GPUs that the driver sees; 0 without a driver."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -55,7 +56,7 @@ def nvidia_gpus() -> int:
 
 
 def run_patch_match(sparse: Path, pictures: Path, workspace: Path) -> None:
-    """COLMAP's sparse model and its pictures to depth maps in the workspace, in the model's unit; raises InputError where it cannot run."""
+    """Write depth maps of COLMAP's sparse model to the workspace, in the model's unit. Raises InputError if it cannot run."""
     obstacle = patch_match_obstacle()
     if obstacle:
         raise InputError(obstacle)
@@ -66,7 +67,7 @@ def run_patch_match(sparse: Path, pictures: Path, workspace: Path) -> None:
 
 
 def read_patch_match(workspace: Path, picture: str, camera: Camera, distortion: Distortion) -> Plane:
-    """Depth (H, W) of a picture (its file name) on its own, distorted pixels, in the model's unit; NaN where COLMAP has none."""
+    """Read the depth (H, W) of a picture (its file name) on its own, distorted pixels, in the model's unit; NaN where COLMAP has none."""
     import pycolmap
 
     path = workspace / _MAPS / f"{picture}.geometric.bin"
@@ -82,7 +83,7 @@ def read_patch_match(workspace: Path, picture: str, camera: Camera, distortion: 
 
 
 def on_original_pixels(depth: Float32[np.ndarray, "rows columns"], undistorted: Camera, camera: Camera, distortion: Distortion) -> Plane:
-    """An undistorted picture's depth (0: none) seen at the pixels of the real one, the nearest for each; NaN where there is none."""
+    """Resample an undistorted picture's depth (0: none) to the pixels of the original by nearest neighbour; NaN where there is none."""
     rays = (undistorted_px(camera, distortion, camera.pixel_centres_px()) - camera.principal_px) / np.asarray(camera.focal_px)
     samples = (rays * undistorted.focal_px + undistorted.principal_px - 0.5).astype(np.float32)
     x, y = np.moveaxis(np.nan_to_num(samples, nan=-10.0), -1, 0)
@@ -90,18 +91,14 @@ def on_original_pixels(depth: Float32[np.ndarray, "rows columns"], undistorted: 
     return np.where(found > 0, found, np.nan).astype(np.float32)
 
 
-def patch_match_clue(depth_m: Plane) -> SparseDepths:
-    """All known pixels as depths known at single places, for `Clues.sparse`: the sweep then looks only near them."""
+def patch_match_prior(depth_m: Plane) -> SparseDepths:
+    """Return all known pixels as sparse depths, so that the sweep searches only near them."""
     row, column = np.nonzero(np.isfinite(depth_m))
     return SparseDepths(np.stack([column + 0.5, row + 0.5], axis=-1), depth_m[row, column].astype(np.float64))
 
 
-WORKSPACE = "patch_match"
-_FINISHED = "finished"
-
-
 class PatchMatchScene:
-    """model: in COLMAP's own unit, with its scale. Raises InputError where PatchMatch cannot run."""
+    """PatchMatch depths of a scene. model: in COLMAP's own unit, with its scale. Raises InputError if PatchMatch cannot run."""
 
     def __init__(self, scene: Path, model: SparseModel) -> None:
         obstacle = patch_match_obstacle()
@@ -111,11 +108,11 @@ class PatchMatchScene:
         job = job_from_json(read_json(folder / JOB_NAME, "what COLMAP was asked to do (run `mrbokeh capture poses --overwrite`)"))
         self._job, self._model, self._workspace = job, model, folder / WORKSPACE
         if not (self._workspace / _FINISHED).is_file():
-            run_patch_match(folder / "sparse", folder / job.pictures_folder, self._workspace)
+            run_patch_match(folder / MODEL_FOLDER, folder / job.pictures_folder, self._workspace)
             (self._workspace / _FINISHED).touch()
 
     def depths_in(self, name: str) -> SparseDepths:
-        """Every pixel of a view that PatchMatch knows, in metres."""
+        """Return every pixel of a view that PatchMatch knows, in metres."""
         view = self._model.view(name)
         depth = read_patch_match(self._workspace, self._job.file_of(name), view.camera, view.distortion)
-        return patch_match_clue((depth * np.float32(self._model.metres_per_unit)).astype(np.float32))
+        return patch_match_prior((depth * np.float32(self._model.metres_per_unit)).astype(np.float32))

@@ -1,12 +1,11 @@
-"""Plane sweep in dioptres: how well neighbouring views agree with the reference if its points lay on each of many planes.
+"""Plane sweep in dioptres: the agreement of neighbouring views with the reference if its points lay on each of many planes.
 
 Collins 1996 (A space-sweep approach to true multi-image matching), with zero-mean normalised cross-correlation in windows and
-the mean of the best few neighbours (Kang, Szeliski and Chai 2001), so that a view in which a point is hidden has no say.
-Planes lie equally apart in dioptres: so do their pictures in a neighbour, and so does blur.
+the mean of the best few neighbours (Kang, Szeliski and Chai 2001), so that a view in which a point is hidden does not count.
+Planes are equally spaced in dioptres: so are their pictures in a neighbour, and so is blur. Their step moves the picture of the
+widest neighbour by a given number of pixels.
 
-Planes of a sweep, equally spaced in dioptres: steps that move the picture of the widest neighbour by so many pixels.
-
-A second, fine sweep around a surface: windows slant with it, so that steep surfaces are matched as sharply as those that face us.
+A second, fine sweep around a surface slants the windows with it, so that steep surfaces match as sharply as frontal ones.
 """
 
 from collections.abc import Sequence
@@ -26,11 +25,14 @@ WORST_COST = 255
 UNSEEN = -2.0
 """Score of a point that no neighbour sees."""
 _LEAST_BAND = 32
+LEAST_PARALLAX_PX = 8.0
+_PROBES = 5
+_LEAST_CURVATURE = 1e-4
 
 
 @dataclass(frozen=True)
 class Matching:
-    """How windows are compared.
+    """Comparison of windows.
 
     radius_px: windows are squares of 2 radius + 1 pixels.
     best: how many neighbours count; 0 takes half of them, rounded up.
@@ -52,11 +54,11 @@ def plane_sweep(
     matching: Matching | None = None,
     base_dioptre: Plane | None = None,
 ) -> Costs:
-    """(H, W, D) cost of each plane, 255 (1 - correlation) in 0..255: 0 agrees, 255 is uncorrelated or worse.
+    """Return the (H, W, D) cost of each plane, 255 (1 - correlation) in 0..255: 0 agrees, 255 is uncorrelated or worse.
 
     offsets: the dioptres of the planes; with base_dioptre (H, W) they are added to it, which sweeps a shell around a surface and
       so compares slanted windows where the surface slants.
-    Where no neighbour sees a point its cost is 255. Memory: 1 byte per cell and a band of rows of float32 scores.
+    The cost is 255 where no neighbour sees a point. Memory: 1 byte per cell and a band of rows of float32 scores.
     """
     matching = matching or Matching()
     height, width = reference.structure.shape
@@ -78,7 +80,7 @@ def cost_of(score: Float32[np.ndarray, "rows width"]) -> UInt8[np.ndarray, "rows
 
 
 def window_statistics(structure: Plane, radius_px: int) -> tuple[Plane, Plane]:
-    """(mean, variance) in the windows around each pixel; at the border windows are cut off."""
+    """Return (mean, variance) in the windows around each pixel; windows are cut off at the border."""
     size = (2 * radius_px + 1, 2 * radius_px + 1)
     ones = cv2.boxFilter(np.ones_like(structure), cv2.CV_64F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
     sums = [
@@ -88,7 +90,7 @@ def window_statistics(structure: Plane, radius_px: int) -> tuple[Plane, Plane]:
 
 
 class PlaneScores:
-    """Scores of one plane after another (or of shells around base_dioptre): what stays the same is worked out once."""
+    """Scores of one plane after another (or of shells around base_dioptre), with everything they share computed once."""
 
     def __init__(self, reference: SweepView, neighbours: Sequence[SweepView], matching: Matching, base_dioptre: Plane) -> None:
         if not neighbours:
@@ -100,7 +102,7 @@ class PlaneScores:
         self._views = [packed_view(reference, each) for each in neighbours]
 
     def of_rows(self, first: int, end: int, offset: float) -> Float32[np.ndarray, "rows width"]:
-        """Mean correlation with the best neighbours of rows first <= y < end; `UNSEEN` where none sees the point."""
+        """Return the mean correlation with the best neighbours of rows first <= y < end; `UNSEEN` where none sees the point."""
         from capture.dense._plane_sweep_numba import mean_of_best, score_neighbour
 
         matching = self._matching
@@ -113,12 +115,8 @@ class PlaneScores:
         return best
 
 
-LEAST_PARALLAX_PX = 8.0
-_PROBES = 5
-
-
 def pixels_per_dioptre(reference: SweepView, neighbour: SweepView, nearest_dioptre: float, farthest_dioptre: float) -> float:
-    """The fastest that a point moves in the neighbour's picture with its dioptre (0 for a neighbour at the same place)."""
+    """Return the largest shift of a point in the neighbour's picture per dioptre (0 for a neighbour at the same place)."""
     camera = reference.camera
     x, y = np.meshgrid(np.linspace(0.0, camera.width_px, _PROBES), np.linspace(0.0, camera.height_px, _PROBES))
     plane = (np.stack([x, y], axis=-1) - camera.principal_px) / np.asarray(camera.focal_px)
@@ -138,9 +136,9 @@ def pixels_per_dioptre(reference: SweepView, neighbour: SweepView, nearest_diopt
 def dioptre_planes(
     reference: SweepView, neighbours: Sequence[SweepView], dioptre_range: tuple[float, float], step_px: float = 0.5, most: int = 0
 ) -> Float[np.ndarray, " planes"]:
-    """Dioptres from far to near (ascending) in steps of at most `step_px` in the widest neighbour; `most` > 0 caps their number.
+    """Return dioptres from far to near (ascending) in steps of at most `step_px` in the widest neighbour; `most` > 0 caps their number.
 
-    dioptre_range: (farthest, nearest), 1 / metres. Raises InputError where no neighbour stands apart from the reference.
+    dioptre_range: (farthest, nearest), 1 / metres. Raises InputError if no neighbour stands apart from the reference.
     """
     farthest, nearest = dioptre_range
     if not 0.0 <= farthest < nearest:
@@ -157,7 +155,7 @@ def dioptre_planes(
 
 
 def by_parallax(reference: SweepView, neighbours: Sequence[SweepView], dioptre_range: tuple[float, float]) -> list[SweepView]:
-    """The neighbours, least parallax first, for in those planes lie densest; but last those that show too little to tell depth."""
+    """Sort neighbours by parallax, least first, since their planes are densest; those with too little to tell depth come last."""
     farthest, nearest = dioptre_range
 
     def place(neighbour: SweepView) -> tuple[bool, float]:
@@ -167,13 +165,13 @@ def by_parallax(reference: SweepView, neighbours: Sequence[SweepView], dioptre_r
     return sorted(neighbours, key=place)
 
 
-_LEAST_CURVATURE = 1e-4
-
-
 @dataclass(frozen=True)
 class Refined:
-    """dioptre (H, W); score: correlation there, -1..1 (-2 where no neighbour sees the point); curvature: how sharply the score falls
-    off within a step, 0 where the best is at the end of the shell; there the dioptre is left as it was."""
+    """A refined surface.
+
+    dioptre (H, W). score: correlation there, -1..1 (-2 where no neighbour sees the point). curvature: drop of the score within a step,
+    0 if the best is at the end of the shell; there the dioptre is left as it was.
+    """
 
     dioptre: Plane
     score: Plane
@@ -188,7 +186,7 @@ def refine(
     reach: int = 2,
     matching: Matching | None = None,
 ) -> Refined:
-    """The best of 2 reach + 1 surfaces, step_dioptre apart, around base_dioptre, and between them by a parabola."""
+    """Choose the best of 2 reach + 1 surfaces, step_dioptre apart, around base_dioptre, and interpolate by a parabola."""
     sweep = PlaneScores(reference, neighbours, matching or Matching(), base_dioptre)
     offsets = [step_dioptre * k for k in range(-reach, reach + 1)]
     result = Refined(*(np.empty_like(base_dioptre) for _ in range(3)))
@@ -207,7 +205,7 @@ def refine(
 def _peak(
     scores: Float32[np.ndarray, "offsets rows width"],
 ) -> tuple[Float32[np.ndarray, "rows width"], Float32[np.ndarray, "rows width"], Float32[np.ndarray, "rows width"]]:
-    """(fractional index of the peak, its score, its curvature); the middle index and curvature 0 where the peak is at an end."""
+    """Return (fractional index of the peak, its score, its curvature); the middle index and curvature 0 if the peak is at an end."""
     best = scores.argmax(axis=0)
     middle, inside = len(scores) // 2, (best > 0) & (best < len(scores) - 1)
     at = np.where(inside, best, middle)

@@ -1,9 +1,7 @@
-"""`mrbokeh capture depth`: dense metric depth of every stack from its neighbours and its focus, then the picture made with it.
+"""`mrbokeh capture depth`: dense metric depth of every stack from its neighbours and its focus, and the picture made with it.
 
-Needs merged stacks, poses and their scale. The first pass's picture and depth are kept in first_pass/ and are what every run
-starts from, so that a run again with other settings, or an interrupted one, gives the same.
-
-A stack with dense depth on disk: the picture made with it, depth and what they came from.
+Needs merged stacks, poses and their scale. The first pass's picture and depth are kept in first_pass/ as the input of every run,
+so that a run with other settings, or a continued one, gives the same result.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture.dense.dense_depth import DenseSettings, dense_depth
-from capture.dense.depth_priors import Clues, FocusVote, SparseDepths, focus_vote_of_map, near_lights
+from capture.dense.depth_priors import DepthPriors, FocusVote, SparseDepths, focus_vote_of_map, near_highlights
 from capture.dense.finish import DenseDepth
 from capture.dense.patch_match import PatchMatchScene
 from capture.dense.sweep_view import FirstPictures, SweepView, nearest_views
@@ -23,7 +21,7 @@ from capture.merging.merged_pictures import write_readable_pictures
 from capture.merging.preferred_side import PREFERRED
 from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, SliceOptics, first_pass_path, keep_first_pass, second_pass
-from capture.poses.colmap import RECONSTRUCTION_FOLDER
+from capture.poses.colmap_job import RECONSTRUCTION_FOLDER
 from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model
 from mrbokeh.figures.stack_pictures import write_merge_sheet
 from mrbokeh.images.camera_rgb import read_camera_rgb
@@ -38,10 +36,14 @@ Plane = Float32[np.ndarray, "height width"]
 # Between these confidences the second pass takes over from the first; seams are as soft as this.
 _DOUBTED, _TRUSTED = 0.3, 0.6
 _SEAM_PX = 1.5
+_FEWEST_POINTS = 20
 
 
 def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, object]) -> FocalStack:
-    """Pictures first, stack.json last; retouches and the preferred side are of the first picture. record: what the depth was made from."""
+    """Write the pictures first, stack.json last, without retouches and the preferred side, which belong to the first picture.
+
+    record: what the depth was made from.
+    """
     kept = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)}
     deepened = replace(stack, metadata=kept | {DEPTH_SOURCE: record})
     write_merged(
@@ -59,7 +61,7 @@ def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, objec
 
 
 def _picture(stack: FocalStack, found: DenseDepth) -> Rgb:
-    """The second pass where its depth can be trusted, else the first: a wrong depth takes pixels from slices in which they are blurred.
+    """Return the second pass where its depth is trusted, else the first: a wrong depth selects slices in which a pixel is blurred.
 
     On traced stacks the mixture is 0 to 2 dB above the second pass and 0.1 to 0.9 dB above the first.
     """
@@ -72,7 +74,7 @@ def _picture(stack: FocalStack, found: DenseDepth) -> Rgb:
 
 
 def _focus_index(stack: FocalStack, depth_m: Float[np.ndarray, "height width"]) -> Plane:
-    """The fractional index of the slice that is focused at each depth; the first pass's where focus distances are unknown."""
+    """Return the fractional index of the slice focused at each depth; the first pass's if focus distances are unknown."""
     if not stack.is_metric:
         return read_exr(first_pass_path(stack, stack.depth_path))[0].channels["focus_index"].astype(np.float32)
     dioptres = np.array([1.0 / distance for distance in stack.focus_distances_m if distance is not None])
@@ -80,13 +82,11 @@ def _focus_index(stack: FocalStack, depth_m: Float[np.ndarray, "height width"]) 
     return np.interp(1.0 / depth_m, dioptres[order], np.arange(len(dioptres))[order].astype(np.float64)).astype(np.float32)
 
 
-_FEWEST_POINTS = 20
-
-
 @dataclass(frozen=True)
 class SceneDepthSettings:
-    """neighbours: how many views a stack is compared with. overwrite: also where the depth is there already.
+    """Settings of a scene's depth.
 
+    neighbours: how many views a stack is compared with. overwrite: recompute existing depth.
     patch_match: COLMAP's PatchMatch narrows the sweep (needs pycolmap-cuda12 and an NVIDIA GPU).
     """
 
@@ -98,14 +98,17 @@ class SceneDepthSettings:
 
 @dataclass(frozen=True)
 class SceneDepth:
-    """stacks: with dense depth now. left_out: names of stacks without a pose, or with guessed metres, which keep their depth from focus."""
+    """The result.
+
+    Stacks: with dense depth now. left_out: names of stacks without a pose, or with guessed metres; they keep depth from focus.
+    """
 
     stacks: tuple[FocalStack, ...]
     left_out: tuple[str, ...]
 
 
 def deepen_scene(scene: Path, settings: SceneDepthSettings | None = None) -> SceneDepth:
-    """Dense depth and second-pass picture for every placed stack of a scene; finished ones are kept unless to overwrite."""
+    """Compute dense depth and second-pass picture for every placed stack of a scene; finished ones are kept unless overwrite is set."""
     settings = settings or SceneDepthSettings()
     unscaled = read_sparse_model(scene / RECONSTRUCTION_FOLDER)
     model = unscaled.scaled()
@@ -127,14 +130,14 @@ def deepen_scene(scene: Path, settings: SceneDepthSettings | None = None) -> Sce
 
 @dataclass(frozen=True)
 class SceneKnowledge:
-    """model: in metres. pictures: of the first pass. patch_match: its depths, where it was asked for."""
+    """Shared inputs of all stacks. model: in metres. pictures: of the first pass. patch_match: its depths, if requested."""
 
     model: SparseModel
     pictures: FirstPictures
     patch_match: PatchMatchScene | None = None
 
     def sparse_depths(self, name: str) -> SparseDepths:
-        """Raises InputError where a view sees too few points to know its range of depths."""
+        """Return the known depths of a view. Raises InputError if it sees too few points to know its range of depths."""
         sparse = SparseDepths(*self.model.depths_in(name))
         if len(sparse.depth_m) < _FEWEST_POINTS:
             raise InputError(
@@ -145,7 +148,7 @@ class SceneKnowledge:
 
 
 def deepen_stack(stack: FocalStack, known: SceneKnowledge, settings: SceneDepthSettings) -> FocalStack:
-    """One stack; its pictures are written first and stack.json last."""
+    """Compute and write the depth of one stack; its pictures are written first and stack.json last."""
     name, pictures = stack.folder.name, known.pictures
     chosen = [view for view in nearest_views(known.model, name, settings.neighbours) if view.name in pictures.stacks]
     record = depth_record(stack, known, [view.name for view in chosen])
@@ -158,36 +161,36 @@ def deepen_stack(stack: FocalStack, known: SceneKnowledge, settings: SceneDepthS
         _sweep_view(known.model.view(name), pictures.view(name)),
         [_sweep_view(view, pictures.view(view.name)) for view in chosen],
         sparse.dioptre_range(),
-        Clues(focus_clue(stack, rgb), sparse),
+        DepthPriors(focus_prior(stack, rgb), sparse),
         settings.dense,
     )
     return write_deepened(stack, found, record)
 
 
 def _sweep_view(view: SparseView, structure: Plane) -> SweepView:
-    """Sparse views know the size at which COLMAP saw them."""
+    """Resize a sparse view's camera from the size COLMAP saw to that of the structure."""
     height, width = structure.shape
     camera = view.camera if (view.camera.width_px, view.camera.height_px) == (width, height) else view.camera.resized(width, height)
     return SweepView(structure, camera, view.distortion)
 
 
-def focus_clue(stack: FocalStack, rgb: Rgb) -> FocusVote | None:
-    """The depth from focus of the first pass, silent around lights; None where focus distances are unknown."""
+def focus_prior(stack: FocalStack, rgb: Rgb) -> FocusVote | None:
+    """Return the vote of the first pass's depth from focus, without trust near highlights; None if focus distances are unknown."""
     if not stack.is_metric:
         return None
     channels = read_exr(first_pass_path(stack, stack.depth_path))[0].channels
     optics = SliceOptics.of_stack(stack, rgb.shape[1])
-    confidence = np.where(near_lights(rgb, _largest_coc_px(optics)), 0.0, channels["confidence"])
+    confidence = np.where(near_highlights(rgb, _largest_coc_px(optics)), 0.0, channels["confidence"])
     return focus_vote_of_map(channels["focus_index"].astype(np.float32), confidence.astype(np.float32), np.array(optics.focus_dioptres))
 
 
 def _largest_coc_px(optics: SliceOptics) -> float:
-    """Of anything within the range of the stack's focus."""
+    """Return the largest blur of anything within the range of the stack's focus."""
     return float(max(optics.px_per_dioptre) * np.ptp(optics.focus_dioptres))
 
 
 def depth_record(stack: FocalStack, known: SceneKnowledge, neighbours: Sequence[str]) -> dict[str, object]:
-    """What a dense depth was made from, as far as stack.json can tell: whether it is still the right one."""
+    """Return what a dense depth was made from, as far as stack.json can tell, to decide whether it is still valid."""
     pose = known.model.view(stack.folder.name).camera.camera_from_world
     points_m = known.model.depths_in(stack.folder.name)[1]
     return {
@@ -200,7 +203,7 @@ def depth_record(stack: FocalStack, known: SceneKnowledge, neighbours: Sequence[
 
 
 def is_depth_stale(stack: FocalStack) -> bool:
-    """Whether the focus was calibrated anew since the stack's dense depth was found, as another scale does it."""
+    """Tell whether the focus was recalibrated, for example by another scale, since the stack's dense depth was found."""
     record = stack.metadata.get(DEPTH_SOURCE)
     return isinstance(record, Mapping) and record["focus_distances_m"] != _focus_of(stack)
 

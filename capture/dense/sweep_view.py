@@ -1,9 +1,4 @@
-"""What a plane sweep knows of one viewpoint: its picture as structure, its camera, and the numbers that the loops take.
-
-The first-pass pictures of a scene's stacks, as a plane sweep wants them.
-
-Which other views tell most about the depth of one: those that share its points from places apart, but not too far.
-"""
+"""Viewpoints of a plane sweep: picture as structure, camera, and the numbers that the loops take; a scene's pictures and neighbours."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,29 +18,31 @@ Plane = Float32[np.ndarray, "height width"]
 BRIGHTEST = 1.2
 _BAND_ROWS = 64
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+_HELD = 8
+_BEST_ANGLE_RAD = np.deg2rad(8.0)
 
 
 @dataclass(frozen=True, eq=False)
 class SweepView:
-    """structure (H, W): what is compared between views, see `structure_of`; camera, distortion: see `SparseView`, in metres."""
+    """One viewpoint. structure (H, W): compared between views, see `structure_of`; camera, distortion: see `SparseView`, in metres."""
 
     structure: Plane
     camera: Camera
     distortion: Distortion = (0.0, 0.0)
 
     def resized(self, width_px: int, height_px: int) -> "SweepView":
-        """The same view with fewer pixels, each the mean of what it covers."""
+        """Return the view with fewer pixels, each the mean of its area."""
         smaller = cv2.resize(self.structure, (width_px, height_px), interpolation=cv2.INTER_AREA)
         return SweepView(smaller, self.camera.resized(width_px, height_px), self.distortion)
 
 
 def structure_of(rgb: Float32[np.ndarray, "height width 3"]) -> Plane:
-    """Scene-linear RGB to the square root of luminance, in which shot noise is even; over-range lights are cut at `BRIGHTEST`."""
+    """Return the square root of scene-linear luminance, in which shot noise is uniform; highlights are clipped at `BRIGHTEST`."""
     return np.sqrt(np.clip(rgb @ _LUMINANCE, 0.0, BRIGHTEST))
 
 
 def rays_of(view: SweepView) -> Float32[np.ndarray, "height width 2"]:
-    """Through the centre of each pixel, the point at depth 1 m in camera axes; NaN where distortion folds the picture."""
+    """Return the point at depth 1 m through the centre of each pixel in camera axes; NaN where distortion folds the picture."""
     camera = view.camera
     rays = np.empty((camera.height_px, camera.width_px, 2), np.float32)
     for first in range(0, camera.height_px, _BAND_ROWS):  # in double precision, so in bands
@@ -57,12 +54,12 @@ def rays_of(view: SweepView) -> Float32[np.ndarray, "height width 2"]:
 
 
 def neighbour_from_reference(reference: Camera, neighbour: Camera) -> Float[np.ndarray, "4 4"]:
-    """Rigid transform of points in the reference camera's axes into the neighbour's, metres."""
+    """Return the rigid transform from the reference camera's axes to the neighbour's, metres."""
     return neighbour.camera_from_world @ reference.world_from_camera
 
 
 def packed_view(reference: SweepView, neighbour: SweepView) -> Float32[np.ndarray, " 18"]:
-    """Rotation (9, by rows), translation (3), focal length (2), principal point in samples (2), k1, k2 for the loops.
+    """Return rotation (9, by rows), translation (3), focal length (2), principal point in samples (2), k1, k2 for the loops.
 
     A point on the ray (x, y, 1) at dioptre d is (x, y, 1) / d; times d it is R (x, y, 1) + d t in the neighbour: finite at infinity.
     Samples count from the centre of the first pixel, hence the half pixel less.
@@ -73,18 +70,15 @@ def packed_view(reference: SweepView, neighbour: SweepView) -> Float32[np.ndarra
     return np.array([*pose[:3, :3].ravel(), *pose[:3, 3], *camera.focal_px, *principal, *neighbour.distortion], np.float32)
 
 
-_HELD = 8
-
-
 class FirstPictures:
-    """stacks: by the name of their view. A few structures are held."""
+    """First-pass pictures of a scene's stacks, by the name of their view. A few structures are cached."""
 
     def __init__(self, stacks: dict[str, FocalStack]) -> None:
         self.stacks = stacks
         self.view = lru_cache(_HELD)(self._view)
 
     def rgb(self, name: str) -> Float32[np.ndarray, "height width 3"]:
-        """Linear Rec.709."""
+        """Return linear Rec.709."""
         stack = self.stacks[name]
         return stack.to_rec709(read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path)))
 
@@ -92,11 +86,8 @@ class FirstPictures:
         return structure_of(self.rgb(view_name))
 
 
-_BEST_ANGLE_RAD = np.deg2rad(8.0)
-
-
 def nearest_views(model: SparseModel, name: str, count: int) -> list[SparseView]:
-    """At most `count` other views, best first.
+    """Return at most `count` other views that tell most about the depth of one, best first.
 
     Each common point gives a vote that grows with the angle under which the two cameras see it up to 8 degrees and falls
     beyond (as COLMAP and MVSNet choose their sources): less is too little parallax, more changes what is seen.

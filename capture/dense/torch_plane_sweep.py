@@ -1,4 +1,4 @@
-"""The plane sweep by torch, on a GPU or for tests on the CPU: the same costs as `plane_sweep` to rounding."""
+"""The plane sweep by torch, on a GPU or for tests on the CPU: the same costs as `plane_sweep` up to rounding."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ def plane_sweep_on(
     matching: Matching | None = None,
     base_dioptre: Plane | None = None,
 ) -> Costs:
-    """See `plane_sweep`, the twin. device: 'cuda', 'cuda:1', 'cpu'. Device memory: about 60 bytes a pixel and a byte per cell."""
+    """Return the costs of `plane_sweep`. device: 'cuda', 'cuda:1', 'cpu'. Device memory: about 60 bytes a pixel and a byte per cell."""
     if not neighbours:
         raise InputError("a plane sweep needs at least one neighbouring view, got none: photograph from more places")
     place, rules = device_named(device), matching or Matching()
@@ -45,7 +45,7 @@ def plane_sweep_on(
 def _warped(
     picture: Float32[Tensor, "rows columns"], rays: Float32[Tensor, "height width 2"], dioptre: Picture, view: list[float]
 ) -> tuple[Picture, Tensor]:
-    """(bilinear samples of the neighbour, whether it sees the point)."""
+    """Return (bilinear samples of the neighbour, whether it sees the point)."""
     a, b = rays.unbind(-1)
     x, y, z = (view[3 * row] * a + view[3 * row + 1] * b + view[3 * row + 2] + view[9 + row] * dioptre for row in range(3))
     z = z.clamp_min(1e-6)
@@ -61,7 +61,7 @@ def _warped(
 
 
 class _Windows:
-    """Correlation in windows around each pixel of the reference; sums in double precision, for their differences are small."""
+    """Correlation in windows around each pixel of the reference; sums in double precision, since their differences are small."""
 
     def __init__(self, structure: Picture, matching: Matching) -> None:
         self._radius, self._noise = matching.radius_px, matching.noise**2

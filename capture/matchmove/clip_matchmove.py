@@ -1,6 +1,6 @@
 """Match-move of a clip: keyframes to COLMAP, then every frame against the model that comes back.
 
-Keyframes of a clip, evenly spread over the motion of the picture: none where the camera rests, many where it is thrown.
+Keyframes are evenly spread over the motion of the picture: none while the camera rests, many in a fast pan.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from capture.matchmove.frame_poses import FramePose, poses_between
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, ruler_scale
-from capture.matchmove.quality_warnings import doubts, require_walking
+from capture.matchmove.quality_warnings import quality_warnings, require_translation
 from capture.poses.colmap import PoseSettings, find_picture_poses
 from capture.poses.colmap_matches import median_parallax_deg
 from capture.poses.sparse_model import SparseModel, SparseView
@@ -36,10 +36,11 @@ _APART_SHARE = 0.035
 _FEWEST = 8
 _LOST_SHARE = 0.1
 """Motion counted for a step in which no feature could be followed: a fast blur."""
+_STILL_SHARE = 0.02
 
 
 def motion_of_clip(clip: Path, info: VideoInfo) -> Float64[np.ndarray, " frames"]:
-    """Of each frame, how far the picture has moved since the first one: the sum of median displacements, in picture widths."""
+    """Return how far the picture has moved by each frame: the sum of median displacements since the first, in picture widths."""
     width_px = min(_SEARCH_WIDTH_PX, info.width_px)
     height_px = max(16, round(info.height_px * width_px / info.width_px))
     moved: list[float] = []
@@ -52,7 +53,7 @@ def motion_of_clip(clip: Path, info: VideoInfo) -> Float64[np.ndarray, " frames"
 
 
 def chosen_keyframes(motion: Float64[np.ndarray, " frames"], most: int) -> list[int]:
-    """Frame numbers; the first and the last are always among them."""
+    """Choose frame numbers; the first and the last are always among them."""
     count = int(np.clip(motion[-1] / _APART_SHARE + 1, _FEWEST, most))
     if count >= len(motion):
         return list(range(len(motion)))
@@ -63,7 +64,7 @@ def chosen_keyframes(motion: Float64[np.ndarray, " frames"], most: int) -> list[
 
 
 def write_keyframes(clip: Path, info: VideoInfo, numbers: Sequence[int], folder: Path) -> None:
-    """frame_000012.png, as the codes of the video are, at its full size; those that lie there already stay."""
+    """Write frame_000012.png, with the video's code values at its full size; existing ones are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = {number: folder / f"{view_name(number)}.png" for number in numbers}
     for stale in set(folder.glob("frame_*.png")) - set(wanted.values()):
@@ -80,7 +81,7 @@ def view_name(number: int) -> str:
 
 
 def _step(before: Grey, grey: Grey) -> float:
-    """Median displacement in pixels."""
+    """Return the median displacement in pixels."""
     places = cv2.goodFeaturesToTrack(before, _FEATURES, 0.01, 8.0)
     if places is None:
         return 0.0
@@ -91,15 +92,12 @@ def _step(before: Grey, grey: Grey) -> float:
     return float(np.median(np.linalg.norm(there[good] - start[good], axis=1)))
 
 
-_STILL_SHARE = 0.02
-
-
 @dataclass(frozen=True)
 class MatchmoveSettings:
-    """keyframes: at most so many, and those of the picks. overwrite: start COLMAP from nothing.
+    """Settings of a match-move. keyframes: at most so many, plus those of the picks. overwrite: restart COLMAP from nothing.
 
-    Metres come from a board that is seen in the clip, a ruler on the ground, or the distance of the cameras of two frames, the first of
-    them that is given. ground: where the world stands; without it as COLMAP has it.
+    Metres come from a board that is seen in the clip, a ruler on the ground, or the distance of the cameras of two frames, whichever
+    is given first. ground: the place of the world; without it as COLMAP has it.
     """
 
     keyframes: int = 40
@@ -118,16 +116,16 @@ class MatchmoveSettings:
 
     @property
     def picked_frames(self) -> set[int]:
-        """That must be keyframes."""
+        """Return the frames that must be keyframes."""
         picks = {each.frame for each in (self.ground, self.ruler) if each is not None}
         return picks | set(() if self.distance is None else self.distance[:2])
 
 
 @dataclass(frozen=True)
 class Matchmove:
-    """track: metric only with a board. model: of the keyframes, in the track's unit. lost: frames that no pose was found for.
+    """The result. track: metric only with a scale. model: of the keyframes, in the track's unit. lost: frames without a pose.
 
-    doubts: in words, why the track may be wrong; none where nothing speaks against it.
+    warnings: reasons why the track may be wrong, in words.
     """
 
     track: CameraTrack
@@ -136,13 +134,13 @@ class Matchmove:
     lost: tuple[int, ...]
     residual_px: float
     parallax_deg: float
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def matchmove_clip(clip: Path, work: Path, settings: MatchmoveSettings | None = None) -> Matchmove:
-    """work: folder for keyframes and COLMAP's files, with which an interrupted run goes on.
+    """Find the camera of every frame. work: folder for keyframes and COLMAP's files, with which an interrupted run continues.
 
-    Raises InputError where the camera rests or only turns: then no place in space follows from the clip.
+    Raises InputError if the camera rests or only rotates: then no position in space follows from the clip.
     """
     settings, info = settings or MatchmoveSettings(), probe(clip)
     motion = motion_of_clip(clip, info)
@@ -157,12 +155,12 @@ def matchmove_clip(clip: Path, work: Path, settings: MatchmoveSettings | None = 
     write_keyframes(clip, info, keyframes, work / "images")
     poses = PoseSettings(settings.mapper, settings.camera_model, "shared", settings.max_image_size_px, overwrite=settings.overwrite)
     model = _of_clip(clip, work, poses)
-    require_walking(clip, model)
+    require_translation(clip, model)
     return _with_all_frames(clip, info, _standing(model, settings, work / "images"))
 
 
 def _standing(model: SparseModel, settings: MatchmoveSettings, pictures: Path) -> SparseModel:
-    """On the ground and in metres, as far as the settings tell."""
+    """Put the model on the ground and in metres, as far as the settings allow."""
     if settings.ground is not None:
         model = on_ground(model, model.view(view_name(settings.ground.frame)), settings.ground)
     if settings.board is not None:
@@ -180,7 +178,7 @@ def _of_clip(clip: Path, work: Path, poses: PoseSettings) -> SparseModel:
         return find_picture_poses(work / "images", work, poses)
     except InputError as error:
         raise InputError(
-            f"{clip}: no match-move ({error}). A camera that only turns, and water, leaves and crowds that move by themselves, give none: "
+            f"{clip}: no match-move ({error}). A camera that only rotates, and water, leaves or crowds in motion, give none: "
             f"track a printed board with `mrbokeh track`, or film with the camera moving sideways"
         ) from None
 
@@ -211,11 +209,19 @@ def _with_all_frames(clip: Path, info: VideoInfo, model: SparseModel) -> Matchmo
     residuals = [pose.residual_px for pose in found.values()] or [float(model.errors_px.mean())]
     made = CameraTrack(frames, "-y", model.metres_per_unit is not None)
     parallax_deg, residual_px = median_parallax_deg(model), float(np.sqrt(np.mean(np.square(residuals))))
-    return Matchmove(made, model, len(times_s), lost, residual_px, parallax_deg, doubts(model, list(found.values()), parallax_deg))
+    return Matchmove(
+        track=made,
+        model=model,
+        frame_count=len(times_s),
+        lost=lost,
+        residual_px=residual_px,
+        parallax_deg=parallax_deg,
+        warnings=quality_warnings(model, list(found.values()), parallax_deg),
+    )
 
 
 def _stretch(model: SparseModel, greys: list[Grey], first: int, views: Mapping[int, SparseView]) -> dict[int, FramePose]:
-    """Frames from `first` on; its ends are keyframes where they are in views."""
+    """Find the poses of the frames from `first` on between keyframes; its ends are keyframes if they are in views."""
     last = len(greys) - 1
     ends = {place: views[first + place] for place in {0, last} if first + place in views}
     if last < 1 or not ends:

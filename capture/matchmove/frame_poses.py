@@ -1,5 +1,8 @@
-"""Poses of the frames between two keyframes: what a keyframe sees of the model is carried by flow, forwards from one, backwards from
-the other, and each frame's pose is solved from both (PnP with RANSAC, then least squares)."""
+"""Poses of the frames between two keyframes.
+
+Points that a keyframe sees of the model are carried by optical flow, forwards from one and backwards from the other, and each
+frame's pose is solved from both (PnP with RANSAC, then least squares).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +28,7 @@ _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-10)
 
 @dataclass(frozen=True)
 class SeenPoints:
-    """points: indices into the model. xy_px: where a picture has them."""
+    """Points of the model in a picture. points: indices into the model. xy_px: their positions."""
 
     points: Int64[np.ndarray, " seen"]
     xy_px: Float64[np.ndarray, "seen 2"]
@@ -33,7 +36,10 @@ class SeenPoints:
 
 @dataclass(frozen=True)
 class FramePose:
-    """camera: with its pose in the model's unit. residual_px: RMS over the points that fit. fitting: their share of those carried here."""
+    """The pose of one frame.
+
+    camera: with its pose in the model's unit. residual_px: RMS over the points that fit. fitting: their fraction of those carried here.
+    """
 
     camera: Camera
     distortion: Distortion
@@ -42,7 +48,7 @@ class FramePose:
 
 
 def seen_by(model: SparseModel, view: SparseView) -> SeenPoints:
-    """The best of what a view observes: points of many views first, as long as it takes to fill the picture."""
+    """Return the points of a view seen by the most other views, as many as it takes to fill the picture."""
     points = model.points_of(view).astype(np.int64)
     xy_px, _ = model.depths_in(view)
     often = np.bincount(model.observations[:, 1], minlength=len(model.points))[points]
@@ -51,9 +57,9 @@ def seen_by(model: SparseModel, view: SparseView) -> SeenPoints:
 
 
 def poses_between(model: SparseModel, greys: Sequence[Grey], ends: Mapping[int, SparseView]) -> dict[int, FramePose]:
-    """greys: frames of one stretch, consecutive. ends: the views of its first and last frame, by place in greys; one may be missing.
+    """Return the poses of the frames between the ends on which at least 12 points agree.
 
-    Returns the poses of the frames between that at least 12 points agree on.
+    greys: consecutive frames of one stretch. ends: the views of its first and last frame, by place in greys; one may be missing.
     """
     carried: list[list[SeenPoints]] = [[] for _ in greys]
     for place, view in ends.items():
@@ -66,7 +72,7 @@ def poses_between(model: SparseModel, greys: Sequence[Grey], ends: Mapping[int, 
 
 
 def _guess(ends: Mapping[int, SparseView], place: int) -> SparseView:
-    """What lies between the ends, as a start."""
+    """Interpolate between the ends as a start."""
     places = sorted(ends)
     if len(places) == 1:
         return ends[places[0]]
@@ -92,7 +98,7 @@ def _pose(model: SparseModel, carried: Sequence[SeenPoints], guess: SparseView) 
 
 
 def _solved(points: np.ndarray, xy_px: np.ndarray, camera: Camera) -> tuple[Pose, float, float] | None:
-    """(camera_from_world, RMS distance of the points that fit, their share)."""
+    """Return (camera_from_world, RMS distance of the points that fit, their fraction)."""
     matrix, before = opencv_matrix(camera), camera.camera_from_world
     wrong_px = max(1.0, _WRONG_PX * camera.width_px / 1280)
     cv2.setRNGSeed(0)

@@ -1,7 +1,4 @@
-"""The world of a match-move on the ground: a plane through points of the model around picked pixels, the first pick as its origin.
-
-Pixels of a clip as people write them: FRAME:X,Y/X,Y/...
-"""
+"""The ground of a match-move: a plane through points of the model around picked pixels, with the first pick as origin."""
 
 from dataclasses import dataclass
 
@@ -22,7 +19,7 @@ _FEWEST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class GroundPicks:
-    """Three pixels or more of one frame with the ground between them; x runs from the first to the second."""
+    """Three or more pixels of one frame with the ground between them; x runs from the first to the second."""
 
     frame: int
     xy_px: Float64[np.ndarray, "picks 2"]
@@ -30,7 +27,7 @@ class GroundPicks:
 
 @dataclass(frozen=True)
 class Ruler:
-    """Two pixels of one frame on the ground, and how far apart they are there."""
+    """Two pixels of one frame on the ground, and their distance there."""
 
     frame: int
     xy_px: Float64[np.ndarray, "2 2"]
@@ -38,9 +35,9 @@ class Ruler:
 
 
 def on_ground(model: SparseModel, view: SparseView, picks: GroundPicks) -> SparseModel:
-    """The model in another world: y down and 0 on the ground, the origin at the first pick, x towards the second; lengths stay.
+    """Move the model to a world with y down and 0 on the ground, the origin at the first pick, x towards the second; lengths stay.
 
-    Raises InputError where too few points of the model lie between the picks, or no plane holds half of them.
+    Raises InputError if too few points of the model lie between the picks, or no plane holds half of them.
     """
     points = _points_between(model, view, picks)
     normal, offset = _plane(points, view.centre, picks)
@@ -56,7 +53,7 @@ def on_ground(model: SparseModel, view: SparseView, picks: GroundPicks) -> Spars
 
 
 def ruler_scale(view: SparseView, ruler: Ruler) -> float:
-    """Metres per unit of a model whose ground is y = 0; view: of the ruler's frame."""
+    """Return metres per unit of a model whose ground is y = 0; view: of the ruler's frame."""
     if not 0.0 < ruler.metres < float("inf"):
         raise InputError(f"--ruler: expected a positive number of metres, got {ruler.metres:g}")
     one, other = (_on_plane(view, xy_px, np.array([0.0, -1.0, 0.0]), 0.0) for xy_px in ruler.xy_px)
@@ -79,7 +76,7 @@ def _points_between(model: SparseModel, view: SparseView, picks: GroundPicks) ->
 
 
 def _plane(points: Float64[np.ndarray, "points 3"], centre: np.ndarray, picks: GroundPicks) -> tuple[Float64[np.ndarray, "3"], float]:
-    """(normal towards the camera, offset) of normal . x = offset: RANSAC, then least squares over what lies on the best plane."""
+    """Return (normal towards the camera, offset) of normal . x = offset: RANSAC, then least squares over the best plane's points."""
     rng, near = np.random.default_rng(0), _ON_PLANE * np.median(np.linalg.norm(points - centre, axis=1))
     corners = points[np.argsort(rng.random((_TRIALS, len(points))), axis=1)[:, :3]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -107,7 +104,7 @@ def _on_plane(view: SparseView, xy_px: np.ndarray, normal: np.ndarray, offset: f
 
 
 def parse_ground(text: str) -> GroundPicks:
-    """FRAME:X,Y/X,Y/X,Y, three pixels or more."""
+    """Parse FRAME:X,Y/X,Y/X,Y, three pixels or more."""
     expected = "--ground must be FRAME:X,Y/X,Y/X,Y, three pixels or more with ground between them, such as 0:300,900/1500,900/900,700"
     try:
         frame, pixels = text.split(":")
@@ -120,7 +117,7 @@ def parse_ground(text: str) -> GroundPicks:
 
 
 def parse_ruler(text: str) -> Ruler:
-    """FRAME:X,Y/X,Y/METRES."""
+    """Parse FRAME:X,Y/X,Y/METRES."""
     try:
         frame, rest = text.split(":")
         one, other, metres = rest.split("/")
@@ -130,7 +127,7 @@ def parse_ruler(text: str) -> Ruler:
 
 
 def parse_frame_distance(text: str) -> tuple[int, int, float]:
-    """FRAME_A,FRAME_B,METRES."""
+    """Parse FRAME_A,FRAME_B,METRES."""
     try:
         one, other, metres = text.split(",")
         return int(one), int(other), float(metres)

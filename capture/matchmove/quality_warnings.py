@@ -1,10 +1,8 @@
-"""Whether a camera that only turns explains the keyframes as well as the model in space that COLMAP made of them.
+"""Reasons to distrust a match-move, and the refusal of a camera that only rotates.
 
-COLMAP finds such models: with a wrong focal length and distortion, turning about a point looks a little like walking around one.
-The plain explanation is tried too: all points at infinity, one rotation for each view, one focal length and one term of distortion,
-by least squares on the pixels. Where it does as well, nothing tells where the camera was.
-
-Why a match-move may be wrong.
+COLMAP finds models for such cameras: with a wrong focal length and distortion, rotating looks a little like walking around a point.
+The simple explanation is tried too: all points at infinity, one rotation for each view, one focal length and one term of distortion,
+by least squares on the pixels. If it fits as well, nothing tells where the camera was.
 """
 
 from dataclasses import dataclass
@@ -22,12 +20,19 @@ from mrbokeh.system.errors import InputError
 
 _MOST_POINTS = 300
 _FOCAL_STARTS = (0.7, 1.0, 1.4)
-"""In focal lengths of the model, which is wrong where the camera only turns."""
+"""Starting focal lengths over the model's, which is wrong if the camera only rotates."""
+_ROTATES_AS_WELL = 3.0
+"""Multiple of the model's residual up to which a rotation explains the clip: 1.2 for a rotating camera, 22 for a moving one."""
+_ROTATES_PX = 0.25
+"""Residual below which it does in any case: features are not placed better than that."""
+_TOO_FEW_POINTS, _FEW_POINTS = 30, 150
+_SMALL_PARALLAX_DEG = 4.0
+_FEW_INLIERS = 0.8
 
 
 @dataclass(frozen=True)
 class _Tracks:
-    """views, points: which view sees which point; offsets_px: where, from the principal point."""
+    """Tracks of points. views, points: which view sees which point; offsets_px: position from the principal point."""
 
     views: Int64[np.ndarray, " seen"]
     points: Int64[np.ndarray, " seen"]
@@ -36,8 +41,8 @@ class _Tracks:
     point_count: int
 
 
-def turning_residual_px(model: SparseModel) -> float:
-    """Median distance between where points are seen and where a camera that only turns would see them; inf where it explains nothing."""
+def rotation_only_residual_px(model: SparseModel) -> float:
+    """Return the median reprojection error of a camera that only rotates."""
     tracks = _best_tracks(model)
     focal_px = model.views[0].camera.focal_px[0]
     fits = [_fitted(tracks, focal_px * factor) for factor in _FOCAL_STARTS]
@@ -45,7 +50,7 @@ def turning_residual_px(model: SparseModel) -> float:
 
 
 def model_residual_px(model: SparseModel) -> float:
-    """The same of the model itself."""
+    """Return the median reprojection error of the model."""
     off = []
     for index, view in enumerate(model.views):
         seen = model.observations[:, 0] == index
@@ -54,7 +59,7 @@ def model_residual_px(model: SparseModel) -> float:
 
 
 def _best_tracks(model: SparseModel) -> _Tracks:
-    """Points that most views see."""
+    """Return the points that most views see."""
     often = np.bincount(model.observations[:, 1], minlength=len(model.points))
     chosen = np.argsort(-often, kind="stable")[:_MOST_POINTS]
     kept = np.isin(model.observations[:, 1], chosen)
@@ -62,11 +67,17 @@ def _best_tracks(model: SparseModel) -> _Tracks:
     principal_px = np.array([view.camera.principal_px for view in model.views])
     _, numbered = np.unique(points, return_inverse=True)
     offsets_px = model.observed_xy_px[kept] - principal_px[views]
-    return _Tracks(views.astype(np.int64), numbered.astype(np.int64), offsets_px, len(model.views), int(numbered.max()) + 1)
+    return _Tracks(
+        views=views.astype(np.int64),
+        points=numbered.astype(np.int64),
+        offsets_px=offsets_px,
+        view_count=len(model.views),
+        point_count=int(numbered.max()) + 1,
+    )
 
 
 def _fitted(tracks: _Tracks, focal_px: float) -> np.ndarray:
-    """What remains, in pixels."""
+    """Fit the rotations and return the residuals, in pixels."""
     start = np.concatenate([[np.log(focal_px), 0.0], _chained(tracks, focal_px).as_rotvec()[1:].ravel()])
     bounds = np.full(len(start), np.inf)
     bounds[:2] = np.log(4.0), 1.0
@@ -77,7 +88,7 @@ def _fitted(tracks: _Tracks, focal_px: float) -> np.ndarray:
 
 
 def _residuals(parameters: np.ndarray, tracks: _Tracks) -> np.ndarray:
-    """In pixels; the direction of each point is the mean of the rays that see it."""
+    """Return the residuals in pixels; the direction of each point is the mean of the rays that see it."""
     focal_px, k1 = float(np.exp(parameters[0])), float(parameters[1])
     turns = Rotation.from_rotvec(np.concatenate([np.zeros(3), parameters[2:]]).reshape(-1, 3))[tracks.views]
     rays = turns.inv().apply(_rays(tracks.offsets_px / focal_px, k1))
@@ -89,7 +100,7 @@ def _residuals(parameters: np.ndarray, tracks: _Tracks) -> np.ndarray:
 
 
 def _rays(bent: Float64[np.ndarray, "seen 2"], k1: float) -> Float64[np.ndarray, "seen 3"]:
-    """Of length 1; distortion taken out by fixed point."""
+    """Return rays of length 1; distortion is removed by fixed-point iteration."""
     plane = bent
     for _ in range(8):
         plane = bent / np.maximum(1.0 + k1 * np.sum(plane**2, axis=1, keepdims=True), 0.2)
@@ -98,7 +109,7 @@ def _rays(bent: Float64[np.ndarray, "seen 2"], k1: float) -> Float64[np.ndarray,
 
 
 def _chained(tracks: _Tracks, focal_px: float) -> Rotation:
-    """camera from world of each view, from view to view by the points that both see (Kabsch 1976)."""
+    """Return camera from world of each view, chained from view to view by their common points (Kabsch 1976)."""
     rays = _rays(tracks.offsets_px / focal_px, 0.0)
     turns = [Rotation.identity()]
     for one, other in pairwise(range(tracks.view_count)):
@@ -111,39 +122,28 @@ def _chained(tracks: _Tracks, focal_px: float) -> Rotation:
     return Rotation.concatenate(turns)
 
 
-_TURNS_AS_WELL = 3.0
-"""Times the model's residual up to which a camera that only turns explains the clip: 1.2 for one that does, 22 for one that walks."""
-
-_TURNS_PX = 0.25
-"""Below which it does in any case: features are not placed better than that."""
-
-_TOO_FEW_POINTS, _FEW_POINTS = 30, 150
-_SMALL_PARALLAX_DEG = 4.0
-_FEW_INLIERS = 0.8
-
-
 def _points_of_keyframe(model: SparseModel) -> float:
-    """Median number that one sees."""
+    """Return the median number of points that a keyframe sees."""
     return float(np.median(np.bincount(model.observations[:, 0], minlength=len(model.views))))
 
 
-def require_walking(clip: Path, model: SparseModel) -> None:
-    """Raises InputError where the camera seems to have stood at one place."""
+def require_translation(clip: Path, model: SparseModel) -> None:
+    """Raise InputError if the camera seems to have stayed at one place."""
     if (points := _points_of_keyframe(model)) < _TOO_FEW_POINTS:
         raise InputError(
             f"{clip}: COLMAP placed {len(model.views)} keyframes by {points:.0f} points each, too few to trust: film more texture with the "
-            f"camera moving sideways (one that only turns gives no points), or track a printed board"
+            f"camera moving sideways (one that only rotates gives no points), or track a printed board"
         )
-    turning_px, model_px = turning_residual_px(model), model_residual_px(model)
-    if turning_px < max(_TURNS_AS_WELL * model_px, _TURNS_PX):
+    rotating_px, model_px = rotation_only_residual_px(model), model_residual_px(model)
+    if rotating_px < max(_ROTATES_AS_WELL * model_px, _ROTATES_PX):
         raise InputError(
-            f"{clip}: the camera seems only to turn (turning alone explains what it sees to {turning_px:.2f} px, a way through space to "
+            f"{clip}: the camera seems only to rotate (rotation alone explains the clip to {rotating_px:.2f} px, a path through space to "
             f"{model_px:.2f} px), so that nothing tells where it was: film with the camera moving sideways, or track a printed board"
         )
 
 
-def doubts(model: SparseModel, found: list[FramePose], parallax_deg: float) -> tuple[str, ...]:
-    """In words: what a scene at rest and a moving camera do not show."""
+def quality_warnings(model: SparseModel, found: list[FramePose], parallax_deg: float) -> tuple[str, ...]:
+    """Return warnings about a scene that moves, or a camera that hardly does."""
     points = _points_of_keyframe(model)
     fitting = float(np.median([pose.fitting for pose in found])) if found else 1.0
     left_out = len(model.left_out)

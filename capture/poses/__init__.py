@@ -1,1 +1,1 @@
-"""Camera poses of several viewpoints, by COLMAP."""
+"""Camera poses of several viewpoints, found by COLMAP."""

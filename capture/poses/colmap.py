@@ -1,6 +1,6 @@
 """Camera poses of many viewpoints by COLMAP (Schoenberger and Frahm 2016; global: Pan et al. 2024): SIFT, matches, mapping.
 
-COLMAP in a process of its own: some of its errors abort the interpreter, and those must reach the user as one sentence.
+COLMAP runs in a process of its own: some of its errors abort the interpreter, and the user must still get a one-line error.
 """
 
 import json
@@ -24,7 +24,11 @@ import capture
 from capture.poses.colmap_job import (
     CAMERA_CHOICES,
     CAMERA_MODELS,
+    DATABASE_NAME,
+    JOB_NAME,
     MAPPERS,
+    MODEL_FOLDER,
+    RECONSTRUCTION_FOLDER,
     ColmapJob,
     camera_model_for,
     described,
@@ -44,17 +48,17 @@ from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError, MissingExtraError
 
 LOG_NAME = "colmap.log"
-DATABASE_NAME = "database.db"
 
 _WORKER = "capture.poses.colmap_worker"
 _STAGES = ("features", "matches", "poses")
 _LOOK_EVERY_S = 0.5
+IMAGES_FOLDER = "images"
 
 
 def run_colmap(folder: Path, pictures: int) -> dict[str, Any] | None:
-    """Run the job in `folder`; returns None, or where no model was found what COLMAP saw in the matches.
+    """Run the job in `folder`; return None, or match statistics if no model was found.
 
-    Raises MissingExtraError without pycolmap, InputError where the process dies; its output is in colmap.log.
+    Raises MissingExtraError without pycolmap, InputError if the process dies; its output is in colmap.log.
     """
     if find_spec("pycolmap") is None:
         raise MissingExtraError("pycolmap", "capture")
@@ -70,7 +74,7 @@ def run_colmap(folder: Path, pictures: int) -> dict[str, Any] | None:
 
 @contextmanager
 def _worker(folder: Path, log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
-    """The process, ended with the block however the block ends."""
+    """Start the process and terminate it when the block ends."""
     root = str(Path(capture.__file__).parent.parent)
     path = os.pathsep.join(each for each in (root, os.environ.get("PYTHONPATH", "")) if each)
     command = [sys.executable, "-m", _WORKER, str(folder)]
@@ -83,7 +87,7 @@ def _worker(folder: Path, log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
 
 
 def _follow(process: "subprocess.Popen[str]", bars: Progress) -> dict[str, Any]:
-    """Show what the worker tells; returns the last that it told."""
+    """Show the worker's progress; return its last message."""
     tasks, last = {}, {}
     assert process.stdout is not None
     for line in process.stdout:
@@ -100,7 +104,7 @@ def _follow(process: "subprocess.Popen[str]", bars: Progress) -> dict[str, Any]:
 
 @contextmanager
 def _features_shown(folder: Path, pictures: int, bars: Progress) -> Iterator[None]:
-    """COLMAP does not tell how far its features are, but its database can be asked."""
+    """Show the progress of the features by polling COLMAP's database, since COLMAP does not report it."""
     if bars.disable:
         yield
         return
@@ -139,14 +143,12 @@ def _death(folder: Path, status: int, last: dict[str, Any]) -> str:
     )
 
 
-RECONSTRUCTION_FOLDER = "reconstruction"
-IMAGES_FOLDER = "images"
-JOB_NAME = "colmap_job.json"
-
-
 @dataclass(frozen=True)
 class PoseSettings:
-    """cameras: auto, shared or separate. threads: -1 takes all cores; only 1 repeats to the last digits. seed: of COLMAP's draws."""
+    """Settings of COLMAP.
+
+    cameras: auto, shared or separate. threads: -1 takes all cores; only 1 is reproducible to the last digit. seed: of COLMAP's draws.
+    """
 
     mapper: str = "incremental"
     camera_model: str = "auto"
@@ -167,7 +169,7 @@ class PoseSettings:
 
 
 def find_scene_poses(scene: Path | str, settings: PoseSettings | None = None) -> SparseModel:
-    """Poses of all merged stacks of a scene, in SCENE/reconstruction; what is there already is kept or gone on with."""
+    """Find the poses of all merged stacks of a scene, in SCENE/reconstruction; existing results are kept or continued."""
     scene, settings = Path(scene), settings or PoseSettings()
     folder = scene / RECONSTRUCTION_FOLDER
     if _kept(folder, settings):
@@ -183,7 +185,7 @@ def find_scene_poses(scene: Path | str, settings: PoseSettings | None = None) ->
 
 
 def find_picture_poses(images: Path | str, out: Path | str, settings: PoseSettings | None = None) -> SparseModel:
-    """Poses of the pictures of a plain folder, in `out`; the views are named as the files."""
+    """Find the poses of the pictures in a plain folder and write them to `out`; views are named after the files."""
     images, out, settings = Path(images), Path(out), settings or PoseSettings()
     if _kept(out, settings):
         return read_sparse_model(out)
@@ -201,7 +203,7 @@ def _common(settings: PoseSettings, cameras: Sequence[int]) -> dict[str, Any]:
 
 
 def _kept(folder: Path, settings: PoseSettings) -> bool:
-    """Whether finished poses stay; to overwrite clears what earlier runs left."""
+    """Tell whether finished poses are kept; with overwrite, delete the results of earlier runs."""
     if not settings.overwrite:
         return (folder / POSES_NAME).exists()
     for name in (POSES_NAME, SCALE_NAME, JOB_NAME):
@@ -213,11 +215,11 @@ def _kept(folder: Path, settings: PoseSettings) -> bool:
 def _forget_database(folder: Path) -> None:
     for path in folder.glob(f"{DATABASE_NAME}*"):
         path.unlink()
-    shutil.rmtree(folder / "sparse", ignore_errors=True)
+    shutil.rmtree(folder / MODEL_FOLDER, ignore_errors=True)
 
 
 def _solve(folder: Path, job: ColmapJob) -> SparseModel:
-    """Go on with the database of an interrupted run where it holds the features of the same pictures."""
+    """Run COLMAP, continuing with the database of an interrupted run if it holds the features of the same pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     if not _same_features(folder / JOB_NAME, job):
         _forget_database(folder)

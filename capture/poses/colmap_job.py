@@ -1,6 +1,6 @@
-"""What COLMAP is asked to do, as a document: it crosses to the process that runs COLMAP and tells whether old results still fit.
+"""The job given to COLMAP, a document that its process reads and that tells whether old results still fit, and its pictures.
 
-The all-in-focus pictures of a scene, or the pictures of a folder, as COLMAP wants them: 8 bits, files, cameras.
+The pictures are those of a folder, or the all-in-focus pictures of a scene, written with 8 bits.
 """
 
 import hashlib
@@ -25,11 +25,24 @@ FEWEST_FOR_TWO_TERMS = 5
 """Pictures of one camera below which a second term of distortion fits noise: alone, it ran to -200 on sacre_coeur's facade."""
 
 MAPPERS = ("incremental", "global")
+CAMERA_CHOICES = ("auto", "shared", "separate")
+JOB_NAME = "colmap_job.json"
+DATABASE_NAME = "database.db"
+MODEL_FOLDER = "sparse"
+RECONSTRUCTION_FOLDER = "reconstruction"
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+Prior = tuple[float, float, float] | None
+_MID_GREY = 0.18
+_BRIGHT_QUANTILE = 0.95
+_EVERY_NTH_PIXEL = 7
 
 
 @dataclass(frozen=True)
 class ColmapPicture:
-    """name: of the view. file: relative to the folder of pictures. sha256: of the file. camera: pictures of one number share a camera."""
+    """One picture.
+
+    name: of the view. file: relative to the folder of pictures. sha256: of the file. camera: number of its camera; pictures may share one.
+    """
 
     name: str
     file: str
@@ -41,9 +54,8 @@ class ColmapPicture:
 class ColmapJob:
     """Pictures, cameras and settings.
 
-    fewest_terms: leave out terms of distortion that the pictures do not bear out, once the poses are found.
-    cameras: for each camera the prior (focal length, principal point x, y) in px of the pictures, or None to take what the
-      files' Exif tells.
+    fewest_terms: drop terms of distortion that the pictures do not support, once the poses are found.
+    cameras: for each camera the prior (focal length, principal point x, y) in px of the pictures, or None to use the Exif data.
     pictures_folder: of the pictures, relative to the folder of the reconstruction or absolute.
     """
 
@@ -58,11 +70,11 @@ class ColmapJob:
     threads: int = -1
 
     def file_of(self, name: str) -> str:
-        """Of the picture of that view, relative to the folder of pictures."""
+        """Return the picture of a view, relative to the folder of pictures."""
         return next(each.file for each in self.pictures if each.name == name)
 
     def features_key(self) -> dict[str, Any]:
-        """What the features and matches depend on: where it differs, the database is of no use."""
+        """Return everything that features and matches depend on; if it differs, the database is useless."""
         document = job_to_json(self)
         return {key: value for key, value in document.items() if key not in ("mapper", "threads", "fewest_terms")}
 
@@ -82,30 +94,20 @@ def job_from_json(document: dict[str, Any]) -> ColmapJob:
 
 
 def camera_model_for(cameras: Sequence[int], choice: str) -> str:
-    """auto: two terms of distortion where every camera has pictures enough, else one. cameras: the number of each picture's."""
+    """Resolve "auto": two terms of distortion if every camera has enough pictures, else one. cameras: the camera number of each picture."""
     if choice != "auto":
         return choice
     fewest = min(Counter(cameras).values())
     return "RADIAL" if fewest >= FEWEST_FOR_TWO_TERMS else "SIMPLE_RADIAL"
 
 
-CAMERA_CHOICES = ("auto", "shared", "separate")
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-
-Prior = tuple[float, float, float] | None
-
-_MID_GREY = 0.18
-_BRIGHT_QUANTILE = 0.95
-_EVERY_NTH_PIXEL = 7
-
-
 def view_name(stack: FocalStack, scene: Path) -> str:
-    """The folder of a stack below the scene, with slashes."""
+    """Return the folder of a stack relative to the scene, with slashes."""
     return stack.folder.relative_to(scene).as_posix()
 
 
 def write_stack_pictures(scene: Path, stacks: Sequence[FocalStack], images: Path) -> list[str]:
-    """VIEW.png of every stack, all at one exposure; returns the file names below `images`."""
+    """Write VIEW.png of every stack, all at one exposure; return the file names below `images`."""
     stops = common_exposure_stops(stacks)
     files = [f"{view_name(stack, scene)}.png" for stack in stacks]
     for stack, file in zip(track(stacks, "pictures for COLMAP"), files, strict=True):
@@ -114,7 +116,7 @@ def write_stack_pictures(scene: Path, stacks: Sequence[FocalStack], images: Path
 
 
 def common_exposure_stops(stacks: Sequence[FocalStack]) -> float:
-    """Brings the median luminance of all views to mid grey, but no more than a twentieth of the pixels above white."""
+    """Return the stops that bring the median luminance of all views to mid grey with at most 5 % of the pixels above white."""
     values = [luminance(stack.all_in_focus())[::_EVERY_NTH_PIXEL, ::_EVERY_NTH_PIXEL].ravel() for stack in stacks]
     pooled = np.concatenate(values)
     middle, bright = float(np.median(pooled)), float(np.quantile(pooled, _BRIGHT_QUANTILE))
@@ -123,10 +125,10 @@ def common_exposure_stops(stacks: Sequence[FocalStack]) -> float:
 
 
 def stack_cameras(stacks: Sequence[FocalStack], choice: str) -> tuple[list[int], list[Prior]]:
-    """(number of the camera of each stack, prior of each camera): one for each size, lens and focus of the reference slice.
+    """Return (camera number of each stack, prior of each camera): one for each size, lens and focus of the reference slice.
 
-    The focal length in pixels breathes with the focus, so only pictures registered to the same focus share a camera.
-    Where nobody knows the focus, stacks of one size are taken to have been focused alike; what merging guessed is no prior.
+    The focal length in pixels breathes with the focus, so only pictures registered to the same focus share a camera. If the focus is
+    unknown, stacks of one size are assumed to share it; distances guessed by merging are not used as priors.
     """
     stacks = [as_stated(stack) for stack in stacks]
     keys = [_camera_key(stack) for stack in stacks]
@@ -144,7 +146,7 @@ def _camera_key(stack: FocalStack) -> tuple[object, ...]:
 
 
 def picture_cameras(files: Sequence[Path], choice: str) -> tuple[list[int], list[Prior]]:
-    """One camera for all where all pictures have one size, else one for each; the focal length is what Exif tells."""
+    """Return one camera for all pictures if they have one size, else one for each; the focal length comes from Exif."""
     sizes = [_size_px(file) for file in files]
     if choice == "auto":
         choice = "shared" if len(set(sizes)) == 1 else "separate"
@@ -175,7 +177,7 @@ def _size_px(file: Path) -> tuple[int, int]:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """The pictures of a folder by name. Raises InputError where there are fewer than two."""
+    """List the pictures of a folder by name. Raises InputError if there are fewer than two."""
     if not folder.is_dir():
         raise InputError(f"expected a folder of pictures at {folder}, but there is none")
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
@@ -185,7 +187,7 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def described(names: Sequence[str], files: Sequence[str], cameras: Sequence[int], folder: Path) -> tuple[ColmapPicture, ...]:
-    """With the hash of each file, by which a changed picture is known."""
+    """Describe the pictures with a hash of each file, so that changed pictures are noticed."""
     hashes = [hashlib.sha256((folder / file).read_bytes()).hexdigest() for file in files]
     rows = zip(names, files, hashes, cameras, strict=True)
     return tuple(ColmapPicture(name, file, sha256, camera) for name, file, sha256, camera in rows)

@@ -1,4 +1,4 @@
-"""How well pictures fit together pair by pair, from COLMAP's database: what there is to say where it finds no model."""
+"""Statistics of COLMAP's matches, and the messages that explain a missing or weak model with them."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ LEAST_MODEL_PARALLAX_DEG = 1.5
 
 
 def match_statistics(database: Path) -> dict[str, Any]:
-    """pictures, pairs, good_pairs (FEWEST_MATCHES or more), and the shares of those without parallax and of those walking forward."""
+    """Return pictures, pairs, good_pairs (FEWEST_MATCHES or more), and the fractions with low parallax and with forward motion."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
@@ -46,7 +46,7 @@ def match_statistics(database: Path) -> dict[str, Any]:
 
 
 def _rays(opened: Any, image: Any, keypoints: np.ndarray) -> np.ndarray:
-    """(K, 3) unit vectors in camera axes, by the camera as it was before any mapping."""
+    """Return (K, 3) unit vectors in camera axes, by the camera before any mapping."""
     camera = opened.read_camera(image.camera_id)
     plane = camera.cam_from_img(opened.read_keypoints(image.image_id)[keypoints, :2].astype(np.float64))
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
@@ -54,7 +54,7 @@ def _rays(opened: Any, image: Any, keypoints: np.ndarray) -> np.ndarray:
 
 
 def _parallax_deg(rays_1: np.ndarray, rays_2: np.ndarray, rotation_2_from_1: np.ndarray) -> float:
-    """Median angle between the two rays of a match, turned into one frame: that under which the point sees the two cameras."""
+    """Return the median angle between the two rays of a match in one frame, which is the angle between the cameras seen from the point."""
     cosines = np.sum(rays_1 @ rotation_2_from_1.T * rays_2, axis=1)
     return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1.0, 1.0))))
 
@@ -65,7 +65,7 @@ def _forward(translation: np.ndarray) -> float:
 
 
 def failure_message(seen: dict[str, Any]) -> str:
-    """Why there is no model, and what to do."""
+    """Explain why there is no model and what to do."""
     pictures, pairs, good = seen["pictures"], seen["pairs"], seen["good_pairs"]
     if good < max(1, pictures - 1):
         why = f"only {good} of {pairs} pairs of pictures share {FEWEST_MATCHES} points, too few to connect them"
@@ -83,7 +83,7 @@ def failure_message(seen: dict[str, Any]) -> str:
 
 
 def weak_model_message(model: SparseModel) -> str | None:
-    """None where the model can be used; else why not: too few views, or points seen under too small an angle."""
+    """Return None if the model is usable, else the reason: too few views, or too small an angle between the rays to its points."""
     placed, total = len(model.views), len(model.views) + len(model.left_out)
     if 2 * placed <= total or (placed < 3 <= total):
         return (
@@ -100,7 +100,7 @@ def weak_model_message(model: SparseModel) -> str | None:
 
 
 def median_parallax_deg(model: SparseModel) -> float:
-    """Median over the points of the largest angle between two of the rays that see one."""
+    """Return the median over the points of the largest angle between two of their rays."""
     centres = np.array([view.centre for view in model.views])
     views, points = model.observations.T
     rays = model.points[points] - centres[views]

@@ -1,12 +1,10 @@
-"""COLMAP itself, run as `python -m capture.poses.colmap_worker FOLDER`: what it cannot survive ends this process and no other.
+"""COLMAP itself, run as `python -m capture.poses.colmap_worker FOLDER`, so that its crashes end this process only.
 
-FOLDER/colmap_job.json says what to do (`colmap_job`). Finished stages in FOLDER/database.db are gone on with; the largest model
-goes to FOLDER/sparse/, and as a SparseModel to FOLDER (poses.json, points.npz). Progress is one JSON object a line on standard
-output: {"stage", "done", "total"}, at the end {"failure": {...}} where no model was found.
+FOLDER/colmap_job.json is the job (`colmap_job`). Finished stages in FOLDER/database.db are continued; the largest model goes to
+FOLDER/sparse/, and as a SparseModel to FOLDER (poses.json, points.npz). Progress is one JSON object a line on standard output:
+{"stage", "done", "total"}, at the end {"failure": {...}} if no model was found.
 
-The last bundle adjustment: with a robust loss, and with no more terms of distortion than the pictures bear out.
-
-A reconstruction of COLMAP as a SparseModel.
+The last bundle adjustment is robust and keeps only those terms of distortion that the pictures support.
 """
 
 import copy
@@ -21,25 +19,26 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from capture.poses.cauchy_loss import CAUCHY_95
-from capture.poses.colmap_job import ColmapJob, ColmapPicture, job_from_json
+from capture.poses.cauchy_loss import CAUCHY_95, MEDIAN_OF_RAYLEIGH
+from capture.poses.colmap_job import DATABASE_NAME, JOB_NAME, MODEL_FOLDER, ColmapJob, ColmapPicture, job_from_json
 from capture.poses.colmap_matches import match_statistics
 from capture.poses.sparse_model import Distortion, SparseModel, SparseView, write_sparse_model
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import read_json
 
-_MEDIAN_OF_RAYLEIGH = 1.1774  # of the length of an error whose two parts are normal with a deviation of 1
 _LEAST_LOSS_SCALE_PX = 0.05
 _LEAST_COST_PX2 = 1e-12
 _MODEL_OF_TERMS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.SIMPLE_RADIAL, pycolmap.CameraModelId.RADIAL)
+_FEWEST_VIEWS = 2
+_PAIRS_AT_ONCE = 40
 
 
 def adjusted(model: Any, fewest_terms: bool) -> Any:
-    """The pycolmap.Reconstruction after the adjustment. fewest_terms: leave out terms of distortion that explain no more than noise.
+    """Return the pycolmap.Reconstruction after the adjustment. fewest_terms: drop terms of distortion that explain no more than noise.
 
-    A term that nothing in the pictures asks for still takes part in the fit, and moves the focal length and the depth with it: on
-    three traced scenes without distortion, the metres of camera centres and of a board disagreed by 0.09, 0.07 and 0.06 % with the
-    terms and by 0.02 % without, where the noise of the matches alone leaves 0.04 and 0.02 %.
+    A superfluous term still takes part in the fit, and moves the focal length and the depth with it: on three traced scenes without
+    distortion, the metres of camera centres and of a board disagreed by 0.09, 0.07 and 0.06 % with the terms and by 0.02 % without,
+    where the noise of the matches alone leaves 0.04 and 0.02 %.
     """
     loss_px = _loss_scale_px(model)
     refine_robustly(model, loss_px)
@@ -53,10 +52,10 @@ def adjusted(model: Any, fewest_terms: bool) -> Any:
 
 
 def refine_robustly(model: Any, loss_px: float) -> None:
-    """Bundle adjustment with Cauchy's loss, 95 % efficient for normal errors: 2.385 sigma (Holland and Welsch 1977).
+    """Run a bundle adjustment with Cauchy's loss, 95 % efficient for normal errors: 2.385 sigma (Holland and Welsch 1977).
 
     COLMAP's own last adjustment is least squares over all matches within 4 px, in which a few wrong ones outweigh thousands of
-    good ones at 0.06 px: it left the focal length of a traced scene 0.25 % off, this leaves 0.05 %.
+    good ones at 0.06 px: it left the focal length of a traced scene 0.25 % off; this adjustment leaves 0.05 %.
     """
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -68,12 +67,12 @@ def refine_robustly(model: Any, loss_px: float) -> None:
 
 
 def _loss_scale_px(model: Any) -> float:
-    sigma_px = float(np.median([point.error for point in model.points3D.values()])) / _MEDIAN_OF_RAYLEIGH
+    sigma_px = float(np.median([point.error for point in model.points3D.values()])) / MEDIAN_OF_RAYLEIGH
     return max(CAUCHY_95 * sigma_px, _LEAST_LOSS_SCALE_PX)
 
 
 def _terms(model: Any) -> int:
-    """Terms of radial distortion that every camera of the model has."""
+    """Return the number of terms of radial distortion that every camera of the model has."""
     return min(_MODEL_OF_TERMS.index(camera.model) for camera in model.cameras.values())
 
 
@@ -87,9 +86,9 @@ def _with_one_term_less(model: Any) -> Any:
 
 
 def _criterion(model: Any, loss_px: float) -> float:
-    """Schwarz (1978): n ln(cost) + terms ln(n), the less the better; n: residuals less those that the points themselves use up.
+    """Return Schwarz's criterion (1978), n ln(cost) + terms ln(n), lower is better; n: residuals less the coordinates of the points.
 
-    By the logarithm of the cost, not by the cost over an assumed variance: real residuals have longer tails than normal ones.
+    The logarithm of the cost replaces the cost over an assumed variance, since real residuals have longer tails than normal ones.
     """
     residuals_px = _residuals_px(model)
     cost = float(np.sum(loss_px**2 * np.log1p(np.sum(residuals_px**2, axis=1) / loss_px**2)))
@@ -98,7 +97,7 @@ def _criterion(model: Any, loss_px: float) -> float:
 
 
 def _residuals_px(model: Any) -> Float[np.ndarray, "seen 2"]:
-    """Of every sighting of every point."""
+    """Return the reprojection errors of all observations."""
     residuals = [np.zeros((0, 2))]
     for image in model.images.values():
         seen = [point for point in image.points2D if point.has_point3D()]
@@ -110,7 +109,7 @@ def _residuals_px(model: Any) -> Float[np.ndarray, "seen 2"]:
 
 
 def sparse_model_of(reconstruction: Any, pictures: Sequence[ColmapPicture]) -> SparseModel:
-    """Views in the order of the pictures; those that COLMAP could not place are left_out."""
+    """Convert a reconstruction to a SparseModel with views in the order of the pictures; pictures without a pose are left_out."""
     images = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     placed = [each for each in pictures if each.file in images]
     views = tuple(_view(each.name, images[each.file]) for each in placed)
@@ -139,18 +138,13 @@ def _view(name: str, image: Any) -> SparseView:
 
 
 def _camera(camera: Any, pose: np.ndarray) -> tuple[Camera, Distortion]:
-    """SIMPLE_PINHOLE has f, cx, cy; SIMPLE_RADIAL also k; RADIAL k1, k2. COLMAP's pixel centres lie where ours do."""
+    """Convert SIMPLE_PINHOLE (f, cx, cy), SIMPLE_RADIAL (and k) or RADIAL (and k1, k2). COLMAP's pixel centres lie where ours do."""
     focal, cx, cy, *terms = (float(value) for value in camera.params)
     k1, k2 = (*terms, 0.0, 0.0)[:2]
-    return Camera(camera.width, camera.height, (focal, focal), (cx, cy), pose), (k1, k2)
-
-
-DATABASE_NAME = "database.db"
-JOB_NAME = "colmap_job.json"
-MODEL_FOLDER = "sparse"
-
-_FEWEST_VIEWS = 2
-_PAIRS_AT_ONCE = 40
+    return Camera(width_px=camera.width, height_px=camera.height, focal_px=(focal, focal), principal_px=(cx, cy), camera_from_world=pose), (
+        k1,
+        k2,
+    )
 
 
 def run_job(folder: Path) -> None:
@@ -171,7 +165,7 @@ def run_job(folder: Path) -> None:
 
 
 def find_features(folder: Path, job: ColmapJob) -> None:
-    """SIFT of what has none yet, one camera after the other, so that the pictures of a camera share its entry in the database."""
+    """Find the missing SIFT features, camera by camera, so that the pictures of a camera share its entry in the database."""
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=job.max_image_size_px, num_threads=job.threads, use_gpu=False)
     for number, prior in enumerate(job.cameras):
         files = [each.file for each in job.pictures if each.camera == number]
@@ -195,7 +189,7 @@ def find_features(folder: Path, job: ColmapJob) -> None:
 
 
 def _without_features(database: Path, files: Sequence[str]) -> tuple[list[str], int | None]:
-    """(files that the database does not know yet, its camera for those it knows)."""
+    """Return (files without features in the database, the camera of those with features)."""
     with pycolmap.Database.open(database) as opened:
         known = {image.name: image for image in opened.read_all_images() if opened.exists_keypoints(image.image_id)}
     cameras = [known[file].camera_id for file in files if file in known]
@@ -203,7 +197,7 @@ def _without_features(database: Path, files: Sequence[str]) -> tuple[list[str], 
 
 
 def match_features(folder: Path, job: ColmapJob) -> None:
-    """Every picture with every other, some pairs at a time so that an interruption loses little."""
+    """Match every picture with every other, in batches of pairs so that an interruption loses little."""
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
     verification.ransac.random_seed = job.seed
@@ -231,7 +225,7 @@ def _unmatched_pairs(database: Path) -> tuple[list[tuple[str, str]], int]:
 
 
 def find_models(folder: Path, job: ColmapJob) -> dict[int, Any]:
-    """Structure from motion; one thread, because sums of several do not come out the same twice."""
+    """Run structure from motion on one thread, because sums over several threads are not reproducible."""
     output = folder / MODEL_FOLDER
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir()

@@ -1,10 +1,10 @@
-"""A lens as calibrated against depth: what its stated focus distances really mean and how its blur grows; for later stacks.
+"""Calibration of a lens against depth: its true focus for each stated distance and the growth of its blur; used on later stacks.
 
 lens_calibration.json: {"format": "mrbokeh-lens-calibration", "version": 1, "lens_model", "focal_length_mm", "f_number", "width_px",
 "offset_m", "rows": [{"stated_dioptre", "dioptre", "px_per_dioptre", "breathing_scale", "sigma_dioptre", "stacks"}]}, rows from far
-to near. stated_dioptre is null where the camera did not tell; such rows say something of their own stack only.
+to near. stated_dioptre is null if the camera stated none; such rows hold for their own stack only.
 
-A lens calibration put to use on stacks without camera poses: their focus distances, and the depth from focus that rests on them.
+The calibration gives stacks without camera poses their focus distances, and with them metric depth from focus.
 """
 
 from collections.abc import Sequence
@@ -33,8 +33,8 @@ class CalibratedFocus:
 
     stated_dioptre: 1 / the focus distance that the camera or the user stated, from the lens. dioptre: 1 / the distance from the
     entrance pupil, as found. px_per_dioptre: growth of the circle of confusion in the photograph (before registration enlarges it)
-    at the calibration's width_px. breathing_scale: what enlarges the photograph to the reference of its stack.
-    stacks: how many stacks the row is the mean of.
+    at the calibration's width_px. breathing_scale: enlargement of the photograph in registration to the reference of its stack.
+    stacks: how many stacks the row averages.
     """
 
     stated_dioptre: float | None
@@ -47,7 +47,10 @@ class CalibratedFocus:
 
 @dataclass(frozen=True)
 class LensCalibration:
-    """offset_m: what the stated distances count too much, as seen from the entrance pupil. rows: far to near."""
+    """A calibrated lens.
+
+    offset_m: what the stated distances exceed those from the entrance pupil by. rows: far to near.
+    """
 
     lens_model: str | None
     focal_length_mm: float
@@ -57,9 +60,9 @@ class LensCalibration:
     rows: tuple[CalibratedFocus, ...]
 
     def dioptre_of(self, stated_dioptre: float) -> float:
-        """What the lens is focused on where it states this: the offset, and the rows' differences from it, interpolated.
+        """Return the true focus for a stated one: the offset, plus the rows' differences from it, interpolated.
 
-        Beyond the rows the difference of the last one holds on.
+        Beyond the rows the difference of the last one is used.
         """
         stated, found = self._table("dioptre")
         return self._expected(stated_dioptre) + float(np.interp(stated_dioptre, stated, found - [self._expected(each) for each in stated]))
@@ -80,9 +83,9 @@ class LensCalibration:
 
 
 def apply_lens_calibration(stack: FocalStack, calibration: LensCalibration) -> FocalStack:
-    """The stack with calibrated focus distances, and px_per_dioptre in the metadata of its slices; nothing is written.
+    """Return the stack with calibrated focus distances, and px_per_dioptre in the metadata of its slices; nothing is written.
 
-    What was stated stays in the metadata. Raises InputError where the lens is another or a distance is unknown.
+    The stated distances stay in the metadata. Raises InputError if the lens is another or a distance is unknown.
     """
     check_lens(stack, calibration)
     unknown = [each.path for each, distance in zip(stack.slices, stated_distances_m(stack), strict=True) if distance is None]
@@ -98,7 +101,10 @@ def apply_lens_calibration(stack: FocalStack, calibration: LensCalibration) -> F
 
 
 def with_calibrated_focus(each: Slice, stated_m: float | None, dioptre: float, px_per_dioptre: float, width_px: int) -> Slice:
-    """px_per_dioptre: of the photograph at width_px; what is registered has it times the slice's scale."""
+    """Return the slice with its calibrated focus.
+
+    px_per_dioptre: of the photograph at width_px; a registered picture has it times the slice's scale.
+    """
     told = {GROWTH: px_per_dioptre, GROWTH_WIDTH: width_px}
     stated = "inf" if stated_m == float("inf") else stated_m
     distance_m = 1.0 / dioptre if dioptre > 0 else float("inf")
@@ -106,13 +112,13 @@ def with_calibrated_focus(each: Slice, stated_m: float | None, dioptre: float, p
 
 
 def focused_stack(stack: FocalStack, slices: Sequence[Slice]) -> FocalStack:
-    """The stack with these slices, its lens focused as its reference."""
+    """Return the stack with these slices and its lens focused as in its reference."""
     changed = replace(stack, slices=tuple(slices))
     return changed if changed.lens is None else replace(changed, lens=changed.stated_lens_of(changed.reference))
 
 
 def stated_distances_m(stack: FocalStack) -> tuple[float | None, ...]:
-    """What the camera or the user stated, also after a calibration has put its own distances in their place."""
+    """Return the distances stated by the camera or the user, also after a calibration has replaced them."""
     stated = (each.metadata.get(STATED_DISTANCE, each.focus_distance_m) for each in stack.slices)
     return tuple(None if each is None else float(each) for each in stated)
 
@@ -122,7 +128,7 @@ def lens_model_of(stack: FocalStack) -> str | None:
 
 
 def check_lens(stack: FocalStack, calibration: LensCalibration) -> None:
-    """Raises InputError where the stack was taken with another lens, focal length or f-number."""
+    """Raise InputError if the stack was taken with another lens, focal length or f-number."""
     if stack.lens is None:
         raise InputError(f"{stack.folder} does not know its lens: give focal_length_mm and f_number in a lens.toml and ingest again")
     ours, theirs = lens_model_of(stack), calibration.lens_model
@@ -154,7 +160,7 @@ def read_lens_calibration(path: Path | str) -> LensCalibration:
 
 
 def calibrate_scene(scene: Path, calibration: LensCalibration) -> list[FocalStack]:
-    """Apply to every stack of a scene and write; all lenses are checked before anything is changed."""
+    """Apply the calibration to every stack of a scene and write them; all lenses are checked before anything is changed."""
     stacks = find_focal_stacks(scene)
     for stack in stacks:
         check_lens(stack, calibration)
@@ -168,7 +174,7 @@ def calibrate_scene(scene: Path, calibration: LensCalibration) -> list[FocalStac
 
 
 def write_calibrated(before: FocalStack, after: FocalStack) -> None:
-    """Write a merged stack with other focus distances, and its depth in metres anew from the focus index."""
+    """Write a merged stack with new focus distances, and its depth in metres recomputed from the focus index."""
     depth_m, turned = depth_m_of(after, after.focus_index()), is_near_first(before) != is_near_first(after)
     assert depth_m is not None, f"{after.folder}: calibrated stacks are metric"
     write_changed_metres(with_known_nearest(after, turned), depth_m, turned)

@@ -1,14 +1,13 @@
-"""SparseModel: cameras of many viewpoints and the points they saw in common, as structure from motion finds them.
+"""SparseModel: cameras of many viewpoints and the points they have in common, as structure from motion finds them, and its files.
 
-Radial lens distortion: where a pinhole's pixel lies in the picture of a real lens, and back. Pictures are never resampled.
+Cameras have radial lens distortion (Brown-Conrady with two terms, COLMAP's RADIAL model; SIMPLE_RADIAL has k2 = 0): with (u, v) the
+position over the focal length from the principal point and r^2 = u^2 + v^2, the picture has (u, v) (1 + k1 r^2 + k2 r^4). Positions
+are converted between the undistorted pinhole and the picture; pictures are never resampled.
 
-Brown-Conrady with two radial terms, as COLMAP's RADIAL model (SIMPLE_RADIAL has k2 = 0): with (u, v) the position over the
-focal length from the principal point and r^2 = u^2 + v^2, the picture has (u, v) (1 + k1 r^2 + k2 r^4).
-
-A SparseModel on disk: poses.json (views), points.npz (points and observations) and scale.json (metres, see `scale_file`).
+A SparseModel on disk is poses.json (views), points.npz (points and observations) and scale.json (metres, see `capture.scale.answer`).
 
 poses.json: {"format": "mrbokeh-poses", "version": 1, "views": [{"name", "camera": {...}, "distortion": [k1, k2]}], "left_out": [names]}
-camera_from_world of a view is in the model's own unit; scale.json, where it is there, says how many metres that is.
+camera_from_world of a view is in the model's own unit; scale.json, if present, states its metres.
 """
 
 from dataclasses import dataclass, replace
@@ -28,10 +27,16 @@ Positions = Float[np.ndarray, "*batch 2"]
 
 _NEWTON_STEPS = 12
 _LARGEST_RADIUS = 4.0  # tan of 76 degrees: beyond what a pinhole with distortion can describe
+FORMAT = "mrbokeh-poses"
+VERSION = 1
+POSES_NAME = "poses.json"
+POINTS_NAME = "points.npz"
+SCALE_NAME = "scale.json"
+_ARRAYS = ("points", "errors_px", "observations", "observed_xy_px")
 
 
 def distorted_px(camera: Camera, distortion: Distortion, xy_px: Positions) -> Positions:
-    """Pixel positions of the undistorted pinhole to positions in the picture."""
+    """Convert pixel positions of the undistorted pinhole to positions in the picture."""
     plane = _plane(camera, xy_px)
     k1, k2 = distortion
     r2 = np.sum(plane**2, axis=-1, keepdims=True)
@@ -39,9 +44,9 @@ def distorted_px(camera: Camera, distortion: Distortion, xy_px: Positions) -> Po
 
 
 def undistorted_px(camera: Camera, distortion: Distortion, xy_px: Positions) -> Positions:
-    """Positions in the picture to pixel positions of the undistorted pinhole: the inverse of `distorted_px`.
+    """Convert positions in the picture to pixel positions of the undistorted pinhole: the inverse of `distorted_px`.
 
-    NaN beyond the radius at which barrel distortion folds the picture back, for no point is seen there.
+    NaN beyond the radius at which barrel distortion folds the picture back, since no point is seen there.
     """
     plane = _plane(camera, xy_px)
     if not any(distortion):
@@ -53,7 +58,7 @@ def undistorted_px(camera: Camera, distortion: Distortion, xy_px: Positions) -> 
 
 
 def _undistorted_radius(radius: Float[np.ndarray, "*batch 1"], distortion: Distortion) -> Float[np.ndarray, "*batch 1"]:
-    """Newton's method kept between 0 and the fold, where r (1 + k1 r^2 + k2 r^4) grows."""
+    """Solve for the radius by Newton's method between 0 and the fold, where r (1 + k1 r^2 + k2 r^4) grows."""
     k1, k2 = distortion
     fold = _fold_radius(distortion)
     true_radius = np.minimum(radius, 0.99 * fold)
@@ -68,7 +73,7 @@ def _undistorted_radius(radius: Float[np.ndarray, "*batch 1"], distortion: Disto
 
 
 def _fold_radius(distortion: Distortion) -> float:
-    """The least radius at which d/dr of r (1 + k1 r^2 + k2 r^4) is 0."""
+    """Return the smallest radius at which d/dr of r (1 + k1 r^2 + k2 r^4) is 0."""
     k1, k2 = distortion
     roots = np.roots([5.0 * k2, 3.0 * k1, 1.0]) if k2 else np.array([-1.0 / (3.0 * k1)])
     squares = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
@@ -89,7 +94,7 @@ class SparseView:
 
     name: of its stack (folder below the scene).
     camera: the pinhole part; the translation of camera_from_world is in the model's unit.
-    distortion: radial k1, k2 (see `distortion`); 0, 0 is a pinhole.
+    distortion: radial k1, k2; 0, 0 is a pinhole.
     """
 
     name: str
@@ -98,26 +103,26 @@ class SparseView:
 
     @property
     def centre(self) -> Float[np.ndarray, "3"]:
-        """The camera's centre (entrance pupil) in the world, in the model's unit."""
+        """Return the camera's centre (entrance pupil) in the world, in the model's unit."""
         return self.camera.world_from_camera[:3, 3]
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
-        """World points to (positions in the picture, depth along the axis in the model's unit)."""
+        """Project world points to (positions in the picture, depth along the axis in the model's unit)."""
         xy_px, depth = self.camera.project(points)
         return distorted_px(self.camera, self.distortion, xy_px), depth
 
     def unproject(self, xy_px: Float[np.ndarray, "*batch 2"], depth: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3"]:
-        """Positions in the picture at a depth to world points: the inverse of `project`."""
+        """Convert positions in the picture at a depth to world points: the inverse of `project`."""
         return self.camera.unproject(undistorted_px(self.camera, self.distortion, xy_px), depth)
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """Views, points and who saw what. All lengths are in the model's own unit.
+    """Views, points and their observations. All lengths are in the model's own unit.
 
-    errors_px: mean distance between where a point is seen and where it projects to.
-    observations: (M, 2) index of the view, index of the point; observed_xy_px: (M, 2) where, in the picture.
-    metres_per_unit: None until the scale is known; 1 where lengths are metres.
+    errors_px: mean reprojection error of each point.
+    observations: (M, 2) index of the view, index of the point; observed_xy_px: (M, 2) position in the picture.
+    metres_per_unit: None until the scale is known; 1 if lengths are metres.
     left_out: names of views that could not be placed.
     """
 
@@ -151,13 +156,13 @@ class SparseModel:
         raise InputError(f"expected a view of the sparse model, got {name!r}{why}: choose one of {', '.join(v.name for v in self.views)}")
 
     def scaled(self) -> "SparseModel":
-        """The same in metres. Raises InputError where the scale is not known."""
+        """Return the model in metres. Raises InputError if the scale is not known."""
         if self.metres_per_unit is None:
             raise InputError("the poses have no scale in metres yet: run `mrbokeh capture scale` on the scene")
         return self.times(self.metres_per_unit)
 
     def times(self, metres_per_unit: float) -> "SparseModel":
-        """All lengths multiplied by a trial scale; the result counts as metres."""
+        """Return the model with all lengths multiplied by a trial scale; the result counts as metres."""
         views = []
         for each in self.views:
             pose = each.camera.camera_from_world.copy()
@@ -166,7 +171,7 @@ class SparseModel:
         return replace(self, views=tuple(views), points=self.points * metres_per_unit, metres_per_unit=1.0)
 
     def moved(self, there_from_world: Float[np.ndarray, "4 4"]) -> "SparseModel":
-        """The same in another world: a rotation and a shift in the model's unit."""
+        """Return the model in another world: a rotation and a shift in the model's unit."""
         back = np.linalg.inv(there_from_world)
         views = tuple(
             replace(each, camera=replace(each.camera, camera_from_world=each.camera.camera_from_world @ back)) for each in self.views
@@ -174,11 +179,11 @@ class SparseModel:
         return replace(self, views=views, points=self.points @ there_from_world[:3, :3].T + there_from_world[:3, 3])
 
     def points_of(self, view: SparseView | str) -> Int[np.ndarray, " seen"]:
-        """Indices of the points that a view observes, in the order of `depths_in`."""
+        """Return the indices of the points that a view observes, in the order of `depths_in`."""
         return self.observations[self._of_view(view), 1]
 
     def depths_in(self, view: SparseView | str) -> tuple[Float[np.ndarray, "seen 2"], Float[np.ndarray, " seen"]]:
-        """(positions in the picture (K, 2), depth along the axis (K,) in the model's unit) of the points that a view observes."""
+        """Return (positions in the picture (K, 2), depth along the axis (K,) in the model's unit) of the points that a view observes."""
         seen = self.view(view) if isinstance(view, str) else view
         _, depth = seen.camera.project(self.points[self.points_of(view)])
         return self.observed_xy_px[self._of_view(view)], depth
@@ -188,17 +193,8 @@ class SparseModel:
         return np.flatnonzero(self.observations[:, 0] == self.index_of(name))
 
 
-FORMAT = "mrbokeh-poses"
-VERSION = 1
-POSES_NAME = "poses.json"
-POINTS_NAME = "points.npz"
-SCALE_NAME = "scale.json"
-
-_ARRAYS = ("points", "errors_px", "observations", "observed_xy_px")
-
-
 def write_sparse_model(folder: Path | str, model: SparseModel) -> None:
-    """poses.json is written last and is the sign that the model is whole; the scale of an earlier model goes with that model."""
+    """Write the model, poses.json last as the sign that it is whole; the scale of an earlier model is deleted."""
     folder = Path(folder)
     for stale in (POSES_NAME, SCALE_NAME):
         (folder / stale).unlink(missing_ok=True)
@@ -208,7 +204,7 @@ def write_sparse_model(folder: Path | str, model: SparseModel) -> None:
 
 
 def read_sparse_model(folder: Path | str) -> SparseModel:
-    """The model of SCENE/reconstruction; metres_per_unit is that of scale.json, None where there is none yet."""
+    """Read the model of SCENE/reconstruction; metres_per_unit is that of scale.json, None if there is none yet."""
     folder = Path(folder)
     document = read_json(folder / POSES_NAME, "camera poses (run `mrbokeh capture poses` on the scene)")
     if document.get("format") != FORMAT or document.get("version") != VERSION:

@@ -1,1 +1,1 @@
-"""Metres: the scale of a reconstruction and the focus of its stacks."""
+"""The metric scale of a reconstruction, and the focus of its stacks calibrated with it."""

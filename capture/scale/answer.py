@@ -1,8 +1,6 @@
-"""What each way to find the scale answers: metres per unit of the model, how sure, and what it rests on.
+"""Answers of the ways to find the scale: metres per unit, uncertainty and facts; the answer of a measured distance; scale.json.
 
-The scale from the measured distance between two camera centres (entrance pupils).
-
-scale.json: what every way to find the scale answered, how far they disagree, and which one counts.
+scale.json holds every answer, how far they disagree, and which one is used:
 
 {"format": "mrbokeh-scale", "version": 1, "metres_per_unit", "used": method, "answers": [{"method", "metres_per_unit", "uncertainty",
 "facts", "outlines_px"}], "disagreement": {method: relative difference from the one used}, "missing": {method: why there is no answer}}
@@ -21,12 +19,18 @@ from mrbokeh.system.errors import InputError
 
 METHODS = ("board", "distance", "focus")
 """The best trusted first."""
+_RULER_M = 0.001
+FORMAT = "mrbokeh-scale"
+VERSION = 1
+_NOTEWORTHY = 0.02
+_DEVIATIONS = 3.0
 
 
 @dataclass(frozen=True)
 class ScaleAnswer:
-    """metres_per_unit; uncertainty: one standard deviation, relative. facts: counts and residuals, for people to judge by.
+    """The scale by one method.
 
+    metres_per_unit; uncertainty: one standard deviation, relative. facts: counts and residuals for people to judge by.
     outlines_px: by view, the corners (x, y) of a board in the picture, so that training can leave it out.
     """
 
@@ -37,11 +41,8 @@ class ScaleAnswer:
     outlines_px: dict[str, list[list[float]]] = field(default_factory=dict)
 
 
-_RULER_M = 0.001
-
-
 def distance_scale(model: SparseModel, view_a: str, view_b: str, metres: float) -> ScaleAnswer:
-    """As good as the ruler: the uncertainty stands for 1 mm."""
+    """Return the scale from the measured distance between two camera centres (entrance pupils); its uncertainty stands for 1 mm."""
     if not 0.0 < metres < float("inf"):
         raise InputError(f"the distance between {view_a} and {view_b} must be a positive number of metres, got {metres}")
     units = float(np.linalg.norm(model.view(view_a).centre - model.view(view_b).centre))
@@ -51,7 +52,7 @@ def distance_scale(model: SparseModel, view_a: str, view_b: str, metres: float) 
 
 
 def parse_distance(text: str) -> tuple[str, str, float]:
-    """ "VIEW_A,VIEW_B,METRES"."""
+    """Parse "VIEW_A,VIEW_B,METRES"."""
     try:
         view_a, view_b, metres = (each.strip() for each in text.split(","))
         return view_a, view_b, float(metres)
@@ -60,23 +61,16 @@ def parse_distance(text: str) -> tuple[str, str, float]:
         raise InputError(f"{told}, got {text!r}") from None
 
 
-FORMAT = "mrbokeh-scale"
-VERSION = 1
-
-_NOTEWORTHY = 0.02
-_DEVIATIONS = 3.0
-
-
 @dataclass(frozen=True)
 class ScaleResult:
-    """answers: the most trusted first, which is the one used. missing: why other methods have no answer."""
+    """All answers, the most trusted first, which is the one used. missing: why other methods have no answer."""
 
     answers: tuple[ScaleAnswer, ...]
     missing: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, answers: Sequence[ScaleAnswer], missing: Mapping[str, str]) -> "ScaleResult":
-        """Raises InputError where no method has an answer, with what each looked for."""
+        """Sort the answers by trust. Raises InputError if no method has an answer, with what each looked for."""
         if not answers:
             reasons = "; ".join(f"{method}: {missing[method]}" for method in METHODS if method in missing)
             raise InputError(f"the scale in metres stays unknown. {reasons}")
@@ -88,12 +82,12 @@ class ScaleResult:
 
     @property
     def disagreement(self) -> dict[str, float]:
-        """How much larger than the one used each other answer is, relative."""
+        """Return the relative excess of each other answer over the one used."""
         return {each.method: each.metres_per_unit / self.used.metres_per_unit - 1.0 for each in self.answers[1:]}
 
     @property
     def contradictions(self) -> tuple[str, ...]:
-        """Methods that differ from the one used by more than 2 % and more than three of their joint standard deviations."""
+        """Return the methods that differ from the one used by more than 2 % and more than three joint standard deviations."""
         return tuple(
             each.method
             for each in self.answers[1:]

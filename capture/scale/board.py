@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from capture.poses.cauchy_loss import MEDIAN_OF_RAYLEIGH
 from capture.poses.sparse_model import SparseModel, SparseView, undistorted_px
 from capture.scale.answer import ScaleAnswer
 from mrbokeh.optics.lens import MM_PER_M
@@ -24,7 +25,6 @@ POSES_SIGMA, POSES_SIGMA_WITH_DISTORTION = 5e-4, 1e-3
 distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too. That is noise of the matches: 0.1 px on 500
 points of the lab's seven views leave 0.09 % root mean square beside a term of distortion that is there, and 0.06 % without one.
 """
-_MEDIAN_OF_RAYLEIGH = 1.1774  # of the length of an error whose two parts are normal with a deviation of 1
 _WRONG_SIGMAS = 5.0
 _LEAST_WRONG_PX = 0.1
 Points = Float[np.ndarray, "points 3"]
@@ -114,7 +114,13 @@ def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDete
         "metres_per_unit_of_triangulated_corners": 1.0 / start.scale,
     }
     of_poses = POSES_SIGMA_WITH_DISTORTION if any(any(view.distortion) for view in model.views) else POSES_SIGMA
-    return ScaleAnswer("board", 1.0 / fit.scale, float(np.hypot(sigma, of_poses)), facts, board_outlines(model, board, seen, fit))
+    return ScaleAnswer(
+        method="board",
+        metres_per_unit=1.0 / fit.scale,
+        uncertainty=float(np.hypot(sigma, of_poses)),
+        facts=facts,
+        outlines_px=board_outlines(model, board, seen, fit),
+    )
 
 
 def board_outlines(model: SparseModel, board: CharucoBoard, seen: BoardDetections, fit: Similarity) -> dict[str, list[list[float]]]:
@@ -128,7 +134,7 @@ def board_outlines(model: SparseModel, board: CharucoBoard, seen: BoardDetection
 def _wrong(residuals_px: Float[np.ndarray, "seen 2"]) -> np.ndarray:
     """Mark residuals beyond five standard deviations: a partly covered corner lies about a pixel off."""
     off_px = np.linalg.norm(residuals_px, axis=1)
-    return off_px > max(_WRONG_SIGMAS * float(np.median(off_px)) / _MEDIAN_OF_RAYLEIGH, _LEAST_WRONG_PX)
+    return off_px > max(_WRONG_SIGMAS * float(np.median(off_px)) / MEDIAN_OF_RAYLEIGH, _LEAST_WRONG_PX)
 
 
 def _from_triangulated(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> tuple[Similarity, float]:

@@ -2,12 +2,10 @@
 
 A point at depth z (model units, from the entrance pupil) is sharp in the slice whose stated focus distance D, less one offset e
 for the lens, is its depth in metres: 1 / (D - e) = 1 / (s z). EXIF counts from the film plane, the thin lens from its principal
-plane, COLMAP from the entrance pupil; e is what is left between them, a few centimetres at most.
+plane, COLMAP from the entrance pupil; e is the remaining difference, a few centimetres at most.
 
-Where between the slices of a stack each sparse point is sharpest: the peak of its sharpness over the focus, in dioptres.
-
-The measure is the local energy of a band-passed picture; its logarithm is a parabola near the focus, in dioptres, because blur
-grows in proportion to them (Nayar and Nakagawa 1994, Shape from Focus, take a normal curve for the same reason).
+The sharpness of a point is the local energy of a band-passed picture. Its logarithm is a parabola near the focus, in dioptres,
+because blur is proportional to them (Nayar and Nakagawa 1994, Shape from Focus, use a normal curve for the same reason).
 """
 
 from collections.abc import Iterable, Sequence
@@ -33,20 +31,31 @@ _REACH = 3
 _LEAST_RISE = float(np.log(3.0))
 
 Curves = Float[np.ndarray, "slices points"]
+FEWEST_POINTS = 50
+OFFSET_SIGMA_M = 0.03
+"""How far the entrance pupil of a photographic lens may well lie from where its focus distances count."""
+SIGNIFICANT = 3.0
+"""Standard deviations from 0 at which an offset counts."""
+_NO_OFFSET_M = 1e-6
+_STEPS = 25
+_LEAST_STATED_SIGMA = 0.001
 
 
 @dataclass(frozen=True)
 class SharpnessPeaks:
-    """Log energies of the points that have a peak inside the stack, and the slice that is highest."""
+    """Log energies of the points that have a peak inside the stack, and the slice in which they are highest."""
 
     points: Int[np.ndarray, " peaks"]
     log_energy: Float[np.ndarray, "slices peaks"]
     highest: Int[np.ndarray, " peaks"]
 
     def dioptres(self, focus_dioptres: Float[np.ndarray, " slices"]) -> Float[np.ndarray, " peaks"]:
-        """Vertices of parabolas through up to three slices on either side of the highest, placed at their focus; NaN where one
-        opens upwards. As many on one side as on the other: the curve is wider than a parabola, which would pull the vertex. Slices whose
-        focus is NaN are none of them, and what is sharpest there has no vertex."""
+        """Return the vertices of parabolas through up to three slices on either side of the highest; NaN if one opens upwards.
+
+        Both sides have the same number of slices: the curve is wider than a parabola, and an uneven choice would shift the vertex. Slices
+        with
+        NaN focus are not used, and points that are sharpest there have no vertex.
+        """
         vertices = np.full(len(self.points), np.nan)
         for slice_index in np.unique(self.highest):
             mine = self.highest == slice_index
@@ -66,13 +75,13 @@ class SharpnessPeaks:
 
 
 def _reach(known: Bool[np.ndarray, " slices"], middle: int) -> int:
-    """How many neighbours on either side are known without a gap, up to _REACH; 0 where the middle itself is not."""
+    """Return how many neighbours on either side are known without a gap, up to _REACH; 0 if the middle is unknown."""
     reaches = (n for n in range(_REACH, 0, -1) if middle >= n and middle + n < len(known) and known[middle - n : middle + n + 1].all())
     return next(reaches, 0)
 
 
 def sharpness_curves(slices: Iterable[Float32[np.ndarray, "height width 3"]], xy_px: Float[np.ndarray, "points 2"]) -> Curves:
-    """Energy of each point in each registered slice (linear RGB); one slice is held at a time."""
+    """Return the energy of each point in each registered slice (linear RGB); one slice is held at a time."""
     places = (xy_px - 0.5).astype(np.float32)
     rows = []
     for rgb in slices:
@@ -83,7 +92,7 @@ def sharpness_curves(slices: Iterable[Float32[np.ndarray, "height width 3"]], xy
 
 
 def sharpness_peaks(curves: Curves) -> SharpnessPeaks:
-    """Points whose sharpest slice is neither the first nor the last, and at least thrice as sharp as the least sharp."""
+    """Keep points whose sharpest slice is neither the first nor the last, and at least three times as sharp as the least sharp."""
     log_energy = np.log(np.maximum(curves, 1e-20))
     highest = np.argmax(log_energy, axis=0)
     inside = (highest > 0) & (highest < len(curves) - 1)
@@ -92,23 +101,13 @@ def sharpness_peaks(curves: Curves) -> SharpnessPeaks:
     return SharpnessPeaks(points, log_energy[:, points], highest[points])
 
 
-FEWEST_POINTS = 50
-OFFSET_SIGMA_M = 0.03
-"""How far the entrance pupil of a photographic lens may well lie from where its focus distances count."""
-SIGNIFICANT = 3.0
-"""Standard deviations from 0 at which an offset counts."""
-
-_NO_OFFSET_M = 1e-6
-_STEPS = 25
-_LEAST_STATED_SIGMA = 0.001
-
-
 @dataclass(frozen=True)
 class FocusSample:
-    """Peaks of one stack. depth: of its peaks, in model units. focus_dioptres: as stated, NaN where unknown.
+    """Peaks of one stack.
 
-    stated_sigma: one standard deviation of these, by the intervals that the cameras' codes stand for; 0 where nothing is known of it,
-    inf where a sentinel stands for the distance: such a slice has no say.
+    depth: of its peaks, in model units. focus_dioptres: as stated, NaN where unknown.
+    stated_sigma: standard deviation of these, from the intervals of the cameras' codes; 0 where unknown, inf where a sentinel stands for
+    the distance: such a slice has no weight.
     """
 
     view: str
@@ -120,20 +119,27 @@ class FocusSample:
 
 
 def focus_sample(model: SparseModel, view: str, stack: FocalStack) -> FocusSample:
-    """Sharpness of the stack's registered slices at the points that the view observes."""
+    """Measure the sharpness of the stack's registered slices at the points that the view observes."""
     if not stack.registered:
         raise InputError(f"{stack.folder} is not registered: run `mrbokeh capture merge` on it")
     xy_px, depth = model.depths_in(view)
     curves = sharpness_curves(track(stack.iter_rgb(), f"{view}: sharpness", len(stack)), xy_px)
     peaks = sharpness_peaks(curves)
     stated = np.array([np.nan if distance is None else 1.0 / distance for distance in stated_distances_m(stack)])
-    return FocusSample(view, peaks, xy_px[peaks.points], depth[peaks.points], stated, stated_sigma_dioptre(stack))
+    return FocusSample(
+        view=view,
+        peaks=peaks,
+        xy_px=xy_px[peaks.points],
+        depth=depth[peaks.points],
+        focus_dioptres=stated,
+        stated_sigma=stated_sigma_dioptre(stack),
+    )
 
 
 def stated_sigma_dioptre(stack: FocalStack) -> Float[np.ndarray, " slices"]:
-    """Of a distance that may lie anywhere in its interval: the width over the square root of 12; inf where it is stated by a sentinel.
+    """Return the standard deviation of a distance anywhere in its interval: the width over the square root of 12; inf for a sentinel.
 
-    A sentinel's interval has a width too, but is one-sided about its infinity: that would pull all one way, however little it weighs.
+    A sentinel's interval has a width too, but is one-sided about its infinity and would bias the result, however little it weighs.
     """
     intervals = [(each.metadata.get("focus") or {}).get("lens_interval_dioptre") or (0.0, 0.0) for each in stack.slices]
     widths = np.array([abs(float(upper) - float(lower)) for lower, upper in intervals])
@@ -142,7 +148,7 @@ def stated_sigma_dioptre(stack: FocalStack) -> Float[np.ndarray, " slices"]:
 
 @dataclass(frozen=True)
 class _Peaks:
-    """Peaks of all stacks in one: dioptre by the stated distances, depth in units, group: the stated distance it is sharpest at."""
+    """Peaks of all stacks: dioptre by the stated distances, depth in units, group: the stated distance at which each is sharpest."""
 
     dioptre: Float[np.ndarray, " peaks"]
     depth: Float[np.ndarray, " peaks"]
@@ -151,10 +157,10 @@ class _Peaks:
 
 
 def focus_scale(samples: Sequence[FocusSample]) -> ScaleAnswer:
-    """Robust fit of the scale and one offset; each stated distance may be off by an error that its points share.
+    """Fit the scale and one offset robustly; each stated distance may have an error that its points share.
 
-    Scale and offset pull on each other, so an offset that is not told apart from 0 is set to 0; what that would change in the
-    scale counts as uncertainty.
+    Scale and offset are correlated, so an offset that is not significant is set to 0; the resulting change of the scale counts as
+    uncertainty.
     """
     peaks = _joined(samples, 0.0)
     if len(peaks.depth) < FEWEST_POINTS:
@@ -183,7 +189,10 @@ def focus_scale(samples: Sequence[FocusSample]) -> ScaleAnswer:
 
 @dataclass(frozen=True)
 class _Fit:
-    """scale_sigma is relative. residual_dioptre: of one peak. stated_sigma_dioptre: of the stated distances, beyond their peaks' noise."""
+    """A fitted scale and offset.
+
+    scale_sigma is relative. residual_dioptre: of one peak. stated_sigma_dioptre: of the stated distances, beyond their peaks' noise.
+    """
 
     scale: float
     scale_sigma: float
@@ -194,10 +203,10 @@ class _Fit:
 
 
 def _fit(peaks: _Peaks, offset_sigma_m: float) -> _Fit:
-    """Gauss-Newton on the means of the groups, Cauchy-weighted within each.
+    """Run Gauss-Newton on the means of the groups, Cauchy-weighted within each.
 
-    Groups count by their points, for noise is even over the picture; but how sure the result is depends on how far whole groups
-    are off, as they show it and as the stated intervals allow: a sandwich covariance (Huber 1967).
+    Groups count by their points, since noise is uniform over the picture; but the uncertainty of the result depends on the errors of
+    whole groups, as observed and as the stated intervals allow: a sandwich covariance (Huber 1967).
     """
     scale, offset_m = float(np.median(1.0 / (peaks.dioptre * peaks.depth))), 0.0
     members = [np.flatnonzero(peaks.group == group) for group in np.unique(peaks.group)]
@@ -217,11 +226,18 @@ def _fit(peaks: _Peaks, offset_sigma_m: float) -> _Fit:
     inverse = np.linalg.inv(normal)
     meat = (weighted * (noise + between)[:, None]).T @ weighted + prior
     sigma = np.sqrt(np.diag(inverse @ meat @ inverse))
-    return _Fit(scale, float(sigma[0]), offset_m, float(sigma[1]), deviation(off), float(np.sqrt(np.mean(between))))
+    return _Fit(
+        scale=scale,
+        scale_sigma=float(sigma[0]),
+        offset_m=offset_m,
+        offset_sigma_m=float(sigma[1]),
+        residual_dioptre=deviation(off),
+        stated_sigma_dioptre=float(np.sqrt(np.mean(between))),
+    )
 
 
 def _group_means(off: np.ndarray, slopes: np.ndarray, members: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(robust mean of each group, its variance from noise, its derivatives by log scale and offset)."""
+    """Return (robust mean of each group, its variance from noise, its derivatives by log scale and offset)."""
     means, noise, directions = [], [], []
     for mine in members:
         middle = np.median(off[mine])
@@ -234,7 +250,7 @@ def _group_means(off: np.ndarray, slopes: np.ndarray, members: Sequence[np.ndarr
 
 
 def _joined(samples: Sequence[FocusSample], offset_m: float) -> _Peaks:
-    """Peaks by the distances as stated; their parabolas lie where the blur is even: in dioptres from the pupil, by this offset."""
+    """Join the peaks of all stacks by their stated distances; parabolas are fitted in dioptres from the pupil, by this offset."""
     dioptres, depths, groups, sigmas = [np.zeros(0)], [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros(0)]
     stated: dict[float, int] = {}
     for sample in samples:

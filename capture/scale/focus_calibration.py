@@ -1,13 +1,11 @@
-"""Where each slice of a stack is really focused and how fast its blur grows, found against depth from several views.
+"""The true focus of each slice of a stack and the growth of its blur, found against depth from several views.
 
-Blur around points of known depth is c = k_i |F_i - 1 / z| in slice i: both flanks of a V over the dioptres, whose tip is the focus
-F_i (from the entrance pupil) and whose slope is k_i. A thin lens has k_i = Lens.coc_px_per_dioptre, but lenses that focus by
-moving glass inside change focal length and pupil, and f-numbers are nominal; EXIF's focus is coarse and counts from elsewhere.
+Blur around points of known depth is c = k_i |F_i - 1 / z| in slice i: a V over the dioptres, whose tip is the focus F_i (from the
+entrance pupil) and whose slope is k_i. A thin lens has k_i = Lens.coc_px_per_dioptre, but lenses with internal focusing change focal
+length and pupil, and f-numbers are nominal; EXIF's focus is coarse and has another origin.
 
-How wide the blur is around points of known depth: the disc that turns the all-in-focus picture into the slice.
-
-Around each point the all-in-focus picture, blurred by openings of growing diameter, is held against the slice; the diameter that
-fits best is the point's circle of confusion.
+The diameter c of a point is measured by comparing its surroundings in the slice with the all-in-focus picture blurred by openings
+of growing diameter.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,11 +28,22 @@ _WELL_MATCHED = 0.2
 _PIXEL_IN_DISC_PX2 = 4.0 / 3.0
 
 Plane = Float32[np.ndarray, "height width"]
+FEWEST_SAMPLES = 60
+LEAST_BLUR_PX = 2.0
+FOCUS_SIGMA_DIOPTRE = 0.05
+"""How far a first idea of the focus may well be off: half a step of Nikon's 8-bit code is 0.03 to 0.06 dioptres at 0.5 to 1 m."""
+GROWTH_SIGMA = 0.01
+"""How far the growth in one slice, over that of a thin lens, may well differ from the growth in the others."""
+_DIAMETER_SIGMA_PX = 0.1
+_COMMON_ERROR_PX = 0.06  # of all diameters of a slice alike: what the foci of a traced lab of 12 slices were off, times their growth
+_PASSES = 4
+_TRIED = 101
+_ROUGH_PX = 0.5
 
 
 @dataclass(frozen=True)
 class BlurSamples:
-    """Diameters of circles of confusion, measured. slices, points: indices of each; diameter_px: in the registered slice."""
+    """Measured circles of confusion. slices, points: indices of each; diameter_px: in the registered slice."""
 
     slices: Int[np.ndarray, " samples"]
     points: Int[np.ndarray, " samples"]
@@ -42,7 +51,10 @@ class BlurSamples:
 
 
 def measure_blur(all_in_focus: Plane, slices: Iterable[Plane], xy_px: Float[np.ndarray, "points 2"], aperture: Aperture) -> BlurSamples:
-    """all_in_focus, slices: luminance in one geometry. Only what fits well and lies between 2 and 14 px is returned."""
+    """Measure the blur around points; only well-fitting diameters between 2 and 14 px are returned.
+
+    all_in_focus, slices: luminance in one geometry.
+    """
     blurred = [_blurred(all_in_focus, diameter, aperture) for diameter in _DIAMETERS_PX]
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for index, plane in enumerate(slices):
@@ -55,9 +67,9 @@ def measure_blur(all_in_focus: Plane, slices: Iterable[Plane], xy_px: Float[np.n
 def best_diameters(
     plane: Plane, sharp: Plane, blurred: Sequence[Plane], xy_px: Float[np.ndarray, "points 2"]
 ) -> Float[np.ndarray, " points"]:
-    """Diameter of the blur nearest to the slice around each point; NaN where none is much nearer than no blur.
+    """Return the diameter of the blur nearest to the slice around each point; NaN if none is much nearer than no blur.
 
-    A rasterized opening takes in the pixel's own square, which the sharp picture has once already. A disc of diameter c has
+    A rasterized opening includes the pixel's own square, which the sharp picture has once already. A disc of diameter c has
     the variance c^2 / 16 along an axis, a pixel 1/12, so what fits as c is sqrt(c^2 + 4/3).
     """
     places = (xy_px - 0.5).astype(np.float32)
@@ -79,7 +91,7 @@ def _blurred(picture: Plane, diameter_px: float, aperture: Aperture) -> Plane:
 
 
 def _unlike(a: Plane, b: Plane, places: Float32[np.ndarray, "points 2"]) -> Float[np.ndarray, " points"]:
-    """Variance of the difference within a window: a constant that leaks in from beyond it does not count."""
+    """Return the variance of the difference within a window, which ignores a constant that leaks in from beyond it."""
     difference = a - b
     size = (WINDOW_PX, WINDOW_PX)
     variance = cv2.blur(difference**2, size) - cv2.blur(difference, size) ** 2
@@ -87,27 +99,12 @@ def _unlike(a: Plane, b: Plane, places: Float32[np.ndarray, "points 2"]) -> Floa
     return sampled.ravel().astype(np.float64)
 
 
-FEWEST_SAMPLES = 60
-LEAST_BLUR_PX = 2.0
-FOCUS_SIGMA_DIOPTRE = 0.05
-"""How far a first idea of the focus may well be off: half a step of Nikon's 8-bit code is 0.03 to 0.06 dioptres at 0.5 to 1 m."""
-
-GROWTH_SIGMA = 0.01
-"""How far the growth in one slice, over that of a thin lens, may well differ from the growth in the others."""
-
-_DIAMETER_SIGMA_PX = 0.1
-_COMMON_ERROR_PX = 0.06  # of all diameters of a slice alike: what the foci of a traced lab of 12 slices were off, times their growth
-_PASSES = 4
-_TRIED = 101
-_ROUGH_PX = 0.5
-
-
 @dataclass(frozen=True)
 class FocusStart:
-    """First ideas: focus dioptres of the slices, and how their growth of blur compares (a thin lens's px per dioptre, or all 1).
+    """First estimates: focus dioptres of the slices, and the relative growth of their blur (a thin lens's px per dioptre, or all 1).
 
-    sigma_dioptre: how far the dioptres may well be off, of all slices or of each. beyond: slices of which nothing else is known than that
-    they are focused beyond all others, so that their focus is looked for there: from too far a start the fit finds a wrong one.
+    sigma_dioptre: the error to expect in the dioptres, of all slices or of each. beyond: slices known only to be focused beyond all others,
+    so that their focus is searched there: too far a start would lead the fit to a wrong one.
     """
 
     dioptres: Float[np.ndarray, " slices"]
@@ -118,9 +115,10 @@ class FocusStart:
 
 @dataclass(frozen=True)
 class FocusFit:
-    """dioptres: focus of each slice, 1 / metres from the entrance pupil. px_per_dioptre: of the registered slices measured.
+    """The calibrated focus of each slice.
 
-    sigma_dioptre: one standard deviation of each focus. samples: how many measured diameters tell of each slice.
+    dioptres: 1 / metres from the entrance pupil. px_per_dioptre: of the registered slices measured.
+    sigma_dioptre: one standard deviation of each focus. samples: measured diameters in each slice.
     """
 
     dioptres: Float[np.ndarray, " slices"]
@@ -130,7 +128,7 @@ class FocusFit:
 
 
 def calibrate_focus(blur: BlurSamples, point_dioptres: Float[np.ndarray, " points"], start: FocusStart) -> FocusFit:
-    """Robust fit (Cauchy's loss) of all V's of a stack; where nothing tells, the start stays.
+    """Fit all V's of a stack robustly (Cauchy's loss); without samples a slice keeps its start.
 
     point_dioptres: 1 / metres of the points by the scaled model.
     """
@@ -158,7 +156,7 @@ def calibrate_focus(blur: BlurSamples, point_dioptres: Float[np.ndarray, " point
 
 @dataclass(frozen=True)
 class _Fit:
-    """Parameters: log of the common growth, the deviations of the slices from it, their focus dioptres."""
+    """The least-squares problem. Parameters: log of the common growth, the deviations of the slices from it, their focus dioptres."""
 
     slices: np.ndarray
     point_dioptre: np.ndarray
@@ -175,7 +173,7 @@ class _Fit:
         return np.concatenate([[np.log(common)], np.zeros(len(dioptres)), dioptres])
 
     def _looked_for(self, index: int, common: float) -> float:
-        """The focus between infinity and the others' that explains most samples of a slice; where it has none, that of the start."""
+        """Return the focus between infinity and the other slices that explains most samples of a slice; the start without samples."""
         mine, others = self.slices == index, np.delete(self.start.dioptres, self.start.beyond)
         if not mine.any() or not others.size:
             return float(self.start.dioptres[index])
@@ -192,7 +190,7 @@ class _Fit:
         return np.asarray(growth[self.slices] * np.abs(dioptres[self.slices] - self.point_dioptre))
 
     def measurable(self, values: np.ndarray) -> np.ndarray:
-        """By prediction and not by measurement, which would prefer those that noise has pushed inside."""
+        """Select by the predicted diameter; selecting by the measured one would prefer those that noise has pushed inside."""
         predicted = self.predicted_px(values)
         return (predicted > LEAST_BLUR_PX) & (predicted < MOST_BLUR_PX)
 
@@ -207,7 +205,7 @@ class _Fit:
         return np.concatenate([uneven, moved]) / CAUCHY_95
 
     def jacobian(self, values: np.ndarray, within: np.ndarray) -> np.ndarray:
-        """Derivatives of the residuals: (samples within + two priors for each slice, parameters)."""
+        """Return the derivatives of the residuals: (samples within + two priors for each slice, parameters)."""
         count, slices = len(self.start.dioptres), self.slices[within]
         dioptres, growth = self.meaning(values)
         off = dioptres[slices] - self.point_dioptre[within]

@@ -1,4 +1,4 @@
-"""The calibration of focus for the stacks of a scaled scene, and the lens calibration that they give together."""
+"""Focus calibration of the stacks of a scaled scene, and the lens calibrations that follow from them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ _UNKNOWN_SIGMA_DIOPTRE = 0.5
 
 @dataclass(frozen=True)
 class StackFocus:
-    """fit: px_per_dioptre at the width of the stack's registered pictures."""
+    """The calibrated focus of one stack. fit: px_per_dioptre at the width of the stack's registered pictures."""
 
     stack: FocalStack
     fit: FocusFit
@@ -53,13 +53,13 @@ def stack_focus(metric: SparseModel, view: str, stack: FocalStack, start: FocusS
 
 
 def spread_points(xy_px: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " chosen"]:
-    """One point for each square of the size of a window: neighbours see the same pixels and would only seem to confirm each other."""
+    """Choose one point per window-sized square: neighbours share pixels and are not independent."""
     cells = np.floor(xy_px / WINDOW_PX).astype(np.int64)
     return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
 def reduced(plane: Plane, factor: int) -> Float32[np.ndarray, "reduced_height reduced_width"]:
-    """Means of factor x factor pixels; what is left over at the right and below is cut off."""
+    """Average blocks of factor x factor pixels; incomplete blocks at the right and bottom are dropped."""
     if factor == 1:
         return plane
     height, width = plane.shape[0] // factor, plane.shape[1] // factor
@@ -67,8 +67,8 @@ def reduced(plane: Plane, factor: int) -> Float32[np.ndarray, "reduced_height re
 
 
 def focus_start(stack: FocalStack, sample: FocusSample, metres_per_unit: float, offset_m: float, width_px: int) -> FocusStart:
-    """Start as stated, less the offset of the lens, and hardly trusting a sentinel; where distances are unknown, from the points that are
-    sharpest in each slice.
+    """Start from the stated distances less the offset of the lens, hardly trusting a sentinel; without distances, from the depths of the
+    points that are sharpest in each slice.
     """
     count = len(stack)
     growth = np.ones(count)
@@ -93,7 +93,7 @@ def focus_start(stack: FocalStack, sample: FocusSample, metres_per_unit: float, 
 
 
 def calibrated_stack(found: StackFocus, view: SparseView) -> FocalStack:
-    """The stack with its calibrated focus, and with the camera (in metres) and the distortion that the views gave it."""
+    """Return the stack with its calibrated focus, its camera (in metres) and the distortion of its view."""
     stack, slices = found.stack, []
     rows = zip(stack.slices, stated_distances_m(stack), found.fit.dioptres, found.fit.px_per_dioptre, strict=True)
     for each, stated_m, dioptre, growth in rows:
@@ -102,7 +102,7 @@ def calibrated_stack(found: StackFocus, view: SparseView) -> FocalStack:
 
 
 def _with_known_metres(stack: FocalStack) -> FocalStack:
-    """Say of a stack whose metres were guessed before that they rest on the camera poses now."""
+    """Record that metres that were guessed before now rest on the camera poses."""
     if METRES not in stack.metadata:
         return stack
     return replace(stack, metadata=stack.metadata | {METRES: {"known": True, "why": "metres rest on the camera poses"}})
@@ -113,7 +113,7 @@ def with_view(stack: FocalStack, view: SparseView) -> FocalStack:
 
 
 def lens_calibrations(found: Mapping[str, StackFocus], offset_m: float) -> list[LensCalibration]:
-    """One for each lens (model, focal length, f-number) among the stacks, the one with the most stacks first."""
+    """Return one calibration for each lens (model, focal length, f-number) among the stacks, the one with the most stacks first."""
     groups: dict[tuple[str | None, float, float], list[StackFocus]] = {}
     for each in found.values():
         if each.stack.lens is not None:
@@ -125,7 +125,7 @@ def lens_calibrations(found: Mapping[str, StackFocus], offset_m: float) -> list[
 
 
 def _rows(members: Sequence[StackFocus]) -> tuple[CalibratedFocus, ...]:
-    """One for each stated focus, weighted by how sure each stack is; unknown ones and sentinels, which state none, stay apart."""
+    """Return one row for each stated focus, weighted by each stack's certainty; unknown ones and sentinels stay separate."""
     width_px = members[0].width_px
     alike: dict[object, list[CalibratedFocus]] = {}
     for number, each in enumerate(members):
@@ -135,7 +135,13 @@ def _rows(members: Sequence[StackFocus]) -> tuple[CalibratedFocus, ...]:
         for index, (photo, stated_m, dioptre, growth, sigma) in enumerate(zip(*columns, strict=True)):
             stated = None if stated_m is None else 1.0 / stated_m
             per_dioptre = float(growth) / photo.scale * width_px / each.width_px
-            row = CalibratedFocus(stated, float(dioptre), per_dioptre, photo.scale, float(sigma))
+            row = CalibratedFocus(
+                stated_dioptre=stated,
+                dioptre=float(dioptre),
+                px_per_dioptre=per_dioptre,
+                breathing_scale=photo.scale,
+                sigma_dioptre=float(sigma),
+            )
             alike.setdefault((number, index) if stated is None else round(stated, 5), []).append(row)
     return tuple(sorted((_mean(rows) for rows in alike.values()), key=lambda row: row.dioptre))
 
@@ -147,4 +153,11 @@ def _mean(rows: Sequence[CalibratedFocus]) -> CalibratedFocus:
         return float(np.average([getattr(row, name) for row in rows], weights=weight))
 
     sigma = float(weight.sum() ** -0.5)
-    return CalibratedFocus(rows[0].stated_dioptre, mean("dioptre"), mean("px_per_dioptre"), mean("breathing_scale"), sigma, len(rows))
+    return CalibratedFocus(
+        stated_dioptre=rows[0].stated_dioptre,
+        dioptre=mean("dioptre"),
+        px_per_dioptre=mean("px_per_dioptre"),
+        breathing_scale=mean("breathing_scale"),
+        sigma_dioptre=sigma,
+        stacks=len(rows),
+    )

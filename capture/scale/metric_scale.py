@@ -1,7 +1,4 @@
-"""The scale of a scene's camera poses in metres by every means at hand, and what follows from it: calibrated focus, metric cameras.
-
-What was found about scale and focus, in lines for people.
-"""
+"""The metric scale of a scene's camera poses by every available method, then calibrated focus and cameras in metres."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -11,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.poses.colmap_job import job_from_json
+from capture.poses.colmap_job import JOB_NAME, RECONSTRUCTION_FOLDER, job_from_json
 from capture.poses.lens_calibration import FILE_NAME as CALIBRATION_NAME
 from capture.poses.lens_calibration import LensCalibration, write_calibrated, write_lens_calibration
 from capture.poses.sparse_model import POSES_NAME, SCALE_NAME, SparseModel, read_sparse_model
@@ -26,15 +23,15 @@ from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard
 
-RECONSTRUCTION_FOLDER = "reconstruction"
-JOB_NAME = "colmap_job.json"
-
 Picture = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
 class ScaleRequest:
-    """board: that lies in the scene. distance: (view, view, metres) between two camera centres. calibrate: also the focus."""
+    """Options of `mrbokeh capture scale`.
+
+    board: lies in the scene. distance: (view, view, metres) between two camera centres. calibrate: also the focus.
+    """
 
     board: CharucoBoard | None = None
     distance: tuple[str, str, float] | None = None
@@ -44,7 +41,10 @@ class ScaleRequest:
 
 @dataclass(frozen=True)
 class ScaledScene:
-    """calibrated: the fit of each stack. uncalibrated: why others have none. written: lens calibrations, the scene's own first."""
+    """The result of scaling.
+
+    calibrated: the fit of each stack. uncalibrated: why others have none. calibrations: written, the scene's own first.
+    """
 
     result: ScaleResult
     calibrated: Mapping[str, StackFocus] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class ScaledScene:
 def scale_scene(scene: Path | str, request: ScaleRequest) -> ScaledScene:
     """Write scale.json; for stacks also lens_calibration.json, and into stack.json the calibrated focus and the metric camera.
 
-    A scale that is there already is kept. Raises InputError where no method answers, or one that was asked for does not.
+    An existing scale is kept. Raises InputError if no method answers, or a requested one does not.
     """
     scene = Path(scene)
     folder = reconstruction_folder(scene)
@@ -72,7 +72,7 @@ def scale_scene(scene: Path | str, request: ScaleRequest) -> ScaledScene:
 
 
 def _kept(folder: Path, request: ScaleRequest) -> ScaleResult:
-    """The scale that is there. Raises InputError where something is asked for that it does not rest on."""
+    """Return the existing scale. Raises InputError if it does not rest on everything that is requested."""
     kept = read_scale(folder)
     facts = {each.method: each.facts for each in kept.answers}
     if request.board is not None and "board" not in facts:
@@ -85,19 +85,19 @@ def _kept(folder: Path, request: ScaleRequest) -> ScaleResult:
 
 
 def reconstruction_folder(scene: Path) -> Path:
-    """SCENE/reconstruction, or the folder itself where plain pictures were reconstructed into it."""
+    """Return SCENE/reconstruction, or the folder itself if plain pictures were reconstructed into it."""
     return scene if (scene / POSES_NAME).exists() else scene / RECONSTRUCTION_FOLDER
 
 
 def merged_stacks(scene: Path, model: SparseModel) -> dict[str, FocalStack]:
-    """The stacks of the model's views, so far as there are any and they are merged."""
+    """Return the merged stacks among the model's views."""
     folders = {view.name: scene / view.name for view in model.views}
     stacks = {name: read_focal_stack(folder) for name, folder in folders.items() if (folder / STACK_NAME).is_file()}
     return {name: stack for name, stack in stacks.items() if stack.registered and stack.merged}
 
 
 def _answers(model: SparseModel, folder: Path, samples: Mapping[str, FocusSample], request: ScaleRequest) -> ScaleResult:
-    """What was asked for must answer; the focus distances are tried in any case."""
+    """Collect the answers: requested methods must answer; the focus distances are tried in any case."""
     answers: list[ScaleAnswer] = []
     missing = {"board": "none was given (--board)", "distance": "none was given (--distance)"}
     if request.board is not None:
@@ -121,7 +121,7 @@ def _focus_answer(samples: Mapping[str, FocusSample]) -> ScaleAnswer:
 
 
 def view_pictures(model: SparseModel, folder: Path) -> Iterator[Picture]:
-    """The 8-bit pictures that the poses were found with, in the order of the views."""
+    """Yield the 8-bit pictures that the poses were found with, in the order of the views."""
     job = job_from_json(read_json(folder / JOB_NAME, "what COLMAP was asked to do (run `mrbokeh capture poses --overwrite`)"))
     for view in model.views:
         path = folder / job.pictures_folder / job.file_of(view.name)
@@ -134,7 +134,7 @@ def view_pictures(model: SparseModel, folder: Path) -> Iterator[Picture]:
 def _calibrated(
     scene: Path, model: SparseModel, stacks: Mapping[str, FocalStack], samples: Mapping[str, FocusSample], result: ScaleResult
 ) -> ScaledScene:
-    """stack.json of every stack gets its camera; a stack whose focus cannot be calibrated keeps its stated distances."""
+    """Write the camera into stack.json of every stack; a stack whose focus cannot be calibrated keeps its stated distances."""
     metric = model.times(result.used.metres_per_unit)
     offset_m = offset_of(result)
     calibrated, uncalibrated = {}, {}
@@ -159,12 +159,12 @@ def _calibrated(
 
 
 def numbered(name: str, number: int) -> str:
-    """name.json for the first, name_2.json for the second."""
+    """Return name.json for the first, name_2.json for the second."""
     return name if number == 0 else name.replace(".json", f"_{number + 1}.json")
 
 
 def offset_of(result: ScaleResult) -> float:
-    """The offset of the lens that came with the focus distances; 0 where they have no answer."""
+    """Return the lens offset of the focus answer; 0 if there is none."""
     return next((float(each.facts["offset_m"]) for each in result.answers if each.method == "focus"), 0.0)
 
 

@@ -1,1 +1,1 @@
-"""Focus bracketing: how many slices, and a camera that takes them one after another."""
+"""Focus bracketing: plan the slices of a focus stack and let a tethered camera take them one after another."""

@@ -1,9 +1,8 @@
-"""What every tethered camera can be asked for, whatever stands behind it.
+"""The driver protocol of tethered cameras, and the scale of their focus motors.
 
-What the steps of a focus motor mean: pairs of (steps from an end stop, dioptres), read off the lens once.
-
-Cameras move their motors by steps and tell no position. Counted from an end stop the steps are repeatable, and dioptres grow
-evenly with the extension of a thin lens, so that two known distances give the whole scale; more of them bend it piecewise.
+Cameras move their motors by steps and do not report a position. Counted from an end stop the steps are repeatable, and dioptres
+grow linearly with the extension of a thin lens. Two known distances therefore give the whole scale; more of them make it
+piecewise linear.
 
     {"format": "mrbokeh-focus-steps", "version": 1, "stop": "near", "points": [[180, 2.0], [1450, 0.5]]}
 """
@@ -22,6 +21,7 @@ from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-focus-steps"
 VERSION = 1
+Preview = UInt8[np.ndarray, "height width 3"]
 
 
 class Stop(StrEnum):
@@ -32,15 +32,15 @@ class Stop(StrEnum):
 
     @property
     def away(self) -> int:
-        """The sign of steps that lead away from it, + being towards infinity."""
+        """Return the sign of steps that lead away from this stop; + is towards infinity."""
         return 1 if self is Stop.near else -1
 
 
 @dataclass(frozen=True)
 class FocusSteps:
-    """points: (steps away from the stop, dioptres from the lens), at least two, in the order of their steps.
+    """The scale of a focus motor, measured while moving away from the stop only, so that play is part of it.
 
-    Steps count what the motor was told, moving away from the stop only: play is then part of the scale.
+    points: (steps away from the stop, dioptres from the lens), at least two, in the order of their steps.
     """
 
     stop: Stop
@@ -55,7 +55,7 @@ class FocusSteps:
             )
 
     def steps_at(self, dioptre: float) -> int:
-        """Whole steps from the stop; beyond the points the nearest two are continued."""
+        """Return whole steps from the stop; beyond the points the nearest segment is extrapolated."""
         steps, dioptres = np.array(self.points).T
         return round(_piecewise(dioptre * -self.stop.away, dioptres * -self.stop.away, steps))
 
@@ -65,13 +65,13 @@ class FocusSteps:
 
     @property
     def dioptres_per_step(self) -> float:
-        """On average over the points, positive."""
+        """Return the mean over the points, positive."""
         (first, start), (last, end) = self.points[0], self.points[-1]
         return abs(end - start) / (last - first)
 
 
 def _piecewise(x: float, known_x: np.ndarray, known_y: np.ndarray) -> float:
-    """Through the points in straight lines, the outer ones continued; known_x rises."""
+    """Interpolate linearly between the points and extrapolate the outer segments; known_x rises."""
     segment = int(np.clip(np.searchsorted(known_x, x) - 1, 0, len(known_x) - 2))
     (x0, x1), (y0, y1) = known_x[segment : segment + 2], known_y[segment : segment + 2]
     return float(y0 + (x - x0) * (y1 - y0) / (x1 - x0))
@@ -100,11 +100,8 @@ def steps_from_json(document: Any, where: str) -> FocusSteps:
         raise error if isinstance(error, InputError) else InputError(f"{where}: this scale is damaged ({error!r})") from None
 
 
-Preview = UInt8[np.ndarray, "height width 3"]
-
-
 class CameraError(InputError):
-    """The camera did not answer, or answered that it cannot. What was shot before is kept."""
+    """The camera did not answer, or refused. Everything shot before is kept."""
 
 
 class EndStop(Exception):  # noqa: N818 - it tells where the lens is, and is no error while homing
@@ -120,7 +117,10 @@ class Ability(StrEnum):
 
 @dataclass(frozen=True)
 class CameraDescription:
-    """name: the model; port: where it is connected. focus_steps: where a camera knows what its steps mean."""
+    """A camera and its abilities.
+
+    name: the model. port: where it is connected. focus_steps: the scale of its motor, None if the camera does not know it.
+    """
 
     name: str
     port: str
@@ -130,9 +130,9 @@ class CameraDescription:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What stays the same in all slices; None keeps what the camera has.
+    """Settings shared by all slices; None keeps the camera's own.
 
-    exposure_time_s: seconds; white_balance: a word of the camera's own list, such as "Daylight", that is not automatic.
+    exposure_time_s: seconds. white_balance: one of the camera's own words, such as "Daylight", and not automatic.
     """
 
     exposure_time_s: float | None = None
@@ -143,7 +143,7 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class Shot:
-    """One photograph as the camera's file. name: the camera's own name for it. steps: its step counter, None without motor."""
+    """One photograph as the camera's file. name: the camera's own name for it. steps: its step counter, None without a motor."""
 
     data: bytes
     name: str
@@ -152,34 +152,34 @@ class Shot:
 
 @runtime_checkable
 class CameraDriver(Protocol):
-    """A camera on a cable, in a folder or in memory. All methods raise CameraError where the camera fails.
+    """A camera on a cable, in a folder or in memory. All methods raise CameraError if the camera fails or lacks the ability.
 
-    Counted steps are positive towards infinity. What an ability is missing for raises CameraError, too.
+    Counted steps are positive towards infinity.
     """
 
     def describe(self) -> CameraDescription: ...
 
     def configure(self, settings: CameraSettings) -> dict[str, str]:
-        """Manual exposure, RAW, a fixed white balance, autofocus off, as far as it can; what is set now, by name.
+        """Set manual exposure, RAW, a fixed white balance and autofocus off as far as possible; return what is set now, by name.
 
-        Raises InputError where the exposure would stay automatic.
+        Raises InputError if the exposure would stay automatic.
         """
         ...
 
     def preview(self) -> Preview:
-        """One frame of the live view, encoded for display (sRGB)."""
+        """Return one frame of the live view, encoded for display (sRGB)."""
         ...
 
     def focus_step(self, steps: int) -> None:
-        """Drive the focus motor; positive goes to infinity. Raises EndStop where it cannot make all of the steps."""
+        """Drive the focus motor; positive goes to infinity. Raises EndStop if it cannot make all of the steps."""
         ...
 
     def home(self, stop: Stop) -> None:
-        """Drive against an end stop and count from there: the step counter is 0."""
+        """Drive against an end stop and reset the step counter to 0 there."""
         ...
 
     def capture(self) -> Shot:
-        """Release the shutter (or wait for the photographer) and take over the whole file."""
+        """Release the shutter (or wait for the photographer) and return the whole file."""
         ...
 
     def close(self) -> None: ...

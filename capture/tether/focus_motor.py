@@ -1,9 +1,9 @@
-"""A focus motor that only counts, made to return to the same place: from an end stop, always arriving in the same direction.
+"""Repeatable positions of a focus motor that only counts steps, and the measurement of its scale.
 
-Gears have play: after turning round, the first steps move nothing. A place is therefore always reached moving away from the
-stop. To go back, the motor first goes `backlash_steps` too far, or to the stop again, and comes forward from there.
+Gears have play: after a reversal the first steps move nothing. A position is therefore always reached moving away from the stop.
+To go back, the motor first goes `backlash_steps` too far, or to the stop again, and approaches from there.
 
-What the steps of a focus motor mean, measured: sweep the focus over targets at known distances and see where each is sharp.
+The scale is measured by sweeping the focus over targets at known distances and finding the steps at which each is sharpest.
 """
 
 import time
@@ -16,6 +16,11 @@ from jaxtyping import Float64
 from capture.tether.camera_driver import CameraDriver, CameraError, EndStop, FocusSteps, Stop
 from capture.tether.live_view import Spot, sharpness
 from mrbokeh.system.errors import InputError
+
+_MOST_POSITIONS = 2000
+_LEVEL = 0.5
+_HIGHEST_LEVEL = 0.9
+_TINY = 1e-12
 
 
 class TravelEndError(CameraError):
@@ -37,7 +42,7 @@ class FocusAxis:
 
     @property
     def steps(self) -> int | None:
-        """Where the motor is, in steps from the stop; None before the first homing."""
+        """Return the position in steps from the stop; None before the first homing."""
         return self._steps
 
     def home(self) -> None:
@@ -48,7 +53,7 @@ class FocusAxis:
     def move_to(self, target: int) -> None:
         """Go to `target` steps from the stop, arriving away from the stop, and wait until the lens has settled.
 
-        Raises TravelEndError where the far end of the travel comes before.
+        Raises TravelEndError if the far end of the travel comes first.
         """
         if target < 0:
             raise CameraError(f"{-target} steps before the {self.stop} stop cannot be reached: plan a range that the lens has")
@@ -81,15 +86,9 @@ class FocusAxis:
         self._steps = (self._steps or 0) + steps
 
 
-_MOST_POSITIONS = 2000
-_LEVEL = 0.5
-_HIGHEST_LEVEL = 0.9
-_TINY = 1e-12
-
-
 @dataclass(frozen=True)
 class Target:
-    """Something with detail, at a known distance from the lens, at a known place of the picture."""
+    """A detailed object at a known distance from the lens and at a known place in the picture."""
 
     spot: Spot
     distance_m: float
@@ -100,7 +99,10 @@ class Target:
 
 @dataclass(frozen=True)
 class FocusSweep:
-    """steps: (P,) positions from the stop; sharpness: (T, P) of each target there."""
+    """Sharpness of each target over a sweep of the focus.
+
+    steps: (P,) positions from the stop. sharpness: (T, P).
+    """
 
     steps: Float64[np.ndarray, " positions"]
     sharpness: Float64[np.ndarray, "targets positions"]
@@ -115,9 +117,9 @@ def measure_focus_steps(
     frames: int = 3,
     advance: Callable[[], None] = lambda: None,
 ) -> FocusSteps:
-    """The scale of a motor from two or more targets at different distances. step: between two readings of the sweep.
+    """Return the scale of a motor from two or more targets at different distances. step: steps between two readings of the sweep.
 
-    Raises InputError where a target is never sharp, or where their order does not fit the stop.
+    Raises InputError if a target is never sharp, or if their order does not fit the stop.
     """
     if len({target.distance_m for target in targets}) < 2:
         raise InputError(f"measuring the steps of a motor needs targets at two distances or more, got {len(targets)}: add a target")
@@ -131,7 +133,7 @@ def measure_focus_steps(
 def sweep_focus(
     axis: FocusAxis, camera: CameraDriver, targets: Sequence[Target], *, step: int, frames: int, advance: Callable[[], None]
 ) -> FocusSweep:
-    """From the stop to the other end of the travel, in the direction in which slices are approached."""
+    """Read the sharpness from the stop to the other end of the travel, in the direction in which slices are approached."""
     axis.home()
     steps, values = [], []
     for position in range(_MOST_POSITIONS):
@@ -149,10 +151,10 @@ def sweep_focus(
 
 
 def peak_steps(sweep: FocusSweep, index: int, target: Target) -> float:
-    """Where one target is sharpest: the middle of what lies above half of its largest sharpness, weighted by how far above.
+    """Return where one target is sharpest: the centroid of the part above half of its largest sharpness, weighted by the excess.
 
-    A live view has few pixels, so that the top is flat and its largest reading is noise; its slopes tell the middle.
-    Near an end of the travel a higher level is taken, of which both slopes are there.
+    A live view has few pixels, so the top of the curve is flat and its largest reading is noise; the slopes determine the middle.
+    Near an end of the travel a higher level is used, so that both slopes lie within the sweep.
     """
     values = sweep.sharpness[index] / max(float(sweep.sharpness[index].max()), _TINY)
     top = int(np.argmax(values))

@@ -1,14 +1,10 @@
-"""A camera on a cable through libgphoto2.
+"""A tethered camera through libgphoto2, its focus motor, and the list of connected cameras.
 
-Focus motors over libgphoto2: Nikon counts steps and reports its ends, Canon makes steps of three sizes and reports nothing.
-
-Both move only while the live view runs and the lens is switched to autofocus. Neither tells where it is. That Nikon's positive
-steps go to infinity follows from Nikon's direction codes (1 to the closest focus, 2 to infinity), of which libgphoto2 takes the
-first for negative numbers; no such camera was at hand to see it, hence `reverse`. Nikon answers with the error of its ends
-also when steps are too small for a lens, or when it does not let itself be driven at all: libgphoto2 tells these apart only in
-its messages.
-
-Which cameras libgphoto2 finds, and opening one of them.
+Nikon motors count steps and report their ends; Canon motors make steps of three sizes and report nothing. Both move only while
+the live view runs and the lens is switched to autofocus, and neither reports its position. That Nikon's positive steps go to
+infinity follows from Nikon's direction codes (1 to the closest focus, 2 to infinity), the first of which libgphoto2 uses for
+negative numbers; no such camera was available for a test, hence `reverse`. Nikon also answers with the error of its ends if steps
+are too small for a lens, or if the lens cannot be driven at all: libgphoto2 distinguishes these only in its messages.
 """
 
 import time
@@ -35,11 +31,16 @@ _ROUNDS_HOME = 4
 # Canon tells no end: as many large steps as take any lens from one end to the other.
 CANON_STEPS_HOME = 60
 Sleep = Callable[[float], None]
+_LIVE_VIEW_SWITCH = ("viewfinder", "eosviewfinder")
+_LIVE_VIEW_SIGNS = (*_LIVE_VIEW_SWITCH, "liveviewsize", "liveviewimagequality", "evfmode")
+_EVENT_WAIT_MS = 200
+_MOST_EVENTS = 50
+Answer = TypeVar("Answer")
 
 
 @runtime_checkable
 class FocusDrive(Protocol):
-    """A motor that goes a number of its own steps, positive towards infinity, and to an end."""
+    """A motor that makes a number of its own steps, positive towards infinity, or drives to an end."""
 
     def step(self, steps: int) -> None: ...
 
@@ -47,7 +48,7 @@ class FocusDrive(Protocol):
 
 
 class NikonFocusDrive:
-    """manualfocusdrive is a number of steps, at most 32767 at a time."""
+    """Nikon's motor: manualfocusdrive is a number of steps, at most 32767 at a time."""
 
     def __init__(self, config: CameraConfig, *, reverse: bool = False, sleep: Sleep = time.sleep) -> None:
         self._config, self._sign, self._sleep = config, -1 if reverse else 1, sleep
@@ -68,10 +69,10 @@ class NikonFocusDrive:
 
 
 class CanonFocusDrive:
-    """manualfocusdrive is "Near 1" to "Far 3"; the same word twice moves once unless "None" comes between.
+    """Canon's motor: manualfocusdrive is "Near 1" to "Far 3"; repeating a word has no effect unless "None" comes between.
 
-    level: the size of a step, 1 to 3. The sizes differ from lens to lens and are no multiples of one another, so that only
-    one of them is counted.
+    level: the size of a step, 1 to 3. The sizes differ from lens to lens and are not multiples of one another, so only one of them
+    is counted.
     """
 
     def __init__(self, config: CameraConfig, level: int = 1, *, reverse: bool = False, sleep: Sleep = time.sleep) -> None:
@@ -94,7 +95,7 @@ class CanonFocusDrive:
 
 
 def focus_drive(config: CameraConfig, *, level: int = 1, reverse: bool = False, sleep: Sleep = time.sleep) -> FocusDrive | None:
-    """The motor of this camera, or None where libgphoto2 knows none."""
+    """Return the motor of this camera, or None if libgphoto2 knows none."""
     if config.first((FOCUS_DRIVE,)) is None:
         return None
     if any(each.startswith("Near") for each in config.choices(FOCUS_DRIVE)):
@@ -103,7 +104,7 @@ def focus_drive(config: CameraConfig, *, level: int = 1, reverse: bool = False, 
 
 
 def drive(config: CameraConfig, value: object, sleep: Sleep) -> None:
-    """One command to the motor, again while the camera is busy. Raises EndStop at the end of the travel."""
+    """Send one command to the motor, repeating it while the camera is busy. Raises EndStop at the end of the travel."""
     gp = library()
     for _ in range(_MOST_ATTEMPTS):
         try:
@@ -119,15 +120,11 @@ def drive(config: CameraConfig, value: object, sleep: Sleep) -> None:
     raise CameraError("driving the focus motor failed: the camera stays busy; is its live view on and the lens in autofocus?")
 
 
-_LIVE_VIEW_SWITCH = ("viewfinder", "eosviewfinder")
-_LIVE_VIEW_SIGNS = (*_LIVE_VIEW_SWITCH, "liveviewsize", "liveviewimagequality", "evfmode")
-_EVENT_WAIT_MS = 200
-_MOST_EVENTS = 50
-Answer = TypeVar("Answer")
-
-
 class Gphoto2Camera:
-    """A CameraDriver. camera: a gphoto2.Camera, already initialised; focus_level and reverse_focus: see gphoto2_focus."""
+    """A CameraDriver over libgphoto2.
+
+    camera: a gphoto2.Camera, already initialised. focus_level: the size of Canon's steps. reverse_focus: swaps the motor's directions.
+    """
 
     def __init__(
         self, camera: Any, port: str, *, focus_level: int = 1, reverse_focus: bool = False, sleep: Callable[[float], None] = time.sleep
@@ -171,7 +168,7 @@ class Gphoto2Camera:
         self._steps = 0
 
     def capture(self) -> Shot:
-        """The RAW, where one shot makes several files. They stay on the card, if they go there at all."""
+        """Release the shutter and return the RAW if one shot makes several files. They stay on the card, if they go there at all."""
         self._switch_live_view(False)
         path = self._patiently("taking a photograph", lambda: self._camera.capture(self._gp.GP_CAPTURE_IMAGE))
         found = [(path.folder, path.name), *self._files_added()]
@@ -179,12 +176,12 @@ class Gphoto2Camera:
         return Shot(self.download(folder, name), name, self._steps)
 
     def download(self, folder: str, name: str) -> bytes:
-        """A whole file of the camera."""
+        """Return a whole file of the camera."""
         file = self._patiently(f"copying {name}", lambda: self._camera.file_get(folder, name, self._gp.GP_FILE_TYPE_NORMAL))
         return _bytes_of(file)
 
     def close(self) -> None:
-        """Live view off, mirror down; a camera that is gone already does not matter."""
+        """Switch the live view off and release the camera, even if it is already unplugged."""
         try:
             self._switch_live_view(False)
             self._camera.exit()
@@ -198,7 +195,7 @@ class Gphoto2Camera:
         return self._drive
 
     def _switch_live_view(self, on: bool) -> None:
-        """Motors and frames need it; long transfers do not go well with it."""
+        """Switch the live view: motors and previews need it on, long transfers need it off."""
         name = self._config.first(_LIVE_VIEW_SWITCH)
         if name is not None and on != self._live:
             self._config.set(name, 1 if on else 0)
@@ -216,7 +213,7 @@ class Gphoto2Camera:
         return found
 
     def _patiently(self, doing: str, ask: Callable[[], Answer]) -> Answer:
-        """Again while the camera is busy, as it is right after a move or a shot."""
+        """Ask again while the camera is busy, as it is right after a move or a shot."""
         for attempt in range(_MOST_ATTEMPTS):
             with explained(doing):
                 try:
@@ -234,7 +231,7 @@ def _bytes_of(file: Any) -> bytes:
 
 @dataclass(frozen=True)
 class FoundCamera:
-    """A camera as libgphoto2 lists it. description: None where it could not be opened, which `problem` explains."""
+    """A camera as libgphoto2 lists it. description: None if it could not be opened; `problem` says why."""
 
     model: str
     port: str
@@ -243,13 +240,13 @@ class FoundCamera:
 
 
 def detected() -> list[tuple[str, str]]:
-    """(model, port) of everything connected."""
+    """Return (model, port) of every connected camera."""
     with explained("looking for cameras"):
         return gphoto2_library.detected()
 
 
 def list_cameras() -> list[FoundCamera]:
-    """Every camera with what it can do; each is opened and let go again."""
+    """Describe every connected camera; each is opened and closed again."""
     cameras = []
     for model, port in detected():
         try:
@@ -265,7 +262,7 @@ def list_cameras() -> list[FoundCamera]:
 
 
 def open_camera(port: str | None = None, *, focus_level: int = 1, reverse_focus: bool = False) -> Gphoto2Camera:
-    """The only camera, or the one at a port such as usb:001,005. Raises CameraError where there is none, InputError where many."""
+    """Open the only camera, or the one at a port such as usb:001,005. Raises CameraError without one, InputError for several."""
     try:
         model, at = chosen_of(detected(), port, "--camera")
     except NoCameraError as error:

@@ -1,11 +1,7 @@
-"""The settings of a camera by libgphoto2's names, which differ from maker to maker: find, read, choose.
+"""Camera settings over libgphoto2: find, read and choose them, and fix those that must not change within a bracket.
 
-libgphoto2's errors as those of a camera driver.
-
-Settings that must not change within a bracket, over libgphoto2, for the makers whose names are known.
-
-The names are those of libgphoto2's ptp2 driver (Nikon, Canon, Sony, Fuji share it). What a camera does not have is left out of
-the answer, so that the log of a shoot shows what nobody controlled.
+The names are those of libgphoto2's ptp2 driver (Nikon, Canon, Sony and Fuji share it) and differ from maker to maker. A setting
+that a camera does not have is left out of the answer, so that the log of a shoot shows what was not controlled.
 """
 
 import re
@@ -17,10 +13,18 @@ from capture.tether.camera_driver import CameraError, CameraSettings
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.gphoto2_library import explanation, library
 
+EXPOSURE_MODES = ("expprogram", "autoexposuremode", "shootingmode")
+FILE_FORMATS = ("imagequality", "imageformat")
+SHUTTER = ("shutterspeed2", "shutterspeed")
+APERTURE = ("f-number", "aperture")
+FOCUS_MODES = ("focusmode2", "focusmode")
+FOCUS_DRIVE = "manualfocusdrive"
+_AUTO_ISO = ("isoauto", "autoiso", "isoautocontrol")
+
 
 @contextmanager
 def explained(doing: str) -> Iterator[None]:
-    """A block in which libgphoto2's errors become CameraError; `doing` says in words what was tried."""
+    """Turn libgphoto2's errors within the block into CameraError; `doing` names the attempt."""
     gp = library()
     try:
         yield
@@ -35,7 +39,7 @@ class CameraConfig:
         self._camera, self._gp = camera, library()
 
     def first(self, names: Sequence[str]) -> str | None:
-        """The first of several names that this camera knows."""
+        """Return the first of several names that this camera knows."""
         return next((name for name in names if self._widget(name) is not None), None)
 
     def value(self, name: str) -> Any:
@@ -43,7 +47,7 @@ class CameraConfig:
         return None if widget is None else widget.get_value()
 
     def choices(self, name: str) -> list[str]:
-        """The words that a setting may have; empty where it is no choice or unknown."""
+        """Return the possible values of a setting; empty if it is not a choice or unknown."""
         widget = self._widget(name)
         if widget is None or widget.get_type() not in (self._gp.GP_WIDGET_RADIO, self._gp.GP_WIDGET_MENU):
             return []
@@ -58,15 +62,15 @@ class CameraConfig:
             self.set_raw(name, value)
 
     def set_raw(self, name: str, value: Any) -> None:
-        """The same, with libgphoto2's own errors."""
+        """Set a value and let libgphoto2's own errors through."""
         widget = self._camera.get_single_config(name)
         widget.set_value(value)
         self._camera.set_single_config(name, widget)
 
     def choose(self, names: Sequence[str], fits: Callable[[str], bool], what: str) -> str | None:
-        """Set the first choice that fits, unless the one that is set does; the word, None where the camera has no such setting.
+        """Set the first choice that fits, unless the current one does; return it, or None if the camera has no such setting.
 
-        Raises InputError where it has the setting, but none of its choices fits or it can only be set on the camera.
+        Raises InputError if it has the setting but none of its choices fits, or if it can only be set on the camera.
         """
         name = self.first(names)
         if name is None:
@@ -83,7 +87,7 @@ class CameraConfig:
         return found
 
     def choose_nearest(self, names: Sequence[str], wanted: float, what: str, within: float = 0.05) -> str | None:
-        """Set the choice whose number is nearest to `wanted`, at most a share `within` away; None where there is no such setting."""
+        """Set the choice whose number is nearest to `wanted`, within a relative error; return None if there is no such setting."""
         name = self.first(names)
         if name is None:
             return None
@@ -106,20 +110,11 @@ class CameraConfig:
 
 
 def number_in(text: str) -> float | None:
-    """The number of "f/4", "0.0100s", "1/125", "ISO 200" or "30"; None for words such as Auto and Bulb."""
+    """Parse the number in "f/4", "0.0100s", "1/125", "ISO 200" or "30"; None for words such as Auto and Bulb."""
     found = re.search(r"(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?", text)
     if found is None:
         return None
     return float(found[1]) / float(found[2] or 1.0) if float(found[2] or 1.0) else None
-
-
-EXPOSURE_MODES = ("expprogram", "autoexposuremode", "shootingmode")
-FILE_FORMATS = ("imagequality", "imageformat")
-SHUTTER = ("shutterspeed2", "shutterspeed")
-APERTURE = ("f-number", "aperture")
-FOCUS_MODES = ("focusmode2", "focusmode")
-FOCUS_DRIVE = "manualfocusdrive"
-_AUTO_ISO = ("isoauto", "autoiso", "isoautocontrol")
 
 
 def is_manual(word: str) -> bool:
@@ -127,7 +122,7 @@ def is_manual(word: str) -> bool:
 
 
 def is_raw_only(word: str) -> bool:
-    """RAW without a JPEG beside it, which would only cost time."""
+    """Tell whether a file format is RAW without a JPEG beside it, which would only cost time."""
     text = word.strip().lower()
     return re.match(r"(nef|raw|craw|uncompressed raw)\b", text) is not None and not re.search(r"jpe?g|fine|normal|basic|\+", text)
 
@@ -141,7 +136,7 @@ def is_off(word: str) -> bool:
 
 
 def configure(config: CameraConfig, settings: CameraSettings) -> dict[str, str]:
-    """Apply the settings; what is set now, by what it is. Raises InputError where the exposure is or would be automatic."""
+    """Apply the settings and return what is set now, by name. Raises InputError if the exposure is or would be automatic."""
     done = {
         "exposure mode": config.choose(EXPOSURE_MODES, is_manual, "manual exposure (M)"),
         "automatic ISO": config.choose(_AUTO_ISO, is_off, "automatic ISO off"),
@@ -158,7 +153,7 @@ def configure(config: CameraConfig, settings: CameraSettings) -> dict[str, str]:
 
 
 def _focus_mode(config: CameraConfig) -> str | None:
-    """Manual where the ring is turned by hand. Motors can only be driven while lens and body are in autofocus: left alone then."""
+    """Set manual focus for a ring turned by hand. A motor needs the autofocus position of lens and body, so its mode is only read."""
     if config.first((FOCUS_DRIVE,)) is None:
         return config.choose(FOCUS_MODES, is_off, "manual focus")
     name = config.first(FOCUS_MODES)
@@ -172,7 +167,7 @@ def _white_balance(wanted: str | None) -> Callable[[str], bool]:
 
 
 def _numbered(config: CameraConfig, names: tuple[str, ...], wanted: float | None, what: str) -> str | None:
-    """Set a number, or say which one is set."""
+    """Set a number, or return the current one."""
     if wanted is not None:
         within = 0.12 if names == SHUTTER else 0.05
         word = config.choose_nearest(names, wanted, what, within)

@@ -1,7 +1,4 @@
-"""What a frame of the live view tells: how sharp it is, and whether its exposure fits.
-
-The live view in a terminal: sharpness against the best so far, clipped shares and a histogram, renewed frame by frame.
-"""
+"""Sharpness and exposure of live view frames, and their display in a terminal."""
 
 import threading
 from collections.abc import Callable
@@ -22,11 +19,13 @@ HISTOGRAM_BINS = 32
 _CLIPPED = 254
 _BLACK = 1
 _WINDOW_PX = 1.0
+_BAR = 40
+_FRAMES_PER_S = 8
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A square part of the picture: its middle in shares of width and height, its side in shares of the width."""
+    """A square part of the picture: its centre in fractions of width and height, its side in fractions of the width."""
 
     x: float = 0.5
     y: float = 0.5
@@ -37,7 +36,7 @@ class Spot:
             raise InputError(f"a spot needs x, y and a side from 0 to 1, got {self.x:g}, {self.y:g}, {self.side:g}")
 
     def cut(self, preview: Preview) -> UInt8[np.ndarray, "side_y side_x 3"]:
-        """The pixels of the spot, at least 8 x 8."""
+        """Return the pixels of the spot, at least 8 x 8."""
         height, width = preview.shape[:2]
         half = max(4, round(0.5 * self.side * width))
         column, row = (
@@ -48,9 +47,10 @@ class Spot:
 
 @dataclass(frozen=True)
 class LiveReading:
-    """sharpness: focus energy over mean light, so that exposure does not matter; no unit, to be compared within a scene.
+    """Sharpness and exposure of one frame.
 
-    clipped, black: shares of the pixels with a channel at its end. histogram: shares of the pixels by encoded brightness.
+    sharpness: focus energy over mean light, independent of the exposure; no unit, comparable within a scene. clipped, black: fractions of
+    the pixels with a channel at its end. histogram: fractions of the pixels by encoded brightness.
     """
 
     sharpness: float
@@ -59,13 +59,13 @@ class LiveReading:
     histogram: Float64[np.ndarray, " bins"]
 
     def bars(self) -> str:
-        """The histogram as text, one character per bin."""
+        """Return the histogram as text, one character per bin."""
         top = float(self.histogram.max()) or 1.0
         return "".join(" ▁▂▃▄▅▆▇█"[int(np.ceil(8.0 * each / top))] for each in self.histogram)
 
 
 def read_live(preview: Preview, spot: Spot | None = None) -> LiveReading:
-    """Sharpness is that of the spot, or of the whole frame; exposure always that of the frame."""
+    """Measure the sharpness of the spot, or of the whole frame, and the exposure of the frame."""
     brightest, mean = preview.max(axis=2), preview.mean(axis=2)
     counts = np.histogram(mean, HISTOGRAM_BINS, (0.0, 256.0))[0]
     return LiveReading(
@@ -77,17 +77,13 @@ def read_live(preview: Preview, spot: Spot | None = None) -> LiveReading:
 
 
 def sharpness(preview: Preview) -> float:
-    """Mean energy of fine detail over mean light. Energy of the root of light grows with light, so the ratio does not."""
+    """Return the mean energy of fine detail over mean light. The energy of the square root of light is proportional to light."""
     light = srgb_to_linear(np.ascontiguousarray(preview).astype(np.float32) / np.float32(255.0)).astype(np.float32)
     return float(focus_energy(light, _WINDOW_PX).mean() / max(float(luminance(light).mean()), 1e-4))
 
 
-_BAR = 40
-_FRAMES_PER_S = 8
-
-
 def show_live(camera: CameraDriver, stopped: Callable[[], bool], console: Console, spot: Spot | None = None) -> LiveReading:
-    """Read and show frames until `stopped`; at least one. Ends with the last reading."""
+    """Read and show frames until `stopped`, at least one; return the last reading."""
     best = 0.0
     with Live(console=console, refresh_per_second=_FRAMES_PER_S, transient=True) as live:
         while True:
@@ -99,7 +95,7 @@ def show_live(camera: CameraDriver, stopped: Callable[[], bool], console: Consol
 
 
 def live_table(reading: LiveReading, best: float) -> Table:
-    """One reading; the sharpness also as a share of the best one."""
+    """Return the table of one reading, with the sharpness also as a fraction of the best one."""
     share = reading.sharpness / best if best > 0.0 else 0.0
     table = Table(title="live view (Enter goes on)", show_header=False)
     table.add_row(
@@ -112,7 +108,7 @@ def live_table(reading: LiveReading, best: float) -> Table:
 
 
 def enter_pressed() -> Callable[[], bool]:
-    """Whether somebody has pressed Enter since; standard input that ends counts as Enter."""
+    """Return a function that tells whether Enter has been pressed since; the end of standard input counts as Enter."""
     pressed = threading.Event()
 
     def wait() -> None:

@@ -1,11 +1,9 @@
-"""A shot onto the disk: whole or not at all, and what its metadata tells about it.
+"""Photographs of a shoot: saving one whole or not at all, its metadata, and the check that the focus came back at the end.
 
-Did the focus come back? The first slice once more at the end, against the first and the second.
-
-Blur shows in the energy of fine detail. Over the tiles of the picture, the second slice differs from the first in a pattern
-of gains and losses; how much of that pattern the repeated slice shows is how far its focus is off, as a share of the gap
-between two slices: positive towards the second, negative away from it. What blurs by less than a pixel does not show, so that
-errors below half a gap come out up to half as large as they are; without any, noise makes less than 0.01.
+Blur shows in the energy of fine detail. Over the tiles of the picture, the second slice differs from the first in a pattern of
+gains and losses. The first slice is shot again at the end; the amount of that pattern in it is its focus error as a fraction of
+the gap between two slices: positive towards the second, negative away from it. Blur of less than a pixel does not show, so errors
+below half a gap are underestimated by up to one half; without an error, noise gives less than 0.01.
 """
 
 from dataclasses import asdict, dataclass
@@ -30,6 +28,13 @@ from mrbokeh.system.atomic_files import atomic_path
 
 # EXIF rounds exposure times; a third of a stop is 26 %.
 _SAME_EXPOSURE = 0.03
+WIDTH_PX = 960
+LARGEST_FOCUS_ERROR = 0.15
+LARGEST_SHIFT_PX = 2.0
+LARGEST_BRIGHTNESS_ERROR = 0.02
+_TILES = (16, 24)
+_FLOOR = 0.05
+Rgb = Float32[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class SavedShot:
     metadata: PhotoMetadata
 
     def record(self) -> dict[str, Any]:
-        """What the log keeps: JSON-ready, distances in metres as `focus_distance_m` from the lens, None where unknown."""
+        """Return what the log keeps: JSON-ready, distances in metres as `focus_distance_m` from the lens, None if unknown."""
         metadata = self.metadata
         return {
             "file": self.path.name,
@@ -61,7 +66,7 @@ class SavedShot:
 
 
 def save_shot(shot: Shot, folder: Path, stem: str) -> SavedShot:
-    """Write a shot under a stem with the suffix the camera gave it. Raises CameraError where it did not arrive whole."""
+    """Write a shot under a stem with the suffix the camera gave it. Raises CameraError if it did not arrive whole."""
     suffix = PurePath(shot.name).suffix.lower()
     if suffix not in PHOTO_SUFFIXES:
         raise CameraError(f"the camera sent {shot.name}, which is no photograph: set it to RAW")
@@ -76,7 +81,7 @@ def save_shot(shot: Shot, folder: Path, stem: str) -> SavedShot:
 
 
 def require_same_exposure(first: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raise CameraError where two records state different exposures: the camera chose by itself."""
+    """Raise CameraError if two records state different exposures: the camera chose by itself."""
     for name in ("exposure_time_s", "iso", "f_number"):
         kept, new = first["stated"][name], now["stated"][name]
         if kept and new and abs(new / kept - 1.0) > _SAME_EXPOSURE:
@@ -90,19 +95,11 @@ def _dioptre(distance_m: float | None) -> float | None:
     return None if distance_m is None else 1.0 / distance_m
 
 
-WIDTH_PX = 960
-LARGEST_FOCUS_ERROR = 0.15
-LARGEST_SHIFT_PX = 2.0
-LARGEST_BRIGHTNESS_ERROR = 0.02
-_TILES = (16, 24)
-_FLOOR = 0.05
-Rgb = Float32[np.ndarray, "height width 3"]
-
-
 @dataclass(frozen=True)
 class ReturnCheck:
-    """focus_error: share of a slice's gap, None where there is only one slice. shift_px: in pixels of the photograph.
+    """Comparison of the first slice with its repetition at the end.
 
+    focus_error: fraction of a slice's gap, None if there is only one slice. shift_px: in pixels of the photograph.
     brightness: mean light of the repetition over that of the first.
     """
 
@@ -129,7 +126,7 @@ class ReturnCheck:
 
 
 def check_return(first: Path, repeated: Path, second: Path | None) -> ReturnCheck:
-    """Compare photographs of one size. second: the slice next to the first, None where there is only one."""
+    """Compare photographs of one size. second: the slice next to the first, None if there is only one."""
     reference, scale = _reduced(first)
     again = _reduced(repeated)[0]
     error = None if second is None else focus_error(reference, again, _reduced(second)[0])
@@ -139,14 +136,14 @@ def check_return(first: Path, repeated: Path, second: Path | None) -> ReturnChec
 
 
 def focus_error(first: Rgb, repeated: Rgb, second: Rgb) -> float:
-    """How far from `first` towards `second` the focus of `repeated` is: least squares over the logarithms of tile energies."""
+    """Return how far from `first` towards `second` the focus of `repeated` is: least squares over the logarithms of tile energies."""
     start, now, end = (_log_energies(each) for each in (first, repeated, second))
     way = end - start
     return float((way * (now - start)).sum() / max(float((way * way).sum()), 1e-12))
 
 
 def _reduced(path: Path) -> tuple[Rgb, float]:
-    """The photograph at most WIDTH_PX wide, and how many pixels of the original each of its pixels stands for."""
+    """Return the photograph at most WIDTH_PX wide, and the original pixels per pixel of it."""
     decoded = develop(path, None, half_size=is_raw(path), max_width=WIDTH_PX)
     return decoded.rgb, decoded.photosites.width / decoded.rgb.shape[1]
 

@@ -1,13 +1,7 @@
-"""`mrbokeh capture shoot`: one bracket, slice by slice, each on the disk and in the log before the next is taken.
+"""`mrbokeh capture shoot`: one bracket, slice by slice; each is on the disk and in the log before the next is taken.
 
 SHOOT/slice_00.nef, ...; shoot.json, the log; lens.toml with what the photographs do not state; .check/ with the first slice
 shot again at the end. The folder goes to `mrbokeh capture ingest` as it is.
-
-How a slice comes into focus: by the camera's motor, or by the photographer's hand.
-
-How a bracket is shot, and what a shoot needs of the world around it.
-
-One bracket while it is shot: a slice into focus, onto the disk and into the log; the first slice once more at the end.
 """
 
 import time
@@ -27,17 +21,22 @@ from mrbokeh.optics.lens import film_plane_m
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
+CHECK_FOLDER = ".check"
+_SAME_LENS = 0.03
+
 
 @runtime_checkable
 class Focusing(Protocol):
+    """A way to focus for each slice: by the camera's motor, or by the photographer's hand."""
+
     def focus_on(self, index: int) -> float:
-        """Focus as the slice needs it; the dioptres reached, as far as known. Raises CameraError where it cannot be reached."""
+        """Focus for a slice and return the dioptres reached, as far as known. Raises CameraError if they cannot be reached."""
         ...
 
 
 @dataclass(frozen=True)
 class ByMotor:
-    """Whole steps of a motor, so that the focus is up to half a step off the plan."""
+    """Focusing by whole steps of a motor, up to half a step off the plan."""
 
     plan: FocusPlan
     axis: FocusAxis
@@ -51,7 +50,7 @@ class ByMotor:
 
 @dataclass(frozen=True)
 class ByHand:
-    """The photographer turns the ring; `ask` shows what to do and returns when it is done."""
+    """Focusing by the photographer, who turns the ring; `ask` shows what to do and returns when it is done."""
 
     plan: FocusPlan
     ask: Callable[[str], None]
@@ -67,11 +66,12 @@ class ByHand:
 
 @dataclass(frozen=True)
 class ShootOptions:
-    """settings: fixed for all slices. focus_steps: the motor's scale; None asks the camera. by_hand: leave the motor alone.
+    """Options of a bracket.
 
+    settings: fixed for all slices. focus_steps: the motor's scale; None asks the camera. by_hand: leave the motor alone.
     backlash_steps, settle_s: see FocusAxis. spot: where the live view's sharpness is read, None for the whole picture.
     check: shoot slice 0 again at the end.
-    planned_distances: let lens.toml state the planned focus even where the photographs state their own.
+    planned_distances: let lens.toml state the planned focus even if the photographs state their own.
     """
 
     settings: CameraSettings = field(default_factory=CameraSettings)
@@ -94,7 +94,10 @@ def _wait_for_enter(text: str) -> None:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """say: shows a line; ask: shows one and waits until the photographer is ready; sleep: waits some seconds; now: the time."""
+    """Terminal and clock of a shoot.
+
+    say: shows a line. ask: shows one and waits until the photographer is ready. sleep: waits some seconds. now: the time.
+    """
 
     say: Callable[[str], None] = print
     ask: Callable[[str], None] = _wait_for_enter
@@ -102,13 +105,9 @@ class Surroundings:
     now: Callable[[], datetime] = datetime.now
 
 
-CHECK_FOLDER = ".check"
-_SAME_LENS = 0.03
-
-
 @dataclass(frozen=True)
 class Bracket:
-    """Everything that a shoot has at hand. abilities: of the camera."""
+    """A bracket while it is shot. abilities: of the camera."""
 
     plan: FocusPlan
     camera: CameraDriver
@@ -119,7 +118,7 @@ class Bracket:
     world: Surroundings
 
     def take(self, index: int) -> None:
-        """One slice. Raises CameraError, which says how much is kept."""
+        """Take one slice. Raises CameraError, which says how much is kept."""
         try:
             dioptre = self.focusing.focus_on(index)
             live = self._live()
@@ -136,7 +135,7 @@ class Bracket:
         write_sidecar(self.log, self.plan, planned_distances=self.options.planned_distances)
 
     def check(self) -> None:
-        """Slice 0 again, compared with what it was; into the log, and warnings to the photographer."""
+        """Shoot slice 0 again, compare it with the first one, log the result and warn the photographer."""
         self.focusing.focus_on(0)
         repeated = save_shot(self.camera.capture(), self.log.folder / CHECK_FOLDER, "slice_00_again")
         second = self._path(1) if 1 in self.log.slices else None
@@ -147,7 +146,7 @@ class Bracket:
             self.world.say(f"warning: {warning}")
 
     def lens_remarks(self) -> list[str]:
-        """Where the photographs state another lens than the one that was planned for."""
+        """Return remarks if the photographs state another lens than the planned one."""
         stated, remarks = self.log.slices[0]["stated"], []
         for name, unit in (("focal_length_mm", " mm"), ("f_number", "")):
             planned, real = getattr(self.plan.lens, name), stated[name]
@@ -158,7 +157,7 @@ class Bracket:
         return remarks
 
     def _require_manual_exposure(self, record: dict[str, Any], saved: SavedShot) -> None:
-        """A photograph exposed otherwise than the first is taken back: it would come after others that are right."""
+        """Delete a photograph whose exposure differs from the first one's, and raise CameraError."""
         if not self.log.slices:
             return
         try:
@@ -168,7 +167,7 @@ class Bracket:
             raise
 
     def _live(self) -> dict[str, float] | None:
-        """Sharpness and exposure as the live view shows them, if there is one; the photograph matters more."""
+        """Return sharpness and exposure of the live view, or None if there is none or it fails; the photograph matters more."""
         if Ability.live_view not in self.abilities:
             return None
         try:
@@ -182,7 +181,7 @@ class Bracket:
 
 
 def shoot(plan: FocusPlan, camera: CameraDriver, out: Path, options: ShootOptions, world: Surroundings) -> ShootLog:
-    """Take what is missing of the plan. Raises CameraError where the camera fails; run again, it goes on at the first missing slice."""
+    """Take the missing slices of the plan. Raises CameraError if the camera fails; run again, it continues at the first missing slice."""
     description = camera.describe()
     log = open_log(out, plan, description.name, overwrite=options.overwrite)
     if len(log.slices) == len(plan) and (log.check or not options.check):
@@ -192,7 +191,7 @@ def shoot(plan: FocusPlan, camera: CameraDriver, out: Path, options: ShootOption
     focusing = _focusing(plan, camera, description, options, world)
     log.focus_steps = steps_to_json(focusing.steps) if isinstance(focusing, ByMotor) else None
     log.write()
-    bracket = Bracket(plan, camera, description.abilities, focusing, log, options, world)
+    bracket = Bracket(plan=plan, camera=camera, abilities=description.abilities, focusing=focusing, log=log, options=options, world=world)
     missing = [index for index in range(len(plan)) if index not in log.slices]
     for index in _shown(missing, focusing):
         bracket.take(index)
@@ -204,7 +203,7 @@ def shoot(plan: FocusPlan, camera: CameraDriver, out: Path, options: ShootOption
 
 
 def _configure(camera: CameraDriver, settings: CameraSettings, log: ShootLog) -> None:
-    """Set up, and see that a shoot that goes on does so with the same settings."""
+    """Configure the camera and refuse to continue a shoot with other settings."""
     now = camera.configure(settings)
     changed = [f"{name} {log.settings[name]}, now {now.get(name)}" for name in log.settings if log.settings[name] != now.get(name)]
     if log.slices and changed:
@@ -228,5 +227,5 @@ def _focusing(
 
 
 def _shown(missing: list[int], focusing: Focusing) -> Iterable[int] | Iterator[int]:
-    """Under a bar, but for somebody who is being talked to."""
+    """Show a progress bar, except to a photographer who is being asked to turn the ring."""
     return track(missing, "shooting") if isinstance(focusing, ByMotor) else missing

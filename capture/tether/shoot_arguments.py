@@ -1,7 +1,4 @@
-"""The words of `mrbokeh capture shoot` on the command line, read.
-
-The camera that a word on the command line stands for.
-"""
+"""Parsing of the arguments of `mrbokeh capture shoot`, and the camera that its --camera names."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +11,7 @@ from mrbokeh.system.errors import InputError
 
 
 def steps_between(plan: FocusPlan, near_steps: int | None, far_steps: int | None, home: str) -> FocusSteps | None:
-    """--near-steps and --far-steps, for the plan's range."""
+    """Return the scale given by --near-steps and --far-steps for the plan's range, None without them."""
     if near_steps is None and far_steps is None:
         return None
     if near_steps is None or far_steps is None:
@@ -30,7 +27,7 @@ def parse_stop(text: str) -> Stop:
 
 
 def parse_seconds(text: str | None) -> float | None:
-    """ "1/60" or "0.5"."""
+    """Parse "1/60" or "0.5"."""
     try:
         seconds = None if text is None else float(Fraction(text))
     except (ValueError, ZeroDivisionError):
@@ -41,7 +38,7 @@ def parse_seconds(text: str | None) -> float | None:
 
 
 def parse_spot(text: str | None) -> Spot | None:
-    """ "X,Y" in shares of width and height."""
+    """Parse "X,Y" in fractions of width and height."""
     if text is None:
         return None
     try:
@@ -52,7 +49,7 @@ def parse_spot(text: str | None) -> Spot | None:
 
 
 def parse_target(text: str) -> Target:
-    """ "X,Y=METRES"."""
+    """Parse "X,Y=METRES"."""
     place, equals, distance = text.partition("=")
     spot = parse_spot(place)
     try:
@@ -65,7 +62,7 @@ def parse_target(text: str) -> Target:
 
 
 def open_named(name: str, plan: FocusPlan, *, timeout_s: float, focus_level: int, reverse_focus: bool) -> CameraDriver:
-    """gphoto2, gphoto2:PORT, folder:DIR or simulated."""
+    """Open gphoto2, gphoto2:PORT, folder:DIR or simulated."""
     kind, _, rest = name.partition(":")
     if kind == "gphoto2":
         from capture.tether.gphoto2_camera import open_camera

@@ -1,10 +1,10 @@
-"""shoot.json: what was shot so far, written after every photograph, so that a torn cable or Ctrl-C costs nothing.
+"""shoot.json, the log of a bracket, and lens.toml, which states what its photographs do not.
 
-{"format": "mrbokeh-shoot", "version": 1, "camera": "...", "settings": {...}, "plan": {...}, "focus_steps": {...} or null,
- "slices": [{"index": 0, "file": "slice_00.nef", "camera_name": "DSC_0001.NEF", "bytes": 25165824, "steps": 180, ...}, ...],
- "check": {...} or null}
+The log is written after every photograph, so that a loose cable or Ctrl-C loses nothing:
 
-lens.toml of a shoot: what its photographs do not state, from the plan and the motor.
+    {"format": "mrbokeh-shoot", "version": 1, "camera": "...", "settings": {...}, "plan": {...}, "focus_steps": {...} or null,
+     "slices": [{"index": 0, "file": "slice_00.nef", "camera_name": "DSC_0001.NEF", "bytes": 25165824, "steps": 180, ...}, ...],
+     "check": {...} or null}
 """
 
 import json
@@ -23,6 +23,7 @@ from mrbokeh.system.errors import InputError
 _LOG_NAME = "shoot.json"
 FORMAT = "mrbokeh-shoot"
 VERSION = 1
+_HEAD = "# written by mrbokeh capture shoot: what the photographs themselves do not state\n"
 
 
 @dataclass
@@ -60,7 +61,7 @@ class ShootLog:
 
 
 def open_log(folder: Path, plan: FocusPlan, camera: str, *, overwrite: bool) -> ShootLog:
-    """The log to go on with, or a new one. Raises InputError where the folder holds another bracket or other photographs."""
+    """Return the log to continue, or a new one. Raises InputError if the folder holds another bracket or other photographs."""
     document = json.loads(json.dumps(plan_to_json(plan)))
     if overwrite:
         _remove(folder)
@@ -78,7 +79,7 @@ def open_log(folder: Path, plan: FocusPlan, camera: str, *, overwrite: bool) -> 
 
 
 def read_log(folder: Path) -> ShootLog:
-    """The log of a folder, without slices whose files are gone or not what they were."""
+    """Read the log of a folder without slices whose files are missing or have changed."""
     path = folder / _LOG_NAME
     document = read_json(path, "the log of a shoot (shoot.json)")
     try:
@@ -86,7 +87,15 @@ def read_log(folder: Path) -> ShootLog:
             raise InputError(f"{path}: expected the log of a shoot of version {VERSION}, got {document['format']}, {document['version']}")
         slices = {int(each["index"]): each for each in document["slices"] if _is_there(folder, each)}
         check = document["check"] if len(slices) == len(document["slices"]) else None
-        return ShootLog(folder, document["plan"], document["camera"], document["settings"], document["focus_steps"], slices, check)
+        return ShootLog(
+            folder=folder,
+            plan=document["plan"],
+            camera=document["camera"],
+            settings=document["settings"],
+            focus_steps=document["focus_steps"],
+            slices=slices,
+            check=check,
+        )
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: this log is damaged ({error!r}): give another --out, or --overwrite to shoot it again") from None
 
@@ -103,7 +112,7 @@ def _require_no_strangers(folder: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """The photographs that an earlier log names, and the log; nothing else."""
+    """Delete the photographs that an earlier log names, and the log; nothing else."""
     if not (folder / _LOG_NAME).exists():
         return
     for record in read_json(folder / _LOG_NAME, "the log of a shoot (shoot.json)").get("slices", []):
@@ -111,14 +120,11 @@ def _remove(folder: Path) -> None:
     (folder / _LOG_NAME).unlink()
 
 
-_HEAD = "# written by mrbokeh capture shoot: what the photographs themselves do not state\n"
-
-
 def write_sidecar(log: ShootLog, plan: FocusPlan, *, planned_distances: bool = False) -> Path | None:
-    """Write, renew or remove the shoot's lens.toml; one that somebody else wrote is left alone. None where there is none of ours.
+    """Write, renew or remove the shoot's lens.toml; return None if there is none of ours. A file that somebody else wrote is left alone.
 
-    Focus distances are written where a photograph states none, where those stated do not tell the slices apart, since
-    cameras round them, or always (planned_distances), which suits a motor whose scale was measured.
+    Focus distances are written if a photograph states none, if the stated ones do not distinguish the slices, since cameras round
+    them, or always (planned_distances), which suits a motor whose scale was measured.
     """
     path = log.folder / LENS_FILE
     if path.exists() and not path.read_text(encoding="utf-8").startswith(_HEAD):
@@ -133,7 +139,7 @@ def write_sidecar(log: ShootLog, plan: FocusPlan, *, planned_distances: bool = F
 
 
 def states_focus(log: ShootLog) -> bool:
-    """Whether the photographs tell their focus distances well enough to tell the slices apart."""
+    """Tell whether the stated focus distances distinguish all slices."""
     stated = [each["stated"]["focus_dioptre"] for _, each in sorted(log.slices.items())]
     return None not in stated and all(near > far for near, far in pairwise(stated))
 

@@ -1,11 +1,8 @@
-"""A focus motor with what makes real ones hard: it counts nothing, its gears have play, and its travel ends.
+"""A camera without hardware, for the demo and for tests: a thin lens before a small scene, on a motor with play and stops.
 
-The files of the simulated camera: 16-bit TIFF with EXIF, its focus distance as coarse as real cameras state it.
-
-TIFF and not DNG: a mosaic would need a model of a sensor, which is data sets' business, and RAW adds nothing to what a bracket
-has to prove. 16 bits keep the light linear to 0.01 %, and the file takes the way of every other photograph.
-
-A camera without hardware: a thin lens before a small scene, on a motor with play and stops. For the demo and for tests.
+Its files are 16-bit TIFF with EXIF, their focus distances as coarse as those of real cameras. A DNG would need a model of a
+sensor's mosaic, and RAW adds nothing to what a bracket has to prove. 16 bits keep the light linear to 0.01 %, and the file is
+read like every other photograph.
 """
 
 import math
@@ -24,13 +21,26 @@ from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.optics.lens import Lens, film_plane_m
 from mrbokeh.system.errors import MissingExtraError
 
+CAMERA_MODEL = "Simulated Thin Lens"
+ELECTRONS_AT_WHITE = 40000.0
+_NIKON_LARGEST = 254
+_FINE = 100000
+_CENTIMETRES = 3
+FocusQuantum = Callable[[float], float | None]
+NORMAL_EXPOSURE_S = 1.0 / 60.0
+NORMAL_ISO = 100.0
+LARGEST_WIDTH_PX = 960
+_ASPECT = 1.5
+_BEFORE_NEAR = 0.25
+_PREVIEW_SHARE = 0.5
+
 
 @dataclass
 class SimulatedMotor:
-    """A gear that pushes a lens; the lens lies up to `backlash_steps` behind the gear.
+    """A gear that pushes a lens; the lens lies up to `backlash_steps` behind the gear. It counts nothing, and its travel ends.
 
-    travel_steps: of the lens, from its near stop (0) to infinity. The focus changes evenly in dioptres, from
-    nearest_dioptre to 0. gear, lens: where both are; a motor that was switched on may stand anywhere.
+    travel_steps: of the lens, from its near stop (0) to infinity. The focus changes linearly in dioptres, from nearest_dioptre to 0.
+    gear, lens: positions of both; a motor that was just switched on may stand anywhere.
     """
 
     nearest_dioptre: float
@@ -41,17 +51,17 @@ class SimulatedMotor:
 
     @property
     def dioptre(self) -> float:
-        """In focus, from the lens; 0 is infinity."""
+        """Return the focus in dioptres from the lens; 0 is infinity."""
         return self.nearest_dioptre * (1.0 - self.lens / self.travel_steps)
 
     @property
     def focus_steps(self) -> FocusSteps:
-        """The scale as it shows when one counts from the near stop and moves away from it: the play comes first."""
+        """Return the scale as counted from the near stop: the play comes first."""
         far = self.backlash_steps + self.travel_steps
         return FocusSteps(Stop.near, ((float(self.backlash_steps), self.nearest_dioptre), (float(far), 0.0)))
 
     def drive(self, steps: int) -> None:
-        """Positive is towards infinity. Raises EndStop where a stop was met on the way."""
+        """Move the gear, positive towards infinity. Raises EndStop if a stop was met on the way."""
         self.gear += steps
         # The gear takes the lens along forwards once the play is used up, backwards at its front face.
         self.lens = min(max(self.lens, self.gear - self.backlash_steps), self.gear)
@@ -62,44 +72,35 @@ class SimulatedMotor:
             raise EndStop
 
     def bump(self, steps: float) -> None:
-        """Somebody touches the ring: the lens slips on its gear."""
+        """Slip the lens on its gear, as if somebody touched the ring."""
         self.lens = min(max(self.lens + steps, 0.0), float(self.travel_steps))
         self.gear = min(max(self.gear, self.lens), self.lens + self.backlash_steps)
 
 
-CAMERA_MODEL = "Simulated Thin Lens"
-ELECTRONS_AT_WHITE = 40000.0
-_NIKON_LARGEST = 254
-_FINE = 100000
-_CENTIMETRES = 3
-
-FocusQuantum = Callable[[float], float | None]
-
-
 def nikon_code(distance_m: float) -> float:
-    """The distance that Nikon's 8-bit code stands for: 0.01 * 10^(v / 40) m, steps of 5.9 %."""
+    """Round to the distance of Nikon's 8-bit code: 0.01 * 10^(v / 40) m, steps of 5.9 %."""
     code = _NIKON_LARGEST if math.isinf(distance_m) else min(round(40.0 * math.log10(distance_m / 0.01)), _NIKON_LARGEST)
     return float(0.01 * 10.0 ** (code / 40.0))
 
 
 def to_centimetre(distance_m: float) -> float | None:
-    """Whole centimetres; infinity is not stated."""
+    """Round to whole centimetres; infinity is not stated."""
     return None if math.isinf(distance_m) else round(distance_m, 2)
 
 
 def unstated(distance_m: float) -> None:  # noqa: ARG001
-    """Most cameras say nothing."""
+    """State no distance, as most cameras do."""
     return
 
 
 def exposed(light: Rgb, rng: np.random.Generator) -> Rgb:
-    """Photon noise on light whose 1.0 fills the sensor, then the sensor's limit."""
+    """Add photon noise to light whose 1.0 fills the sensor, then clip at the sensor's limit."""
     electrons = rng.poisson(np.clip(light, 0.0, 2.0) * ELECTRONS_AT_WHITE)
     return np.minimum(electrons / ELECTRONS_AT_WHITE, 1.0).astype(np.float32)
 
 
 def encoded_tiff(rgb: Rgb, exif: dict[str, str]) -> bytes:
-    """A 16-bit sRGB TIFF in memory, with EXIF."""
+    """Encode a 16-bit sRGB TIFF in memory, with EXIF."""
     try:
         import pyexiv2
     except ImportError:
@@ -114,7 +115,7 @@ def encoded_tiff(rgb: Rgb, exif: dict[str, str]) -> bytes:
 
 
 def exif_of(lens: Lens, width_px: int, exposure_time_s: float, iso: float, taken_at: datetime, quantum: FocusQuantum) -> dict[str, str]:
-    """The Exif directory as a camera writes it. quantum: distance from the film plane to the one that is stated, or None."""
+    """Return the Exif directory as a camera writes it. quantum: maps a distance from the film plane to the stated one, or None."""
     per_cm = Fraction(width_px * 10) / Fraction(str(lens.sensor_width_mm))
     stated = quantum(film_plane_m(lens))
     exif = {
@@ -137,19 +138,12 @@ def _rational(value: float, denominator: int) -> str:
     return f"{round(value * denominator)}/{denominator}"
 
 
-NORMAL_EXPOSURE_S = 1.0 / 60.0
-NORMAL_ISO = 100.0
-LARGEST_WIDTH_PX = 960
-_ASPECT = 1.5
-_BEFORE_NEAR = 0.25
-_PREVIEW_SHARE = 0.5
-
-
 @dataclass
 class SimulatedCamera:
-    """A CameraDriver. lens: wide open, its focus is the motor's; exposure time and ISO act on the light, f-number on the blur.
+    """A simulated CameraDriver.
 
-    quantum: how it states the focus distance. knows_steps: whether it tells what its steps mean (no real camera does).
+    lens: wide open, its focus is the motor's; exposure time and ISO act on the light, the f-number on the blur.
+    quantum: rounds the stated focus distance. knows_steps: whether it reports the scale of its motor (no real camera does).
     """
 
     lens: Lens
@@ -168,7 +162,7 @@ class SimulatedCamera:
 
     @classmethod
     def for_plan(cls, plan: FocusPlan) -> "SimulatedCamera":
-        """The plan's lens before cards at the distances that the plan spans; its near stop is a little nearer than the plan."""
+        """Put the plan's lens before cards that span the planned distances; its near stop is a little nearer than the plan."""
         width_px = min(plan.image_width_px, LARGEST_WIDTH_PX)
         nearest = plan.dioptres[0] + _BEFORE_NEAR * max(plan.dioptres[0] - plan.dioptres[-1], 0.1)
         return cls(plan.lens, SimulatedScene.between(plan.range.near_m, plan.range.far_m), SimulatedMotor(nearest), width_px)
@@ -218,11 +212,11 @@ class SimulatedCamera:
 
     @property
     def focused_lens(self) -> Lens:
-        """The lens as its motor has it."""
+        """Return the lens as the motor has focused it."""
         return self.lens.focused_at(1.0 / self.motor.dioptre if self.motor.dioptre > 0.0 else float("inf"))
 
     def _photographed(self, width_px: int) -> Rgb:
-        """What the sensor counts, with new noise each time; the light behind it is kept while nothing moves."""
+        """Return the exposed picture with new noise each time; the light behind it is cached while nothing moves."""
         state = (self.focused_lens.focus_distance_m, self.lens.f_number, width_px)
         if self._light is None or self._light[0] != state:
             self._light = state, self.scene.photographed(self.focused_lens, width_px, round(width_px / _ASPECT))

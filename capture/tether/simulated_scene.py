@@ -1,4 +1,4 @@
-"""A small scene of textured cards for the simulated camera, seen through a thin lens that breathes."""
+"""A small scene of textured cards for the simulated camera, rendered through a thin lens with focus breathing."""
 
 import math
 from dataclasses import dataclass, replace
@@ -22,8 +22,8 @@ Rgb = Float32[np.ndarray, "height width 3"]
 class Card:
     """A textured rectangle facing the camera.
 
-    depth_m: from the lens. left, top, right, bottom: its place in the picture of an unbreathing lens, in shares of the
-    width from the middle (-0.5 to 0.5). seed: of its texture.
+    depth_m: from the lens. left, top, right, bottom: its place in the picture of a lens without breathing, in fractions of the width
+    from the centre (-0.5 to 0.5). seed: of its texture.
     """
 
     depth_m: float
@@ -35,7 +35,7 @@ class Card:
 
     @cached_property
     def texture(self) -> Rgb:
-        """Detail of all sizes, 0.05 to 0.75."""
+        """Return detail of all sizes, 0.05 to 0.75."""
         height, width = (round(_TEXELS_PER_WIDTH * each) for each in (self.bottom - self.top, self.right - self.left))
         return textured(height, width, self.seed)
 
@@ -48,14 +48,20 @@ class SimulatedScene:
 
     @classmethod
     def between(cls, near_m: float, far_m: float) -> "SimulatedScene":
-        """Three cards from near to far, equally far apart in dioptres, the farthest of which is the wall."""
+        """Place three cards from near to far, equally spaced in dioptres; the farthest is the wall."""
         near, far = 1.0 / near_m, 1.0 / far_m
         middle, back = 2.0 / (near + far), min(far_m, 1e3)
-        wall = Card(back, -0.75, -0.75, 0.75, 0.75, seed=3)
-        return cls((Card(near_m, -0.44, -0.14, -0.12, 0.26, seed=1), Card(middle, 0.06, -0.2, 0.4, 0.12, seed=2), wall))
+        wall = Card(depth_m=back, left=-0.75, top=-0.75, right=0.75, bottom=0.75, seed=3)
+        return cls(
+            (
+                Card(depth_m=near_m, left=-0.44, top=-0.14, right=-0.12, bottom=0.26, seed=1),
+                Card(depth_m=middle, left=0.06, top=-0.2, right=0.4, bottom=0.12, seed=2),
+                wall,
+            )
+        )
 
     def photographed(self, lens: Lens, width_px: int, height_px: int) -> Rgb:
-        """Scene-linear Rec.709 through the lens; rows and columns around the picture are rendered and cut off again."""
+        """Render scene-linear Rec.709 through the lens, with a margin that is cropped again."""
         margin = math.ceil(max(abs(float(lens.coc_px(card.depth_m, width_px))) for card in self.cards) / 2.0) + 2
         layers = [_layer(card, lens, width_px, height_px, margin) for card in self.cards]
         # A wider picture of the same pixels: the sensor grows with it.
@@ -66,7 +72,7 @@ class SimulatedScene:
 
 @lru_cache(maxsize=8)
 def textured(height: int, width: int, seed: int) -> Rgb:
-    """Octaves of noise, the finest _FINEST_TEXELS wide, in slightly different tones."""
+    """Sum octaves of noise in slightly different tones, the finest _FINEST_TEXELS wide."""
     rng = np.random.default_rng(seed)
     shade = np.zeros((height, width, 3), np.float32)
     for octave in range(_OCTAVES):
@@ -79,7 +85,7 @@ def textured(height: int, width: int, seed: int) -> Rgb:
 
 
 def _layer(card: Card, lens: Lens, width_px: int, height_px: int, margin: int) -> Layer:
-    """The card as a pinhole in the middle of the lens sees it; straight edges with area coverage."""
+    """Draw the card as seen by a pinhole in the centre of the lens; straight edges with area coverage."""
     breathing = lens.image_distance_mm / lens.focal_length_mm
     size = width_px + 2 * margin, height_px + 2 * margin
     left, right = (each * breathing * width_px + size[0] / 2 for each in (card.left, card.right))
@@ -93,7 +99,7 @@ def _layer(card: Card, lens: Lens, width_px: int, height_px: int, margin: int) -
 def _pasted(
     texture: Rgb, place_px: tuple[float, float, float, float], size_px: tuple[int, int]
 ) -> Float32[np.ndarray, "new_height new_width 3"]:
-    """The texture over (left, top, right, bottom); reduced to whole pixels by area averages, the rest by interpolation."""
+    """Resample the texture to (left, top, right, bottom): area averages down to whole pixels, then interpolation."""
     left, top, right, bottom = place_px
     whole = min(texture.shape[1], math.ceil(right - left)), min(texture.shape[0], math.ceil(bottom - top))
     reduced = cv2.resize(texture, whole, interpolation=cv2.INTER_AREA)
@@ -106,5 +112,5 @@ def _pasted(
 
 
 def _covered(count: int, start: float, end: float) -> Float[np.ndarray, " count"]:
-    """Share of each of `count` unit cells that lies between start and end."""
+    """Return the fraction of each of `count` unit cells between start and end."""
     return np.diff(np.clip(np.arange(count + 1), start, end))

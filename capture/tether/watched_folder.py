@@ -1,7 +1,4 @@
-"""A folder as a camera: the maker's own software or a wireless card drops files there, the photographer focuses and releases.
-
-Whether a photograph that is still being written is whole: as its format tells, not by hope.
-"""
+"""A folder as a camera: the maker's own software or a wireless card drops files there, the photographer focuses and releases."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +16,10 @@ _ENDS = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND\xaeB`\x82"}
 
 
 def is_whole(path: Path) -> bool:
-    """JPEG and PNG have an end mark; TIFF and most RAW say where their pixels are. Other formats count as whole unless empty."""
+    """Tell whether a photograph that may still be being written is complete.
+
+    JPEG and PNG have an end mark; TIFF and most RAW state where their pixels are. Other formats count as whole unless empty.
+    """
     try:
         size = path.stat().st_size
         if size == 0:
@@ -38,7 +38,7 @@ def is_whole(path: Path) -> bool:
 
 @dataclass
 class WatchedFolder:
-    """A CameraDriver without shutter, motor and live view. What lies in the folder at the start is not taken.
+    """A CameraDriver without shutter, motor and live view. Files that are in the folder at the start are ignored.
 
     stable_s: how long a file must not have grown. raw_wait_s: how long a JPEG waits for a RAW of the same name.
     timeout_s: how long to wait for a photograph. The files stay where they are; the shoot gets copies.
@@ -78,7 +78,7 @@ class WatchedFolder:
         raise CameraError("a watched folder has no focus motor")
 
     def capture(self) -> Shot:
-        """The next new photograph, once it is whole. Where RAW and JPEG of one shot come, the RAW."""
+        """Return the next new photograph once it is whole; if one shot makes RAW and JPEG, the RAW."""
         start = self.clock()
         while self.clock() - start < self.timeout_s:
             path = next(self._whole(), None)
@@ -100,7 +100,7 @@ class WatchedFolder:
         return [path for path in self._photographs() if path.stem not in self._taken]
 
     def _whole(self) -> Iterator[Path]:
-        """New files that have not grown for a while and are whole; a JPEG only after its time to wait for a RAW."""
+        """Yield new files that have stopped growing and are whole; a JPEG only after its time to wait for a RAW."""
         new = self._new()
         raw = {path.stem for path in new if path.suffix.lower() in RAW_SUFFIXES}
         for path in new:
@@ -112,7 +112,7 @@ class WatchedFolder:
                 yield path
 
     def _unchanged_s(self, path: Path) -> float:
-        """Since when the file has the size it has, as far as it was watched."""
+        """Return the seconds since the file last grew, as far as it was watched."""
         try:
             size, now = path.stat().st_size, self.clock()
         except FileNotFoundError:

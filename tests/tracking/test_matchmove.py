@@ -14,7 +14,7 @@ from capture.cli import app
 from capture.matchmove.clip_matchmove import MatchmoveSettings, chosen_keyframes, matchmove_clip, motion_of_clip
 from capture.matchmove.frame_poses import poses_between
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, parse_frame_distance, parse_ground, parse_ruler, ruler_scale
-from capture.matchmove.quality_warnings import model_residual_px, turning_residual_px
+from capture.matchmove.quality_warnings import model_residual_px, rotation_only_residual_px
 from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
@@ -125,8 +125,8 @@ def test_turning_is_told_from_walking() -> None:
     """Corners off by 0.1 px: turning explains a turning camera to that noise, a walking one not."""
     still, moved = (model_of(cameras, 0.1) for cameras in (turning(6), walking(6)))
     # Away from the noise's own median of 0.118 px, what is fitted takes a little with it.
-    assert turning_residual_px(still) < 1.3 * model_residual_px(still) == pytest.approx(1.3 * 0.1177, rel=0.05)
-    assert turning_residual_px(moved) > 5.0 * model_residual_px(moved)
+    assert rotation_only_residual_px(still) < 1.3 * model_residual_px(still) == pytest.approx(1.3 * 0.1177, rel=0.05)
+    assert rotation_only_residual_px(moved) > 5.0 * model_residual_px(moved)
 
 
 FLOOR_POINTS = np.array([[-0.6, 0.8, 2.0], [0.9, 0.8, 2.1], [0.8, 0.8, 3.3], [-0.7, 0.8, 3.2]])
@@ -242,7 +242,7 @@ def test_a_camera_on_a_tripod_is_refused(tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "clip.mkv", turning(25))
     result = CliRunner().invoke(app, ["matchmove", str(clip), "--out", str(tmp_path / "track.json"), "--keyframes", "8"])
     assert result.exit_code == 1 and not (tmp_path / "track.json").exists()
-    assert any(text in str(result.exception) for text in ("only to turn", "no match-move", "too few to trust"))
+    assert any(text in str(result.exception) for text in ("only to rotate", "no match-move", "too few to trust"))
 
 
 @pytest.mark.slow
@@ -252,7 +252,7 @@ def test_a_pan_over_water_is_refused_or_doubted(shared_data: Path, tmp_path: Pat
     if not path.is_file():
         pytest.skip("video/ducks_720p.mp4 is not in the shared test data")
     try:
-        told = "; ".join(matchmove_clip(path, tmp_path / "work").doubts)
+        told = "; ".join(matchmove_clip(path, tmp_path / "work").warnings)
     except InputError as error:
         told = str(error)
-    assert "degrees only" in told or "only to turn" in told or "no match-move" in told
+    assert "degrees only" in told or "only to rotate" in told or "no match-move" in told

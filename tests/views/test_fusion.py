@@ -11,7 +11,7 @@ from capture.dense.depth_priors import (
     add_focus_votes,
     agreement,
     focus_vote_of_map,
-    near_lights,
+    near_highlights,
 )
 
 SLICE_DIOPTRES = np.linspace(1.6, 0.5, 12)
@@ -29,7 +29,7 @@ def vote_for(index: float) -> FocusVote:
 def test_lights_reach_as_far_as_half_the_largest_blur() -> None:
     rgb = np.full((41, 41, 3), 0.2, np.float32)
     rgb[20, 20, 0] = 3.0
-    row = near_lights(rgb, 12.0)[20]
+    row = near_highlights(rgb, 12.0)[20]
     assert row[20 - 6 : 20 + 7].all()
     assert not row[: 20 - 8].any() and not row[20 + 9 :].any()
 

@@ -18,10 +18,10 @@ from capture.dense.plane_sweep import (
     plane_sweep,
     refine,
 )
-from capture.dense.plane_sweep_plainly import scores_of_surface
 from capture.dense.sweep_view import BRIGHTEST, SweepView, structure_of
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
+from tests.scenes.dense_references import scores_of_surface
 from tests.scenes.plane_sweep_scenes import FOCAL_PX, TracedViews, card, traced, wall
 
 INNER = np.s_[8:-8, 12:-12]

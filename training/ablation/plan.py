@@ -190,7 +190,13 @@ def read_data_sets(folders: Sequence[Path]) -> list[DataSet]:
 def planned_runs(rows: Sequence[Row], data_sets: Sequence[DataSet], out: Path, ablation: Ablation) -> list[PlannedRun]:
     """Seed by seed and row by row, so that an unfinished table has as many whole rounds as possible."""
     return [
-        PlannedRun(row, seed, each, settings_of(row, each.width_px, seed, ablation), run_folder(out, each.name, row, seed))
+        PlannedRun(
+            row=row,
+            seed=seed,
+            data_set=each,
+            settings=settings_of(row, each.width_px, seed, ablation),
+            folder=run_folder(out, each.name, row, seed),
+        )
         for seed in range(ablation.seeds)
         for row in rows
         for each in data_sets
@@ -226,4 +232,4 @@ def _data_set(folder: Path) -> DataSet:
     if not split.test or split.held_out_slices:
         raise InputError(f"{folder} has {len(data.stacks)} stack and none to test on: give data with at least two viewpoints")
     names = tuple(stack_name(stack) for stack in split.test)
-    return DataSet(folder.resolve().name, folder, data, names, slice_size_px(data.stacks[0], 0)[1])
+    return DataSet(name=folder.resolve().name, folder=folder, data=data, held_out=names, width_px=slice_size_px(data.stacks[0], 0)[1])

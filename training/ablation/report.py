@@ -31,6 +31,8 @@ from training.fitting.settings import FILE_NAME as SETTINGS_NAME
 from training.fitting.settings import TrainSettings
 
 Lines = Mapping[TableName, Sequence[Line]]
+SLICES_OF_A_SET = 2
+_WHERE = ("device", "threads", "seed", "minutes", "epochs")
 
 
 def write_results(out: Path, tables: Lines, commands: Sequence[str]) -> None:
@@ -69,9 +71,6 @@ def _sheet(out: Path, name: TableName) -> Path:
     return out / f"{FILE_NAMES[name]}.png"
 
 
-SLICES_OF_A_SET = 2
-
-
 def write_sheet(out: Path, table: TableName, rows: Sequence[Row], data_sets: Sequence[DataSet], device: str = "cpu") -> Path:
     """rows: those that are finished on all of the sets, with seed 0."""
     path = out / f"{FILE_NAMES[table]}.png"
@@ -101,9 +100,6 @@ def _sheet_rows(label: str, seen: UnseenSlice, blurs: dict[str, Blur]) -> list[S
         SheetRow(f"{label}, {what}", {caption: enlarged(picture[window]) for caption, picture in shown.items()})
         for what, window in windows.items()
     ]
-
-
-_WHERE = ("device", "threads", "seed", "minutes", "epochs")
 
 
 class Report:

@@ -31,6 +31,8 @@ from training.fitting.objective import loss
 from training.fitting.run_folder import RunFacts, build_network, load_run
 from training.fitting.train import require_same_settings
 
+FLICKER = "flicker"
+
 
 def machine_line() -> str:
     """Processor, cores, the GPU where torch sees one, and versions."""
@@ -47,9 +49,6 @@ def _processor() -> str:
     except OSError:
         return platform.processor() or platform.machine()
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-
-
-FLICKER = "flicker"
 
 
 def result_of(planned: PlannedRun, lpips: Perceptual | None = None) -> RunResult:

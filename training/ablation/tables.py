@@ -19,6 +19,16 @@ from training.evaluation.scores import NOT_MEASURED, mean_known
 FILE_NAME = "result.json"
 SCORES_NAME = "scores.csv"
 FORMAT = "mrbokeh-ablation-result"
+PAPER_MEASURES = {"psnr_db": ("PSNR dB", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4)}
+OUR_MEASURES = {
+    "edge_psnr_db": ("edge PSNR dB", 2),
+    "energy_ratio": ("energy", 3),
+    "leak": ("leak", 4),
+    "highlight_error": ("lights", 3),
+    "flicker": ("flicker", 5),
+}
+_MEASURES = PAPER_MEASURES | OUR_MEASURES
+NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -94,18 +104,6 @@ def summary(row: Row, results: Sequence[RunResult], sets: Sequence[str]) -> Summ
     )
 
 
-PAPER_MEASURES = {"psnr_db": ("PSNR dB", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4)}
-OUR_MEASURES = {
-    "edge_psnr_db": ("edge PSNR dB", 2),
-    "energy_ratio": ("energy", 3),
-    "leak": ("leak", 4),
-    "highlight_error": ("lights", 3),
-    "flicker": ("flicker", 5),
-}
-_MEASURES = PAPER_MEASURES | OUR_MEASURES
-NAN = float("nan")
-
-
 @dataclass(frozen=True)
 class Line:
     """A finished row; sets: the data it is the mean of. gap_db, paper_gap_db: to the first row of the table, negative is worse."""
@@ -133,7 +131,7 @@ def _group(table: TableName, results: Sequence[RunResult], sets: tuple[str, ...]
         if mine is not None:
             gap_db = NAN if best is None else mine.means["psnr_db"] - best.means["psnr_db"]
             paper_gap_db = NAN if paper is None or paper_best is None else paper.psnr_db - paper_best.psnr_db
-            lines.append(Line(sets, mine, paper, gap_db, paper_gap_db))
+            lines.append(Line(sets=sets, summary=mine, paper=paper, gap_db=gap_db, paper_gap_db=paper_gap_db))
     return lines
 
 

@@ -64,7 +64,16 @@ def ablate_command(
     tables = _tables(table)
     chosen = _rows(tables, rows)
     base = None if settings is None else load_settings(settings)
-    shared = Ablation(_minutes(minutes, epochs), epochs, seeds, tile_px, overlap_px, device, threads, base)
+    shared = Ablation(
+        minutes=_minutes(minutes, epochs),
+        epochs=epochs,
+        seeds=seeds,
+        tile_px=tile_px,
+        overlap_px=overlap_px,
+        device=device,
+        threads=threads,
+        base=base,
+    )
     sets = read_data_sets(data)
     planned = planned_runs(chosen, sets, out, shared)
     if dry_run:

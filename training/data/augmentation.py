@@ -19,6 +19,14 @@ from jaxtyping import Float32
 from training.data.pairs import Pair
 
 _SIGMA_IN_CELLS = 0.7  # two cells away little is left, and the grid does not show
+Dioptres = Float32[np.ndarray, "height width"]
+MEDIAN_RELATIVE_ERROR = 0.0016
+_SIGMA_PER_MEDIAN = 1.0 / 0.6745  # of a normal distribution, of its absolute value
+MISTAKEN_SHARE, MISTAKEN_BY_DIOPTRES = 0.03, 0.05  # the rest of the 2 to 6 % are pixels beside silhouettes, and depend on the scene
+SILHOUETTE_PX = 0.9  # standard deviation along each axis, by which edges are pushed
+_GROWN_SHARE = 0.5  # of the picture, where near things are also a pixel larger or smaller
+_LARGEST_SHARE = 0.5
+_ERROR_CELL_PX, _REGION_CELL_PX, _EDGE_CELL_PX = 64.0, 16.0, 12.0
 
 
 def smooth_noise(size_px: tuple[int, int], cell_px: float, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
@@ -44,17 +52,6 @@ def _weights(length_px: int, cell_px: float) -> Float32[np.ndarray, "pixels node
     offsets = (np.arange(length_px) + 0.5)[:, None] - nodes
     weights = np.exp(-0.5 * (offsets / (_SIGMA_IN_CELLS * cell_px)) ** 2)
     return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True), np.float32)
-
-
-Dioptres = Float32[np.ndarray, "height width"]
-
-MEDIAN_RELATIVE_ERROR = 0.0016
-_SIGMA_PER_MEDIAN = 1.0 / 0.6745  # of a normal distribution, of its absolute value
-MISTAKEN_SHARE, MISTAKEN_BY_DIOPTRES = 0.03, 0.05  # the rest of the 2 to 6 % are pixels beside silhouettes, and depend on the scene
-SILHOUETTE_PX = 0.9  # standard deviation along each axis, by which edges are pushed
-_GROWN_SHARE = 0.5  # of the picture, where near things are also a pixel larger or smaller
-_LARGEST_SHARE = 0.5
-_ERROR_CELL_PX, _REGION_CELL_PX, _EDGE_CELL_PX = 64.0, 16.0, 12.0
 
 
 def augmented(pair: Pair, depth_noise: float, rng: np.random.Generator, largest_coc_px: float = math.inf) -> Pair:

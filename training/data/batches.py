@@ -74,7 +74,14 @@ class Drawing:
         window = self.pairs.window(picture, rows)
         for _ in range(self.crops_per_picture):
             columns, column_weight = self._interval(width, rng)
-            yield Crop(window, rows, columns, row_weight, column_weight, int(rng.integers(2**63)) if self.noisy else 0)
+            yield Crop(
+                window=window,
+                rows=rows,
+                columns=columns,
+                row_weight=row_weight,
+                column_weight=column_weight,
+                noise_seed=int(rng.integers(2**63)) if self.noisy else 0,
+            )
 
     def _interval(self, length_px: int, rng: np.random.Generator) -> tuple[slice, Float32[np.ndarray, " length"]]:
         """A random interval along one side and the weight of its pixels.
@@ -176,7 +183,15 @@ def _pair(pairs: PairSet, crop: Crop, depth_noise: float, largest_coc_px: float)
 def _single(pair: Pair) -> Batch:
     rgb, coc_px, place, lens = network_inputs(pair)
     saturated = None if pair.saturated is None else torch.from_numpy(pair.saturated.copy())[None, None]
-    return Batch(rgb, coc_px, _channel_first(pair.target), torch.from_numpy(pair.weight.copy())[None, None], place, lens, saturated)
+    return Batch(
+        rgb=rgb,
+        coc_px=coc_px,
+        target=_channel_first(pair.target),
+        weight=torch.from_numpy(pair.weight.copy())[None, None],
+        place=place,
+        lens=lens,
+        saturated=saturated,
+    )
 
 
 def _joined(batches: Sequence[Batch]) -> Batch:

@@ -16,6 +16,11 @@ from mrbokeh.system.resources import cores
 from training.data.pairs import Counting, Pair, StackRows, read_pair, read_stack_rows, slice_size_px
 from training.data.stacks import ChosenSlices, stack_name
 
+__all__ = ["Pair", "PairSet", "read_pair"]
+_PLANES = 8  # of float32: two pictures, circles of confusion, weight
+_PIECE_ROWS = 256  # of a picture that is looked at piece by piece
+_PIECES_AHEAD = 4
+
 
 @dataclass(frozen=True)
 class Window:
@@ -97,13 +102,6 @@ class ReadAhead:
                 if self._kept[window].done() and (expected_too or window not in self._expected):
                     self._forget(window)
         return self.held_bytes + needed_bytes <= self.limit_bytes
-
-
-__all__ = ["Pair", "PairSet", "read_pair"]
-
-_PLANES = 8  # of float32: two pictures, circles of confusion, weight
-_PIECE_ROWS = 256  # of a picture that is looked at piece by piece
-_PIECES_AHEAD = 4
 
 
 class PairSet:

@@ -169,7 +169,14 @@ def _parse(file: BinaryIO) -> _Layout | None:
     height, width, lines = window[3] - window[1] + 1, window[2] - window[0] + 1, _LINES_PER_BLOCK[compression]
     count = -(-height // lines)
     offsets = struct.unpack(f"<{count}Q", file.read(8 * count))
-    return _Layout(height, width, compression > 0, lines, _channels(header["channels"]), offsets)
+    return _Layout(
+        height=height,
+        width=width,
+        compressed=compression > 0,
+        lines_per_block=lines,
+        channels=_channels(header["channels"]),
+        offsets=offsets,
+    )
 
 
 def _channels(entries: bytes) -> tuple[tuple[str, np.dtype], ...]:

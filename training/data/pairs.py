@@ -21,6 +21,12 @@ Mask = Bool[np.ndarray, "height width"]
 
 REASONS = ("moving", "border", "board", "low_confidence")
 """Masks of the stack that are read; its "saturated" means saturated in any slice, and each slice has a mask of its own."""
+# Nobody knows what the network should give there, so neither loss nor score counts them.
+# "saturated" of the exclusion masks means saturated in any slice; a light that is full where it is sharp is well measured in the discs
+# of other slices, so each slice has its own mask. Saturated targets pull: counted as recorded they cost 7 to 8 dB on a traced still life
+# with lights (gated form, held-out view against its unclipped truth), or with a modelled white of the sensor 2 dB or nothing. Leaving
+# them out of all slices instead of their own is 0.1 to 0.5 dB worse where nothing is saturated, 0.7 to 0.9 dB better over all pixels.
+_LOW_CONFIDENCE = "low_confidence"
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,9 @@ def read_stack_rows(stack: FocalStack, rows: slice) -> StackRows:
         raise InputError(f"{stack.folder} has no all-in-focus picture with depth in metres: run `mrbokeh capture merge` on it")
     depth = read_rows(stack.depth_path, rows, ("Z", "confidence"))
     all_in_focus = stack.to_rec709(_stacked(read_rows(stack.all_in_focus_path, rows, "RGB")))
-    return StackRows(rows, all_in_focus, depth["Z"], depth["confidence"], _exclusions(stack, rows))
+    return StackRows(
+        rows=rows, all_in_focus=all_in_focus, depth_m=depth["Z"], confidence=depth["confidence"], exclusions=_exclusions(stack, rows)
+    )
 
 
 def read_slice_rows(stack: FocalStack, index: int, rows: slice, shared: StackRows | None = None) -> SliceRows:
@@ -82,14 +90,6 @@ def _exclusions(stack: FocalStack, rows: slice) -> dict[str, Mask]:
 
 def _stacked(channels: dict[str, Float32[np.ndarray, "height width"]]) -> Float32[np.ndarray, "height width 3"]:
     return np.stack([channels[name] for name in "RGB"], axis=-1)
-
-
-# Nobody knows what the network should give there, so neither loss nor score counts them.
-# "saturated" of the exclusion masks means saturated in any slice; a light that is full where it is sharp is well measured in the discs
-# of other slices, so each slice has its own mask. Saturated targets pull: counted as recorded they cost 7 to 8 dB on a traced still life
-# with lights (gated form, held-out view against its unclipped truth), or with a modelled white of the sensor 2 dB or nothing. Leaving
-# them out of all slices instead of their own is 0.1 to 0.5 dB worse where nothing is saturated, 0.7 to 0.9 dB better over all pixels.
-_LOW_CONFIDENCE = "low_confidence"
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,11 @@ from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
 Result = TypeVar("Result")
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _FORGET_PEAK = "5"
+FRAMES = 8
+FINE_STEP_PX = 1.5
+LEAST_FRAMES = 5
+REFERENCE_RENDERER = "polygon"
+Image = Float32[np.ndarray, "height width 3"]
 
 
 def timed(work: Callable[[], Result]) -> tuple[Result, float]:
@@ -71,14 +76,6 @@ def _give_back() -> None:
 def _status_kib(name: str) -> int:
     line = next(each for each in _STATUS.read_text(encoding="ascii").splitlines() if each.startswith(f"{name}:"))
     return int(line.split()[1])
-
-
-FRAMES = 8
-FINE_STEP_PX = 1.5
-LEAST_FRAMES = 5
-REFERENCE_RENDERER = "polygon"
-
-Image = Float32[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
@@ -188,7 +185,13 @@ def scored(methods: Sequence[Method], unseen: Unseen, extras: Extras, sheets: Sh
         if sheets is not None:
             sheets.note(index, seen, {name: picture for name, (picture, _) in results.items()})
     networks, gaussians = (tuple(each.name for each in methods if each.kind == kind) for kind in ("network", "Gaussian"))
-    return Evaluation(tuple(scores), networks, gaussians, {}, {name: each for name, each in memory.items() if not np.isnan(each)})
+    return Evaluation(
+        scores=tuple(scores),
+        networks=networks,
+        rivals=gaussians,
+        flicker={},
+        peak_memory_mib={name: each for name, each in memory.items() if not np.isnan(each)},
+    )
 
 
 def unseen_of(stacks: Sequence[FocalStack], seen: Sequence[Seen]) -> Unseen:

@@ -27,6 +27,12 @@ from training.evaluation.unseen_slice import UnseenSlice
 from training.fitting.run_folder import load_run
 
 SIGMA_STEP_PX = 0.25
+Image = Float32[np.ndarray, "height width 3"]
+Blur = Callable[[Pair], Image]
+NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE = "network", "no blur", "Gaussian, scattered", "Gaussian, gathered", "scatter reference"
+NEAREST = "nearest slice"
+RENDERERS = ("polygon", "low-rank", "laplacian", "scatter")
+"""Renderers that a table has unless it is told otherwise; `lrdm` takes minutes a picture."""
 
 
 def sigma_per_coc(aperture: Aperture) -> float:
@@ -101,10 +107,6 @@ def scatter_reference(
     return (blurred.rgb[inside] / np.maximum(blurred.alpha[inside], 1e-6)[..., None]).astype(np.float32)
 
 
-Image = Float32[np.ndarray, "height width 3"]
-Blur = Callable[[Pair], Image]
-
-
 def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, Seen]:
     """(the function, what it was trained on) of a run folder or an .onnx file. device: of a run, cpu or cuda."""
     if network.suffix.lower() == ".onnx":
@@ -123,12 +125,6 @@ def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, Seen]:
         return result[0].permute(1, 2, 0).contiguous().cpu().numpy()
 
     return blur, Seen(facts.trained_on, facts.held_out_slices)
-
-
-NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE = "network", "no blur", "Gaussian, scattered", "Gaussian, gathered", "scatter reference"
-NEAREST = "nearest slice"
-RENDERERS = ("polygon", "low-rank", "laplacian", "scatter")
-"""Renderers that a table has unless it is told otherwise; `lrdm` takes minutes a picture."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,10 @@ _LEGEND = (
     "the light there. Lights: absolute error over light, unclipped, in the discs of lights (0.5: half of the light is missing). Flicker: "
     "error of second differences in time, over 4, times 1000. ms: median of a picture. MiB: memory of a picture, weights apart."
 )
+MOST_ROWS = 12
+CROP_PX = 96
+CELL_PX = 192
+Image = Float32[np.ndarray, "height width 3"]
 
 
 def table_rows(result: Evaluation) -> list[tuple[str, ...]]:
@@ -81,13 +85,6 @@ def write_numbers(path: Path, scores: Sequence[Score]) -> None:
         rows: Any = csv.DictWriter(file, [each.name for each in fields(Score)])
         rows.writeheader()
         rows.writerows(vars(each) for each in scores)
-
-
-MOST_ROWS = 12
-CROP_PX = 96
-CELL_PX = 192
-
-Image = Float32[np.ndarray, "height width 3"]
 
 
 class Sheets:

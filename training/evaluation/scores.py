@@ -22,6 +22,7 @@ from training.evaluation.unseen_slice import UnseenSlice, edge_band, light_discs
 
 Image = Float32[np.ndarray, "height width 3"]
 Perceptual = Callable[[Image, Image], float]
+NOT_MEASURED = "LPIPS is not measured: no weights are shipped (see --lpips)."
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,14 @@ class SliceScorer:
     def score(self, method: str, picture: Image, seconds: float = float("nan")) -> Score:
         seen, truth, counted = self._seen, self._seen.pair.target, self._seen.counted
         shown = np.where(counted[..., None], picture, truth)  # SSIM and LPIPS want whole pictures
-        plain = Score(seen.stack, seen.index, method, psnr(picture, truth, mask=counted), ssim(shown, truth), seconds=seconds)
+        plain = Score(
+            stack=seen.stack,
+            slice_index=seen.index,
+            method=method,
+            psnr_db=psnr(picture, truth, mask=counted),
+            ssim=ssim(shown, truth),
+            seconds=seconds,
+        )
         return replace(
             plain,
             edge_psnr_db=psnr(picture, truth, mask=self._edges) if self._edges.any() else float("nan"),
@@ -105,9 +113,6 @@ class Evaluation:
 def mean_known(values: Sequence[float]) -> float:
     known = [value for value in values if not np.isnan(value)]
     return float(np.mean(known)) if known else float("nan")
-
-
-NOT_MEASURED = "LPIPS is not measured: no weights are shipped (see --lpips)."
 
 
 class OnnxPerceptualDistance:

@@ -16,6 +16,16 @@ from mrbokeh.stacks.focal_stack import FocalStack
 from training.data.dataset import Pair, PairSet
 from training.data.stacks import stack_name
 
+EDGE_STEP_PX = 2.0
+"""An edge is where the circle of confusion of neighbouring pixels differs by more."""
+SHARP_PX = 2.0
+"""What has a smaller circle of confusion is sharp."""
+WHITE = 1.0
+LEAST_DISC_PX = 3.0
+LEAST_LIGHT = 0.05
+"""A disc ends where it brings less radiance."""
+Mask = Bool[np.ndarray, "height width"]
+
 
 @dataclass(frozen=True)
 class UnseenSlice:
@@ -52,7 +62,15 @@ def unseen_slice(pairs: PairSet, index: int) -> UnseenSlice:
     stack, slice_index = pairs.keys[index]
     saturated = stack.slice_masks(slice_index).saturated
     nearest = _nearest(stack, slice_index, pairs.left_out(stack))
-    return UnseenSlice(stack_name(stack), slice_index, pairs[index], _lens(stack, slice_index), stack.depth_m(), saturated, nearest)
+    return UnseenSlice(
+        stack=stack_name(stack),
+        index=slice_index,
+        pair=pairs[index],
+        lens=_lens(stack, slice_index),
+        depth_m=stack.depth_m(),
+        saturated=saturated,
+        nearest=nearest,
+    )
 
 
 def _nearest(stack: FocalStack, index: int, others: Sequence[int]) -> Float32[np.ndarray, "height width 3"] | None:
@@ -66,18 +84,6 @@ def _lens(stack: FocalStack, index: int) -> Lens:
     """The lens of the slice, opened by as much as registration enlarged its blur."""
     lens = stack.lens_of(index)
     return replace(lens, f_number=lens.f_number / stack.slices[index].scale)
-
-
-EDGE_STEP_PX = 2.0
-"""An edge is where the circle of confusion of neighbouring pixels differs by more."""
-SHARP_PX = 2.0
-"""What has a smaller circle of confusion is sharp."""
-WHITE = 1.0
-LEAST_DISC_PX = 3.0
-LEAST_LIGHT = 0.05
-"""A disc ends where it brings less radiance."""
-
-Mask = Bool[np.ndarray, "height width"]
 
 
 def edge_band(seen: UnseenSlice) -> Mask:

@@ -35,6 +35,8 @@ from training.networks.network_settings import NetworkSettings
 
 ASSUMED_PSNR_DB = 42.0  # of a trained network against the truth, where no truth is given (Mandl et al. 2024, Table 1)
 SLICES, LARGEST_SIDE_PX = 4, 448
+TIMED_SIZE_PX = (360, 640)
+ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -121,10 +123,6 @@ def _middle(length_px: int) -> slice:
     return slice(start, min(length_px, start + LARGEST_SIDE_PX))
 
 
-TIMED_SIZE_PX = (360, 640)
-ROUNDS = 3
-
-
 @dataclass(frozen=True)
 class FastExported:
     """loss_db: measured (see `training.export.fast_onnx`); naive_ms, fast_ms: of a picture with every circle of confusion
@@ -164,7 +162,14 @@ def export_fast_network(
         export_network(network, settings, facts, Path(folder) / "naive.onnx")
         naive_ms, fast_ms = _timed([Path(folder) / "naive.onnx", temporary], made_up_inputs(network_facts, looks[0]))
         exported = OnnxNetwork(temporary)
-        result = FastExported(exported.facts, plan, loss, naive_ms, fast_ms, largest_difference(network, exported))
+        result = FastExported(
+            facts=exported.facts,
+            plan=plan,
+            loss_db=loss,
+            naive_ms=naive_ms,
+            fast_ms=fast_ms,
+            difference=largest_difference(network, exported),
+        )
     write_json(record_path(path), {**_record(result, max_psnr_loss_db, scenes), **json.loads(result.facts.to_json())})
     return result
 

@@ -25,6 +25,7 @@ from training.networks.gated_network import LOGIT_LIMIT, GatedTiles
 from training.networks.network import BlurNetwork
 
 _ONE = numpy_helper.from_array(np.ones(1, np.float32))
+_GROUPS_AT_ONCE = 5
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,14 @@ def prepared(graph: GraphBuilder, network: BlurNetwork, weights: GatedWeights, c
     lines = times(graph, ramp_lines(weights.knots_px), with_one, whole)
     ramps = graph.op("Clip", lines, graph.floats(0.0), graph.floats(1.0))
     features = _features(graph, network, grow, whole)
-    return GatedInputs(graph.op("Unsqueeze", light, graph.ints([1])), ramps, features, position, whole, true_size)
+    return GatedInputs(
+        light=graph.op("Unsqueeze", light, graph.ints([1])),
+        ramps=ramps,
+        features=features,
+        position=position,
+        size=whole,
+        true_size=true_size,
+    )
 
 
 def times(graph: GraphBuilder, weight: np.ndarray, planes: str, size: list[str]) -> str:
@@ -168,9 +176,6 @@ def _shares(graph: GraphBuilder, weights: GatedWeights, group: Group, features: 
     logits = graph.op("Add", product, graph.floats(bias.reshape(-1, 1, 1)))
     shape = graph.op("Concat", graph.ints([-1, group.count, weights.bases, 1]), *size, axis=0)
     return graph.op("Softmax", graph.op("Reshape", logits, shape), axis=2)
-
-
-_GROUPS_AT_ONCE = 5
 
 
 def hidden_features(graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, coverages: Sequence[str]) -> str:

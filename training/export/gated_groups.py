@@ -71,7 +71,7 @@ def _group(weights: GatedWeights, bins: range, factor: int) -> Group:
     stacked = np.stack([widened(each, largest) for each in kernels])  # (bins, bases, colours, k, k)
     repeats = 2 if weights.colours == 3 else 4
     maps = np.tile(stacked, (1, 1, repeats, 1, 1)).reshape(-1, 1, largest, largest).astype(np.float32)
-    return Group(bins.start, bins.stop, factor, maps, _span_px(weights.knots_px, bins))
+    return Group(first=bins.start, end=bins.stop, factor=factor, kernels=maps, span_px=_span_px(weights.knots_px, bins))
 
 
 def _at_resolution(kernels: np.ndarray, factor: int) -> np.ndarray:

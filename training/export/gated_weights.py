@@ -18,6 +18,8 @@ from torch import nn
 from training.networks.gated_network import GatedTiles
 
 CHANNELS = 16  # ONNX Runtime convolves channel by channel in blocks of so many
+_STIFFNESS = 0.3  # fewer knots are drawn to the values at their places; without it neighbours that know little swing apart
+_NEGLIGIBLE = 1e-5  # part of a knot, a matter of rounding
 
 
 @dataclass(frozen=True)
@@ -70,15 +72,15 @@ def weights_of(tiles: GatedTiles) -> GatedWeights:
     logits, logits_bias = pointwise(tiles.hide_out)
     mixing, none = tiles.mixing, np.zeros((len(order), 1, 0), np.float32)
     return GatedWeights(
-        np.asarray(tiles.knots)[order],
-        tuple(kernels[each] for each in order),
-        hidden[:, : len(order)].T[order],
-        hidden[:, len(order) :].T[order],
-        hidden_bias,
-        logits[order],
-        logits_bias[order],
-        none if mixing is None else mixing.weight.detach()[0].numpy()[order],
-        none[:, 0] if mixing is None else mixing.bias.detach()[0].numpy()[order],
+        knots_px=np.asarray(tiles.knots)[order],
+        kernels=tuple(kernels[each] for each in order),
+        of_gates=hidden[:, : len(order)].T[order],
+        of_coverages=hidden[:, len(order) :].T[order],
+        hidden_bias=hidden_bias,
+        logits=logits[order],
+        logits_bias=logits_bias[order],
+        shares=none if mixing is None else mixing.weight.detach()[0].numpy()[order],
+        shares_bias=none[:, 0] if mixing is None else mixing.bias.detach()[0].numpy()[order],
     )
 
 
@@ -99,10 +101,6 @@ def widened(kernels: Float[np.ndarray, "... k k"], size: int) -> Float[np.ndarra
     """Put zeros around kernels."""
     margin = (size - kernels.shape[-1]) // 2
     return np.pad(kernels, [(0, 0)] * (kernels.ndim - 2) + [(margin, margin)] * 2)
-
-
-_STIFFNESS = 0.3  # fewer knots are drawn to the values at their places; without it neighbours that know little swing apart
-_NEGLIGIBLE = 1e-5  # part of a knot, a matter of rounding
 
 
 def thinned(weights: GatedWeights, spacing: float) -> GatedWeights:

@@ -20,6 +20,7 @@ from jaxtyping import Float, Float64
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 _RIDGE = 1e-6  # tents are nearly linearly dependent
+OPSET, IR_VERSION = 18, 9
 
 
 def taps_radius(radius_px: int, factor: int) -> int:
@@ -72,9 +73,6 @@ def _responses(radius_px: int, factor: int) -> Float64[np.ndarray, "factor reach
 
 def _padded(kernel: np.ndarray, size: int) -> np.ndarray:
     return np.pad(kernel.astype(np.float64), (size - kernel.shape[0]) // 2)
-
-
-OPSET, IR_VERSION = 18, 9
 
 
 class GraphBuilder:

@@ -70,7 +70,14 @@ def _gated_plans(tiles: GatedTiles) -> list[Plan]:
         weights = thinned(whole, spacing)
         for least in LEAST_PIXELS:
             factors = _factors(sizes, least)
-            plan = Plan(least, factors, (None,) * len(factors), reach_px(weights, factors), spacing, len(weights.knots_px))
+            plan = Plan(
+                least_pixels=least,
+                factors=factors,
+                ranks=(None,) * len(factors),
+                reach_px=reach_px(weights, factors),
+                spacing=spacing,
+                bins=len(weights.knots_px),
+            )
             found.setdefault((tuple(weights.knots_px), *shared(weights, factors)), (cost(weights, factors), plan))
     return [plan for _, plan in sorted(found.values(), key=lambda each: each[0])]
 

@@ -27,6 +27,10 @@ from training.export.graph_builder import GraphBuilder, binned, enlarged
 from training.networks.network import BlurNetwork, tile_count
 from training.networks.published_network import PublishedTiles, ResidualBlock
 
+CHANNELS = 16
+_SPARE = 1.1  # so many times the channels may be computed in vain before strips are worth their margins
+_MODES = {"replicate": "edge", "reflect": "reflect", "zeros": "constant"}
+
 
 @dataclass(frozen=True)
 class SeparableKernels:
@@ -115,11 +119,6 @@ def _toeplitz(vectors: Float32[np.ndarray, "maps size"], piece: int) -> Float32[
     for place in range(piece):
         matrix[:, place : place + size, place] = vectors
     return matrix
-
-
-CHANNELS = 16
-_SPARE = 1.1  # so many times the channels may be computed in vain before strips are worth their margins
-_MODES = {"replicate": "edge", "reflect": "reflect", "zeros": "constant"}
 
 
 @dataclass(frozen=True)

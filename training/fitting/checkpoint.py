@@ -25,6 +25,8 @@ from training.networks.network import BlurNetwork
 
 TABLE_NAME = "curve.csv"
 PICTURE_NAME = "curve.png"
+_HALVES = {"bfloat16": torch.bfloat16, "float16": torch.float16}
+FILE_NAME = "checkpoint.pt"
 
 
 class CurvePoint(NamedTuple):
@@ -62,9 +64,6 @@ def draw_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
     rate.set_xlabel("step")
     with atomic_path(folder / PICTURE_NAME) as temporary:
         figure.savefig(temporary, dpi=100)
-
-
-_HALVES = {"bfloat16": torch.bfloat16, "float16": torch.float16}
 
 
 class Learner:
@@ -138,9 +137,6 @@ class Learner:
         self.best = state["best"]
         self._optimizer.load_state_dict(state["optimizer"])
         self._scaler.load_state_dict(state["scaler"])
-
-
-FILE_NAME = "checkpoint.pt"
 
 
 @dataclass

@@ -27,6 +27,13 @@ from training.fitting.settings import TrainSettings
 
 FOLDER_NAME = "sheets"
 MOST_KEPT = 16
+SLICES = 4
+SIDE_PX = 384
+"""Side of the middle of a picture that a look is at: with blur of 66 px a network took 20 s for a whole picture of 0.8 megapixels."""
+# Drawing takes a moment, which looks that follow one another closely do not all need.
+_DRAWN_EVERY_S = 20.0
+# Of the curve, over the whole budget, beside those where held-out slices are looked at.
+POINTS = 200
 
 
 def small_picture(picture: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "small_height small_width 3"]:
@@ -52,11 +59,6 @@ def write_sheet(run_folder: Path, step: int, rows: Sequence[SheetRow]) -> None:
 
 def _step(path: Path) -> int:
     return int(path.stem.removeprefix("step_"))
-
-
-SLICES = 4
-SIDE_PX = 384
-"""Side of the middle of a picture that a look is at: with blur of 66 px a network took 20 s for a whole picture of 0.8 megapixels."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +119,6 @@ def _psnr_db(result: torch.Tensor, batch: Batch) -> float:
     weight = batch.weight.expand_as(error)
     mean = float((weight * error.square()).sum() / weight.sum().clamp(min=1e-6))
     return -10.0 * math.log10(max(mean, 1e-12))
-
-
-# Drawing takes a moment, which looks that follow one another closely do not all need.
-_DRAWN_EVERY_S = 20.0
-# Of the curve, over the whole budget, beside those where held-out slices are looked at.
-POINTS = 200
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,10 @@ from training.fitting.run_folder import build_network
 from training.fitting.settings import TrainSettings
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+LEAST_STEPS = 200
+"""The smallest networks have learnt a lens roughly after so many; with a tenth of them the result is what it began as."""
+_TELLING_STEPS = 6
+_LONGEST_SHARE = 0.05  # of the budget until the rate is known; at LEAST_STEPS in all that would be ten steps
 
 
 class StoppedError(KeyboardInterrupt):
@@ -72,12 +76,6 @@ class Interruption:
         if self._alone and self.asked == number == signal.SIGINT:
             raise KeyboardInterrupt
         self.asked = number
-
-
-LEAST_STEPS = 200
-"""The smallest networks have learnt a lens roughly after so many; with a tenth of them the result is what it began as."""
-_TELLING_STEPS = 6
-_LONGEST_SHARE = 0.05  # of the budget until the rate is known; at LEAST_STEPS in all that would be ten steps
 
 
 def is_rate_known(ends_s: Sequence[float], budget_s: float) -> bool:

@@ -76,7 +76,13 @@ def build_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
     grid = TileGrid(facts.height_px, facts.width_px, tile.tile_px, tile.overlap_px) if tile.tile_px else None
     with torch.random.fork_rng():
         torch.manual_seed(settings.seed)
-        return BlurNetwork(tile, facts.largest_coc_px, facts.radiance_scale, grid, facts.lens_ranges)
+        return BlurNetwork(
+            settings=tile,
+            largest_coc_px=facts.largest_coc_px,
+            radiance_scale=facts.radiance_scale,
+            grid=grid,
+            lens_ranges=facts.lens_ranges,
+        )
 
 
 def save_network(folder: Path, network: BlurNetwork) -> None:

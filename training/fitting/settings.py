@@ -20,6 +20,8 @@ from training.networks.network_settings import NetworkSettings
 FORMAT = "mrbokeh-training-settings"
 VERSION = 1
 FILE_NAME = "settings.json"
+_TRUTH = {"true": True, "false": False}
+_BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
 
 @dataclass(frozen=True)
@@ -134,10 +136,6 @@ def read_settings(folder: Path) -> TrainSettings:
 
 def load_settings(path: Path) -> TrainSettings:
     return settings_from_json(read_json(path, "the settings of a training run (settings.json)"), str(path))
-
-
-_TRUTH = {"true": True, "false": False}
-_BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
 
 def with_overrides(settings: TrainSettings, assignments: Sequence[str]) -> TrainSettings:

@@ -41,6 +41,10 @@ from training.networks.network_settings import NetworkSettings
 
 INTERLEAVING = 2
 START_OF_BRANCH = 0.1  # of PyTorch's weights
+SIGMA_OVER_COC = 0.25
+SMALLEST_SIGMA_PX, LARGEST_SIGMA_OVER_COC, SIGMA_RATIO = 0.35, 0.4, math.sqrt(2.0)
+TRUNCATED_AT_SIGMA = 3.5
+SHARPEST_LOGIT = -6.0  # softplus gives 0.0025 px^2, the blur in focus at the start: as good as none, but it can learn
 
 
 class DeepFocusTiles(nn.Module):
@@ -115,12 +119,6 @@ class _ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.outer(functional.elu(self.inner(functional.elu(x))))
-
-
-SIGMA_OVER_COC = 0.25
-SMALLEST_SIGMA_PX, LARGEST_SIGMA_OVER_COC, SIGMA_RATIO = 0.35, 0.4, math.sqrt(2.0)
-TRUNCATED_AT_SIGMA = 3.5
-SHARPEST_LOGIT = -6.0  # softplus gives 0.0025 px^2, the blur in focus at the start: as good as none, but it can learn
 
 
 class NeuralCameraTiles(nn.Module):

@@ -30,6 +30,8 @@ from torch import Tensor, nn
 from training.networks.kernels import depthwise, fresh_kernels
 from training.networks.network_settings import NetworkSettings
 
+LOGIT_LIMIT = 10.0
+
 
 def bins_px(blocks: int, per_size: int, signed: bool) -> tuple[list[float], list[int]]:
     """(circles of confusion at which the gates peak, n of each one's kernel), by n, near before far.
@@ -93,9 +95,6 @@ class FieldMixing(nn.Module):
         return logits.reshape(batch, self.tile_count, len(bins), self.bases, height, width).softmax(dim=3)
 
 
-LOGIT_LIMIT = 10.0
-
-
 class GatedTiles(nn.Module):
     """The gated network for all tiles at once: input (B, C tiles, t, t) in [-1, 1], output (B, 3 tiles, t, t).
 
@@ -117,7 +116,11 @@ class GatedTiles(nn.Module):
         self.hide_out = nn.Conv2d(settings.hidden * tiles, bins * tiles, 1, groups=tiles)
         for parameter in self.hide_out.parameters():
             nn.init.zeros_(parameter)
-        self.mixing = FieldMixing(settings.input_channels - 4, settings.hidden, bins, self.bases, tiles) if self.bases > 1 else None
+        self.mixing = (
+            FieldMixing(inputs=settings.input_channels - 4, hidden=settings.hidden, bins=bins, bases=self.bases, tiles=tiles)
+            if self.bases > 1
+            else None
+        )
 
     def _fresh_kernels(self, n: int, initialisation: str) -> nn.Parameter:
         knots = [knot for knot, radius in zip(self.knots, self.radii, strict=True) if radius == n]

@@ -23,6 +23,10 @@ from mrbokeh.optics.aperture import Aperture
 LEAST_SIZE = 9
 """Width of kernels from which on the transforms are faster (half the time at 9, a twentieth at 21, less than a hundredth at 35)."""
 _CHANNELS_AT_ONCE = 64  # bounds the memory of the transforms
+FLAT_SHARE, FLAT_SHARE_IN_FOCUS = 0.05, 0.005  # of a fresh kernel, so that every one of its pixels can learn
+# Several bases of a bin must begin apart, or they would all learn the same: discs clipped from different sides, as cat-eyes are, on
+# floors that lean to these sides (in focus, where a disc has no shape, the floor alone). Their mean leans nowhere.
+CAT_EYE, LEAN = 0.6, 0.5
 
 
 def depthwise(maps: Tensor, kernels: Tensor, bias: Tensor | None = None, padding: int = 0) -> Tensor:
@@ -78,12 +82,6 @@ def _gradients(
         seen = torch.fft.rfft2(functional.pad(maps.contiguous(), (padding,) * 4), s=lengths)
         of_kernels = torch.fft.irfft2((seen * error.conj()).sum(dim=0), s=lengths)[:, :size, :size]
     return of_maps, of_kernels
-
-
-FLAT_SHARE, FLAT_SHARE_IN_FOCUS = 0.05, 0.005  # of a fresh kernel, so that every one of its pixels can learn
-# Several bases of a bin must begin apart, or they would all learn the same: discs clipped from different sides, as cat-eyes are, on
-# floors that lean to these sides (in focus, where a disc has no shape, the floor alone). Their mean leans nowhere.
-CAT_EYE, LEAN = 0.6, 0.5
 
 
 def disc_kernel(size: int, diameter_px: float) -> Tensor:
