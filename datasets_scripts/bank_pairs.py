@@ -4,10 +4,9 @@
     python -m datasets_scripts.bank_pairs BANK --out DATASET [--scenes 10 --focuses 5 --lens lens.json]
     mrbokeh train fit DATASET --out RUN
 
-Random layered scenes are rendered with the exact kernels of the bank (`ScatterReference`), each focused at several distances. What is
-hard in photographs is exact here: all-in-focus picture and depth. Finished files are kept; an interrupted run goes on where it stopped.
-
-Layered scenes made from numbers, for training on a measured lens: discs and bars of texture before a wall, with lamps.
+Random layered scenes, discs and bars of texture before a wall with lamps, are rendered with the exact kernels of the bank
+(`ScatterReference`), each focused at several distances. What is hard in photographs is exact here: all-in-focus picture and depth.
+Finished files are kept; an interrupted run goes on where it stopped.
 """
 
 from collections.abc import Callable
@@ -43,51 +42,6 @@ NEAREST_M, FARTHEST_M = 0.9, 6.5
 _TEXTURES: tuple[Callable[..., Texture], ...] = (mottled, wood, checks)
 _LAMPS, _LAMP_RADIANCE = 12, (20.0, 60.0)
 _SHAPES = (3, 7)  # least and most, exclusive
-
-
-def random_layers(size_px: tuple[int, int], rng: np.random.Generator) -> list[Layer]:
-    """Front first, each of one depth, the last a slanted opaque wall; (height, width). Edges are hard: a pixel has one depth."""
-    dioptres = np.sort(rng.uniform(1.0 / FARTHEST_M, 1.0 / NEAREST_M, int(rng.integers(*_SHAPES)) + 1))[::-1]
-    shapes = [_card(size_px, float(1.0 / each), rng) for each in dioptres[:-1]]
-    return [*shapes, _wall(size_px, float(dioptres[-1]), rng)]
-
-
-def _card(size_px: tuple[int, int], depth_m: float, rng: np.random.Generator) -> Layer:
-    inside = _disc(size_px, rng) if rng.random() < 0.5 else _bar(size_px, rng)
-    rgb = np.where(inside[..., None], _texture(size_px, rng), np.float32(0.0))
-    return Layer(rgb, inside.astype(np.float32), np.where(inside, np.float32(depth_m), np.float32(np.inf)).astype(np.float32))
-
-
-def _wall(size_px: tuple[int, int], dioptres: float, rng: np.random.Generator) -> Layer:
-    """Slanted by up to a tenth of its distance, with lamps of one pixel."""
-    across = np.linspace(-0.1, 0.1, size_px[1]) * rng.uniform(-1.0, 1.0)
-    rgb = _texture(size_px, rng)
-    rows, columns = (rng.integers(0, length, _LAMPS) for length in size_px)
-    rgb[rows, columns] = rng.uniform(*_LAMP_RADIANCE, (_LAMPS, 1)) * rng.uniform(0.4, 1.0, (_LAMPS, 3))
-    depth_m = np.clip((1.0 + across) / dioptres, NEAREST_M, FARTHEST_M)
-    return opaque(rgb, np.broadcast_to(depth_m, size_px).astype(np.float32))
-
-
-def _disc(size_px: tuple[int, int], rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
-    rows, columns = np.indices(size_px) + 0.5
-    return np.asarray(
-        np.hypot(rows - rng.uniform(0, size_px[0]), columns - rng.uniform(0, size_px[1])) < size_px[0] * rng.uniform(0.1, 0.3)
-    )
-
-
-def _bar(size_px: tuple[int, int], rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
-    rows, columns = np.indices(size_px) + 0.5
-    angle_rad, row, column = rng.uniform(0.0, np.pi), rng.uniform(0, size_px[0]), rng.uniform(0, size_px[1])
-    away = (columns - column) * np.sin(angle_rad) - (rows - row) * np.cos(angle_rad)
-    return np.asarray(np.abs(away) < size_px[0] * rng.uniform(0.01, 0.08))
-
-
-def _texture(size_px: tuple[int, int], rng: np.random.Generator) -> Float32[np.ndarray, "height width 3"]:
-    colours = rng.uniform(0.05, 0.9, (2, 3))
-    whole = _TEXTURES[int(rng.integers(len(_TEXTURES)))](max(size_px), rng, tuple(colours[0]), tuple(colours[1]))
-    return np.ascontiguousarray(whole[: size_px[0], : size_px[1]]).astype(np.float32)
-
-
 PLAN_NAME = "plan.json"
 _TEST_SHARE = 0.2
 _MOST_BLUR = 0.98  # of what the bank holds
@@ -96,7 +50,7 @@ _SOME_LENS = Lens(focal_length_mm=50.0, f_number=1.0, focus_distance_m=NEAREST_M
 
 @dataclass(frozen=True)
 class PairsPlan:
-    """Equal plans and banks give equal pictures. Scenes are numbered; the last fifth of them, at least one of several, is for testing."""
+    """Settings of a set; equal plans and banks give equal pictures. The last fifth of the scenes, at least one of several, is tested."""
 
     scenes: int = 10
     focuses: int = 5
@@ -121,7 +75,7 @@ class PairsPlan:
 
     @property
     def focus_distances_m(self) -> tuple[float, ...]:
-        """Evenly in dioptres, near to far."""
+        """Focus distances evenly in dioptres, near to far."""
         return tuple(float(each) for each in 1.0 / np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, self.focuses))
 
 
@@ -158,7 +112,7 @@ def _make_stack(folder: Path, plan: PairsPlan, number: int, lens: Lens, renderer
 
 
 def _fitting_lens(bank: PsfBank, plan: PairsPlan) -> Lens:
-    """The f-number at which the largest circle of confusion of any scene is nearly the bank's."""
+    """Return the f-number at which the largest circle of confusion of any scene is nearly the bank's."""
     high_px = next((axis.high for axis in bank.axes if axis.name == "diameter_px"), None)
     if high_px is None:
         raise InputError("expected a bank over diameter, as `mrbokeh lens fit` writes it")
@@ -176,6 +130,49 @@ def _claim(out: Path, document: dict[str, object], overwrite: bool) -> None:
         raise InputError(f"{out} holds something else than a set of pairs: give the name of a new folder")
     (out / MANIFEST).unlink(missing_ok=True)
     write_json(path, document)
+
+
+def random_layers(size_px: tuple[int, int], rng: np.random.Generator) -> list[Layer]:
+    """Return layers (height, width), front first, each of one depth, the last a slanted opaque wall. A pixel has one depth."""
+    dioptres = np.sort(rng.uniform(1.0 / FARTHEST_M, 1.0 / NEAREST_M, int(rng.integers(*_SHAPES)) + 1))[::-1]
+    shapes = [_card(size_px, float(1.0 / each), rng) for each in dioptres[:-1]]
+    return [*shapes, _wall(size_px, float(dioptres[-1]), rng)]
+
+
+def _card(size_px: tuple[int, int], depth_m: float, rng: np.random.Generator) -> Layer:
+    inside = _disc(size_px, rng) if rng.random() < 0.5 else _bar(size_px, rng)
+    rgb = np.where(inside[..., None], _texture(size_px, rng), np.float32(0.0))
+    return Layer(rgb, inside.astype(np.float32), np.where(inside, np.float32(depth_m), np.float32(np.inf)).astype(np.float32))
+
+
+def _wall(size_px: tuple[int, int], dioptres: float, rng: np.random.Generator) -> Layer:
+    """Return a wall slanted by up to a tenth of its distance, with lamps of one pixel."""
+    across = np.linspace(-0.1, 0.1, size_px[1]) * rng.uniform(-1.0, 1.0)
+    rgb = _texture(size_px, rng)
+    rows, columns = (rng.integers(0, length, _LAMPS) for length in size_px)
+    rgb[rows, columns] = rng.uniform(*_LAMP_RADIANCE, (_LAMPS, 1)) * rng.uniform(0.4, 1.0, (_LAMPS, 3))
+    depth_m = np.clip((1.0 + across) / dioptres, NEAREST_M, FARTHEST_M)
+    return opaque(rgb, np.broadcast_to(depth_m, size_px).astype(np.float32))
+
+
+def _disc(size_px: tuple[int, int], rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
+    rows, columns = np.indices(size_px) + 0.5
+    return np.asarray(
+        np.hypot(rows - rng.uniform(0, size_px[0]), columns - rng.uniform(0, size_px[1])) < size_px[0] * rng.uniform(0.1, 0.3)
+    )
+
+
+def _bar(size_px: tuple[int, int], rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
+    rows, columns = np.indices(size_px) + 0.5
+    angle_rad, row, column = rng.uniform(0.0, np.pi), rng.uniform(0, size_px[0]), rng.uniform(0, size_px[1])
+    away = (columns - column) * np.sin(angle_rad) - (rows - row) * np.cos(angle_rad)
+    return np.asarray(np.abs(away) < size_px[0] * rng.uniform(0.01, 0.08))
+
+
+def _texture(size_px: tuple[int, int], rng: np.random.Generator) -> Float32[np.ndarray, "height width 3"]:
+    colours = rng.uniform(0.05, 0.9, (2, 3))
+    whole = _TEXTURES[int(rng.integers(len(_TEXTURES)))](max(size_px), rng, tuple(colours[0]), tuple(colours[1]))
+    return np.ascontiguousarray(whole[: size_px[0], : size_px[1]]).astype(np.float32)
 
 
 def main(

@@ -30,7 +30,7 @@ PLAN_NAME = "plan.json"
 
 
 def make_bokeh_stacks(out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *, overwrite: bool = False) -> FocalStackDataset | None:
-    """Write what is missing of a set, the manifest last; returns it, or None where only some scenes were asked for.
+    """Write what is missing of a set, the manifest last. Return the set, or None where only some scenes were asked for.
 
     Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
     """
@@ -49,7 +49,7 @@ def make_bokeh_stacks(out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *
 
 
 def make_pull(out: Path, plan: StacksPlan, frames: int, *, overwrite: bool = False) -> Path:
-    """A test view focused from the second to the last but one distance, evenly in dioptres, in so many frames; returns its folder."""
+    """Trace a test view in so many focus steps, evenly in dioptres, from the second to the last but one distance; return its folder."""
     if frames < 2:
         raise InputError(f"a focus pull needs at least 2 frames, got {frames}")
     name = next(name for name, part in plan.parts().items() if part == "test")

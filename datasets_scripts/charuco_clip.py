@@ -4,8 +4,6 @@
     python -m datasets_scripts.charuco_clip board.json clip.mp4   # and clip.json: the camera of each frame
 
 Any board will do: of board.json only black_mm is read, rectangles of x, y, width, height in millimetres.
-
-The path of a camera that a hand holds over a table: it wanders slowly about a point and trembles.
 """
 
 from collections.abc import Iterator
@@ -32,11 +30,13 @@ from mrbokeh.video.clip import VideoWriter
 # Sines of unrelated periods: (Hz, share). Breathing and swaying below 1 Hz, tremor of the hand at 6 to 11 Hz.
 _SWAY = ((0.23, 1.0), (0.41, 0.5), (0.87, 0.25))
 _TREMOR = ((6.1, 1.0), (8.3, 0.7), (10.9, 0.4))
+_FOCAL_LENGTH_MM, _SENSOR_WIDTH_MM = 22.0, 24.0
+_TABLE_TEXELS = 256
 
 
 @dataclass(frozen=True)
 class HandHeld:
-    """Looks at target_m (z into the table) from distance_m, elevation_deg above the table, and moves about that.
+    """The path of a hand-held camera: it looks at target_m from distance_m, elevation_deg above the table, wanders and trembles.
 
     sway_m, sway_deg: how far position and gaze wander. tremor_m, tremor_deg: amplitudes of the trembling.
     """
@@ -69,12 +69,8 @@ def _wander(sines: tuple[tuple[float, float], ...], time_s: float, rng: np.rando
     return np.sum([share * np.sin(2 * np.pi * rate * time_s + phase) for (rate, share), phase in zip(sines, phases, strict=True)], axis=0)
 
 
-_FOCAL_LENGTH_MM, _SENSOR_WIDTH_MM = 22.0, 24.0
-_TABLE_TEXELS = 256
-
-
 def pack_table(sheet: Sheet, seed: int = 0) -> PackedTable:
-    """The print as a grid of uneven cells, each black or not: a point is looked up exactly, by two searches."""
+    """Turn the print into a grid of uneven cells, each black or not: a point is looked up exactly, by two searches."""
     # Neighbours share edges but for rounding, which must not open gaps.
     begin, end = sheet.black_mm[:, :2].round(6), (sheet.black_mm[:, :2] + sheet.black_mm[:, 2:]).round(6)
     edges = [_merged(np.concatenate([begin[:, axis], end[:, axis]])) for axis in (0, 1)]
@@ -97,7 +93,7 @@ def _merged(edges_mm: Float64[np.ndarray, " edges"]) -> Float64[np.ndarray, " me
 
 @dataclass(frozen=True)
 class BoardClip:
-    """lens: blurs and gives the angle of view; its focus is where the clip is sharp. noise: see `with_noise`. samples: rays per pixel."""
+    """A clip to make. lens: blurs and gives the angle of view; its focus is where the clip is sharp. samples: rays per pixel."""
 
     sheet: Sheet
     motion: HandHeld
@@ -115,7 +111,7 @@ class BoardClip:
         return Camera(self.width_px, self.height_px, (focal_px, focal_px), (self.width_px / 2, self.height_px / 2), pose)
 
     def pictures(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
-        """Scene-linear RGB, frame by frame; the same numbers at every call."""
+        """Yield scene-linear RGB, frame by frame; the same numbers at every call."""
         table = pack_table(self.sheet, self.motion.seed)
         for frame in range(self.frames):
             rgb = trace_sheet(table, self.camera(frame), self.lens, self.samples, seed=frame)
@@ -123,7 +119,7 @@ class BoardClip:
 
 
 def write_clip(path: Path, clip: BoardClip, *, overwrite: bool = False) -> None:
-    """The video, and beside it a .json of the same name with the camera of each frame."""
+    """Write the video, and beside it a .json of the same name with the camera of each frame."""
     for each in (path, path.with_suffix(".json")):
         refuse_existing(each, overwrite)
     with VideoWriter(path, clip.width_px, clip.height_px, Fraction(clip.fps)) as video:
@@ -135,7 +131,7 @@ def write_clip(path: Path, clip: BoardClip, *, overwrite: bool = False) -> None:
 
 
 def read_clip_cameras(path: Path) -> list[Camera]:
-    """From the .json beside a clip."""
+    """Read the cameras from the .json beside a clip."""
     document = read_json(path, "the cameras of a clip")
     return [camera_from_json(each, f"{path}, frame {number}") for number, each in enumerate(document["cameras"])]
 

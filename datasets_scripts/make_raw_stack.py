@@ -1,12 +1,11 @@
 """Make RAW focal stacks with known truth: a traced still life, photographed by a simulated camera into DNG files.
 
     python -m datasets_scripts.make_raw_stack --out DIR [--viewpoints 3 --slices 7 --width 576 --height 384 --seed 1 --samples 512]
-    python -m datasets_scripts.make_raw_stack --out DIR --scene lab --viewpoints 7 --stacks 1 --slices 12 --width 960 --height 640         --jitter-px 1.2 --jitter-deg 0.03 --full-well 10000 --samples 96
+    python -m datasets_scripts.make_raw_stack --out DIR --scene lab --viewpoints 7 --stacks 1 --slices 12 --width 960 --height 640 \
+        --jitter-px 1.2 --jitter-deg 0.03 --full-well 10000 --samples 96
 
-DIR/view_V/slice_SS.dng are the photographs; DIR/truth.json, DIR/truth/view_V/all_in_focus.exr and depth.exr the truth.
-Finished files are kept, so an interrupted run goes on where it stopped.
-
-What is known exactly about a made RAW stack, as the JSON file beside it.
+DIR/view_V/slice_SS.dng are the photographs; DIR/truth.json (all that is known exactly), DIR/truth/view_V/all_in_focus.exr and depth.exr
+the truth. Finished files are kept, so an interrupted run goes on where it stopped.
 """
 
 from collections.abc import Callable, Iterator
@@ -35,7 +34,6 @@ from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-raw-stack-truth"
 VERSION = 1
-
 _RELATION = (
     "raw share = (raw - black_level) / (white_level - black_level) at each photosite = camera_from_rec709 @ rgb of the colour "
     "under it, times exposure, plus noise, clipped at 1. A reader that divides by as_shot_neutral (white balance, raw white of "
@@ -47,11 +45,13 @@ _REFERENCE = (
     "pixels of slice 0, the nearest focus, which sees the narrowest field. Slice i maps onto it by scaling about principal_px by "
     "focal_px(reference) / focal_px(slice i), or where slices were jittered by views[V].reference_from_slice[i]."
 )
+_BETWEEN_SLICES = timedelta(seconds=2)
+_BETWEEN_VIEWS = timedelta(minutes=5)
 
 
 @dataclass(frozen=True)
 class StackPlan:
-    """Everything that decides the pixels of a made stack.
+    """Settings that decide the pixels of a made stack.
 
     samples: lens rays per pixel; the truth takes as many pinhole rays.
     stacks: how many of the viewpoints are photographed; of the others there is truth only.
@@ -79,7 +79,7 @@ class StackPlan:
 
     @property
     def photographed(self) -> int:
-        """Viewpoints with slices."""
+        """Number of viewpoints with slices."""
         return self.viewpoints if self.stacks is None else min(self.stacks, self.viewpoints)
 
     def lens_at(self, slice_index: int) -> Lens:
@@ -87,15 +87,15 @@ class StackPlan:
 
     @property
     def focus_distances_m(self) -> Float[np.ndarray, " slices"]:
-        """From the lens, near to far, equally spaced in dioptres so that the blur between neighbours is the same everywhere."""
+        """Focus distances from the lens, near to far, evenly in dioptres: the blur between neighbours is the same everywhere."""
         return 1.0 / np.linspace(1.0 / self.stage.near_m, 1.0 / self.stage.far_m, self.slices)
 
     def reference_camera(self, view: int) -> Camera:
-        """Where the truth is seen from: the geometry of slice 0, the nearest focus, which sees the narrowest field."""
+        """Return the camera that the truth is seen from: the geometry of slice 0, the nearest focus, which sees the narrowest field."""
         return self.stage.camera(view, self.width_px, self.height_px, self.lens_at(0))
 
     def camera_at(self, view: int, slice_index: int) -> Camera:
-        """The camera of one slice: breathed, shifted and rolled."""
+        """Return the camera of one slice: breathed, shifted and rolled."""
         camera = self.stage.camera(view, self.width_px, self.height_px, self.lens_at(slice_index))
         shift_px, roll_rad = self.jitter_of(view, slice_index)
         turn = np.eye(4)
@@ -104,7 +104,7 @@ class StackPlan:
         return replace(camera, principal_px=(x_px, y_px), camera_from_world=turn @ camera.camera_from_world)
 
     def jitter_of(self, view: int, slice_index: int) -> tuple[Float[np.ndarray, "2"], float]:
-        """(shift in pixels, roll in radians) of a slice; none for the reference. The shift is at most jitter_px long."""
+        """Return (shift in pixels, roll in radians) of a slice; none for the reference. The shift is at most jitter_px long."""
         if slice_index == 0:
             return np.zeros(2), 0.0
         rng = np.random.default_rng([self.seed, view, slice_index, 7])
@@ -113,12 +113,65 @@ class StackPlan:
         return length_px * np.array([np.cos(angle), np.sin(angle)]), float(roll_rad)
 
     def reference_from_slice(self, view: int, slice_index: int) -> Float[np.ndarray, "2 3"]:
-        """The similarity that takes pixel positions of a slice to those of the reference, exactly."""
+        """Return the similarity that takes pixel positions of a slice to those of the reference, exactly."""
         slice_px, reference_px = (_pixels_from_plane(camera) for camera in (self.camera_at(view, slice_index), self.reference_camera(view)))
         _, roll_rad = self.jitter_of(view, slice_index)
         turn = np.eye(3)
         turn[:2, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
         return (reference_px @ np.linalg.inv(slice_px @ turn))[:2]
+
+
+def make_raw_stack(out: Path, plan: StackPlan, *, overwrite: bool = False) -> int:
+    """Write all that is missing of the plan into `out` and return how many jobs ran.
+
+    Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
+    """
+    most = plan.stage.viewpoints
+    if not 1 <= plan.viewpoints <= most or plan.slices < 1:
+        raise InputError(f"expected 1 to {most} viewpoints and at least 1 slice, got {plan.viewpoints} and {plan.slices}")
+    jobs = list(_jobs(out, plan, cache(partial(plan.stage.build, plan.seed))))
+    claim_folder(out / "truth.json", truth_document(plan), [path for job in jobs for path in job.paths], overwrite)
+    waiting = [job for job in jobs if not job.done]
+    for job in track(waiting, "tracing"):
+        job.make()
+    return len(waiting)
+
+
+def _jobs(out: Path, plan: StackPlan, scene: Callable[[], Scene]) -> Iterator[Job]:
+    """Yield the files of a stack; the scene is built when the first of them is made."""
+    for view in range(plan.viewpoints):
+        folder = out / "truth" / f"view_{view}"
+        yield Job((folder / "all_in_focus.exr", folder / "depth.exr"), partial(_make_truth, scene, plan, view, folder))
+        for index in range(plan.slices if view < plan.photographed else 0):
+            path = out / f"view_{view}" / f"slice_{index:02d}.dng"
+            yield Job((path,), partial(_make_slice, scene, plan, view, index, path))
+
+
+def _make_truth(scene: Callable[[], Scene], plan: StackPlan, view: int, folder: Path) -> None:
+    rgb, depth_m = trace_pinhole(scene(), plan.reference_camera(view), plan.samples, plan.seed, plan.sensor.footprint_px)
+    comment = "metres along the optical axis at pixel centres"
+    write_exr(folder / "depth.exr", ExrPart({"Z": depth_m.astype(np.float16)}, attributes={"comments": comment}))
+    write_image(folder / "all_in_focus.exr", rgb, half=True)
+
+
+def _make_slice(scene: Callable[[], Scene], plan: StackPlan, view: int, index: int, path: Path) -> None:
+    rgb = traced_slice(scene(), plan, view, index)
+    mosaic = plan.sensor.photograph(rgb, np.random.default_rng([plan.seed, view, index]))
+    base = ShotMetadata(plan.lens_at(index))
+    taken_at = base.taken_at + view * _BETWEEN_VIEWS + index * _BETWEEN_SLICES
+    write_dng(path, mosaic, plan.sensor, ShotMetadata(base.lens, taken_at=taken_at))
+
+
+def traced_slice(scene: Scene, plan: StackPlan, view: int, index: int) -> np.ndarray:
+    """Trace one slice as (H, W, 3) scene-linear Rec.709: what the sensor is given, before its colour filters and noise."""
+    return trace(
+        scene,
+        plan.camera_at(view, index),
+        plan.lens_at(index),
+        plan.samples,
+        plan.seed * 1000 + view * 100 + index,
+        plan.sensor.footprint_px,
+    )
 
 
 def _pixels_from_plane(camera: Camera) -> Float[np.ndarray, "3 3"]:
@@ -127,7 +180,7 @@ def _pixels_from_plane(camera: Camera) -> Float[np.ndarray, "3 3"]:
 
 
 def truth_document(plan: StackPlan) -> dict[str, Any]:
-    """The content of truth.json; it is known before any ray is traced, so it also tells whether a folder holds this very plan."""
+    """Return the content of truth.json; it is known before any ray is traced, so it also tells whether a folder holds this very plan."""
     sensor = plan.sensor
     reference = plan.lens_at(0)
     step_dioptre = float(np.diff(1.0 / plan.focus_distances_m).mean()) if plan.slices > 1 else 0.0
@@ -173,63 +226,6 @@ def _sensor_document(sensor: SensorModel) -> dict[str, Any]:
         "rec709_from_balanced_camera": np.linalg.inv(balanced_from_rec709).tolist(),
         "noise": "Poisson photons at full_well_electrons = raw white, Gaussian read noise; None or 0 electrons: no noise",
     }
-
-
-_BETWEEN_SLICES = timedelta(seconds=2)
-_BETWEEN_VIEWS = timedelta(minutes=5)
-
-
-def make_raw_stack(out: Path, plan: StackPlan, *, overwrite: bool = False) -> int:
-    """Write all that is missing of the plan into `out` and return how many jobs ran.
-
-    Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
-    """
-    most = plan.stage.viewpoints
-    if not 1 <= plan.viewpoints <= most or plan.slices < 1:
-        raise InputError(f"expected 1 to {most} viewpoints and at least 1 slice, got {plan.viewpoints} and {plan.slices}")
-    jobs = list(_jobs(out, plan, cache(partial(plan.stage.build, plan.seed))))
-    claim_folder(out / "truth.json", truth_document(plan), [path for job in jobs for path in job.paths], overwrite)
-    waiting = [job for job in jobs if not job.done]
-    for job in track(waiting, "tracing"):
-        job.make()
-    return len(waiting)
-
-
-def _jobs(out: Path, plan: StackPlan, scene: Callable[[], Scene]) -> Iterator[Job]:
-    """Yield the files of a stack; the scene is built when the first of them is made."""
-    for view in range(plan.viewpoints):
-        folder = out / "truth" / f"view_{view}"
-        yield Job((folder / "all_in_focus.exr", folder / "depth.exr"), partial(_make_truth, scene, plan, view, folder))
-        for index in range(plan.slices if view < plan.photographed else 0):
-            path = out / f"view_{view}" / f"slice_{index:02d}.dng"
-            yield Job((path,), partial(_make_slice, scene, plan, view, index, path))
-
-
-def _make_truth(scene: Callable[[], Scene], plan: StackPlan, view: int, folder: Path) -> None:
-    rgb, depth_m = trace_pinhole(scene(), plan.reference_camera(view), plan.samples, plan.seed, plan.sensor.footprint_px)
-    comment = "metres along the optical axis at pixel centres"
-    write_exr(folder / "depth.exr", ExrPart({"Z": depth_m.astype(np.float16)}, attributes={"comments": comment}))
-    write_image(folder / "all_in_focus.exr", rgb, half=True)
-
-
-def _make_slice(scene: Callable[[], Scene], plan: StackPlan, view: int, index: int, path: Path) -> None:
-    rgb = traced_slice(scene(), plan, view, index)
-    mosaic = plan.sensor.photograph(rgb, np.random.default_rng([plan.seed, view, index]))
-    base = ShotMetadata(plan.lens_at(index))
-    taken_at = base.taken_at + view * _BETWEEN_VIEWS + index * _BETWEEN_SLICES
-    write_dng(path, mosaic, plan.sensor, ShotMetadata(base.lens, taken_at=taken_at))
-
-
-def traced_slice(scene: Scene, plan: StackPlan, view: int, index: int) -> np.ndarray:
-    """(H, W, 3) scene-linear Rec.709: what the sensor is given for one slice, before its colour filters and noise."""
-    return trace(
-        scene,
-        plan.camera_at(view, index),
-        plan.lens_at(index),
-        plan.samples,
-        plan.seed * 1000 + view * 100 + index,
-        plan.sensor.footprint_px,
-    )
 
 
 def main(

@@ -2,16 +2,10 @@
 
     python -m datasets_scripts.mixed_reality OUT [--scenes fence,leaves --seed 1 --views 1 --width 640 --height 360 --samples 256]
 
-The object hangs behind a fence or leaves and before everything else. OUT/SCENE_SEED/view_NN/ holds meta.json (lens, camera, openings,
-conventions), scene/all_in_focus.exr, scene/depth.exr, scene/OPENING_FOCUS.exr (the photographs), object.exr (sharp, RGBA and Z),
-both/OPENING_FOCUS.exr (the truth) and sheet.png. Finished files are kept, so an interrupted run goes on where it stopped. It needs
-Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and is fast where LLVM's library is installed (Debian: libllvm19).
-
-Virtual objects for the mixed-reality truth: a ball in a hoop, a box and leaves, between the near things of a scene and the rest.
-
-A contact sheet of one view of the mixed-reality truth: what is sharp, then every photograph beside the same with the object.
-
-The files of one view of the mixed-reality truth: the scene alone, the object alone, and both traced together.
+The object, a ball in a hoop, a box and leaves, hangs behind a fence or leaves and before everything else. OUT/SCENE_SEED/view_NN/ holds
+meta.json (lens, camera, openings, conventions), scene/all_in_focus.exr, scene/depth.exr, scene/OPENING_FOCUS.exr (the photographs),
+object.exr (sharp, RGBA and Z), both/OPENING_FOCUS.exr (the truth) and sheet.png. Finished files are kept, so an interrupted run goes on
+where it stopped. It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and LLVM's library (Debian: libllvm19).
 """
 
 from collections.abc import Iterator
@@ -38,13 +32,21 @@ from mrbokeh.system.errors import InputError
 
 _HOOP_POINTS = 96
 _SUN, _SKY = slice(6, 9), slice(9, 12)
-
 OBJECT_DISTANCES_M: dict[str, float] = {"fence": 1.25, "leaves": 1.9}
 """Scenes with near things, and the distance of the object's middle: behind all of those, before all of the rest."""
+What = Literal["scene", "both"]
+OBJECT_CONVENTIONS = {
+    "scene": "scene/ holds the scene without the object and without lamps that would hang before it: all_in_focus.exr, depth.exr and "
+    "the photographs that the object goes into",
+    "object": "object.exr is the object alone in focus, premultiplied RGBA with Z in metres, nothing before it and nothing behind",
+    "both": "both/ holds scene and object traced together, of the same random numbers as scene/",
+    "light": "nothing throws a shadow and nothing is mirrored, so the light on the scene and on the object is what it is alone",
+}
+DEFAULT_SHAPES = ("disc", "blades7", "cat_eye")
 
 
 def virtual_object(name: str, seed: int) -> TruthScene:
-    """The object of a scene alone, as a thin foreground before nothing; the seed chooses textures and places."""
+    """Build the object of a scene alone, as a thin foreground before nothing; the seed chooses textures and places."""
     rng = np.random.default_rng([seed, *f"object of {name}".encode()])
     distance_m = OBJECT_DISTANCES_M[name]
     centre_m = distance_m * np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.02, 0.02), 1.0])
@@ -55,19 +57,19 @@ def virtual_object(name: str, seed: int) -> TruthScene:
 
 
 def scene_around(name: str, seed: int) -> TruthScene:
-    """The truth scene of that name without the lamps that would hang before or in the object."""
+    """Build the truth scene of that name without the lamps that would hang before or in the object."""
     scene, virtual = make_scene(name, seed), virtual_object(name, seed)
     behind_m = max(float(body.vertices_m[:, 2].max()) for body in virtual.bodies)
     return replace(scene, lamps=tuple(lamp for lamp in scene.lamps if lamp.centre_m[2] > behind_m))
 
 
 def with_object(scene: TruthScene, virtual: TruthScene) -> TruthScene:
-    """Both in one world."""
+    """Return scene and object in one world."""
     return replace(scene, bodies=(*scene.bodies, *(replace(body, thin=False) for body in virtual.bodies)))
 
 
 def without_shadows(packed: PackedScene) -> PackedScene:
-    """The sun reaches whatever faces it: then neither of two things changes the light on the other."""
+    """Let the sun reach whatever faces it: then neither of two things changes the light on the other."""
     facets = packed.facets.copy()
     facets[:, _SKY] += facets[:, _SUN]
     facets[:, _SUN] = 0.0
@@ -99,36 +101,11 @@ def _leaves(rng: np.random.Generator, centre_m: np.ndarray, size_m: float) -> li
 
 
 def _turn(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """Facing the camera within about 30 degrees."""
+    """Draw a turn that faces the camera within about 30 degrees."""
     roll, yaw = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.5, 0.5)
     along = np.array([np.cos(roll) * np.cos(yaw), np.sin(roll), np.cos(roll) * np.sin(yaw)])
     towards = np.array([np.sin(yaw), 0.0, -np.cos(yaw)])
     return np.stack([along, np.cross(towards, along), towards])
-
-
-def write_sheet(folder: Path) -> None:
-    """folder/sheet.png: sharp scene and object, then per opening the photographs, and under them both traced together."""
-    meta = read_json(folder / "meta.json", "the description of a view (meta.json)")
-    virtual, scene_rgb = read_layer(folder / "object.exr"), read_image(folder / "scene" / "all_in_focus.exr")
-    coverage = np.repeat(virtual.alpha[..., None], 3, axis=2)
-    rows = [SheetRow("sharp", {"all in focus": scene_rgb, "the object": virtual.rgb, "its coverage": coverage})]
-    for shape, names in meta["truth"].items():
-        for what in ("scene", "both"):
-            captions = [f"focus {distance_m:.2f} m" for distance_m in meta["focus_distances_m"]]
-            pictures = {caption: read_image(folder / what / name) for caption, name in zip(captions, names, strict=True)}
-            rows.append(SheetRow(f"{shape}, {what}", pictures))
-    write_contact_sheet(folder / "sheet.png", rows)
-
-
-What = Literal["scene", "both"]
-
-OBJECT_CONVENTIONS = {
-    "scene": "scene/ holds the scene without the object and without lamps that would hang before it: all_in_focus.exr, depth.exr and "
-    "the photographs that the object goes into",
-    "object": "object.exr is the object alone in focus, premultiplied RGBA with Z in metres, nothing before it and nothing behind",
-    "both": "both/ holds scene and object traced together, of the same random numbers as scene/",
-    "light": "nothing throws a shadow and nothing is mirrored, so the light on the scene and on the object is what it is alone",
-}
 
 
 class MixedView(ViewFiles):
@@ -151,7 +128,7 @@ class MixedView(ViewFiles):
         return make_tracer(without_shadows(pack(scene, camera)), camera, part, self._plan.seed)
 
     def document(self) -> dict[str, object]:
-        """meta.json: that of the scene's own truth, and what is added."""
+        """Return meta.json: that of the scene's own truth, and what is added."""
         document = view_document(self._plan, self._name, self.scene, self._number)
         conventions = {key: text for key, text in dict(document["conventions"]).items() if key != "layers"}  # type: ignore[call-overload]
         truth = {shape: [truth_name(shape, k) for k in range(len(self.scene.focus_distances_m))] for shape in self._plan.shapes}
@@ -175,7 +152,18 @@ class MixedView(ViewFiles):
                     yield Job((path,), partial(self._make_defocused, what, shape, distance_m, path))
 
     def write_sheet(self) -> None:
-        write_sheet(self.folder)
+        """Write sharp scene and object, then per opening the photographs, and under them both traced together."""
+        folder = self.folder
+        meta = read_json(folder / "meta.json", "the description of a view (meta.json)")
+        virtual, scene_rgb = read_layer(folder / "object.exr"), read_image(folder / "scene" / "all_in_focus.exr")
+        coverage = np.repeat(virtual.alpha[..., None], 3, axis=2)
+        rows = [SheetRow("sharp", {"all in focus": scene_rgb, "the object": virtual.rgb, "its coverage": coverage})]
+        for shape, names in meta["truth"].items():
+            for what in ("scene", "both"):
+                captions = [f"focus {distance_m:.2f} m" for distance_m in meta["focus_distances_m"]]
+                pictures = {caption: read_image(folder / what / name) for caption, name in zip(captions, names, strict=True)}
+                rows.append(SheetRow(f"{shape}, {what}", pictures))
+        write_contact_sheet(folder / "sheet.png", rows)
 
     def _make_sharp(self) -> None:
         layer = self._sharp(self._tracers["scene"])
@@ -194,17 +182,15 @@ class MixedView(ViewFiles):
         write_image(path, tracer.traced(opening, self._plan.samples).rgb + tracer.lamp_light(opening, self._plan.lamp_rays))
 
 
-DEFAULT_SHAPES = ("disc", "blades7", "cat_eye")
-
-
 def mixed_reality(out: Path, plan: TruthPlan, *, overwrite: bool = False) -> int:
-    """`truth_set.make_missing` of MixedView; raises InputError for scenes without an object too."""
+    """Make the missing files of a set, as `truth_set.make_missing` does; raises InputError for scenes without an object too."""
     if set(plan.scenes) - set(OBJECT_DISTANCES_M):
         raise InputError(f"expected scenes out of {','.join(OBJECT_DISTANCES_M)}, got {','.join(plan.scenes)}")
     return make_missing(MixedView, out, plan, overwrite=overwrite)
 
 
 main = truth_command(mixed_reality, tuple(OBJECT_DISTANCES_M), DEFAULT_SHAPES)
+
 
 if __name__ == "__main__":
     typer.run(main)

@@ -37,7 +37,7 @@ _ASK = "No licence text is known to this project: ask the authors before any use
 
 @dataclass(frozen=True)
 class Kind:
-    """stacks: the adapter. lens: what the set says about its lens. licence: a note for the manifest."""
+    """A public set. stacks: the adapter. lens: what the set says about its lens. licence: a note for the manifest."""
 
     stacks: Callable[[Path], list[PublicStack]]
     lens: PublicLens
@@ -92,7 +92,7 @@ def main(
 
 
 def crop_of(text: str) -> tuple[int, int] | None:
-    """(width, height) of "1024x768", None of an empty text."""
+    """Return (width, height) of "1024x768", None of an empty text."""
     if not text:
         return None
     found = re.fullmatch(r"(\d+)x(\d+)", text)

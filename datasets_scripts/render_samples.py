@@ -5,8 +5,6 @@
 OUT/SCENE_SEED/ holds meta.json (settings, conventions), lens.json, samples.npz (LightFieldSamples: layering/light_field_samples.py),
 reference.exr, all_in_focus.exr with Z and motion, layers/NN.exr where a foreground hides what is behind it, and, if asked for,
 noise.json. Finished files are kept, so an interrupted run goes on where it stopped.
-
-What is made of one scene: samples, reference, sharp pictures and their description, each only where it is missing.
 """
 
 from collections.abc import Callable, Iterator
@@ -71,11 +69,11 @@ class SamplesPlan:
             )
 
     def tracer(self, scene: MovingScene, threads: int = 0, repeat: int = 0) -> SampleTracer:
-        """repeat: another one draws other numbers for the same scene."""
+        """Return the sampler of a scene; another `repeat` draws other numbers."""
         return SampleTracer(scene, self.lens, self.width_px, self.height_px, 2 * self.seed + repeat, threads)
 
     def document(self, scene: MovingScene) -> dict[str, Any]:
-        """meta.json."""
+        """Return the content of meta.json."""
         return {
             "format": "mrbokeh-samples",
             "version": 1,
@@ -120,7 +118,7 @@ class SamplesSet:
         claim_folder(self.folder / "meta.json", self._plan.document(self.scene), files, overwrite)
 
     def jobs(self, measure: bool) -> Iterator[Job]:
-        """measure: the noise of the reference too, which is made once more for that."""
+        """Yield the files of the set. measure: the noise of the reference too, which is made once more for that."""
         folder, tracer = self.folder, self._plan.tracer(self.scene, self._threads)
         yield Job(folder / "lens.json", 0, lambda _: write_lens(folder / "lens.json", self._plan.lens))
         yield Job(folder / "samples.npz", tracer.steps, self._make_samples)
@@ -144,7 +142,7 @@ class SamplesSet:
         write_image(self.folder / "reference.exr", self._plan.tracer(self.scene, self._threads).mean(self._plan.reference_spp, advance))
 
     def _measure_noise(self, advance: Advance) -> None:
-        """PSNR in clipped linear light of the reference against a second one, and of the mean of the samples against the first.
+        """Write PSNR in clipped linear light of the reference against a second one, and of the mean of the samples against the first.
 
         The noise of one reference is half the power of the difference, 3 dB less than the first number says.
         """
@@ -158,7 +156,7 @@ class SamplesSet:
 
 
 def in_a_row(arrays: SampleArrays) -> LightFieldSamples:
-    """Pixel by pixel, row by row."""
+    """Return samples pixel by pixel, row by row."""
     height_px, width_px, spp = arrays.time.shape
     count = height_px * width_px * spp
     fields = (arrays.xy_px, arrays.lens_uv, arrays.time, arrays.rgb, arrays.depth_m, arrays.motion_px)
@@ -166,7 +164,7 @@ def in_a_row(arrays: SampleArrays) -> LightFieldSamples:
 
 
 def render_samples(out: Path, plan: SamplesPlan, *, measure: bool = False, overwrite: bool = False, threads: int = 0) -> int:
-    """Write all that is missing of the plan into `out`; returns how many files were made.
+    """Write all that is missing of the plan into `out` and return how many files were made.
 
     Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
     """

@@ -32,7 +32,7 @@ Axes = Float64[np.ndarray, "3 3"]
 
 
 def with_axes(rgb: Picture, camera: Camera, axes_m: Axes, at_m: Vector) -> Picture:
-    """A copy with the axes from `at_m` on, in the world's metres. Lines with an end behind the camera are left out."""
+    """Return a copy with the axes from `at_m` on, in the world's metres. Lines with an end behind the camera are left out."""
     drawn = rgb.copy()
     one, other, _ = axes_m
     corners = [at_m + sides for sides in (one + other, one - other, -one - other, -one + other)]
@@ -44,7 +44,7 @@ def with_axes(rgb: Picture, camera: Camera, axes_m: Axes, at_m: Vector) -> Pictu
 
 
 def axes_of(up: str, size_m: float) -> Axes:
-    """Rows: the two axes of the ground, then up. up: as of a CameraTrack, such as -z."""
+    """Return rows: the two axes of the ground, then up. up: as of a CameraTrack, such as -z."""
     upward = "xyz".index(up[1])
     ground = [number for number in range(3) if number != upward]
     signs = np.array([1.0, 1.0, -1.0 if up[0] == "-" else 1.0])
@@ -52,7 +52,7 @@ def axes_of(up: str, size_m: float) -> Axes:
 
 
 def track_sheet(clip: Path, track: CameraTrack, at_m: Vector, size_m: float) -> Picture:
-    """Three frames of the clip side by side. Raises InputError where the track has no camera of one of them."""
+    """Return three frames of the clip side by side. Raises InputError where the track has no camera of one of them."""
     frames = [np.round(linear_to_srgb(np.clip(frame.rgb, 0.0, 1.0)) * 255.0).astype(np.uint8) for frame in read_frames(clip)]
     chosen = [round(share * (len(frames) - 1)) for share in _SHARES]
     axes_m = axes_of(track.up, size_m)

@@ -1,10 +1,8 @@
-"""The examples of docs/examples.md: what they are called, which commands make them, and the picture of the result.
-
-Build the gallery: run every example of docs/examples.md and show what it made.
+"""Build the gallery: run every example of docs/examples.md and show what it made.
 
     python -m datasets_scripts.gallery gallery_out [--demo demo_out] [--only composite,video] [--update]
 
-They are the only list: a heading, a `sh` block, a picture, and a comment that says which of the files that the block
+The page is the only list of examples: a heading, a `sh` block, a picture, and a comment that says which of the files that the block
 made the picture shows (`<!-- shows: out.png -->`), or which page to look at while its last command runs (`<!-- page: http://... -->`).
 They run in OUT, where demo_out leads to a finished demo and repository to this repository. Finished commands and pictures are kept,
 so that an interrupted run goes on; after a command has changed, begin with an empty folder. OUT/gallery.html shows all; --update puts the
@@ -34,11 +32,16 @@ _ENTRY = re.compile(
     r"<!-- (?P<kind>shows|page): (?P<source>[^\n]+?) -->",
     re.DOTALL | re.MULTILINE,
 )
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "docs" / "examples.md"
+FINISHED = ".finished"
+FINDS = 1
+"""`mrbokeh check` ends with it where it found something, which is what its example shows."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """picture: its path from the page. Either `shows`, files that the commands make (side by side), or `page`, an address."""
+    """An example. picture: its path from the page. Either `shows`, files that the commands make (side by side), or `page`, an address."""
 
     title: str
     commands: tuple[str, ...]
@@ -49,7 +52,7 @@ class Entry:
 
 
 def read_entries(page: str) -> list[Entry]:
-    """All examples with a picture, in order. Raises InputError where there is none."""
+    """Return all examples with a picture, in order. Raises InputError where there is none."""
     entries = [_entry(found) for found in _ENTRY.finditer(page)]
     if not entries:
         raise InputError(
@@ -67,13 +70,6 @@ def _entry(found: re.Match[str]) -> Entry:
 
 def _without_comment(line: str) -> str:
     return re.sub(r"\s+#.*", "", line).strip()
-
-
-ROOT = Path(__file__).resolve().parents[2]
-EXAMPLES = ROOT / "docs" / "examples.md"
-FINISHED = ".finished"
-FINDS = 1
-"""`mrbokeh check` ends with it where it found something, which is what its example shows."""
 
 
 def build(out: Path, entries: list[Entry], demo: Path) -> None:
@@ -101,7 +97,7 @@ def _made(entry: Entry, out: Path) -> bytes:
 
 
 def _run(command: str, out: Path) -> None:
-    """Unless it ran before. The demo was finished before all this, in the folder that the link leads to."""
+    """Run a command unless it ran before. The demo was finished before all this, in the folder that the link leads to."""
     finished = out / FINISHED
     before = finished.read_text(encoding="utf-8").splitlines() if finished.is_file() else []
     if command in before or command.startswith("mrbokeh demo "):
@@ -116,12 +112,12 @@ def _run(command: str, out: Path) -> None:
 
 
 def _with_scripts() -> dict[str, str]:
-    """`python -m datasets_scripts...` is found from any folder."""
+    """Return an environment in which `python -m datasets_scripts...` is found from any folder."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
 
 
 def _words(command: str) -> list[str]:
-    """`mrbokeh` and `python` are those that run this."""
+    """Split a command; `mrbokeh` and `python` become those that run this."""
     program, *words = shlex.split(command)
     own = {"mrbokeh": [sys.executable, "-m", "mrbokeh.cli"], "python": [sys.executable]}
     return [*own.get(program, [program]), *words]

@@ -19,11 +19,11 @@ _FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-sw
 
 
 class NavigatedError(Exception):
-    """An expression was asked for while the browser went from one page to the next."""
+    """An expression was evaluated while the browser went from one page to the next."""
 
 
 class Page:
-    """What the tests do on a page. errors: exceptions and refusals that its console showed."""
+    """A page in the browser. errors: exceptions and refusals that its console showed."""
 
     def __init__(self, devtools: aiohttp.ClientWebSocketResponse) -> None:
         self._devtools, self._number = devtools, 0
@@ -46,7 +46,7 @@ class Page:
             self.errors.append(f"{details['entry']['text']} {details['entry'].get('url', '')}")
 
     async def value(self, expression: str) -> Any:
-        """Of a JavaScript expression, awaited if it is a promise."""
+        """Return the value of a JavaScript expression, awaited if it is a promise."""
         answer = await self.send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
@@ -64,35 +64,35 @@ class Page:
         await self.send("Emulation.setDeviceMetricsOverride", **metrics)
 
     async def box(self, selector: str) -> tuple[float, float, float, float]:
-        """(left, top, width, height) of an element in the window, px."""
+        """Return (left, top, width, height) of an element in the window, px."""
         rect = await self.value(f"(r => [r.left, r.top, r.width, r.height])(document.querySelector('{selector}').getBoundingClientRect())")
         return rect[0], rect[1], rect[2], rect[3]
 
     async def touch(self, *points: list[tuple[float, float]]) -> None:
-        """Fingers down at the first list of points, then along the others, then up."""
+        """Put fingers down at the first list of points, move them along the others, then up."""
         for kind, at in [("touchStart", points[0]), *(("touchMove", each) for each in points[1:])]:
             await self.send("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(at)])
         await self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     async def tap(self, selector: str, x: float = 0.5, y: float = 0.5) -> None:
-        """At a fraction of an element's width and height."""
+        """Tap at a fraction of an element's width and height."""
         await self.value(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
         left, top, width, height = await self.box(selector)
         await self.touch([(left + x * width, top + y * height)])
 
     async def choose(self, selector: str, option: str) -> None:
-        """In a <select>, whose list is the system's own."""
+        """Choose an option of a <select>, whose list is the system's own."""
         await self.value(f"(s => {{ s.value = '{option}'; s.dispatchEvent(new Event('change')); }})(document.querySelector('{selector}'))")
 
     async def screenshot(self) -> np.ndarray:
-        """(H, W, 3) of the window, red first."""
+        """Return (H, W, 3) of the window, red first."""
         png = base64.b64decode((await self.send("Page.captureScreenshot", format="png"))["data"])
         return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))[..., ::-1]
 
 
 @asynccontextmanager
 async def chromium_page(url: str, profile: Path, *flags: str, size_px: tuple[int, int] = (390, 844)) -> AsyncIterator[Page]:
-    """A browser with a profile of its own; it has touch and the size of a phone."""
+    """Yield a page of a browser with a profile of its own; it has touch and the size of a phone."""
     command = [str(CHROMIUM), *_FLAGS, f"--user-data-dir={profile}", *flags, "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

@@ -29,7 +29,7 @@ _STEADY = r"(text => !text.includes('tracking') || /tracking (8\d|9\d|100) %/.te
 
 
 def result_jpeg(*paths: Path) -> bytes:
-    """Pictures side by side. An EXR is tone-mapped, of a video three frames are shown, of a long sheet its upper part."""
+    """Return pictures side by side. An EXR is tone-mapped, of a video three frames are shown, of a long sheet its upper part."""
     pictures = [_shown(path) for path in paths]
     height_px = min(picture.shape[0] for picture in pictures)
     return _jpeg(np.concatenate([_resized(picture, height_px) for picture in pictures], axis=1))
@@ -52,7 +52,7 @@ def _resized(rgb: UInt8[np.ndarray, "height width 3"], height_px: int) -> UInt8[
 
 
 def page_jpeg(command: list[str], address: str, folder: Path) -> bytes:
-    """A page that a command serves, as a browser shows it a few seconds after it was opened."""
+    """Return a page that a command serves, as a browser shows it a few seconds after it was opened."""
     if CHROMIUM is None:
         raise InputError(f"a picture of {address} needs a browser: install Chromium (`apt-get install chromium`)")
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True, start_new_session=True) as server:
@@ -65,7 +65,7 @@ def page_jpeg(command: list[str], address: str, folder: Path) -> bytes:
 
 
 def _wait_for_address(server: "subprocess.Popen[str]") -> None:
-    """Servers print their address once they answer."""
+    """Wait until the server prints its address, which it does once it answers."""
     end_s = time.monotonic() + _STARTS_S
     assert server.stdout is not None
     for line in server.stdout:

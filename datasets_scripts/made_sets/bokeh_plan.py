@@ -1,6 +1,6 @@
-"""The four openings of Neural Bokeh's synthetic sets (Mandl et al. 2024, Figure 5): heart, circle, bladed, round.
+"""The plan of a set of bokeh stacks: scenes, viewpoints, focus distances, the lens, and which stacks are tested on.
 
-What a set of bokeh stacks consists of: scenes, viewpoints, focus distances, the lens, and which stacks are tested on.
+Openings are the four of Neural Bokeh's synthetic sets (Mandl et al. 2024, Figure 5): heart, circle, bladed, round.
 """
 
 from collections.abc import Callable
@@ -20,22 +20,27 @@ from mrbokeh.system.errors import InputError
 
 _RING = FieldStop()
 _ROUND_WITH_RIM = replace(Aperture.disc(), cat_eye=0.35)
+FOCAL_LENGTH_MM, SENSOR_WIDTH_MM = 50.0, 36.0
+NEAREST_FOCUS_M, FARTHEST_FOCUS_M = 0.9, 6.5
+TEST_SHARE = 0.2
+_MOST_ASIDE_M = (0.16, 0.08, 0.04)
+_SMALLEST_PX = 16
 
 
 @dataclass(frozen=True, eq=False)
 class BokehShape:
-    """aperture, stop: what rays go through. stated: the aperture as a lens file can say it; where a stop moves, that of the middle."""
+    """An opening. aperture, stop: what rays go through. stated: the aperture as a lens file can say it; of a stop, that of the middle."""
 
     aperture: Aperture
     stated: Aperture
     stop: FieldStop | None = None
 
     def seen(self, side: int, field_xy: tuple[float, float]) -> Aperture:
-        """The plain aperture at a place of the frame (half diagonals), whether the lens file can state it or not."""
+        """Return the plain aperture at a place of the frame (half diagonals), whether the lens file can state it or not."""
         return self.aperture.seen(side, field_xy) if self.stop is None else self.stop.seen(self.aperture, field_xy)
 
     def document(self) -> dict[str, Any]:
-        """For the manifest: what the lens file leaves out."""
+        """Return what the lens file leaves out, for the manifest."""
         if self.stop is None:
             return {"lens_file": "states the opening exactly"}
         return {
@@ -65,17 +70,9 @@ def bokeh_shape(name: str) -> BokehShape:
     return SHAPES[name]()
 
 
-FOCAL_LENGTH_MM, SENSOR_WIDTH_MM = 50.0, 36.0
-NEAREST_FOCUS_M, FARTHEST_FOCUS_M = 0.9, 6.5
-TEST_SHARE = 0.2
-
-_MOST_ASIDE_M = (0.16, 0.08, 0.04)
-_SMALLEST_PX = 16
-
-
 @dataclass(frozen=True)
 class StackSize:
-    """samples: camera rays per pixel, in two halves, best powers of two; each lamp sends out lamp_rays. f_number sets the largest blur."""
+    """Extent of a set. samples: camera rays per pixel, in two halves, best powers of two; each lamp sends out lamp_rays."""
 
     scenes: tuple[str, ...]
     views: int
@@ -105,7 +102,7 @@ SIZES = {
 
 @dataclass(frozen=True)
 class StacksPlan:
-    """Equal plans give equal pictures, but for the rounding of lamps' light, which threads add in any order."""
+    """Settings of a set; equal plans give equal pictures, but for the rounding of lamps' light, which threads add in any order."""
 
     shape: str
     size: StackSize = field(default_factory=lambda: SIZES["small"])
@@ -131,13 +128,13 @@ class StacksPlan:
 
     @property
     def focus_distances_m(self) -> tuple[float, ...]:
-        """Evenly in dioptres, near to far: the steps of blur are equal."""
+        """Focus distances evenly in dioptres, near to far: the steps of blur are equal."""
         dioptres = np.linspace(1.0 / NEAREST_FOCUS_M, 1.0 / FARTHEST_FOCUS_M, self.size.focuses)
         return tuple(float(each) for each in 1.0 / dioptres)
 
     def parts(self) -> dict[str, Part]:
-        """A fifth of the stacks is for testing: a tenth of the scenes (at least one of several) as a whole, and of the others the last
-        views until the fifth is full, one of each scene before a second one.
+        """Tell which fifth of the stacks is for testing: a tenth of the scenes (at least one of several) as a whole, and of the others the
+        last views until the fifth is full, one of each scene before a second one.
         """
         scenes, views = self.size.scenes, self.size.views
         whole = min(max(1, round(0.5 * TEST_SHARE * len(scenes))), len(scenes) - 1)
@@ -147,7 +144,7 @@ class StacksPlan:
         return {name: "test" if name in apart else "train" for name in self.names}
 
     def camera(self, scene: str, view: int) -> Camera:
-        """The first view looks straight ahead from the middle, the others from random places beside it; all along the axis, since lamps
+        """Return the first view straight ahead from the middle, others from random places beside it; all look along the axis, since lamps
         are discs that face it. The field of view is that of the lens focused at infinity.
         """
         focal_px = FOCAL_LENGTH_MM * self.size.width_px / SENSOR_WIDTH_MM
@@ -158,11 +155,11 @@ class StacksPlan:
         return Camera(self.size.width_px, self.size.height_px, (focal_px, focal_px), middle_px, camera_from_world)
 
     def lens(self, focus_distance_m: float) -> Lens:
-        """As the lens file states it."""
+        """Return the lens that the lens file states."""
         return Lens(FOCAL_LENGTH_MM, self.size.f_number, focus_distance_m, SENSOR_WIDTH_MM, self.opening.stated)
 
     def traced_opening(self, focus_distance_m: float) -> Opening:
-        """The pupil that gives the fixed camera exactly the blur of `Lens.coc_px`: it grows as the lens moves out to focus nearer."""
+        """Return the pupil that gives the fixed camera the blur of `Lens.coc_px`: it grows as the lens moves out to focus nearer."""
         focal_px = FOCAL_LENGTH_MM * self.size.width_px / SENSOR_WIDTH_MM
         per_dioptre_px = self.lens(focus_distance_m).coc_px_per_dioptre(self.size.width_px)
         shape = self.opening

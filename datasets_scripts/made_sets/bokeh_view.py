@@ -41,7 +41,7 @@ class StackView:
         self.focus_distances_m = focus_distances_m or plan.focus_distances_m
 
     def jobs(self) -> Iterator[Job]:
-        """stack.json comes last, when the pictures are there."""
+        """Yield the files of the view; stack.json comes last, when the pictures are there."""
         yield Job((self.folder / "all_in_focus.exr", self.folder / "depth.exr"), self._make_sharp)
         for index in range(len(self.focus_distances_m)):
             yield Job((self.folder / slice_name(index),), partial(self._make_slice, index))
@@ -49,14 +49,14 @@ class StackView:
 
     @cached_property
     def _tracers(self) -> tuple[TruthTracer, TruthTracer]:
-        """Equal but for their random numbers, so that their difference shows the noise."""
+        """Two tracers, equal but for their random numbers, so that their difference shows the noise."""
         camera = self._plan.camera(self._scene, self._view)
         packed = pack(bokeh_scene(self._scene), camera)
         first, second = (make_tracer(packed, camera, "all", 2 * self._plan.seed + half) for half in (0, 1))
         return first, second
 
     def defocused(self, opening: Opening) -> tuple[Picture, float]:
-        """(picture, its noise floor in dB: the PSNR that a perfect method would reach)."""
+        """Return (picture, its noise floor in dB: the PSNR that a perfect method would reach)."""
         size = self._plan.size
         first, second = (
             tracer.traced(opening, self._plan.samples // 2).rgb + tracer.lamp_light(opening, size.lamp_rays // 2)
@@ -91,7 +91,7 @@ class StackView:
 
 
 def dataset_of(out: Path, plan: StacksPlan) -> FocalStackDataset:
-    """The data set of finished stacks. Its radiance scale is the largest radiance: nothing is cut off."""
+    """Return the data set of finished stacks. Its radiance scale is the largest radiance: nothing is cut off."""
     records = tuple(stack_record(out, name, part) for name, part in plan.parts().items())
     floors_db = {record.name: noise_floors_db(read_focal_stack(out / record.name)) for record in records}
     every_db = [each for floors in floors_db.values() for each in floors]

@@ -1,4 +1,4 @@
-"""What a data set still lacks, piece by piece, so that an interrupted run goes on where it stopped."""
+"""Files that a data set still lacks, made piece by piece, so that an interrupted run goes on where it stopped."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,10 +1,8 @@
-"""A simulated digital camera sensor: scene-linear Rec.709 in, Bayer mosaic of integers out, with photon and read noise.
+"""A simulated digital camera: scene-linear Rec.709 in, Bayer mosaic with photon and read noise, DNG files out.
 
-DNG files (Adobe DNG 1.4) that raw converters open: an uncompressed Bayer mosaic with colour, lens and focus metadata.
-
-Distances: EXIF SubjectDistance counts from the film plane, Lens.focus_distance_m from the lens. For a thin lens
-(principal planes together) film_plane_m = d_f + d_s with 1/f = 1/d_f + 1/d_s; `film_plane_distance_m` is that sum and
-`focus_distance_from_film_plane_m` solves it for d_f.
+DNG files (Adobe DNG 1.4) are uncompressed mosaics with colour, lens and focus metadata that raw converters open. EXIF SubjectDistance
+counts from the film plane, Lens.focus_distance_m from the lens. For a thin lens (principal planes together) film_plane_m = d_f + d_s
+with 1/f = 1/d_f + 1/d_s; `film_plane_distance_m` is that sum and `focus_distance_from_film_plane_m` solves it for d_f.
 """
 
 from dataclasses import dataclass
@@ -22,11 +20,16 @@ from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
 
 CFA_PATTERNS = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
-
 # How a plausible white-balanced camera sees linear Rec.709 (rows sum to 1), and what it answers to D65 white before white balance.
 _BALANCED_CAMERA_FROM_REC709 = np.array([[0.68, 0.26, 0.06], [0.16, 0.70, 0.14], [0.04, 0.22, 0.74]])
 _ANSWER_TO_WHITE = np.array([0.5, 1.0, 0.625])
 _MATRIX_DENOMINATOR = 10000
+_FINE_DENOMINATOR = 1000000
+_DISTANCE_DENOMINATOR = 100000
+_D65_ILLUMINANT = 21
+_CFA_PHOTOMETRIC = 32803
+_CENTIMETRES = 3
+_MANUAL_EXPOSURE = 1
 
 
 def _default_camera_from_xyz() -> Float[np.ndarray, "3 3"]:
@@ -76,18 +79,18 @@ class SensorModel:
         return self.camera_from_rec709.sum(axis=1)
 
     def cfa_colours(self, height: int, width: int) -> UInt8[np.ndarray, "height width"]:
-        """(H, W): 0 red, 1 green, 2 blue under each photosite."""
+        """Return (H, W): 0 red, 1 green, 2 blue under each photosite."""
         cell = np.asarray(CFA_PATTERNS[self.pattern], np.uint8).reshape(2, 2)
         return np.tile(cell, (height // 2 + 1, width // 2 + 1))[:height, :width]
 
     def linear_mosaic(self, rgb: Float[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width"]:
-        """Scene-linear Rec.709 to the noise-free share of the raw range at each photosite; may exceed 1 (not clipped yet)."""
+        """Turn scene-linear Rec.709 into the noise-free share of the raw range at each photosite; may exceed 1 (not clipped yet)."""
         camera_rgb = self.exposure * (rgb @ self.camera_from_rec709.T.astype(rgb.dtype))
         colours = self.cfa_colours(*rgb.shape[:2])
         return np.take_along_axis(camera_rgb, colours[..., None].astype(np.intp), axis=2)[..., 0].astype(np.float32)
 
     def expose(self, mosaic: Float[np.ndarray, "height width"], rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
-        """Photon noise (Poisson, saturating at the full well) and read noise (Gaussian) on a noise-free mosaic."""
+        """Add photon noise (Poisson, saturating at the full well) and read noise (Gaussian) to a noise-free mosaic."""
         if not self.full_well_electrons:
             return np.minimum(mosaic, 1.0).astype(np.float32)
         electrons = rng.poisson(np.maximum(mosaic, 0.0) * self.full_well_electrons)
@@ -95,26 +98,18 @@ class SensorModel:
         return (np.minimum(electrons + read, self.full_well_electrons) / self.full_well_electrons).astype(np.float32)
 
     def quantise(self, mosaic: Float[np.ndarray, "height width"]) -> UInt16[np.ndarray, "height width"]:
-        """Share of the raw range to integers: black level at 0, white level at 1, clipped to what the converter can say."""
+        """Turn shares of the raw range into integers: black level at 0, white level at 1, clipped to the converter's range."""
         values = self.black_level + mosaic.astype(np.float64) * (self.white_level - self.black_level)
         return np.clip(np.round(values), 0, self.white_level).astype(np.uint16)
 
     def photograph(self, rgb: Float[np.ndarray, "height width 3"], rng: np.random.Generator) -> UInt16[np.ndarray, "height width"]:
-        """Scene-linear Rec.709 to the raw integers of one exposure."""
+        """Turn scene-linear Rec.709 into the raw integers of one exposure."""
         return self.quantise(self.expose(self.linear_mosaic(rgb), rng))
-
-
-_FINE_DENOMINATOR = 1000000
-_DISTANCE_DENOMINATOR = 100000
-_D65_ILLUMINANT = 21
-_CFA_PHOTOMETRIC = 32803
-_CENTIMETRES = 3
-_MANUAL_EXPOSURE = 1
 
 
 @dataclass(frozen=True)
 class ShotMetadata:
-    """What the camera writes beside the pixels."""
+    """Metadata that the camera writes beside the pixels."""
 
     lens: Lens
     exposure_time_s: Fraction = Fraction(1, 60)
@@ -126,12 +121,12 @@ class ShotMetadata:
 
 
 def film_plane_distance_m(lens: Lens) -> float:
-    """Focus distance as cameras count it: from the sensor."""
+    """Return the focus distance as cameras count it: from the sensor."""
     return lens.focus_distance_m + lens.image_distance_mm / MM_PER_M
 
 
 def focus_distance_from_film_plane_m(film_plane_m: float, focal_length_mm: float) -> float:
-    """The d_f with d_f + f d_f / (d_f - f) = film_plane_m; of the two solutions the one farther from the lens."""
+    """Return d_f with d_f + f d_f / (d_f - f) = film_plane_m; of the two solutions the one farther from the lens."""
     focal_m = focal_length_mm / MM_PER_M
     if film_plane_m < 4.0 * focal_m:
         raise InputError(
@@ -155,7 +150,7 @@ def write_dng(path: Path, mosaic: UInt16[np.ndarray, "height width"], sensor: Se
 
 
 def _dng_tags(sensor: SensorModel, shot: ShotMetadata) -> list[tuple[int, str | int, int, Any, bool]]:
-    """TIFF/EP and DNG tags of the image directory: (code, type, count, value, write once)."""
+    """Return TIFF/EP and DNG tags of the image directory: (code, type, count, value, write once)."""
     baseline_exposure_ev = -float(np.log2(sensor.exposure))
     return [
         (271, "s", 0, shot.camera_make, True),
@@ -178,7 +173,7 @@ def _dng_tags(sensor: SensorModel, shot: ShotMetadata) -> list[tuple[int, str | 
 
 
 def _exif(shot: ShotMetadata, width_px: int) -> dict[str, str]:
-    """The Exif directory; FocalPlaneX/YResolution with a square pixel pitch tell the size of the sensor."""
+    """Return the Exif directory; FocalPlaneX/YResolution with a square pixel pitch tell the size of the sensor."""
     lens = shot.lens
     pixels_per_cm = Fraction(width_px * 10) / Fraction(str(lens.sensor_width_mm))
     distance = "4294967295/1" if np.isinf(lens.focus_distance_m) else _rational_text(film_plane_distance_m(lens), _DISTANCE_DENOMINATOR)

@@ -1,7 +1,4 @@
-"""The five lens openings that the truth is rendered with: disc, seven curved blades, heart, ring and cat-eye.
-
-What a truth set consists of: scenes, views, openings, focus distances, and the camera and the lenses that see them.
-"""
+"""The plan of a truth set: scenes, views, the five openings, focus distances, and the camera and lenses that see them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -80,7 +77,7 @@ class TruthPlan:
         return self.samples * _LAMP_RAYS_PER_SAMPLE
 
     def camera(self, view: int) -> Camera:
-        """The first view looks straight ahead, the others from beside it; the field of view is that of the lens focused at infinity."""
+        """Return a view: the first straight ahead, others from beside it; the field of view is that of the lens focused at infinity."""
         focal_px = FOCAL_LENGTH_MM * self.width_px / SENSOR_WIDTH_MM
         angle_rad, aside_m = 2.4 * view, _STEP_ASIDE_M * min(view, 1)
         camera_from_world = np.eye(4)
@@ -91,7 +88,7 @@ class TruthPlan:
         return Lens(FOCAL_LENGTH_MM, F_NUMBER, focus_distance_m, SENSOR_WIDTH_MM, lens_shape(shape))
 
     def opening(self, shape: str, focus_distance_m: float) -> Opening:
-        """The pupil that gives the fixed camera exactly the blur of `Lens.coc_px`.
+        """Return the pupil that gives the fixed camera exactly the blur of `Lens.coc_px`.
 
         A lens that is focused nearer stands farther from its film and blurs more by the same factor. Here the film stays where
         it is, and the pupil grows by that factor.
@@ -105,7 +102,7 @@ def truth_name(shape: str, focus_index: int) -> str:
 
 
 def view_document(plan: TruthPlan, name: str, scene: TruthScene, view: int) -> dict[str, object]:
-    """meta.json of one view."""
+    """Return meta.json of one view."""
     camera, distances_m = plan.camera(view), list(scene.focus_distances_m)
     return {
         "format": "mrbokeh-truth",

@@ -1,18 +1,15 @@
-"""What an adapter finds in the folder of a public data set, before any picture is read.
-
-Pairs of photographs, narrow and wide open: EBB!, DPDD and folders with one picture per f-number. None of them has depth.
+"""Adapters of public data sets: the files of each stack, found in its folder before any picture is read.
 
 EBB!: Ignatov et al., Rendering Natural Camera Bokeh Effect with Deep Learning (CVPRW 2020), Canon 7D with a 50 mm f/1.8 at f/16 and f/1.8.
+
 DPDD: Abuolaim and Brown, Defocus Deblurring Using Dual-Pixel Data (ECCV 2020), github.com/Abdullah-Abuolaim/defocus-deblurring-dual-pixel:
 Canon 5D Mark IV, TRAIN_c/source blurred, TRAIN_c/target sharp; pairs have the same place in the order of names, not the same name.
 
-RealBokeh (Seizinger et al., Bokehlicious, ICCV 2025; huggingface.co/datasets/timseizinger/RealBokeh_3MP): one f/22 and several wider.
-
+RealBokeh: Seizinger et al., Bokehlicious (ICCV 2025), huggingface.co/datasets/timseizinger/RealBokeh_3MP, one f/22 and several wider.
 SPLIT/metadata/ID.json names the pictures (in/ID_f22.JPG, gt/ID/ID_f2.0.JPG), the f-numbers, the focal length of the zoom and the focus
 distance that the camera reported, which its author calls fairly inaccurate (issue 12 of github.com/TimSeizinger/Bokehlicious).
 
-BLB (Peng et al., BokehMe, CVPR 2022; github.com/JuewenPeng/BokehMe): Blender scenes with depth, five amounts of blur, ten focuses.
-
+BLB: Peng et al., BokehMe (CVPR 2022), github.com/JuewenPeng/BokehMe, Blender scenes with depth, five amounts of blur, ten focuses.
 SCENE/info.json holds focus_distances and blur_parameters, SCENE/image the sharp picture, SCENE/depth.exr metres (65504 is the sky),
 SCENE/bokeh_LL_FF level LL focused at FF. Radius of blur in pixels = blur_parameter |1/depth - 1/focus| (issue 4 there), so a diameter
 grows by twice the parameter per dioptre. JPG files were encoded with a power of 1/2.2 (the repository's Blender guide).
@@ -31,11 +28,15 @@ from mrbokeh.system.errors import InputError
 
 _PICTURES = (*INTEGER_SUFFIXES, *LINEAR_SUFFIXES)
 _F_NUMBER = re.compile(r"(?:^|[^a-z0-9])f[_/-]?(\d+(?:\.\d+)?)$", re.IGNORECASE)
+_TEST_NAMES = ("test", "val", "validation")
+_SPLITS: dict[str, Part] = {"train": "train", "validation": "test", "val": "test", "test": "test"}
+_SUFFIXES = (".exr", ".jpg", ".png")
+_GAMMA = 2.2
 
 
 @dataclass(frozen=True)
 class PublicLens:
-    """focal_length_mm None: nobody knows, the user must say."""
+    """The lens of a set. focal_length_mm None: nobody knows, the user must say."""
 
     focal_length_mm: float | None
     f_number: float
@@ -75,33 +76,35 @@ class PublicStack:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Sorted by number where names are numbers, else by name."""
+    """Return pictures sorted by number where names are numbers, else by name."""
     found = [path for path in folder.iterdir() if path.suffix.lower() in _PICTURES] if folder.is_dir() else []
     return sorted(found, key=lambda path: (int(path.stem) if path.stem.isdigit() else -1, path.name))
 
 
 def unlike(source: Path, kind: str, expected: str) -> InputError:
-    """The mistake of a folder that does not look like the set; layouts differ from version to version of a set."""
+    """Return the mistake of a folder that does not look like the set; layouts differ from version to version of a set."""
     return InputError(
         f"{source} does not look like {kind}: expected {expected}; versions of the set differ, so rename or link its folders to look so"
     )
 
 
 def f_number_of(path: Path) -> float | None:
-    """From a name that ends in it: f2.8.jpg, 12_f22.JPG, scene_f-16.png."""
+    """Return the f-number that a name ends in: f2.8.jpg, 12_f22.JPG, scene_f-16.png."""
     found = _F_NUMBER.search(path.stem)
     return float(found[1]) if found else None
 
 
 EBB_LENS = PublicLens(50.0, 1.8, 22.3)
-DPDD_LENS = PublicLens(None, 4.0, 36.0)
-APERTURE_LENS = PublicLens(None, 1.8, 36.0)
 
-_TEST_NAMES = ("test", "val", "validation")
+
+DPDD_LENS = PublicLens(None, 4.0, 36.0)
+
+
+APERTURE_LENS = PublicLens(None, 1.8, 36.0)
 
 
 def ebb_stacks(source: Path) -> list[PublicStack]:
-    """train/original/N.jpg and train/bokeh/N.jpg; the same folders directly in `source` do as well."""
+    """Find train/original/N.jpg and train/bokeh/N.jpg; the same folders directly in `source` do as well."""
     root = source / "train" if (source / "train").is_dir() else source
     sharp = {path.stem: path for path in pictures_in(root / "original")}
     blurred = {path.stem: path for path in pictures_in(root / "bokeh")}
@@ -112,7 +115,7 @@ def ebb_stacks(source: Path) -> list[PublicStack]:
 
 
 def dpdd_stacks(source: Path) -> list[PublicStack]:
-    """train_c, val_c, test_c with source and target; the dual-pixel views train_l and train_r are not needed."""
+    """Find train_c, val_c, test_c with source and target; the dual-pixel views train_l and train_r are not needed."""
     found: list[PublicStack] = []
     for split in ("train", "val", "test"):
         blurred, sharp = (pictures_in(source / f"{split}_c" / name) for name in ("source", "target"))
@@ -126,7 +129,7 @@ def dpdd_stacks(source: Path) -> list[PublicStack]:
 
 
 def aperture_stacks(source: Path) -> list[PublicStack]:
-    """SCENE/...fN.jpg, or train/SCENE and test/SCENE: the picture with the largest f-number is the sharp one."""
+    """Find SCENE/...fN.jpg, or train/SCENE and test/SCENE: the picture with the largest f-number is the sharp one."""
     found = list(_by_f_number(source, "train"))
     for folder in sorted(path for path in source.iterdir() if path.is_dir()) if source.is_dir() else []:
         found += _by_f_number(folder, _part(folder.name))
@@ -154,11 +157,9 @@ def _part(split: str) -> Part:
 
 REALBOKEH_LENS = PublicLens(50.0, 2.0, 36.0)
 
-_SPLITS: dict[str, Part] = {"train": "train", "validation": "test", "val": "test", "test": "test"}
-
 
 def realbokeh_stacks(source: Path) -> list[PublicStack]:
-    """All scenes of the splits that are there."""
+    """Find all scenes of the splits that are there."""
     files = [(split, path) for split in _SPLITS for path in sorted((source / split / "metadata").glob("*.json"))]
     if not files:
         raise unlike(source, "RealBokeh", "train/metadata/ID.json, with the pictures that it names in train/in and train/gt")
@@ -182,12 +183,9 @@ def _stack(root: Path, split: str, path: Path) -> PublicStack:
 # Stated for all scenes alike, since one network learns one lens; the blur of each level is in px_per_dioptre.
 BLB_LENS = PublicLens(50.0, 1.8, 36.0)
 
-_SUFFIXES = (".exr", ".jpg", ".png")
-_GAMMA = 2.2
-
 
 def blb_stacks(source: Path) -> list[PublicStack]:
-    """One stack per scene and level, all for testing, as the set is meant."""
+    """Find one stack per scene and level, all for testing, as the set is meant."""
     scenes = sorted(path.parent for path in source.glob("*/info.json")) or ([source] if (source / "info.json").is_file() else [])
     if not scenes:
         raise unlike(source, "BLB", "SCENE/info.json beside image.exr, depth.exr and bokeh_00_00.exr")
@@ -215,7 +213,7 @@ def _level(scene: Path, level: int, px_per_dioptre: float, focuses_m: list[float
 
 
 def _picture(scene: Path, name: str) -> Path:
-    """Linear where there is EXR."""
+    """Return a picture's file, linear where there is EXR."""
     for suffix in _SUFFIXES:
         if (scene / f"{name}{suffix}").is_file():
             return scene / f"{name}{suffix}"

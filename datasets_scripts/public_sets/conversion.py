@@ -1,6 +1,6 @@
-"""Depth for sets that have none: maps of the user's, and the distance in focus, found from what is as sharp in both pictures.
+"""Public sets as data sets of focal stacks for `mrbokeh train fit`: linear, with depth, blur per dioptre and masks of what is clipped.
 
-Public sets as data sets of focal stacks for `mrbokeh train fit`: linear, with depth, blur per dioptre and masks of what is clipped.
+Sets without depth take the user's maps; a missing focus distance is found from what is as sharp in both pictures.
 """
 
 from collections.abc import Sequence
@@ -28,20 +28,24 @@ _MAPS = (".exr", ".png", ".tif", ".tiff")
 _BINS = 24
 _FEWEST_PX = 30
 _SMOOTH_PX = 2.0
-
 Plane = Float32[np.ndarray, "height width"]
+# JPEG rounds and rings: what was full may be stored a little lower.
+_CLIPPED_CODE = 250.0 / 255.0
+_LINEAR = (".exr", ".hdr")
+Rgb = Float32[np.ndarray, "height width 3"]
+Mask = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """folder: KEY.exr with metres, or KEY.png and KEY.tif with disparity, white nearest, between near_m and far_m; None: there is none."""
+    """Depth maps in `folder`: KEY.exr in metres, or KEY.png, KEY.tif with disparity, white nearest, between near_m and far_m."""
 
     folder: Path | None = None
     near_m: float | None = None
     far_m: float | None = None
 
     def depth_m(self, stack: PublicStack) -> Plane:
-        """Raises InputError with what is missing."""
+        """Return metres of a stack. Raises InputError with what is missing."""
         if stack.depth is not None:
             return _metres(stack.depth)
         if self.folder is None:
@@ -64,43 +68,9 @@ class DepthMaps:
         return (1.0 / (1.0 / self.far_m + white * (1.0 / self.near_m - 1.0 / self.far_m))).astype(np.float32)
 
 
-def _metres(path: Path) -> Plane:
-    """Depth passes are written as Z, as Y, or as a picture of three equal channels."""
-    channels = read_exr(path)[0].channels
-    if "R" in channels and "Z" not in channels:
-        red = channels["R"].astype(np.float32)
-        return np.where(red > 0, red, np.float32(np.inf))
-    return read_depth(path)
-
-
-def sharpest_depth_m(sharp: Float32[np.ndarray, "height width 3"], blurred: Float32[np.ndarray, "height width 3"], depth_m: Plane) -> float:
-    """The depth at which the blurred picture keeps most of the sharp one's detail: the focus distance, where nobody wrote it down.
-
-    Detail is the energy of gradients, pixels are sorted into 24 bins of equal count by dioptre. Raises InputError where all is flat.
-    """
-    dioptres = 1.0 / depth_m
-    detail, kept = (ndimage.gaussian_gradient_magnitude(rgb.mean(axis=2), _SMOOTH_PX / 2.0) ** 2 for rgb in (sharp, blurred))
-    edges = np.unique(np.quantile(dioptres, np.linspace(0.0, 1.0, _BINS + 1)))
-    number = np.clip(np.searchsorted(edges, dioptres, side="right") - 1, 0, max(len(edges) - 2, 0)).ravel()
-    count, total, left = (np.bincount(number, weights) for weights in (None, detail.ravel(), kept.ravel()))
-    enough = (count >= _FEWEST_PX) & (total > 1e-3 * total.max(initial=0.0))
-    if not enough.any():
-        raise InputError("the focus distance cannot be found: the sharp picture has no detail; state it with --focus-m")
-    best = int(np.argmax(np.where(enough, left / np.maximum(total, 1e-30), -1.0)))
-    return float(1.0 / np.median(dioptres.ravel()[number == best]))
-
-
-# JPEG rounds and rings: what was full may be stored a little lower.
-_CLIPPED_CODE = 250.0 / 255.0
-_LINEAR = (".exr", ".hdr")
-
-Rgb = Float32[np.ndarray, "height width 3"]
-Mask = Bool[np.ndarray, "height width"]
-
-
 @dataclass(frozen=True)
 class Conversion:
-    """kind: of the set. lens: stated for every stack, since one network learns one lens; what differs is in px_per_dioptre.
+    """Settings of a set of that kind. lens: stated for every stack, since one network learns one lens; what differs is in px_per_dioptre.
 
     focus_m: for slices without a focus distance, None: found from what is sharp. crop_px: (width, height) of the middle, for sets whose
     pictures differ in size. licence: the note that goes with the pictures.
@@ -175,7 +145,7 @@ def _write_slice(
 
 
 def _px_per_dioptre(source: PublicSlice, lens: PublicLens, distance_m: float, width_px: int) -> float:
-    """Of the lens that this slice was taken with."""
+    """Return the blur per dioptre of the lens that this slice was taken with."""
     focal_length_mm = source.focal_length_mm or lens.focal_length_mm
     assert focal_length_mm is not None
     return Lens(focal_length_mm, source.f_number or lens.f_number, distance_m, lens.sensor_width_mm).coc_px_per_dioptre(width_px)
@@ -188,7 +158,7 @@ def _stated(conversion: Conversion, distance_m: float) -> Lens:
 
 
 def _linear(path: Path, power: float | None) -> tuple[Rgb, Mask]:
-    """(scene-linear radiance, where a colour was clipped)."""
+    """Return (scene-linear radiance, where a colour was clipped)."""
     if path.suffix.lower() in _LINEAR:
         rgb = read_image(path)
         return rgb, np.zeros(rgb.shape[:2], bool)
@@ -198,7 +168,7 @@ def _linear(path: Path, power: float | None) -> tuple[Rgb, Mask]:
 
 
 def _window(rgb: Rgb, crop_px: tuple[int, int] | None, name: str) -> tuple[slice, slice]:
-    """The middle of the picture, so that field positions stay symmetric."""
+    """Return the middle of the picture, so that field positions stay symmetric."""
     height, width = rgb.shape[:2]
     if crop_px is None:
         return slice(0, height), slice(0, width)
@@ -210,3 +180,29 @@ def _window(rgb: Rgb, crop_px: tuple[int, int] | None, name: str) -> tuple[slice
 
 def _size(picture: np.ndarray) -> str:
     return f"{picture.shape[1]}x{picture.shape[0]}"
+
+
+def _metres(path: Path) -> Plane:
+    """Read a depth pass written as Z, as Y, or as a picture of three equal channels."""
+    channels = read_exr(path)[0].channels
+    if "R" in channels and "Z" not in channels:
+        red = channels["R"].astype(np.float32)
+        return np.where(red > 0, red, np.float32(np.inf))
+    return read_depth(path)
+
+
+def sharpest_depth_m(sharp: Float32[np.ndarray, "height width 3"], blurred: Float32[np.ndarray, "height width 3"], depth_m: Plane) -> float:
+    """Return the depth at which the blurred picture keeps most of the sharp one's detail: its focus distance.
+
+    Detail is the energy of gradients, pixels are sorted into 24 bins of equal count by dioptre. Raises InputError where all is flat.
+    """
+    dioptres = 1.0 / depth_m
+    detail, kept = (ndimage.gaussian_gradient_magnitude(rgb.mean(axis=2), _SMOOTH_PX / 2.0) ** 2 for rgb in (sharp, blurred))
+    edges = np.unique(np.quantile(dioptres, np.linspace(0.0, 1.0, _BINS + 1)))
+    number = np.clip(np.searchsorted(edges, dioptres, side="right") - 1, 0, max(len(edges) - 2, 0)).ravel()
+    count, total, left = (np.bincount(number, weights) for weights in (None, detail.ravel(), kept.ravel()))
+    enough = (count >= _FEWEST_PX) & (total > 1e-3 * total.max(initial=0.0))
+    if not enough.any():
+        raise InputError("the focus distance cannot be found: the sharp picture has no detail; state it with --focus-m")
+    best = int(np.argmax(np.where(enough, left / np.maximum(total, 1e-30), -1.0)))
+    return float(1.0 / np.median(dioptres.ravel()[number == best]))

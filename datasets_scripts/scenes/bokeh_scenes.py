@@ -31,7 +31,7 @@ _RADIANCE = (3.0, 16.0)
 
 @lru_cache(maxsize=1)
 def bokeh_scene(name: str) -> TruthScene:
-    """name: KIND_NUMBER; the number chooses everything that may vary, light included. The last one is kept for its next view."""
+    """Build the scene KIND_NUMBER; the number chooses everything that may vary, light included. The last one is kept for its next view."""
     kind, _, number = name.partition("_")
     if kind not in KINDS or not number.isdigit():
         raise InputError(f"expected a scene such as garlands_1 out of the kinds {', '.join(KINDS)}, got {name!r}")
@@ -110,7 +110,7 @@ KINDS: dict[str, Callable[[np.random.Generator], TruthScene]] = {
 
 
 def _room(rng: np.random.Generator) -> list[Body]:
-    """Less contrast than a photograph may have: the noise of blurred fine detail would hide what is to be measured."""
+    """Build a room of less contrast than a photograph may have: the noise of blurred detail would hide what is to be measured."""
     return stage(rng, dark=0.2, light=0.5)
 
 
@@ -122,7 +122,7 @@ def _thing(rng: np.random.Generator, base_m: np.ndarray) -> list[Body]:
 
 
 def _lights(rng: np.random.Generator, count: int, depths_m: tuple[float, float]) -> list[Lamp]:
-    """In the air, evenly in dioptres; none stands under the ground."""
+    """Return lights in the air, evenly in dioptres; none stands under the ground."""
     lights = []
     for depth_m in _evenly_in_dioptres(count, *depths_m):
         low = min(0.9 * HALF_Y, 0.95 * GROUND_M / depth_m)
@@ -137,7 +137,7 @@ def _light(rng: np.random.Generator, centre_m: np.ndarray, tint: np.ndarray) -> 
 
 
 def _tint(rng: np.random.Generator) -> np.ndarray:
-    """One of the usual colours of bulbs, or white, or any."""
+    """Return one of the usual colours of bulbs, or white, or any."""
     choice = int(rng.integers(len(TINTS) + 2))
     return np.asarray(TINTS[choice]) if choice < len(TINTS) else rng.uniform(0.3, 1.0, 3) ** (choice - len(TINTS))
 

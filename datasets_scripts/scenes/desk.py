@@ -1,7 +1,4 @@
-"""Fairy lights for a traced scene: small lamps on the surfaces that the viewpoints see, far enough apart to be told apart.
-
-A made-up still life for focal stacks: books, boxes, balls and fairy lights on a table before a wall, 0.6 m to 2 m away.
-"""
+"""A made-up still life for focal stacks: books, boxes, balls and fairy lights on a table before a wall, 0.6 m to 2 m away."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +16,6 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
 LIGHTS_PER_VIEW = 12
-
 _TINTS = ((1.0, 0.72, 0.36), (1.0, 0.86, 0.62), (0.55, 0.75, 1.0), (1.0, 0.45, 0.3), (0.6, 1.0, 0.55))
 _RADIANCE = (1.0, 2.6)
 _RADIUS_M_AT_1_M = (1.8e-3, 2.6e-3)
@@ -27,72 +23,10 @@ _GAP_M = 0.008
 _SMOOTH_DIOPTRES = 0.12
 _LEAST_DISTANCE_SHARE = 0.05
 _ATTEMPTS = 60
-
-
-@dataclass(frozen=True)
-class _View:
-    """A viewpoint at low resolution: where its lamps may be hung."""
-
-    camera: Camera
-    depth_m: Float32[np.ndarray, "height width"]
-
-    @property
-    def candidates(self) -> Int[np.ndarray, "pixels 2"]:
-        """(row, column) of pixels away from depth edges and from the border."""
-        dioptres = 1.0 / self.depth_m
-        span = ndimage.maximum_filter(dioptres, 5) - ndimage.minimum_filter(dioptres, 5)
-        inner = np.zeros(dioptres.shape, bool)
-        inner[6:-6, 6:-6] = True
-        return np.argwhere(inner & (span < _SMOOTH_DIOPTRES))
-
-    def point_before_m(self, row: int, column: int) -> Float[np.ndarray, "3"]:
-        """Just before the surface under a pixel: a lamp far from what it is seen against could not be merged with it."""
-        xy_px = np.array([column + 0.5, row + 0.5])
-        point_m = self.camera.unproject(xy_px, np.array(float(self.depth_m[row, column])))
-        towards = self.camera.world_from_camera[:3, 3] - point_m
-        return point_m + _GAP_M * towards / np.linalg.norm(towards)
-
-
-def fairy_lights(scene: Scene, cameras: Sequence[Camera], rng: np.random.Generator) -> Iterator[DiscLight]:
-    """LIGHTS_PER_VIEW lamps hung in the sight of each camera, spread evenly over its dioptres.
-
-    A lamp that would come within 5 % of the picture's width of another in any view is hung elsewhere.
-    """
-    views = [_View(camera, trace_pinhole(scene, camera, 1)[1]) for camera in cameras]
-    hung_m: list[Float[np.ndarray, "3"]] = []
-    for number, view in enumerate(views):
-        for index, members in enumerate(_ranges_of_depth(view)):
-            for row, column in members[rng.permutation(len(members))[:_ATTEMPTS]]:
-                point_m = view.point_before_m(int(row), int(column))
-                if all(_apart(point_m, hung_m, each.camera) for each in views):
-                    hung_m.append(point_m)
-                    tint = np.asarray(_TINTS[(index + number) % len(_TINTS)])
-                    radius_m = rng.uniform(*_RADIUS_M_AT_1_M) * max(float(view.depth_m[row, column]), 0.8)
-                    yield DiscLight(vector(point_m), float(radius_m), vector(tint * rng.uniform(*_RADIANCE)))
-                    break
-
-
-def _ranges_of_depth(view: _View) -> Iterator[Int[np.ndarray, "pixels 2"]]:
-    """The candidates in LIGHTS_PER_VIEW equal ranges of dioptres."""
-    pixels = view.candidates
-    dioptres = 1.0 / view.depth_m[pixels[:, 0], pixels[:, 1]]
-    number = np.floor((dioptres - dioptres.min()) / (np.ptp(dioptres) * (1 + 1e-6)) * LIGHTS_PER_VIEW).astype(int)
-    return (pixels[number == each] for each in range(LIGHTS_PER_VIEW))
-
-
-def _apart(point_m: Float[np.ndarray, "3"], others_m: Sequence[Float[np.ndarray, "3"]], camera: Camera) -> bool:
-    """No other lamp is near in this camera's picture."""
-    if not others_m:
-        return True
-    xy_px, _ = camera.project(np.stack([point_m, *others_m]))
-    return bool(np.hypot(*(xy_px[1:] - xy_px[0]).T).min() >= _LEAST_DISTANCE_SHARE * camera.width_px)
-
-
 TABLE_Y_M = 0.24
 WALL_Z_M = 1.95
 NEAR_FOCUS_M = 0.65
 FAR_FOCUS_M = 2.05
-
 _SUN_TOWARDS = (-0.52, -0.72, -0.46)
 _LIT_VIEWPOINTS = 3
 _PITCH_RAD = np.deg2rad(10.0)
@@ -100,7 +34,7 @@ _PITCH_RAD = np.deg2rad(10.0)
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where a camera stands (world metres) and how far it is turned to the right."""
+    """Place of a camera (world metres) and how far it is turned to the right."""
 
     position_m: Vector
     yaw_rad: float
@@ -116,14 +50,14 @@ VIEWPOINTS = (
 
 
 def desk_camera(index: int, width_px: int, height_px: int, lens: Lens) -> Camera:
-    """One of the viewpoints, tilted down to the table, with the lens's focal length in pixels."""
+    """Return one of the viewpoints, tilted down to the table, with the lens's focal length in pixels."""
     if not 0 <= index < len(VIEWPOINTS):
         raise InputError(f"the desk scene has {len(VIEWPOINTS)} viewpoints, but number {index} was asked for")
     return camera_at(VIEWPOINTS[index], width_px, height_px, lens)
 
 
 def camera_at(view: Viewpoint, width_px: int, height_px: int, lens: Lens) -> Camera:
-    """A camera that stands at a viewpoint, tilted down to the table."""
+    """Return a camera that stands at a viewpoint, tilted down to the table."""
     cos_p, sin_p, cos_y, sin_y = np.cos(_PITCH_RAD), np.sin(_PITCH_RAD), np.cos(view.yaw_rad), np.sin(view.yaw_rad)
     pitch = np.array([[1, 0, 0], [0, cos_p, -sin_p], [0, sin_p, cos_p]])
     yaw = np.array([[cos_y, 0, -sin_y], [0, 1, 0], [sin_y, 0, cos_y]])
@@ -135,7 +69,7 @@ def camera_at(view: Viewpoint, width_px: int, height_px: int, lens: Lens) -> Cam
 
 
 def desk_scene(seed: int) -> Scene:
-    """The still life with baked light. The seed changes textures and lights; the furniture stays."""
+    """Build the still life with baked light. The seed changes textures and lights; the furniture stays."""
     rng = np.random.default_rng([seed, 0])
     scene = bake_lighting(desk_furniture(rng), seed=seed)
     cameras = [desk_camera(view, 144, 96, Lens(35.0, 2.8, NEAR_FOCUS_M, 23.5)) for view in range(_LIT_VIEWPOINTS)]
@@ -143,7 +77,7 @@ def desk_scene(seed: int) -> Scene:
 
 
 def desk_furniture(rng: np.random.Generator) -> Scene:
-    """Room, books, boxes, cards and balls under the sun; no lamps, light not baked yet."""
+    """Build room, books, boxes, cards and balls under the sun; no lamps, light not baked yet."""
     sun = np.asarray(_SUN_TOWARDS) / np.linalg.norm(_SUN_TOWARDS)
     quads = (*_room(rng), *_books(rng), *_boxes(rng), *_cards(rng))
     return Scene(quads, _balls(rng), (), vector(sun), 0.46, 0.3, (0.05, 0.05, 0.06))
@@ -191,7 +125,7 @@ class _Box:
 
 
 def _books(rng: np.random.Generator) -> tuple[Quad, ...]:
-    """Flat piles: (x, z, size, yaw, height of the base above the table, cover colours)."""
+    """Build flat piles: (x, z, size, yaw, height of the base above the table, cover colours)."""
     pages = mottled(256, rng, (0.45, 0.42, 0.34), (0.8, 0.77, 0.68), slope=0.3, contrast=0.3)
     piles = (
         (-0.185, 1.02, (0.21, 0.045, 0.15), 0.15, 0.0, (0.5, 0.09, 0.07), (0.85, 0.74, 0.5)),
@@ -225,7 +159,7 @@ def _boxes(rng: np.random.Generator) -> tuple[Quad, ...]:
 
 
 def _cards(rng: np.random.Generator) -> tuple[Quad, ...]:
-    """Upright printed cards and a poster leaning on the wall: (x, z, width, height, yaw, lean)."""
+    """Build upright printed cards and a poster leaning on the wall: (x, z, width, height, yaw, lean)."""
     places = (
         (0.085, 0.76, 0.1, 0.062, 0.35, 0.12),
         (0.33, 0.75, 0.09, 0.07, -0.3, 0.15),
@@ -252,7 +186,7 @@ def _cards(rng: np.random.Generator) -> tuple[Quad, ...]:
 
 
 def _balls(rng: np.random.Generator) -> tuple[Sphere, ...]:
-    """Balls lie on the table, the last one on a book: (x, z, radius, height of the base)."""
+    """Build balls that lie on the table, the last one on a book: (x, z, radius, height of the base)."""
     places = (
         (-0.115, 0.735, 0.032, 0.0),
         (0.05, 1.06, 0.05, 0.0),
@@ -271,3 +205,62 @@ def _balls(rng: np.random.Generator) -> tuple[Sphere, ...]:
         Sphere((x_m, TABLE_Y_M - base_m - radius_m, z_m), radius_m, skin, (2.0, 1.0))
         for (x_m, z_m, radius_m, base_m), skin in zip(places, skins, strict=True)
     )
+
+
+@dataclass(frozen=True)
+class _View:
+    """A viewpoint at low resolution, with the places where its lamps may be hung."""
+
+    camera: Camera
+    depth_m: Float32[np.ndarray, "height width"]
+
+    @property
+    def candidates(self) -> Int[np.ndarray, "pixels 2"]:
+        """Return (row, column) of pixels away from depth edges and from the border."""
+        dioptres = 1.0 / self.depth_m
+        span = ndimage.maximum_filter(dioptres, 5) - ndimage.minimum_filter(dioptres, 5)
+        inner = np.zeros(dioptres.shape, bool)
+        inner[6:-6, 6:-6] = True
+        return np.argwhere(inner & (span < _SMOOTH_DIOPTRES))
+
+    def point_before_m(self, row: int, column: int) -> Float[np.ndarray, "3"]:
+        """Return a point just before the surface under a pixel: a lamp far from what it is seen against could not be merged with it."""
+        xy_px = np.array([column + 0.5, row + 0.5])
+        point_m = self.camera.unproject(xy_px, np.array(float(self.depth_m[row, column])))
+        towards = self.camera.world_from_camera[:3, 3] - point_m
+        return point_m + _GAP_M * towards / np.linalg.norm(towards)
+
+
+def fairy_lights(scene: Scene, cameras: Sequence[Camera], rng: np.random.Generator) -> Iterator[DiscLight]:
+    """Hang LIGHTS_PER_VIEW small lamps in the sight of each camera, spread evenly over its dioptres.
+
+    A lamp that would come within 5 % of the picture's width of another in any view is hung elsewhere.
+    """
+    views = [_View(camera, trace_pinhole(scene, camera, 1)[1]) for camera in cameras]
+    hung_m: list[Float[np.ndarray, "3"]] = []
+    for number, view in enumerate(views):
+        for index, members in enumerate(_ranges_of_depth(view)):
+            for row, column in members[rng.permutation(len(members))[:_ATTEMPTS]]:
+                point_m = view.point_before_m(int(row), int(column))
+                if all(_apart(point_m, hung_m, each.camera) for each in views):
+                    hung_m.append(point_m)
+                    tint = np.asarray(_TINTS[(index + number) % len(_TINTS)])
+                    radius_m = rng.uniform(*_RADIUS_M_AT_1_M) * max(float(view.depth_m[row, column]), 0.8)
+                    yield DiscLight(vector(point_m), float(radius_m), vector(tint * rng.uniform(*_RADIANCE)))
+                    break
+
+
+def _ranges_of_depth(view: _View) -> Iterator[Int[np.ndarray, "pixels 2"]]:
+    """Return the candidates in LIGHTS_PER_VIEW equal ranges of dioptres."""
+    pixels = view.candidates
+    dioptres = 1.0 / view.depth_m[pixels[:, 0], pixels[:, 1]]
+    number = np.floor((dioptres - dioptres.min()) / (np.ptp(dioptres) * (1 + 1e-6)) * LIGHTS_PER_VIEW).astype(int)
+    return (pixels[number == each] for each in range(LIGHTS_PER_VIEW))
+
+
+def _apart(point_m: Float[np.ndarray, "3"], others_m: Sequence[Float[np.ndarray, "3"]], camera: Camera) -> bool:
+    """Return whether no other lamp is near in this camera's picture."""
+    if not others_m:
+        return True
+    xy_px, _ = camera.project(np.stack([point_m, *others_m]))
+    return bool(np.hypot(*(xy_px[1:] - xy_px[0]).T).min() >= _LEAST_DISTANCE_SHARE * camera.width_px)

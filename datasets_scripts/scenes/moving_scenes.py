@@ -1,8 +1,4 @@
-"""Scenes in motion for the stochastic sampler: bodies that move in straight lines, and the stage that places them by their blur.
-
-Two scenes of metal with small bright highlights, in the spirit of Coins and Gear of Leimkuehler et al. 2018.
-
-Scenes with defocus and motion at once: the out-of-focus fence of Hasselgren et al. 2015, Fig. 8, and four in the spirit of
+"""Scenes with defocus and motion at once: the out-of-focus fence of Hasselgren et al. 2015, Fig. 8, and four in the spirit of
 Whirl, Coins, Rain and Gear of Leimkuehler et al. 2018. Contents come from a seed, all seen by one lens.
 
 Circles of confusion and motion are in widths of the frame (see `Stage`); they reach about 0.1 of it, 50 px at 512.
@@ -19,10 +15,19 @@ from datasets_scripts.tracers.traced_scene import DiscLight, Mover, MovingScene,
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
+_FRONT_COC = -0.03
+_GOLD: tuple[Vector, Vector] = ((0.36, 0.2, 0.04), (0.95, 0.72, 0.24))
+_SILVER: tuple[Vector, Vector] = ((0.28, 0.28, 0.3), (0.88, 0.88, 0.9))
+_COPPER: tuple[Vector, Vector] = ((0.3, 0.1, 0.05), (0.85, 0.42, 0.24))
+_GLINT_NEARER_COC = 0.0015
+_TEETH, _SEGMENTS, _SPOKES, _BLOCKS = 18, 24, 5, 4
+LENS = Lens(135.0, 1.8, 2.0, 36.0)
+_TINTS: tuple[Vector, ...] = ((1.0, 0.72, 0.36), (1.0, 0.86, 0.62), (0.55, 0.75, 1.0), (1.0, 0.42, 0.3), (0.55, 1.0, 0.6))
+
 
 @dataclass(frozen=True)
 class Stage:
-    """Places things by what they look like: the same composition, blur and motion at every size of the picture.
+    """A composition placed by what it looks like: the same blur and motion at every size of the picture.
 
     Positions and sizes are in half widths of the frame at the depth of the thing (the frame reaches from -1 to 1 across and
     from -aspect to aspect down); coc and motion are in widths of the frame, so pixels are this times width_px.
@@ -33,7 +38,7 @@ class Stage:
 
     @property
     def farthest_coc(self) -> float:
-        """The circle of confusion at infinity."""
+        """Return the circle of confusion at infinity."""
         return self.lens.coc_px_per_dioptre(1) / self.lens.focus_distance_m
 
     def depth_m(self, coc: float) -> float:
@@ -47,7 +52,7 @@ class Stage:
         return np.array([x * self.half_width_m(depth_m), y * self.half_width_m(depth_m), depth_m])
 
     def velocity_m(self, motion: tuple[float, float], coc: float, inwards_m: float = 0.0) -> Vector:
-        """Metres per shutter of what moves by so many widths of the frame; inwards_m: away from the camera besides."""
+        """Return metres per shutter of what moves by so many widths of the frame; inwards_m: away from the camera besides."""
         width_m = 2.0 * self.half_width_m(self.depth_m(coc))
         return motion[0] * width_m, motion[1] * width_m, inwards_m
 
@@ -60,7 +65,7 @@ class Stage:
         tilt_rad: float = 0.0,
         repeats: tuple[float, float] = (1.0, 1.0),
     ) -> Quad:
-        """A card around place (x, y, coc), turned in the picture (x towards y), its lower edge tilted away from the camera."""
+        """Return a card around place (x, y, coc), turned in the picture (x towards y), its lower edge tilted away from the camera."""
         centre_m = self.point_m(*place)
         unit_m = self.half_width_m(float(centre_m[2]))
         along = half_size[0] * unit_m * np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
@@ -69,7 +74,7 @@ class Stage:
         return Quad(vector(centre_m - along - down), vector(2.0 * along), vector(2.0 * down), texture, repeats)
 
     def backdrop(self, coc: float, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)) -> Mover:
-        """A wall that fills the frame and all that its blur can reach."""
+        """Return a wall that fills the frame and all that its blur can reach."""
         reach = 1.15 + abs(coc)
         return Mover(self.card((0.0, 0.0, coc), (reach, self.aspect + reach - 1.0), texture, repeats=repeats))
 
@@ -78,17 +83,16 @@ class Stage:
         return Sphere(vector(centre_m), radius * self.half_width_m(float(centre_m[2])), texture, repeats)
 
     def lamp(self, place: tuple[float, float, float], radius: float, radiance_rgb: Vector) -> DiscLight:
-        """A small bright disc that faces the sensor."""
+        """Return a small bright disc that faces the sensor."""
         centre_m = self.point_m(*place)
         return DiscLight(vector(centre_m), radius * self.half_width_m(float(centre_m[2])), radiance_rgb)
 
 
-_FRONT_COC = -0.03
-_GOLD: tuple[Vector, Vector] = ((0.36, 0.2, 0.04), (0.95, 0.72, 0.24))
-_SILVER: tuple[Vector, Vector] = ((0.28, 0.28, 0.3), (0.88, 0.88, 0.9))
-_COPPER: tuple[Vector, Vector] = ((0.3, 0.1, 0.05), (0.85, 0.42, 0.24))
-_GLINT_NEARER_COC = 0.0015
-_TEETH, _SEGMENTS, _SPOKES, _BLOCKS = 18, 24, 5, 4
+def make_scene(name: str, seed: int, lens: Lens, aspect: float) -> MovingScene:
+    """Build one of SCENES; aspect: height over width of the picture."""
+    if name not in SCENES:
+        raise InputError(f"expected a scene out of {', '.join(SCENES)}, got {name!r}")
+    return SCENES[name](Stage(lens, aspect), np.random.default_rng([seed, *name.encode()]))
 
 
 def coins(stage: Stage, rng: np.random.Generator) -> MovingScene:
@@ -162,13 +166,13 @@ def _on_wheel(middle: tuple[float, float, float], radius: float, angle: float, d
 
 
 def _tangent_m(stage: Stage, coc: float, radius: float, angle: float, turn_rad: float) -> Vector:
-    """The velocity of a turn; a half width is half a width of the frame."""
+    """Return the velocity of a turn; a half width is half a width of the frame."""
     speed = 0.5 * radius * turn_rad
     return stage.velocity_m((-speed * float(np.sin(angle)), speed * float(np.cos(angle))), coc)
 
 
 def _minted(rng: np.random.Generator, dark: Vector, light: Vector) -> Texture:
-    """A rim, rings and grain."""
+    """Return the face of a coin: a rim, rings and grain."""
     size = 128
     y, x = (np.mgrid[:size, :size] + 0.5) / size - 0.5
     radius = np.hypot(x, y)
@@ -181,19 +185,8 @@ def _brushed(rng: np.random.Generator, dark: Vector, light: Vector) -> Texture:
     return coloured(0.55 + 0.22 * fractal_noise(128, 128, rng, 3.0, 64.0, 0.3, stretch=10.0), dark, light)
 
 
-LENS = Lens(135.0, 1.8, 2.0, 36.0)
-_TINTS: tuple[Vector, ...] = ((1.0, 0.72, 0.36), (1.0, 0.86, 0.62), (0.55, 0.75, 1.0), (1.0, 0.42, 0.3), (0.55, 1.0, 0.6))
-
-
-def make_scene(name: str, seed: int, lens: Lens, aspect: float) -> MovingScene:
-    """One of SCENES; aspect: height over width of the picture."""
-    if name not in SCENES:
-        raise InputError(f"expected a scene out of {', '.join(SCENES)}, got {name!r}")
-    return SCENES[name](Stage(lens, aspect), np.random.default_rng([seed, *name.encode()]))
-
-
 def fence(stage: Stage, rng: np.random.Generator) -> MovingScene:
-    """A blurred fence before a checkerboard in focus that moves diagonally, and a static one that slants away behind it."""
+    """Return a blurred fence before a checkerboard in focus that moves diagonally, and a static one that slants away behind it."""
     bars = [
         Mover(stage.card((x, 0.0, -0.055), (0.05, 1.3 * stage.aspect), _painted(rng, (0.06, 0.3, 0.1), (0.2, 0.6, 0.24))), in_front=True)
         for x in np.arange(-1.2, 1.21, 0.3)
@@ -257,13 +250,13 @@ def _painted(rng: np.random.Generator, dark: Vector, light: Vector) -> Texture:
 
 
 def _radiance(rng: np.random.Generator, least: float, most: float) -> Vector:
-    """A tinted radiance, spread evenly in its logarithm."""
+    """Return a tinted radiance, spread evenly in its logarithm."""
     red, green, blue = np.asarray(_TINTS[rng.integers(len(_TINTS))]) * np.exp(rng.uniform(np.log(least), np.log(most)))
     return float(red), float(green), float(blue)
 
 
 def _around(stage: Stage, rng: np.random.Generator, least: float) -> tuple[float, float, float]:
-    """A place (x, y, coc), evenly over the frame but for a disc in its middle."""
+    """Return a place (x, y, coc), evenly over the frame but for a disc in its middle."""
     while True:
         x, y = rng.uniform(-1.15, 1.15), rng.uniform(-1.15, 1.15) * stage.aspect
         if np.hypot(x, y) > least:
@@ -271,7 +264,7 @@ def _around(stage: Stage, rng: np.random.Generator, least: float) -> tuple[float
 
 
 def _whirling(stage: Stage, x: float, y: float, coc: float, inwards_m: float) -> Vector:
-    """Round the middle, 0.16 rad per shutter: 0.08 widths of the frame at its side."""
+    """Return the velocity round the middle, 0.16 rad per shutter: 0.08 widths of the frame at its side."""
     return stage.velocity_m((-0.08 * y, 0.08 * x), coc, inwards_m)
 
 
@@ -284,7 +277,7 @@ def _leaf(stage: Stage, texture: Texture, rng: np.random.Generator) -> Mover:
 
 
 def _drop(stage: Stage, rng: np.random.Generator) -> Mover:
-    """A bright little ball that falls by 0.05 to 0.13 widths of the frame."""
+    """Return a bright little ball that falls by 0.05 to 0.13 widths of the frame."""
     place = (float(rng.uniform(-1.1, 1.1)), float(rng.uniform(-1.15, 1.15)) * stage.aspect, float(rng.uniform(-0.1, 0.07)))
     fall, radius = float(rng.uniform(0.05, 0.13)), float(rng.uniform(0.006, 0.016))
     drop = stage.ball(place, radius, plain_texture((1.5, 1.75, 2.1)))

@@ -1,8 +1,7 @@
-"""The desk with what a lens lab adds: a ChArUco board of known size, a dark card of point lights, places without texture.
+"""The scenes that RAW stacks are made of: what stands in them, where cameras stand, which lens photographs them.
 
-For measuring capture: a dark card with lights is where every focus-stacking tool leaves rings, the board gives the scale.
-
-The scenes that RAW stacks are made of: what stands in them, where cameras stand, which lens photographs them.
+The lab is the desk with what measuring needs: a ChArUco board of known size for the scale, places without texture, and a dark card of
+point lights, where every focus-stacking tool leaves rings.
 """
 
 from collections.abc import Callable
@@ -41,13 +40,14 @@ LAB_VIEWPOINTS = (
     Viewpoint((-0.03, -0.045, 0.0), float(np.deg2rad(0.5))),
     Viewpoint((0.04, 0.03, -0.01), float(np.deg2rad(-1.0))),
 )
-
 _TEXELS_PER_SQUARE = 48
 _LIGHTS = 26
 _LIGHT_RADIUS_M = (0.5e-3, 1.1e-3)
 _LIGHT_RADIANCE = (4.0, 40.0)
 _BEFORE_CARD_M = 0.002
 _TINTS = ((1.0, 0.9, 0.75), (1.0, 0.75, 0.45), (0.7, 0.85, 1.0), (1.0, 0.55, 0.4), (0.7, 1.0, 0.7))
+# A ring on purpose: it is point-symmetric, so that front and back blur look alike to a network fed with |CoC|.
+_DESK_LENS = Lens(35.0, 2.0, NEAR_FOCUS_M, 23.5, Aperture.disc().obstructed(0.5))
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class _Card:
 
 
 def _leaning_board(corner_m: Vector, yaw_rad: float, lean_rad: float) -> _Card:
-    """The board with its upper left corner there, its right side turned nearer, its lower side leaning towards the camera."""
+    """Return the board with its upper left corner there, its right side turned nearer, its lower side leaning towards the camera."""
     columns, rows = BOARD_SQUARES
     right = columns * BOARD_SQUARE_M * np.array([np.cos(yaw_rad), 0.0, -np.sin(yaw_rad)])
     nearer = -np.array([np.sin(yaw_rad), 0.0, np.cos(yaw_rad)])
@@ -75,19 +75,23 @@ def _leaning_board(corner_m: Vector, yaw_rad: float, lean_rad: float) -> _Card:
 
 
 DARK_CARD = _Card((-0.31, -0.115, 1.28), (0.3, 0.0, 0.05), (0.0, 0.22, 0.0))
+
+
 GREY_CARD = _Card((0.12, -0.2, 1.62), (0.24, 0.0, -0.04), (0.0, 0.16, 0.0))
+
+
 BOARD = _leaning_board((-0.05, 0.085, 0.93), np.deg2rad(10.0), np.deg2rad(46.0))
 
 
 def lab_camera(index: int, width_px: int, height_px: int, lens: Lens) -> Camera:
-    """One of the viewpoints of the lab."""
+    """Return one of the viewpoints of the lab."""
     if not 0 <= index < len(LAB_VIEWPOINTS):
         raise InputError(f"the lab has {len(LAB_VIEWPOINTS)} viewpoints, but number {index} was asked for")
     return camera_at(LAB_VIEWPOINTS[index], width_px, height_px, lens)
 
 
 def lab_facts() -> dict[str, Any]:
-    """What is known of the board and the dark card, for truth.json."""
+    """Return what is known of the board and the dark card, for truth.json."""
     corners_m = [DARK_CARD.point_m(across, down).tolist() for across, down in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))]
     return {
         "board": {"squares": list(BOARD_SQUARES), "square_m": BOARD_SQUARE_M, "marker_m": BOARD_MARKER_M, "dictionary": BOARD_DICTIONARY},
@@ -96,7 +100,7 @@ def lab_facts() -> dict[str, Any]:
 
 
 def lab_scene(seed: int) -> Scene:
-    """The lab with baked light; the seed changes textures and lights."""
+    """Build the lab with baked light; the seed changes textures and lights."""
     rng = np.random.default_rng([seed, 1])
     furniture = desk_furniture(rng)
     dark = mottled(512, rng, (0.012, 0.012, 0.014), (0.05, 0.048, 0.045), finest=4.0, slope=0.2)
@@ -106,7 +110,7 @@ def lab_scene(seed: int) -> Scene:
 
 
 def board_texture() -> Texture:
-    """The board's print: white paper reflects 0.8, ink 0.03; every square has the same whole number of texels."""
+    """Return the board's print: paper reflects 0.8, ink 0.03; every square has the same whole number of texels."""
     import cv2
 
     columns, rows = BOARD_SQUARES
@@ -118,7 +122,7 @@ def board_texture() -> Texture:
 
 
 def _point_lights(rng: np.random.Generator) -> tuple[DiscLight, ...]:
-    """Jittered over a grid of the dark card, a little before it."""
+    """Return lights jittered over a grid of the dark card, a little before it."""
     columns, rows = 6, 5
     cells = rng.permutation(columns * rows)[:_LIGHTS]
     lights = []
@@ -147,9 +151,6 @@ class StackScene:
 def _desk(seed: int) -> Scene:
     return desk_scene(seed)
 
-
-# A ring on purpose: it is point-symmetric, so that front and back blur look alike to a network fed with |CoC|.
-_DESK_LENS = Lens(35.0, 2.0, NEAR_FOCUS_M, 23.5, Aperture.disc().obstructed(0.5))
 
 STACK_SCENES = {
     "desk": StackScene(_desk, desk_camera, len(VIEWPOINTS), _DESK_LENS, NEAR_FOCUS_M, FAR_FOCUS_M),

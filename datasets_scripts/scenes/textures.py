@@ -21,7 +21,7 @@ def fractal_noise(
     slope: float = 1.0,
     stretch: float = 1.0,
 ) -> Float[np.ndarray, "height width"]:
-    """(H, W) noise of mean 0 and standard deviation 1 with amplitude ~ frequency^-slope per octave, between two wavelengths.
+    """Return (H, W) noise of mean 0, deviation 1 and amplitude ~ frequency^-slope per octave, between two wavelengths.
 
     stretch: how many times longer features are along x than along y.
     """
@@ -35,7 +35,7 @@ def fractal_noise(
 
 
 def coloured(shade: Float[np.ndarray, "height width"], dark: Vector, light: Vector) -> Texture:
-    """From `dark` at shade 0 to `light` at shade 1, kept within [0.01, 0.95]."""
+    """Mix from `dark` at shade 0 to `light` at shade 1, kept within [0.01, 0.95]."""
     mixed = np.asarray(dark) + shade[..., None] * (np.asarray(light) - np.asarray(dark))
     return np.clip(mixed, 0.01, 0.95).astype(np.float32)
 
@@ -80,7 +80,7 @@ def bricks(
 
 
 def checks(size: int, rng: np.random.Generator, first: Vector, second: Vector, count: int = 8) -> Texture:
-    """A woven check: squares of two colours with a thread pattern over them."""
+    """Return a woven check: squares of two colours with a thread pattern over them."""
     y, x = np.mgrid[:size, :size] * count // size
     squares = ndimage.gaussian_filter(((x + y) % 2).astype(float), 1.2, mode="wrap")
     shade = 0.12 + 0.76 * squares + 0.13 * fractal_noise(size, size, rng, 4.0, size / 4.0, 0.5)
@@ -136,6 +136,6 @@ def _print_line(page: Float[np.ndarray, "height width"], top: int, cell: int, rn
 
 
 def _invented_glyph(rng: np.random.Generator) -> Float32[np.ndarray, "7 5"]:
-    """A random pattern, mirrored left to right, which reads as a letter from afar."""
+    """Return a random pattern, mirrored left to right, which reads as a letter from afar."""
     half = rng.random((_GLYPH_ROWS, _GLYPH_COLUMNS // 2 + 1)) < 0.55
     return np.concatenate([half, half[:, -2::-1]], axis=1).astype(np.float32)

@@ -17,14 +17,14 @@ HALF_X, HALF_Y = 0.36, 0.2025
 
 
 def make_scene(name: str, seed: int) -> TruthScene:
-    """A scene of that kind; the seed chooses everything that may vary."""
+    """Build a scene of that kind; the seed chooses everything that may vary."""
     if name not in SCENES:
         raise InputError(f"expected a scene out of {', '.join(SCENES)}, got {name!r}")
     return SCENES[name](np.random.default_rng([seed, *name.encode()]))
 
 
 def _fence(rng: np.random.Generator) -> TruthScene:
-    """A mesh of wires close to the camera; blocks, balls, cards, a wall and lamps behind."""
+    """Return a mesh of wires close to the camera; blocks, balls, cards, a wall and lamps behind."""
     metal = fine(rng, (0.12, 0.12, 0.13), (0.5, 0.48, 0.44))
     bodies = [*stage(rng), *blocks(rng, 7, (2.2, 6.5))]
     near_m = float(rng.uniform(0.78, 0.85))
@@ -98,7 +98,7 @@ def _card(rng: np.random.Generator, x_m: float, depth_m: float, size_m: float, t
 
 
 def slanted_board(rng: np.random.Generator, depth_m: float) -> Body:
-    """A checkerboard that recedes by about its own width."""
+    """Return a checkerboard that recedes by about its own width."""
     texture = checks(512, rng, colour(rng, 0.14), colour(rng, 0.65), count=10)
     side_m = 0.3 * depth_m
     yaw = rng.choice([-1.0, 1.0]) * rng.uniform(0.75, 1.1)

@@ -1,10 +1,8 @@
-"""Compiled bodies that move in straight lines while the shutter is open: what a ray meets first, its light and its motion.
+"""Compiled bodies that move in straight lines while the shutter is open, and the sampler's scrambled numbers.
 
 Camera axes, metres; every ray has d_z = 1 and starts in the plane of the lens, so that its parameter t is depth. A body that
 has moved by d is met by a ray as the body at rest is met by the ray moved by -d. Arrays are passed one by one because
-reading them out of a tuple in an inner loop counts references each time.
-
-Compiled quasi-random numbers: Owen-scrambled Sobol points of each pixel (see `truth_sampling`), and lens points from them.
+reading them out of a tuple in an inner loop counts references each time. Numbers are Owen-scrambled Sobol points (see `sobol`).
 """
 
 import math
@@ -21,6 +19,10 @@ CENTRE, VELOCITY, HALF_BOX, NORMAL, DUAL_U, DUAL_V, RADIANCE = 0, 3, 6, 9, 12, 1
 RADIUS, GAIN, REPEAT_U, REPEAT_V, COLUMNS = 21, 22, 23, 24, 25
 # Columns of the light: the sun's direction, its strength, that of the sky, and the background.
 SUN_DIRECTION, SUN, SKY, BACKGROUND = 0, 3, 4, 5
+DIMENSIONS = 5
+PLACES = 4096
+"""Film points per pixel and axis, so few that float32 holds them exactly in pictures of up to 2048 px."""
+PER_BIT = 1.0 / 4294967296.0
 
 
 class PackedBodies(NamedTuple):
@@ -51,7 +53,7 @@ def first_hit(
     dy: float,
     since: float,
 ) -> tuple[int, float, float, float]:
-    """(body or NOTHING, depth or inf, place u, v on a quad) of the first of `members[:count]`; since: time - 0.5, in shutters."""
+    """Return (body or NOTHING, depth or inf, place u, v on a quad) of the first of `members[:count]`; since: time - 0.5, in shutters."""
     best, best_t, best_u, best_v = NOTHING, math.inf, 0.0, 0.0
     steep_x, steep_y = abs(dx), abs(dy)
     for m in range(count):
@@ -89,7 +91,7 @@ def first_hit(
 
 @njit(cache=True, nogil=True)
 def _bilinear(texels: np.ndarray, start: int, height: int, width: int, u: float, v: float) -> tuple[float, float, float]:
-    """A repeating texture; the centre of texel (0, 0) is half a texel from the corner."""
+    """Return a repeating texture; the centre of texel (0, 0) is half a texel from the corner."""
     x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
     x0, y0 = int(math.floor(x)), int(math.floor(y))
     fx, fy = x - x0, y - y0
@@ -119,7 +121,7 @@ def radiance_of(
     y: float,
     since: float,
 ) -> tuple[float, float, float]:
-    """Linear RGB of a hit at (x, y, t): Lambert under the sun and a sky, which on spheres fades downwards."""
+    """Return the linear RGB of a hit at (x, y, t): Lambert under the sun and a sky, which on spheres fades downwards."""
     if i == NOTHING:
         return light[BACKGROUND], light[BACKGROUND + 1], light[BACKGROUND + 2]
     if kind[i] == LAMP:
@@ -141,7 +143,7 @@ def radiance_of(
 
 @njit(cache=True, nogil=True)
 def motion_of(table: np.ndarray, i: int, t: float, x: float, y: float, since: float, focal_x: float, focal_y: float) -> tuple[float, float]:
-    """Pixels per shutter of the hit point (x, y, t) in the pinhole picture, averaged between its time and the middle of the exposure.
+    """Return pixels per shutter of the hit point (x, y, t) in the pinhole picture, a mean from its time to the middle of the exposure.
 
     (p(t) - p(0.5)) / (t - 0.5) of p = f X / Z is f (V_x Z - V_z X) / (Z Z_middle): the derivative where t = 0.5, and the
     point's place at t = 0.5 follows from it exactly at any time.
@@ -153,14 +155,8 @@ def motion_of(table: np.ndarray, i: int, t: float, x: float, y: float, since: fl
     return focal_x * (table[i, VELOCITY] * t - vz * x) * scale, focal_y * (table[i, VELOCITY + 1] * t - vz * y) * scale
 
 
-DIMENSIONS = 5
-PLACES = 4096
-"""Film points per pixel and axis, so few that float32 holds them exactly in pictures of up to 2048 px."""
-PER_BIT = 1.0 / 4294967296.0
-
-
 class LensTable(NamedTuple):
-    """Uniform points of a pupil from two numbers; see `samples_pupil.lens_table`."""
+    """Uniform points of a pupil from two numbers; see `samples.lens_table`."""
 
     y: np.ndarray
     x: np.ndarray
@@ -169,7 +165,7 @@ class LensTable(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def lens_point(y: np.ndarray, x: np.ndarray, light: np.ndarray, along: float, across: float) -> tuple[float, float]:
-    """`across` chooses the band and the height within it, `along` the place among its spans, both in [0, 1)."""
+    """Return a point of the pupil: `across` chooses the band and the height in it, `along` the place among its spans, both in [0, 1)."""
     scaled = across * y.shape[0]
     band = min(int(scaled), y.shape[0] - 1)
     k = 1
@@ -181,7 +177,7 @@ def lens_point(y: np.ndarray, x: np.ndarray, light: np.ndarray, along: float, ac
 
 @njit(cache=True, nogil=True)
 def place(bits: np.uint32) -> float:
-    """The middle of one of PLACES steps of a pixel's width."""
+    """Return the middle of one of PLACES steps of a pixel's width."""
     return (float(bits >> np.uint32(20)) + 0.5) / PLACES
 
 
@@ -194,7 +190,7 @@ def _mixed(x: np.uint32) -> np.uint32:
 
 @njit(cache=True, nogil=True)
 def fill_seeds(item: int, first_stream: int, seeds: np.ndarray) -> None:
-    """A seed of its own for each pixel (or lamp) and dimension, as `truth_sampling.scramble_seed` gives it."""
+    """Fill a seed for each pixel (or lamp) and dimension, as `sobol.scramble_seed` gives it."""
     for axis in range(seeds.shape[0]):
         stream = _mixed(np.uint32(first_stream + axis + 0x85EBCA6B))
         seeds[axis] = _mixed(np.uint32(np.uint32(np.uint32(item) * np.uint32(0x9E3779B9)) + stream))
@@ -202,7 +198,7 @@ def fill_seeds(item: int, first_stream: int, seeds: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True)
 def scrambled(mirrored_bits: np.uint32, seed: np.uint32) -> np.uint32:
-    """`truth_sampling.owen_scrambled` of a 32-bit fraction given with its bits in reverse order."""
+    """Return `sobol.owen_scrambled` of a 32-bit fraction given with its bits in reverse order."""
     x = np.uint32(mirrored_bits + seed)
     x = np.uint32(x ^ np.uint32(x * np.uint32(0x6C50B47C)))
     x = np.uint32(x ^ np.uint32(x * np.uint32(0xB82F1E52)))

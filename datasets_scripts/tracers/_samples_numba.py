@@ -1,11 +1,9 @@
-"""Compiled loops of the stochastic sampler: rays through a film point, a lens point and a moment, over 8 rows of a picture at a time.
+"""Compiled loops of the stochastic sampler: rays through a film point, a lens point and a moment, 8 rows of a picture at a time.
 
-Every pixel draws its own scrambled points, so that neither threads nor the order of the rows change a bit.
-
-Compiled light of small lamps, which rays through the lens would seldom find: from points on the lamp, in two ways.
-
-Film point p, lens point o and lamp point x at depth z determine each other two by two, x = z p + o (1 - z / d_f): a lamp that is
-much blurred is gathered by every pixel that it reaches, one near the focus is followed to the film.
+Every pixel draws its own scrambled points, so that neither threads nor the order of the rows change a bit. Small lamps, which
+such rays would seldom find, are sampled on themselves. Film point p, lens point o and lamp point x at depth z determine each other
+two by two, x = z p + o (1 - z / d_f): a lamp that is much blurred is gathered by every pixel that it reaches, one near the focus
+is followed to the film.
 """
 
 import math
@@ -34,6 +32,7 @@ from datasets_scripts.tracers._moving_bodies_numba import (
 from mrbokeh.system.kernels import njit
 
 TILE_PX = 8
+OWN_LAMP = 1.0 - 1e-9
 
 
 class Pinhole(NamedTuple):
@@ -187,12 +186,9 @@ def sharp_rows(
                     depth_m[row, column], motion_px[row, column, 0], motion_px[row, column, 1] = math.inf, 0.0, 0.0
 
 
-OWN_LAMP = 1.0 - 1e-9
-
-
 @njit(cache=True, nogil=True)
 def _transmission(vertices: np.ndarray, starts: np.ndarray, weights: np.ndarray, x: float, y: float) -> float:
-    """The weighted sum of the outlines that hold the lens point (even-odd rule)."""
+    """Return the weighted sum of the outlines that hold the lens point (even-odd rule)."""
     total = 0.0
     for k in range(weights.shape[0]):
         inside = False

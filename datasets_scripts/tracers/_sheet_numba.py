@@ -1,4 +1,4 @@
-"""Compiled ray casting of a printed sheet on a table; see `sheet_tracer`."""
+"""Compiled ray casting of a printed sheet on a table; see `sheet`."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ TABLE_TILE_M = 0.5
 
 
 class PackedTable(NamedTuple):
-    """Metres in the plane z = 0. edges_x, edges_y: sorted ends of all black rectangles; black[j, i]: whether the cell between them is.
+    """A print on a table, metres in z = 0. edges_x, edges_y: sorted ends of all rectangles; black[j, i]: whether the cell between them is.
 
     sheet: left, top, right, bottom. paper, ink: (3,) radiance. table: (T, T, 3) radiance that repeats every TABLE_TILE_M.
     """
@@ -25,7 +25,7 @@ class PackedTable(NamedTuple):
 
 
 class PackedLens(NamedTuple):
-    """world_from_camera: (4, 4). focal, principal: (2,) px. radius_m: of the pupil. focus_m: along the axis."""
+    """A camera with a lens. world_from_camera: (4, 4). focal, principal: (2,) px. radius_m: of the pupil. focus_m: along the axis."""
 
     world_from_camera: np.ndarray
     focal: np.ndarray
@@ -36,7 +36,7 @@ class PackedLens(NamedTuple):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _cell(edges: np.ndarray, at: float) -> int:
-    """The last edge that is not beyond `at`; by halves (numba's searchsorted takes three times as long)."""
+    """Return the last edge that is not beyond `at`; by halves (numba's searchsorted takes three times as long)."""
     low, high = 0, len(edges)
     while high - low > 1:
         middle = (low + high) // 2
@@ -82,7 +82,7 @@ def _radiance(table: PackedTable, x: float, y: float) -> tuple[float, float, flo
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _point_seen(lens: PackedLens, x_px: float, y_px: float, u: float, v: float) -> tuple[float, float]:
-    """Where the ray through a place of the picture and (u, v) metres of the pupil meets z = 0; nan if it does not."""
+    """Return the point of z = 0 that the ray through a place of the picture and (u, v) metres of the pupil meets; nan if none."""
     pose = lens.world_from_camera
     # From the pupil's point to where the pinhole's ray meets the focus plane, per metre of depth.
     dx = (x_px - lens.principal[0]) / lens.focal[0] - u / lens.focus_m
@@ -99,7 +99,7 @@ def _point_seen(lens: PackedLens, x_px: float, y_px: float, u: float, v: float) 
 
 @njit(cache=True, error_model="numpy")
 def shade(table: PackedTable, lens: PackedLens, samples: np.ndarray, shifts: np.ndarray, rgb: np.ndarray) -> None:
-    """rgb: (H, W, 3), the mean over samples: (S, 4) pixel x, y and pupil x, y in [0, 1); shifts: (H, W, 4) moves them at each pixel."""
+    """Fill rgb (H, W, 3) with means over samples (S, 4), pixel x, y and pupil x, y in [0, 1); shifts (H, W, 4) move them at each pixel."""
     height, width, _ = rgb.shape
     for row in range(height):
         for column in range(width):

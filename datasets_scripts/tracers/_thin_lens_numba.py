@@ -1,8 +1,6 @@
-"""Compiled bodies of a traced scene: which one a ray meets first, and the light that comes back from it. Camera axes, metres.
+"""Compiled kernels of the thin-lens tracer: what a ray meets first, the light that comes back, the picture, and baked visibility.
 
-Compiled kernels of the thin-lens tracer. Camera axes and metres; t is depth because every ray has d_z = 1.
-
-Compiled visibility rays for baked lighting.
+Camera axes and metres; a ray of the picture has d_z = 1, so that its parameter t is depth.
 """
 
 import math
@@ -16,6 +14,7 @@ from mrbokeh.system.kernels import njit
 NOTHING = -1
 # Without "ninf" and "nnan": a missed body is at infinity.
 FAST = {"reassoc", "contract", "arcp", "nsz"}
+TILE_PX = 8
 
 
 class PackedScene(NamedTuple):
@@ -55,7 +54,7 @@ class PackedScene(NamedTuple):
 
 @njit(cache=True, fastmath=FAST)
 def _quad_hit(s: PackedScene, i: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, float, float]:
-    """(t, position along edge u, along edge v); t is inf where the ray misses."""
+    """Return (t, position along edge u, along edge v); t is inf where the ray misses."""
     nx, ny, nz = s.quad_normal[i, 0], s.quad_normal[i, 1], s.quad_normal[i, 2]
     along = nx * dx + ny * dy + nz * dz
     if along == 0.0:
@@ -86,7 +85,7 @@ def _sphere_hit(s: PackedScene, i: int, ox: float, oy: float, oz: float, dx: flo
 
 @njit(cache=True, fastmath=FAST)
 def _light_hit(s: PackedScene, i: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
-    """A light is a disc parallel to the sensor."""
+    """Return t of the hit, or inf; a light is a disc parallel to the sensor."""
     t = (s.light_centre[i, 2] - oz) / dz
     x, y = ox + t * dx - s.light_centre[i, 0], oy + t * dy - s.light_centre[i, 1]
     return t if t > 0.0 and x * x + y * y <= s.light_radius[i] ** 2 else math.inf
@@ -96,7 +95,7 @@ def _light_hit(s: PackedScene, i: int, ox: float, oy: float, oz: float, dx: floa
 def nearest_hit(
     s: PackedScene, members: np.ndarray, count: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[int, float, float, float]:
-    """(body, t, edge position u, v) of the first of `members[:count]` that the ray o + t d meets; body NOTHING and t inf if none."""
+    """Return (body, t, edge position u, v) of the first of `members[:count]` that the ray o + t d meets; NOTHING and inf if none."""
     quads, spheres = s.quad_corner.shape[0], s.sphere_centre.shape[0]
     best, best_t, best_u, best_v = NOTHING, math.inf, 0.0, 0.0
     for m in range(count):
@@ -115,7 +114,7 @@ def nearest_hit(
 
 @njit(cache=True, fastmath=FAST)
 def _texture_rgb(s: PackedScene, texture: int, u: float, v: float) -> tuple[float, float, float]:
-    """Bilinear, repeating; texel (0, 0)'s centre is half a texel from the corner."""
+    """Return a repeating texture, bilinear; texel (0, 0)'s centre is half a texel from the corner."""
     start, height, width = s.texture_map[texture, 0], s.texture_map[texture, 1], s.texture_map[texture, 2]
     x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
     x0, y0 = math.floor(x), math.floor(y)
@@ -134,7 +133,7 @@ def _texture_rgb(s: PackedScene, texture: int, u: float, v: float) -> tuple[floa
 
 @njit(cache=True, fastmath=FAST)
 def _lightmap_gain(s: PackedScene, quad: int, u: float, v: float) -> float:
-    """Bilinear between texel centres, held constant outside them."""
+    """Return the lightmap, bilinear between texel centres, held constant outside them."""
     start, height, width = s.lightmap[quad, 0], s.lightmap[quad, 1], s.lightmap[quad, 2]
     x, y = min(max(u * width - 0.5, 0.0), width - 1.0), min(max(v * height - 0.5, 0.0), height - 1.0)
     x0, y0 = int(x), int(y)
@@ -147,7 +146,7 @@ def _lightmap_gain(s: PackedScene, quad: int, u: float, v: float) -> float:
 
 @njit(cache=True, fastmath=FAST)
 def _sphere_rgb(s: PackedScene, i: int, px: float, py: float, pz: float) -> tuple[float, float, float]:
-    """Lambert under the sun and a sky that fades downwards; longitude and latitude about the world's x axis carry the texture."""
+    """Return Lambert shading under the sun and a sky that fades downwards; the texture's longitude runs about the world's x axis."""
     r = s.sphere_radius[i]
     nx, ny, nz = (px - s.sphere_centre[i, 0]) / r, (py - s.sphere_centre[i, 1]) / r, (pz - s.sphere_centre[i, 2]) / r
     m = s.world_from_camera
@@ -164,7 +163,7 @@ def _sphere_rgb(s: PackedScene, i: int, px: float, py: float, pz: float) -> tupl
 
 @njit(cache=True, fastmath=FAST)
 def radiance(s: PackedScene, members: np.ndarray, count: int, ox: float, oy: float, dx: float, dy: float) -> tuple[float, float, float]:
-    """Linear RGB that comes back along a ray from the lens point (ox, oy, 0)."""
+    """Return the linear RGB that comes back along a ray from the lens point (ox, oy, 0)."""
     quads, spheres = s.quad_corner.shape[0], s.sphere_centre.shape[0]
     body, t, u, v = nearest_hit(s, members, count, ox, oy, 0.0, dx, dy, 1.0)
     if body == NOTHING:
@@ -179,9 +178,6 @@ def radiance(s: PackedScene, members: np.ndarray, count: int, ox: float, oy: flo
     if s.light_gain[light] > 0.0:
         return 0.0, 0.0, 0.0
     return s.light_rgb[light, 0], s.light_rgb[light, 1], s.light_rgb[light, 2]
-
-
-TILE_PX = 8
 
 
 class PackedView(NamedTuple):
@@ -207,7 +203,7 @@ class PackedView(NamedTuple):
 
 @njit(cache=True, inline="always")
 def _fraction_hash(state: np.uint32) -> float:
-    """A well-mixed number in [0, 1) (the finaliser of MurmurHash3)."""
+    """Return a well-mixed number in [0, 1) (the finaliser of MurmurHash3)."""
     h = np.uint32(state)
     h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x85EBCA6B))
     h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(0xC2B2AE35))
@@ -216,13 +212,13 @@ def _fraction_hash(state: np.uint32) -> float:
 
 @njit(cache=True, fastmath=FAST, inline="always")
 def _ray_slope(pixel: int, jitter: float, footprint: float, principal: float, focal: float) -> float:
-    """x / z (or y / z) of the pinhole ray through a point of the pixel's footprint; jitter counts modulo 1."""
+    """Return x / z (or y / z) of the pinhole ray through a point of the pixel's footprint; jitter counts modulo 1."""
     return (pixel + 0.5 + (jitter - math.floor(jitter) - 0.5) * footprint - principal) / focal
 
 
 @njit(cache=True, fastmath=FAST)
 def pupil_weight(view: PackedView, x: float, y: float) -> float:
-    """The weighted sum of the outlines that hold the lens point (even-odd rule)."""
+    """Return the weighted sum of the outlines that hold the lens point (even-odd rule)."""
     total = 0.0
     for k in range(view.weights.shape[0]):
         inside = False
@@ -250,7 +246,7 @@ def _light_share(
     shift: np.ndarray,
     points: np.ndarray,
 ) -> float:
-    """Share of the pupil through which a pixel sees one strongly blurred light: points on the light instead of on the lens."""
+    """Return the share of the pupil through which a pixel sees one strongly blurred light, by points on the light, not on the lens."""
     body = s.quad_corner.shape[0] + s.sphere_centre.shape[0] + light
     cx, cy, cz = s.light_centre[light, 0], s.light_centre[light, 1], s.light_centre[light, 2]
     per_pupil = 1.0 / ((1.0 - cz * view.inverse_focus) * view.pupil_radius)
@@ -284,7 +280,7 @@ def _shade_pixel(
     points: np.ndarray,
     rgb: np.ndarray,
 ) -> None:
-    """Mean radiance over the pixel's area and the pupil, divided by the weight that the pupil really gave (ratio estimator)."""
+    """Fill rgb with the mean over the pixel's area and the pupil, divided by the weight that the pupil really gave (ratio estimator)."""
     red, green, blue, total = 0.0, 0.0, 0.0, 0.0
     for n in range(points.shape[0]):
         q2, q3 = points[n, 2] + shift[2], points[n, 3] + shift[3]
@@ -357,7 +353,7 @@ def trace_depth(s: PackedScene, view: PackedView, depth_m: np.ndarray) -> None:
 
 @njit(cache=True, fastmath=FAST, parallel=True)
 def open_share(s: PackedScene, members: np.ndarray, points: np.ndarray, directions: np.ndarray, reach_m: float) -> np.ndarray:
-    """(P,) the share of the rays from each point (P, 3) that meets none of the bodies `members` within reach_m.
+    """Return the share (P,) of the rays from each point (P, 3) that meets none of the bodies `members` within reach_m.
 
     A nearer hit counts as open by distance / reach_m, so that a large reach gives a hard answer and a short one a soft one.
     """

@@ -20,7 +20,7 @@ _WORLD_AXES = Camera(1, 1, (1.0, 1.0), (0.5, 0.5))
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """texel_m: size of a lightmap texel. rays: per texel, for sun and for ambient light each.
+    """Fineness and reach of baked light. texel_m: size of a lightmap texel. rays: per texel, for sun and for ambient light each.
 
     sun_radius_rad: half the angle that the sun fills (a window rather than a star).
     ambient_reach_m: what is farther away than this dims no corner.
@@ -33,7 +33,7 @@ class BakeSettings:
 
 
 def bake_lighting(scene: Scene, seed: int = 0, settings: BakeSettings | None = None) -> Scene:
-    """The scene with a lightmap on every quad that has none."""
+    """Return the scene with a lightmap on every quad that has none."""
     settings = settings or BakeSettings()
     packed = pack_scene(replace(scene, lights=()), _WORLD_AXES, pack_view(_WORLD_AXES, Aperture.disc(8), 0.0, 0.0))
     rng = np.random.default_rng(seed)
@@ -65,7 +65,7 @@ def _open(
 
 
 def _lightmap_points_m(quad: Quad, texel_m: float) -> Float[np.ndarray, "h w 3"]:
-    """The middle of each texel, lifted off the quad so that its own surface casts no shadow on it."""
+    """Return the middle of each texel, lifted off the quad so that its own surface casts no shadow on it."""
     edge_u, edge_v = np.asarray(quad.edge_u_m), np.asarray(quad.edge_v_m)
     width, height = (int(np.clip(np.linalg.norm(edge) / texel_m, 2, 256)) for edge in (edge_u, edge_v))
     v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
@@ -73,7 +73,7 @@ def _lightmap_points_m(quad: Quad, texel_m: float) -> Float[np.ndarray, "h w 3"]
 
 
 def _body_boxes_m(scene: Scene) -> Float[np.ndarray, "bodies 2 3"]:
-    """Lowest and highest corner of the box around each quad, then each sphere."""
+    """Return the lowest and highest corner of the box around each quad, then each sphere."""
     boxes = []
     for quad in scene.quads:
         ends = np.stack([np.zeros(3), quad.edge_u_m, quad.edge_v_m, np.add(quad.edge_u_m, quad.edge_v_m)]) + quad.corner_m
@@ -83,25 +83,25 @@ def _body_boxes_m(scene: Scene) -> Float[np.ndarray, "bodies 2 3"]:
 
 
 def _gap_m(boxes_m: Float[np.ndarray, "bodies 2 3"], box_m: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, " bodies"]:
-    """Distance between boxes along the axis in which they are farthest apart; no more than their true distance."""
+    """Return the distance between boxes along the axis in which they are farthest apart; at most their true distance."""
     return np.maximum(boxes_m[:, 0] - box_m[1], box_m[0] - boxes_m[:, 1]).max(axis=1)
 
 
 def _frame(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rows: two directions across `axis`, and `axis` itself."""
+    """Return rows: two directions across `axis`, and `axis` itself."""
     across = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
     across /= np.linalg.norm(across)
     return np.stack([across, np.cross(axis, across), axis])
 
 
 def _cosine_directions(count: int, rng: np.random.Generator) -> Float[np.ndarray, "count 3"]:
-    """Directions over the hemisphere around z, as many as light from there counts (Malley's method)."""
+    """Return directions over the hemisphere around z, as dense as light from there counts (Malley's method)."""
     disc = _disc_directions(count, rng)
     disc[:, 2] = np.sqrt(np.maximum(1.0 - disc[:, 0] ** 2 - disc[:, 1] ** 2, 0.0))
     return disc
 
 
 def _disc_directions(count: int, rng: np.random.Generator) -> Float[np.ndarray, "count 3"]:
-    """(x, y, 1) with x, y even over the unit disc (golden-angle spiral)."""
+    """Return (x, y, 1) with x, y even over the unit disc (golden-angle spiral)."""
     radius, angle = np.sqrt((np.arange(count) + 0.5) / count), np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)) + rng.uniform(0, 2 * np.pi)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(count)])

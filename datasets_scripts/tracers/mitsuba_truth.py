@@ -31,6 +31,8 @@ from datasets_scripts.tracers.truth_scene import FACET_COLUMNS, PackedScene
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.mitsuba.mitsuba_tracer import LLVM, load
 
+_LAMP_RAYS_AT_ONCE = 1 << 22
+
 
 def triangle_scene(vertices_m: Float32[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "triangles 3"]) -> Any:
     """Return a scene of these triangles alone, in their order, in the variant of Mitsuba that is set."""
@@ -46,7 +48,7 @@ def triangle_scene(vertices_m: Float32[np.ndarray, "vertices 3"], triangles: Int
 
 
 class LlvmPupil:
-    """The pupil of an Opening on the device, radius_m and focus_m among it. Numbers that change from picture to picture are opaque, so that kernels are reused."""
+    """The pupil of an Opening on the device; numbers that change from picture to picture are opaque, so that kernels are reused."""
 
     def __init__(self, mi: Any, opening: Opening, camera: Camera) -> None:
         self._mi, self._camera, self._cat_eye, self._stop = mi, camera, opening.aperture.cat_eye, opening.stop
@@ -166,9 +168,6 @@ class LlvmShading:
             for column, share_x in columns:
                 result += share_x * share_y * dr.gather(mi.Color3f, self._texels, start + mi.UInt32(row * w + column), active)
         return result
-
-
-_LAMP_RAYS_AT_ONCE = 1 << 22
 
 
 class LlvmTracer:

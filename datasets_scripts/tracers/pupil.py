@@ -1,9 +1,7 @@
-"""Uniform points in an aperture of any shape: two numbers in [0, 1) to a point of the unit pupil.
+"""Pupils of the truth tracer: even points in an aperture of any shape, and a round stop that changes across the frame.
 
-A round stop in a round opening that changes across the frame: rings that are thick on the left, thin in the middle, open on the right.
-
-The circle bokeh of Neural Bokeh (Mandl et al. 2024, section 4.2) looks so. An aperture's outlines cannot say it, since they are the
-same everywhere but for the cat-eye's rim.
+The circle bokeh of Neural Bokeh (Mandl et al. 2024, section 4.2) needs the stop: rings that are thick on the left, thin in the
+middle and open on the right. An aperture's outlines cannot say it, since they are the same everywhere but for the cat-eye's rim.
 """
 
 from collections.abc import Callable
@@ -20,6 +18,9 @@ from mrbokeh.system.errors import InputError
 
 _SCANLINES = 1 << 16
 _BANDS = 1 << 14
+_LINES = 512
+_TABLE_COLUMNS, _TABLE_ROWS = 65, 49
+_TABLE_REACH = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class PupilTable:
         return self.bands.shape[1] // 2 - 1
 
     def points(self, along: Float[np.ndarray, " n"], across: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-        """(N, 2) points x, y: `across` chooses the band and the height within it, `along` the place on its spans."""
+        """Return (N, 2) points x, y: `across` chooses the band and the height within it, `along` the place on its spans."""
         scaled = across * len(self.bands)
         row = self.bands[np.minimum(scaled.astype(int), len(self.bands) - 1)].astype(np.float64)
         y = row[:, 0] + (scaled % 1.0) * (row[:, 1] - row[:, 0])
@@ -51,7 +52,7 @@ class PupilTable:
 
 
 def pupil_table(aperture: Aperture) -> PupilTable:
-    """The table of an aperture that passes all or nothing at every point: outlines of weight +1 and stops of weight -1."""
+    """Return the table of an aperture that passes all or nothing at every point: outlines of weight +1 and stops of weight -1."""
     if not all(abs(weight) == 1.0 for weight in aperture.weights):
         raise InputError(f"the ray tracer takes apertures that are open or closed (weights +1 and -1), got weights {aperture.weights}")
     every_y = np.concatenate([outline[:, 1] for outline in aperture.outlines])
@@ -64,7 +65,7 @@ def pupil_table(aperture: Aperture) -> PupilTable:
 
 
 def _crossings(aperture: Aperture, y: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows crossings"]:
-    """Sorted x at which each line y enters and leaves the aperture; lines with fewer spans are filled up with empty ones."""
+    """Return sorted x at which each line y enters and leaves the aperture; lines with fewer spans get empty ones."""
     found = []
     for outline in aperture.outlines:
         for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -79,19 +80,14 @@ def _crossings(aperture: Aperture, y: Float[np.ndarray, " rows"]) -> Float[np.nd
 
 
 def two_disc_overlap(distance: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-    """Share of a unit disc that a second unit disc covers, their centres `distance` apart."""
+    """Return the share of a unit disc that a second unit disc covers, their centres `distance` apart."""
     half = np.clip(np.abs(distance) / 2.0, 0.0, 1.0)
     return (np.arccos(half) - half * np.sqrt(1.0 - half**2)) * 2.0 / np.pi
 
 
-_LINES = 512
-_TABLE_COLUMNS, _TABLE_ROWS = 65, 49
-_TABLE_REACH = 1.25
-
-
 @dataclass(frozen=True)
 class FieldStop:
-    """Everything in radii of the unit pupil; x is the field position, in half diagonals.
+    """A round stop in a round opening, in radii of the unit pupil; x is the field position, in half diagonals.
 
     The stop is a disc of radius `radius` around the middle of the pupil. Towards the left edge of the frame (x = -edge) it shrinks to
     `radius_left`, towards the right edge it moves right by `shift_right`; in between it does so in proportion to x.
@@ -107,13 +103,13 @@ class FieldStop:
             raise InputError(f"a stop needs radii between 0 and 1, a shift from 0 to 1 and an edge above 0, got {self}")
 
     def radius_and_shift(self, field_x: Any, minimum: Callable[..., Any] = np.minimum, maximum: Callable[..., Any] = np.maximum) -> Any:
-        """(radius, shift to the right) at field positions x, arrays of NumPy or, with its own minimum and maximum, of Dr.Jit."""
+        """Return (radius, shift to the right) at field positions x, arrays of NumPy or, with its own minimum and maximum, of Dr.Jit."""
         share = field_x * (1.0 / self.edge)
         left, right = minimum(maximum(-share, 0.0), 1.0), minimum(maximum(share, 0.0), 1.0)
         return self.radius + (self.radius_left - self.radius) * left, self.shift_right * right
 
     def seen(self, round_opening: Aperture, field_xy: tuple[float, float]) -> Aperture:
-        """The plain aperture that a point at a place of the frame sees, as polygons; round_opening with its cat-eye."""
+        """Return the plain aperture that a point at a place of the frame sees, as polygons; round_opening with its cat-eye."""
         from shapely import Polygon
 
         radius, shift = self.radius_and_shift(field_xy[0])
@@ -132,12 +128,12 @@ class OpenShares:
 
     @cached_property
     def table(self) -> Float[np.ndarray, "rows columns"]:
-        """Rows: |y| from 0, columns: x from -reach, both to reach, evenly spaced."""
+        """Return shares with rows |y| from 0 and columns x from -reach, both to reach, evenly spaced."""
         x = np.linspace(-_TABLE_REACH, _TABLE_REACH, _TABLE_COLUMNS)
         return np.array([[self.exactly(float(each), float(y)) for each in x] for y in np.linspace(0.0, _TABLE_REACH, _TABLE_ROWS)])
 
     def exactly(self, field_x: float, field_y: float) -> float:
-        """Lengths of the open spans on lines across the pupil, by the midpoint rule in the angle (dense towards the poles)."""
+        """Return the share from open spans on lines across the pupil, by the midpoint rule in the angle (dense towards the poles)."""
         angle = (np.arange(_LINES) + 0.5) * np.pi / _LINES
         y, line_height = -np.cos(angle), np.sin(angle) * np.pi / _LINES
         (left, right), (rim_left, rim_right) = _span(y, 0.0, 0.0, 1.0), _span(y, -self.cat_eye * field_x, -self.cat_eye * field_y, 1.0)
@@ -148,12 +144,12 @@ class OpenShares:
         return float((np.maximum(right - left - hidden, 0.0) * line_height).sum() / np.pi)
 
     def places(self, field_x: Any, field_y: Any) -> tuple[Any, Any]:
-        """(column, row) of a place in the table, still fractions; y counts without its sign."""
+        """Return (column, row) of a place in the table, still fractions; y counts without its sign."""
         step_x, step_y = 2.0 * _TABLE_REACH / (_TABLE_COLUMNS - 1), _TABLE_REACH / (_TABLE_ROWS - 1)
         return (field_x + _TABLE_REACH) * (1.0 / step_x), abs(field_y) * (1.0 / step_y)
 
     def at(self, field_x: Float[np.ndarray, " n"], field_y: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Bilinear in the table."""
+        """Return the shares, bilinear in the table."""
         from scipy.ndimage import map_coordinates
 
         column, row = self.places(field_x, field_y)
@@ -161,12 +157,12 @@ class OpenShares:
 
 
 def _span(y: Float[np.ndarray, " lines"], centre_x: float, centre_y: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """(left, right) end of each line within a disc; left after right where it misses the disc."""
+    """Return (left, right) end of each line within a disc; left after right where it misses the disc."""
     half = np.sqrt(np.maximum(radius**2 - (y - centre_y) ** 2, 0.0))
     misses = np.abs(y - centre_y) >= radius
     return np.where(misses, np.inf, centre_x - half), np.where(misses, -np.inf, centre_x + half)
 
 
 def polygon_share(aperture: Aperture) -> float:
-    """Area of a plain aperture over that of the unit disc."""
+    """Return the area of a plain aperture over that of the unit disc."""
     return net_area((aperture.outlines, aperture.weights)) / np.pi

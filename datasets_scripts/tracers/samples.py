@@ -1,8 +1,4 @@
-"""From a moving scene and a lens to the arrays that the compiled sampler takes.
-
-Lens points in proportion to what an aperture passes: two numbers in [0, 1) to a point of the unit pupil.
-
-Stochastic samples of a moving scene through a thin lens, their converged mean, and the sharp picture in the middle of the exposure.
+"""Stochastic samples of a moving scene through a thin lens, their converged mean, and the sharp picture in the middle of the exposure.
 
 A ray leaves film point xy through lens point (u, v) of the unit pupil and meets, in the focus plane, what a pinhole in the
 middle of the lens sees through xy (Cook et al., Distributed Ray Tracing, SIGGRAPH 1984), with all bodies where they are at
@@ -34,6 +30,149 @@ _NEAREST_M = 1e-3
 _LEAST_GATHERED_PX = 6.0
 _BLACK = plain_texture((0.0, 0.0, 0.0))
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+_SCANLINES = 1 << 13
+_BANDS = 1 << 12
+_NEGATIVE = -1e-9
+WIDEST_PX = 1 << 11
+_STREAMS_PER_SEED = 64
+_SAMPLES, _REFERENCE, _LAMPS, _SHARP = 0, 1, 2, 3
+_GATHERED_SHARE = 4
+_FOLLOWED_RAYS = 1024
+Advance = Callable[[], object]
+
+
+def _silent() -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class SampleArrays:
+    """Samples as (H, W, spp, ...) float32: the fields of LightFieldSamples before they are put in a row.
+
+    depth_m: along the optical axis at the sample's time, inf where nothing was hit. motion_px: pixels per shutter of the hit
+    point in the pinhole picture, averaged from the sample's time to the middle of the exposure (the derivative, exact to first
+    order; for what keeps its depth they are the same), so that xy - coc(depth) / 2 * uv - motion * (time - 0.5) is exact.
+    """
+
+    xy_px: Float32[np.ndarray, "height width spp 2"]
+    lens_uv: Float32[np.ndarray, "height width spp 2"]
+    time: Float32[np.ndarray, "height width spp"]
+    rgb: Float32[np.ndarray, "height width spp 3"]
+    depth_m: Float32[np.ndarray, "height width spp"]
+    motion_px: Float32[np.ndarray, "height width spp 2"]
+
+
+@dataclass(frozen=True)
+class SampleTracer:
+    """A moving scene seen by a lens; equal seeds give equal bits for any number of threads (0: all cores).
+
+    seed: of the sampling alone; the samples and the reference draw independent numbers.
+    """
+
+    scene: MovingScene
+    lens: Lens
+    width_px: int
+    height_px: int
+    seed: int = 0
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.width_px <= WIDEST_PX and 1 <= self.height_px <= WIDEST_PX):
+            raise InputError(f"expected a picture of 1 to {WIDEST_PX} px a side, got {self.width_px}x{self.height_px}")
+        if not self.lens.has_flat_focus:
+            raise InputError("the stochastic sampler takes lenses with a flat focus: leave tilt and field curvature out")
+
+    @property
+    def steps(self) -> int:
+        """Number of times that `samples`, `mean` and `sharp` call `advance`."""
+        return -(-self.height_px // TILE_PX)
+
+    def samples(self, spp: int, advance: Advance = _silent) -> SampleArrays:
+        """Trace spp rays per pixel; lamps are seen by the rays that happen to hit them, as in a path tracer's frame."""
+        size = (self.height_px, self.width_px, spp)
+        out = SampleArrays(*(np.empty((*size, *more), np.float32) for more in ((2,), (2,), (), (3,), (), (2,))))
+        arrays = (out.xy_px, out.lens_uv, out.time, out.rgb, out.depth_m, out.motion_px)
+        packed, table, points = self._packed(), lens_table(self.lens.aperture), mirrored_sobol(spp)
+        self._run(lambda top: sample_rows(packed, self._view, table, points, self._stream(_SAMPLES), top, *arrays), advance)
+        return out
+
+    def mean(self, spp: int, advance: Advance = _silent) -> Float32[np.ndarray, "height width 3"]:
+        """Return the mean over spp rays per pixel (box filter); lamps are sampled on themselves and much better than that."""
+        rgb = np.empty((self.height_px, self.width_px, 3))
+        packed, table, points = self._packed(), lens_table(self.lens.aperture), mirrored_sobol(spp)
+        self._run(lambda top: mean_rows(packed, self._view, table, points, self._stream(_REFERENCE), top, rgb), advance)
+        self._add_lamps(packed, spp, rgb)
+        return rgb.astype(np.float32)
+
+    def sharp(self, spp: int, advance: Advance = _silent) -> Layer:
+        """Return the pinhole picture at (u, v, t) = (0, 0, 0.5) with motion as the extra channels forward.u (right)
+        and forward.v (up, as renderers count).
+
+        Colour and coverage are means over the pixel; depth and motion are those of one surface, met nearest to the pixel's
+        centre, or of the lamps where they give over half of the light. Motion is premultiplied by coverage, as extras are.
+        """
+        size, view = (self.height_px, self.width_px), self._view._replace(pupil_radius=0.0)
+        rgba, depth_m, motion_px = np.zeros((*size, 4)), np.empty(size, np.float32), np.empty((*size, 2), np.float32)
+        packed, points = pack(self.scene, view, 0.0), mirrored_sobol(spp)
+        self._run(lambda top: sharp_rows(packed, view, points, self._stream(_SHARP), top, rgba, depth_m, motion_px), advance)
+        extra = {"forward.u": motion_px[..., :1], "forward.v": -motion_px[..., 1:]}
+        return Layer(rgba[..., :3].astype(np.float32), np.minimum(rgba[..., 3], 1.0).astype(np.float32), depth_m, extra)
+
+    @property
+    def _view(self) -> Pinhole:
+        return pinhole_of(self.lens, self.width_px, self.height_px)
+
+    def _packed(self) -> PackedBodies:
+        return pack(self.scene, self._view, self.lens.aperture.unit_radius)
+
+    def _stream(self, use: int) -> int:
+        return self.seed * _STREAMS_PER_SEED + use * DIMENSIONS
+
+    def _run(self, rows: Callable[[int], None], advance: Advance = _silent) -> None:
+        with _executor(self.threads) as pool:
+            for _ in pool.map(rows, range(0, self.height_px, TILE_PX)):
+                advance()
+
+    def _add_lamps(self, packed: PackedBodies, spp: int, rgb: Float[np.ndarray, "height width 3"]) -> None:
+        """Add much blurred lamps from spp / 4 points on each per pixel, the others from 1024 spp rays of each lamp."""
+        outlines, area, view, stream = self.lens.aperture.packed(), light_through(self.lens.aperture), self._view, self._stream(_LAMPS)
+        gathered = gathered_lamps(packed, view, area)
+        followed = np.flatnonzero((packed.kind == LAMP) & ~gathered)
+        points = mirrored_sobol(max(spp // _GATHERED_SHARE, 16))
+        if gathered.any():
+            self._run(lambda top: gather_rows(packed, view, *outlines, area, gathered, points, stream, top, rgb))
+        if len(followed):
+            table, points = lens_table(self.lens.aperture), mirrored_sobol(spp * _FOLLOWED_RAYS)
+
+            def follow(lamp: int) -> tuple[slice, slice, np.ndarray]:
+                left, top, right, bottom = packed.bounds_px[lamp].clip(0, (self.width_px, self.height_px) * 2).astype(int).tolist()
+                light = np.zeros((min(bottom + 1, self.height_px) - top, min(right + 1, self.width_px) - left))
+                follow_lamp(packed, view, table, lamp, points, stream, left, top, light)
+                return slice(top, top + len(light)), slice(left, left + light.shape[1]), light
+
+            with _executor(self.threads) as pool:
+                for lamp, (rows, columns, light) in zip(followed, pool.map(follow, followed.tolist()), strict=True):
+                    rgb[rows, columns] += light[..., None] * packed.table[lamp, RADIANCE : RADIANCE + 3]
+
+
+@contextmanager
+def _executor(threads: int) -> Iterator[ThreadPoolExecutor]:
+    """Yield threads that stop early when the block is left by an exception."""
+    pool = ThreadPoolExecutor(threads or cpu_count() or 1)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def mirrored_sobol(count: int) -> UInt32[np.ndarray, "count 5"]:
+    """Return the first points of the five-dimensional Sobol sequence as 32-bit fractions with their bits in reverse order."""
+    from scipy.stats import qmc
+
+    if count < 1:
+        raise InputError(f"expected at least 1 sample per pixel, got {count}")
+    points = qmc.Sobol(DIMENSIONS, scramble=False, bits=32).random_base2((count - 1).bit_length())[:count]
+    return reversed_bits(np.round(points * 2.0**32).astype(np.uint64).astype(np.uint32))
 
 
 def pinhole_of(lens: Lens, width_px: int, height_px: int) -> Pinhole:
@@ -42,7 +181,7 @@ def pinhole_of(lens: Lens, width_px: int, height_px: int) -> Pinhole:
 
 
 def pack(scene: MovingScene, view: Pinhole, unit_radius: float) -> PackedBodies:
-    """unit_radius: how far the pupil reaches, in radii of the unit pupil (`Aperture.unit_radius`)."""
+    """Turn a moving scene into arrays. unit_radius: how far the pupil reaches, in radii of the unit pupil (`Aperture.unit_radius`)."""
     rows = np.array([_row(mover, scene) for mover in scene.movers]).reshape(-1, layout.COLUMNS)
     worn = [_BLACK if not isinstance(mover.body, Quad | Sphere) else mover.body.texture for mover in scene.movers]
     distinct = list({id(texture): texture for texture in (_BLACK, *worn)}.values())
@@ -59,7 +198,7 @@ def pack(scene: MovingScene, view: Pinhole, unit_radius: float) -> PackedBodies:
 
 
 def gathered_lamps(packed: PackedBodies, view: Pinhole, pupil_area: float) -> Bool[np.ndarray, " bodies"]:
-    """Lamps whose blur is larger than they are, than their trail and than some pixels, all the time on one side of the focus.
+    """Find the lamps whose blur is larger than they are, than their trail and than some pixels, always on one side of the focus.
 
     A pixel finds enough of the points on such a lamp through its pupil; others are better followed to the film.
     """
@@ -103,7 +242,7 @@ def _row(mover: Mover, scene: MovingScene) -> Float[np.ndarray, " columns"]:
 
 
 def _bounds_px(table: Float[np.ndarray, "bodies columns"], view: Pinhole, unit_radius: float) -> Float[np.ndarray, "bodies 4"]:
-    """x0, y0, x1, y1 of the boxes around the bodies at both ends of the exposure, widened by their blur.
+    """Return x0, y0, x1, y1 of the boxes around the bodies at both ends of the exposure, widened by their blur.
 
     Between the ends a corner's projection runs along a line on which 1 / Z is linear, so that its blur reaches no farther than
     the larger one of both ends.
@@ -120,13 +259,8 @@ def _bounds_px(table: Float[np.ndarray, "bodies columns"], view: Pinhole, unit_r
     return bounds
 
 
-_SCANLINES = 1 << 13
-_BANDS = 1 << 12
-_NEGATIVE = -1e-9
-
-
 def lens_table(aperture: Aperture) -> LensTable:
-    """Bands of equal light, each so thin (1/4096 of the light) that its slanted ends do not matter.
+    """Cut an aperture into bands of equal light, each so thin (1/4096 of the light) that its slanted ends do not matter.
 
     y: (B, 2) top and bottom; x: (B, S + 1) where the transmission changes along the middle of the band; light: (B, S + 1) share
     of the band's light to the left of there, 0 to 1. Apertures of any weights that let no negative light through anywhere
@@ -145,14 +279,14 @@ def lens_table(aperture: Aperture) -> LensTable:
 
 
 def light_through(aperture: Aperture) -> float:
-    """Weighted area of the outlines in units of the squared pupil radius."""
+    """Return the weighted area of the outlines in units of the squared pupil radius."""
     return net_area((aperture.outlines, aperture.weights))
 
 
 def _light_along(
     vertices: Float[np.ndarray, "vertices 2"], starts: Int[np.ndarray, " starts"], weights: Float[np.ndarray, " outlines"], y: np.ndarray
 ) -> tuple[Float[np.ndarray, "rows edges"], Float[np.ndarray, "rows edges"]]:
-    """(x where each line y crosses an outline, sorted; the light passed to the left of there); filled up with the last x."""
+    """Return (x where each line y crosses an outline, sorted; the light passed to the left of there), padded with the last x."""
     columns = [_crossings(vertices[a:b], y) for a, b in pairwise(starts)]
     steps = [weight * np.where(np.arange(each.shape[1]) % 2, -1.0, 1.0) for each, weight in zip(columns, weights, strict=True)]
     crossings, step = np.concatenate(columns, axis=1), np.broadcast_to(np.concatenate(steps), (len(y), sum(map(len, steps))))
@@ -167,7 +301,7 @@ def _light_along(
 
 
 def _crossings(outline: Float[np.ndarray, "vertices 2"], y: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows crossings"]:
-    """Sorted x at which each line crosses one outline, inf where it crosses less often than the other lines."""
+    """Return sorted x at which each line crosses one outline, inf where it crosses less often than the other lines."""
     ends = np.roll(outline, -1, axis=0)
     low, high = np.minimum(outline[:, 1], ends[:, 1]), np.maximum(outline[:, 1], ends[:, 1])
     rows = [np.flatnonzero((y >= a) & (y < b)) for a, b in zip(low, high, strict=True)]
@@ -180,146 +314,3 @@ def _crossings(outline: Float[np.ndarray, "vertices 2"], y: Float[np.ndarray, " 
             result[each, filled[each]] = x0 + (x1 - x0) * (y[each] - y0) / (y1 - y0)
             filled[each] += 1
     return np.sort(result, axis=1)
-
-
-WIDEST_PX = 1 << 11
-_STREAMS_PER_SEED = 64
-_SAMPLES, _REFERENCE, _LAMPS, _SHARP = 0, 1, 2, 3
-_GATHERED_SHARE = 4
-_FOLLOWED_RAYS = 1024
-
-Advance = Callable[[], object]
-
-
-def _silent() -> None:
-    pass
-
-
-@dataclass(frozen=True)
-class SampleArrays:
-    """What the sampler yields, (H, W, spp, ...) float32: the fields of LightFieldSamples before they are put in a row.
-
-    depth_m: along the optical axis at the sample's time, inf where nothing was hit. motion_px: pixels per shutter of the hit
-    point in the pinhole picture, averaged from the sample's time to the middle of the exposure (the derivative, exact to first
-    order; for what keeps its depth they are the same), so that xy - coc(depth) / 2 * uv - motion * (time - 0.5) is exact.
-    """
-
-    xy_px: Float32[np.ndarray, "height width spp 2"]
-    lens_uv: Float32[np.ndarray, "height width spp 2"]
-    time: Float32[np.ndarray, "height width spp"]
-    rgb: Float32[np.ndarray, "height width spp 3"]
-    depth_m: Float32[np.ndarray, "height width spp"]
-    motion_px: Float32[np.ndarray, "height width spp 2"]
-
-
-@dataclass(frozen=True)
-class SampleTracer:
-    """A moving scene seen by a lens; equal seeds give equal bits for any number of threads (0: all cores).
-
-    seed: of the sampling alone; the samples and the reference draw independent numbers.
-    """
-
-    scene: MovingScene
-    lens: Lens
-    width_px: int
-    height_px: int
-    seed: int = 0
-    threads: int = 0
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.width_px <= WIDEST_PX and 1 <= self.height_px <= WIDEST_PX):
-            raise InputError(f"expected a picture of 1 to {WIDEST_PX} px a side, got {self.width_px}x{self.height_px}")
-        if not self.lens.has_flat_focus:
-            raise InputError("the stochastic sampler takes lenses with a flat focus: leave tilt and field curvature out")
-
-    @property
-    def steps(self) -> int:
-        """How often `samples`, `mean` and `sharp` call `advance`."""
-        return -(-self.height_px // TILE_PX)
-
-    def samples(self, spp: int, advance: Advance = _silent) -> SampleArrays:
-        """spp rays per pixel; lamps are seen by the rays that happen to hit them, as in a path tracer's frame."""
-        size = (self.height_px, self.width_px, spp)
-        out = SampleArrays(*(np.empty((*size, *more), np.float32) for more in ((2,), (2,), (), (3,), (), (2,))))
-        arrays = (out.xy_px, out.lens_uv, out.time, out.rgb, out.depth_m, out.motion_px)
-        packed, table, points = self._packed(), lens_table(self.lens.aperture), mirrored_sobol(spp)
-        self._run(lambda top: sample_rows(packed, self._view, table, points, self._stream(_SAMPLES), top, *arrays), advance)
-        return out
-
-    def mean(self, spp: int, advance: Advance = _silent) -> Float32[np.ndarray, "height width 3"]:
-        """The mean over spp rays per pixel (box filter); lamps are sampled on themselves and much better than that."""
-        rgb = np.empty((self.height_px, self.width_px, 3))
-        packed, table, points = self._packed(), lens_table(self.lens.aperture), mirrored_sobol(spp)
-        self._run(lambda top: mean_rows(packed, self._view, table, points, self._stream(_REFERENCE), top, rgb), advance)
-        self._add_lamps(packed, spp, rgb)
-        return rgb.astype(np.float32)
-
-    def sharp(self, spp: int, advance: Advance = _silent) -> Layer:
-        """The pinhole picture at (u, v, t) = (0, 0, 0.5) with motion as the extra channels forward.u (right)
-        and forward.v (up, as renderers count).
-
-        Colour and coverage are means over the pixel; depth and motion are those of one surface, met nearest to the pixel's
-        centre, or of the lamps where they give over half of the light. Motion is premultiplied by coverage, as extras are.
-        """
-        size, view = (self.height_px, self.width_px), self._view._replace(pupil_radius=0.0)
-        rgba, depth_m, motion_px = np.zeros((*size, 4)), np.empty(size, np.float32), np.empty((*size, 2), np.float32)
-        packed, points = pack(self.scene, view, 0.0), mirrored_sobol(spp)
-        self._run(lambda top: sharp_rows(packed, view, points, self._stream(_SHARP), top, rgba, depth_m, motion_px), advance)
-        extra = {"forward.u": motion_px[..., :1], "forward.v": -motion_px[..., 1:]}
-        return Layer(rgba[..., :3].astype(np.float32), np.minimum(rgba[..., 3], 1.0).astype(np.float32), depth_m, extra)
-
-    @property
-    def _view(self) -> Pinhole:
-        return pinhole_of(self.lens, self.width_px, self.height_px)
-
-    def _packed(self) -> PackedBodies:
-        return pack(self.scene, self._view, self.lens.aperture.unit_radius)
-
-    def _stream(self, use: int) -> int:
-        return self.seed * _STREAMS_PER_SEED + use * DIMENSIONS
-
-    def _run(self, rows: Callable[[int], None], advance: Advance = _silent) -> None:
-        with _executor(self.threads) as pool:
-            for _ in pool.map(rows, range(0, self.height_px, TILE_PX)):
-                advance()
-
-    def _add_lamps(self, packed: PackedBodies, spp: int, rgb: Float[np.ndarray, "height width 3"]) -> None:
-        """What is much blurred from spp / 4 points on each lamp per pixel, the rest from 1024 spp rays of each lamp."""
-        outlines, area, view, stream = self.lens.aperture.packed(), light_through(self.lens.aperture), self._view, self._stream(_LAMPS)
-        gathered = gathered_lamps(packed, view, area)
-        followed = np.flatnonzero((packed.kind == LAMP) & ~gathered)
-        points = mirrored_sobol(max(spp // _GATHERED_SHARE, 16))
-        if gathered.any():
-            self._run(lambda top: gather_rows(packed, view, *outlines, area, gathered, points, stream, top, rgb))
-        if len(followed):
-            table, points = lens_table(self.lens.aperture), mirrored_sobol(spp * _FOLLOWED_RAYS)
-
-            def follow(lamp: int) -> tuple[slice, slice, np.ndarray]:
-                left, top, right, bottom = packed.bounds_px[lamp].clip(0, (self.width_px, self.height_px) * 2).astype(int).tolist()
-                light = np.zeros((min(bottom + 1, self.height_px) - top, min(right + 1, self.width_px) - left))
-                follow_lamp(packed, view, table, lamp, points, stream, left, top, light)
-                return slice(top, top + len(light)), slice(left, left + light.shape[1]), light
-
-            with _executor(self.threads) as pool:
-                for lamp, (rows, columns, light) in zip(followed, pool.map(follow, followed.tolist()), strict=True):
-                    rgb[rows, columns] += light[..., None] * packed.table[lamp, RADIANCE : RADIANCE + 3]
-
-
-@contextmanager
-def _executor(threads: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads that stop early when the block is left by an exception."""
-    pool = ThreadPoolExecutor(threads or cpu_count() or 1)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def mirrored_sobol(count: int) -> UInt32[np.ndarray, "count 5"]:
-    """The first points of the five-dimensional Sobol sequence as 32-bit fractions with their bits in reverse order."""
-    from scipy.stats import qmc
-
-    if count < 1:
-        raise InputError(f"expected at least 1 sample per pixel, got {count}")
-    points = qmc.Sobol(DIMENSIONS, scramble=False, bits=32).random_base2((count - 1).bit_length())[:count]
-    return reversed_bits(np.round(points * 2.0**32).astype(np.uint64).astype(np.uint32))

@@ -16,7 +16,7 @@ from mrbokeh.optics.lens import MM_PER_M, Lens
 
 @dataclass(frozen=True)
 class Sheet:
-    """black_mm: (N, 4) x, y, width, height, without overlap. margin_mm: white paper around them. paper, ink: reflectances."""
+    """A printed sheet. black_mm: (N, 4) x, y, width, height, without overlap. margin_mm: white paper around. paper, ink: reflectances."""
 
     black_mm: Float64[np.ndarray, "rectangles 4"]
     margin_mm: float = 12.0
@@ -32,7 +32,7 @@ class Sheet:
 def trace_sheet(
     table: PackedTable, camera: Camera, lens: Lens | None, samples: int, seed: int = 0
 ) -> Float32[np.ndarray, "height width 3"]:
-    """Scene-linear RGB. lens: None is a pinhole; else its focus and aperture blur, while the geometry is that of the camera.
+    """Return scene-linear RGB. lens: None is a pinhole; else its focus and aperture blur, while the geometry is that of the camera.
 
     samples: rays per pixel, Sobol points that every pixel shifts by its own vector.
     """
@@ -48,6 +48,6 @@ def trace_sheet(
 
 
 def with_noise(rgb: Float[np.ndarray, "height width 3"], noise: float, rng: np.random.Generator) -> Float32[np.ndarray, "height width 3"]:
-    """noise: standard deviation at radiance 1; photons make it fall with the root, read noise adds a tenth of it."""
+    """Add noise. noise: standard deviation at radiance 1; photons make it fall with the root, read noise adds a tenth of it."""
     sigma = noise * np.sqrt(np.maximum(rgb, 0.0) + 0.01)
     return (rgb + sigma * rng.standard_normal(rgb.shape)).astype(np.float32)

@@ -14,7 +14,7 @@ DIMENSIONS = 4
 
 
 def sobol_table(samples: int) -> UInt32[np.ndarray, "samples 4"]:
-    """The first points of the four-dimensional Sobol sequence as 32-bit fractions; a power of two is best."""
+    """Return the first points of the four-dimensional Sobol sequence as 32-bit fractions; a power of two is best."""
     from scipy.stats import qmc
 
     sequence = qmc.Sobol(DIMENSIONS, scramble=False, bits=32)
@@ -23,7 +23,7 @@ def sobol_table(samples: int) -> UInt32[np.ndarray, "samples 4"]:
 
 
 def owen_scrambled(bits: Any, seed: Any, reverse_bits: Callable[[Any], Any]) -> Any:
-    """A 32-bit fraction, scrambled; points of one sequence stay well spread where they share the seed."""
+    """Scramble a 32-bit fraction; points of one sequence stay well spread where they share the seed."""
     x = reverse_bits(bits) + seed
     x = x ^ (x * 0x6C50B47C)
     x = x ^ (x * 0xB82F1E52)
@@ -33,19 +33,19 @@ def owen_scrambled(bits: Any, seed: Any, reverse_bits: Callable[[Any], Any]) -> 
 
 
 def scramble_seed(pixel: Any, stream: Any) -> Any:
-    """A seed of its own for each pixel and each stream (a dimension of one picture)."""
+    """Return a seed for each pixel and each stream (a dimension of one picture)."""
     return _mixed(pixel * 0x9E3779B9 + _mixed(stream + 0x85EBCA6B))
 
 
 def _mixed(x: Any) -> Any:
-    """The finaliser of MurmurHash3: every bit of the number changes about half of the bits of the result."""
+    """Mix a number by the finaliser of MurmurHash3: every bit changes about half of the bits of the result."""
     x = (x ^ (x >> 16)) * 0x85EBCA6B
     x = (x ^ (x >> 13)) * 0xC2B2AE35
     return x ^ (x >> 16)
 
 
 def reversed_bits(x: UInt32[np.ndarray, "*batch"]) -> UInt32[np.ndarray, "*batch"]:
-    """The 32 bits of each number in reverse order."""
+    """Return the 32 bits of each number in reverse order."""
     for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
         x = ((x >> shift) & mask) | ((x & mask) << shift)
     return (x >> 16) | (x << 16)

@@ -1,6 +1,4 @@
-"""From Scene, Camera and pupil to the arrays that the compiled tracer takes (camera axes, metres).
-
-A small ray tracer whose lens, occlusion and depth are exact: the truth for photographs made with it and for lens-blur renderers.
+"""A small ray tracer whose lens, occlusion and depth are exact: the truth for photographs made with it and for lens-blur renderers.
 
 A ray leaves pixel position p through lens point u (unit pupil, camera axes x right, y down) and meets, in the focus plane,
 the point that a pinhole at the lens centre sees through p (Cook et al. 1984, Distributed Ray Tracing; thin lens). So a point
@@ -25,12 +23,82 @@ _NEAREST_M = 1e-3
 _UNIT_BOX = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _UNIT_DISC_BOX = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
 _UNIT_QUAD = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+_LENS_DIFFERS = 1e-3
+_LEAST_DRAWN = 32  # so that no pixel of a thin ring is left without a ray
+_PINHOLE_PUPIL = Aperture((np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]),), (1.0,))
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Low-discrepancy points: pixel x, y and pupil x, y in [0, 1); light_points serve lights sampled on their own."""
+
+    points: Float[np.ndarray, "samples 4"]
+    light_points: Float[np.ndarray, "light_samples 4"]
+
+
+def camera_for_lens(camera: Camera, lens: Lens) -> Camera:
+    """Return the camera with the focal length in pixels that the focused lens really has (focus breathing, square pixels)."""
+    focal_px = lens.focal_px(camera.width_px)
+    return replace(camera, focal_px=(focal_px, focal_px))
+
+
+def trace(
+    scene: Scene, camera: Camera, lens: Lens, samples: int, seed: int = 0, footprint_px: float = 1.0
+) -> Float32[np.ndarray, "height width 3"]:
+    """Return scene-linear RGB (H, W, 3) through the lens.
+
+    samples: rays per pixel that pass the aperture (on average).
+    camera: its focal_px must be that of the lens as focused (see `camera_for_lens`), else blur and geometry would disagree.
+    footprint_px: side of the square that a pixel averages; above 1 it stands for an optical low-pass filter.
+    """
+    expected_px = lens.focal_px(camera.width_px)
+    if max(abs(focal / expected_px - 1.0) for focal in camera.focal_px) > _LENS_DIFFERS:
+        raise InputError(
+            f"the camera has a focal length of {camera.focal_px} px, but the lens focused at {lens.focus_distance_m} m "
+            f"has {expected_px:.3f} px: use camera_for_lens(camera, lens)"
+        )
+    view = pack_view(camera, lens.aperture, 0.5e-3 * lens.aperture_diameter_mm, 1.0 / lens.focus_distance_m, footprint_px)
+    return _shaded(scene, camera, view, samples, seed)
+
+
+def trace_pinhole(
+    scene: Scene, camera: Camera, samples: int, seed: int = 0, footprint_px: float = 1.0
+) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
+    """Return (RGB averaged over each pixel's footprint, depth in metres along the axis at its centre) from the middle of the lens."""
+    view = pack_view(camera, _PINHOLE_PUPIL, 0.0, 0.0, footprint_px)
+    depth_m = np.empty((camera.height_px, camera.width_px), np.float32)
+    trace_depth(pack_scene(scene, camera, view), view, depth_m)
+    return _shaded(scene, camera, view, samples, seed), depth_m
+
+
+def _shaded(scene: Scene, camera: Camera, view: PackedView, samples: int, seed: int) -> Float32[np.ndarray, "height width 3"]:
+    if samples < 1:
+        raise InputError(f"expected at least 1 sample per pixel, got {samples}")
+    packed = pack_scene(scene, camera, view)
+    drawn = _draw_samples(view, samples, seed)
+    rgb = np.empty((view.height, view.width, 3), np.float32)
+    shade_picture(packed, view, drawn.points, drawn.light_points, seed, rgb)
+    return rgb
+
+
+def _draw_samples(view: PackedView, samples: int, seed: int) -> _Samples:
+    """Draw scrambled Sobol points; every pixel later shifts them by its own vector (Cranley and Patterson 1976).
+
+    Points of the square around the pupil that miss it are dropped while tracing, so more are drawn than asked for.
+    """
+    from scipy.stats import qmc
+
+    covered = pupil_areas(view).max() / (2.0 * view.pupil_extent) ** 2
+    count = max(int(np.ceil(samples / covered)), _LEAST_DRAWN)
+    sobol = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(seed))
+    points = sobol.random_base2(int(np.ceil(np.log2(count))))
+    return _Samples(points[:count], points[: max(samples // 4, 16)])
 
 
 def pack_view(
     camera: Camera, aperture: Aperture, pupil_radius_m: float, inverse_focus_per_m: float, footprint_px: float = 1.0
 ) -> PackedView:
-    """A camera behind a pupil; inverse_focus_per_m is the focus distance in dioptres (0 = infinity)."""
+    """Return a camera behind a pupil; inverse_focus_per_m is the focus distance in dioptres (0 = infinity)."""
     vertices, starts, weights = aperture.packed()
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
     return PackedView(
@@ -40,7 +108,7 @@ def pack_view(
 
 
 def pack_scene(scene: Scene, camera: Camera, view: PackedView) -> PackedScene:
-    """The scene in camera axes, with the pixels that each body's blur can reach."""
+    """Return the scene in camera axes, with the pixels that each body's blur can reach."""
     rotation, shift = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     corners = _vectors([quad.corner_m for quad in scene.quads]) @ rotation.T + shift
     edges_u = _vectors([quad.edge_u_m for quad in scene.quads]) @ rotation.T
@@ -86,7 +154,7 @@ def pack_scene(scene: Scene, camera: Camera, view: PackedView) -> PackedScene:
 
 
 def pupil_areas(view: PackedView) -> Float[np.ndarray, " outlines"]:
-    """Area of each outline in units of the squared pupil radius (shoelace formula)."""
+    """Return the area of each outline in units of the squared pupil radius (shoelace formula)."""
     return np.array([_polygon_area(view.vertices[a:b]) for a, b in zip(view.starts[:-1], view.starts[1:], strict=True)])
 
 
@@ -100,7 +168,7 @@ def _vectors(rows: Sequence[tuple[float, ...]], size: int = 3) -> Float[np.ndarr
 
 
 def _packed_textures(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(texels (T, 3), start, height and width of each distinct texture, which one each body wears)."""
+    """Return (texels (T, 3), start, height and width of each distinct texture, which one each body wears)."""
     distinct = {id(texture): texture for texture in textures} or {0: np.zeros((1, 1, 3), np.float32)}
     number = {key: index for index, key in enumerate(distinct)}
     texels = np.concatenate([texture.reshape(-1, 3) for texture in distinct.values()])
@@ -123,7 +191,7 @@ def _map_of(shapes: Sequence[tuple[int, ...]]) -> np.ndarray:
 def _light_gains(
     depth_m: Float[np.ndarray, " lights"], radius_m: Float[np.ndarray, " lights"], view: PackedView
 ) -> Float[np.ndarray, " lights"]:
-    """Share of the pupil per point on the light where its blur is larger than the light, else 0: the lens rays find it well enough."""
+    """Return the share of the pupil per point on the light where its blur is larger than the light, else 0, as lens rays find it."""
     weighted_area = float(np.dot(view.weights, pupil_areas(view)))
     pupil_on_light = weighted_area * (view.pupil_radius * (1.0 - depth_m * view.inverse_focus)) ** 2
     share = np.pi * radius_m**2 / np.maximum(pupil_on_light, 1e-300)
@@ -131,7 +199,7 @@ def _light_gains(
 
 
 def _bounds_px(points_m: Float[np.ndarray, "bodies points 3"], view: PackedView) -> Float[np.ndarray, "bodies 4"]:
-    """x0, y0, x1, y1 of the convex hull of each body's points, seen from anywhere in the pupil.
+    """Return x0, y0, x1, y1 of the convex hull of each body's points, seen from anywhere in the pupil.
 
     The blur radius of a depth is focal_px * pupil_radius * |1/z - 1/d_f|, which is largest at one end of the depth range.
     """
@@ -145,75 +213,3 @@ def _bounds_px(points_m: Float[np.ndarray, "bodies points 3"], view: PackedView)
     behind_lens = (points_m[..., 2] <= _NEAREST_M).any(axis=1)
     bounds[behind_lens] = (-np.inf, -np.inf, np.inf, np.inf)
     return bounds
-
-
-_LENS_DIFFERS = 1e-3
-_LEAST_DRAWN = 32  # so that no pixel of a thin ring is left without a ray
-_PINHOLE_PUPIL = Aperture((np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]),), (1.0,))
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """Low-discrepancy points: pixel x, y and pupil x, y in [0, 1); light_points serve lights sampled on their own."""
-
-    points: Float[np.ndarray, "samples 4"]
-    light_points: Float[np.ndarray, "light_samples 4"]
-
-
-def camera_for_lens(camera: Camera, lens: Lens) -> Camera:
-    """The camera with the focal length in pixels that the focused lens really has (focus breathing, square pixels)."""
-    focal_px = lens.focal_px(camera.width_px)
-    return replace(camera, focal_px=(focal_px, focal_px))
-
-
-def trace(
-    scene: Scene, camera: Camera, lens: Lens, samples: int, seed: int = 0, footprint_px: float = 1.0
-) -> Float32[np.ndarray, "height width 3"]:
-    """Scene-linear RGB (H, W, 3) through the lens.
-
-    samples: rays per pixel that pass the aperture (on average).
-    camera: its focal_px must be that of the lens as focused (see `camera_for_lens`), else blur and geometry would disagree.
-    footprint_px: side of the square that a pixel averages; above 1 it stands for an optical low-pass filter.
-    """
-    expected_px = lens.focal_px(camera.width_px)
-    if max(abs(focal / expected_px - 1.0) for focal in camera.focal_px) > _LENS_DIFFERS:
-        raise InputError(
-            f"the camera has a focal length of {camera.focal_px} px, but the lens focused at {lens.focus_distance_m} m "
-            f"has {expected_px:.3f} px: use camera_for_lens(camera, lens)"
-        )
-    view = pack_view(camera, lens.aperture, 0.5e-3 * lens.aperture_diameter_mm, 1.0 / lens.focus_distance_m, footprint_px)
-    return _shaded(scene, camera, view, samples, seed)
-
-
-def trace_pinhole(
-    scene: Scene, camera: Camera, samples: int, seed: int = 0, footprint_px: float = 1.0
-) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
-    """(RGB averaged over each pixel's footprint, depth in metres along the axis at each pixel's centre) from the middle of the lens."""
-    view = pack_view(camera, _PINHOLE_PUPIL, 0.0, 0.0, footprint_px)
-    depth_m = np.empty((camera.height_px, camera.width_px), np.float32)
-    trace_depth(pack_scene(scene, camera, view), view, depth_m)
-    return _shaded(scene, camera, view, samples, seed), depth_m
-
-
-def _shaded(scene: Scene, camera: Camera, view: PackedView, samples: int, seed: int) -> Float32[np.ndarray, "height width 3"]:
-    if samples < 1:
-        raise InputError(f"expected at least 1 sample per pixel, got {samples}")
-    packed = pack_scene(scene, camera, view)
-    drawn = _draw_samples(view, samples, seed)
-    rgb = np.empty((view.height, view.width, 3), np.float32)
-    shade_picture(packed, view, drawn.points, drawn.light_points, seed, rgb)
-    return rgb
-
-
-def _draw_samples(view: PackedView, samples: int, seed: int) -> _Samples:
-    """Scrambled Sobol points; every pixel later shifts them by its own vector (Cranley and Patterson 1976).
-
-    Points of the square around the pupil that miss it are dropped while tracing, so more are drawn than asked for.
-    """
-    from scipy.stats import qmc
-
-    covered = pupil_areas(view).max() / (2.0 * view.pupil_extent) ** 2
-    count = max(int(np.ceil(samples / covered)), _LEAST_DRAWN)
-    sobol = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(seed))
-    points = sobol.random_base2(int(np.ceil(np.log2(count))))
-    return _Samples(points[:count], points[: max(samples // 4, 16)])

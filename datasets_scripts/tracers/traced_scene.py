@@ -1,4 +1,4 @@
-"""What the thin-lens tracer can see: textured quads, textured spheres and small bright discs, with simple light."""
+"""Bodies that our ray tracers see: textured quads and spheres and small bright discs with simple light, at rest or in motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -78,14 +78,14 @@ class Scene:
     background_rgb: Vector = (0.0, 0.0, 0.0)
 
     def unshadowed_gain(self, quad: Quad) -> float:
-        """Sun (Lambert) and ambient light on the lit side of a quad with nothing in the way."""
+        """Return sun (Lambert) and ambient light on the lit side of a quad with nothing in the way."""
         return self.ambient + self.sun * max(float(np.dot(quad.normal, self.sun_direction)), 0.0)
 
 
 def emissive_quad(
     corner_m: Vector, edge_u_m: Vector, edge_v_m: Vector, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)
 ) -> Quad:
-    """A quad whose texture is the radiance that it sends out, whatever the scene's light is."""
+    """Return a quad whose texture is the radiance that it sends out, whatever the scene's light is."""
     return Quad(corner_m, edge_u_m, edge_v_m, texture, repeats, np.ones((1, 1), np.float32))
 
 
@@ -126,11 +126,11 @@ class MovingScene:
         return len({mover.in_front for mover in self.movers}) == 2
 
     def part(self, in_front: bool) -> "MovingScene":
-        """The front layer or everything else, as if the other were not there."""
+        """Return the front layer or everything else, as if the other were not there."""
         return replace(self, movers=tuple(mover for mover in self.movers if mover.in_front == in_front))
 
     def at(self, time: float) -> Scene:
-        """All bodies where they are at a time of the exposure, 0 to 1."""
+        """Return all bodies where they are at a time of the exposure, 0 to 1."""
         moved = [_moved(mover.body, (time - 0.5) * np.asarray(mover.velocity_m)) for mover in self.ordered]
         return Scene(
             tuple(body for body in moved if isinstance(body, Quad)),

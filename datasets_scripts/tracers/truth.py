@@ -71,8 +71,11 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """rgb: mean radiance over the pixel and the open part of the pupil, lamps black. alpha: share of the rays that met a body
-    or the sky. open_share: share of the pupil that the rim leaves open."""
+    """Pictures of one opening.
+
+    rgb: mean radiance over the pixel and the open part of the pupil, lamps black. alpha: share of the rays that met a body
+    or the sky. open_share: share of the pupil that the rim leaves open.
+    """
 
     rgb: Picture
     alpha: Plane
@@ -81,7 +84,7 @@ class Traced:
 
 @runtime_checkable
 class TruthTracer(Protocol):
-    """Looks at one part of a scene ("thin": the foreground alone, "rest": all but that); shadows are those of the whole scene."""
+    """A tracer of one part of a scene ("thin": the foreground alone, "rest": all but that); shadows are those of the whole scene."""
 
     scene: PackedScene
     camera: Camera

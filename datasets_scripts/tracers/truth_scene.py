@@ -1,6 +1,6 @@
-"""Bodies of the truth scenes as triangles: quads, boxes, balls, wires and leaves, each with one texture. World metres, x right, y down.
+"""Truth scenes: bodies of triangles and lamps in world axes, and the same as flat tables in camera axes, which the tracer takes.
 
-A truth scene: bodies and lamps in world axes, and the same as flat tables in camera axes, which a tracer takes.
+World metres, x right, y down. Quads, boxes, balls, wires and leaves have one texture each.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,11 @@ from datasets_scripts.tracers.traced_scene import Texture, Vector
 from mrbokeh.optics.camera import Camera
 
 Place = Vector | Float[np.ndarray, "3"]
-
 _ROUND_SIDES = 96
 _WIRE_SIDES = 24
+FACET_COLUMNS = 13
+_LAMP_SIDES = 48
+_BLACK = np.zeros((1, 1, 3), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,7 @@ class Body:
 
 
 def quad(corner_m: Place, edge_u_m: Place, edge_v_m: Place, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)) -> Body:
-    """A parallelogram; it is lit on the side from which edge_u goes right and edge_v goes down."""
+    """Return a parallelogram; it is lit on the side from which edge_u goes right and edge_v goes down."""
     corner, edge_u, edge_v = (np.asarray(each, np.float64) for each in (corner_m, edge_u_m, edge_v_m))
     unit_uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     normal = np.cross(edge_v, edge_u)
@@ -45,7 +47,7 @@ def quad(corner_m: Place, edge_u_m: Place, edge_v_m: Place, texture: Texture, re
 
 
 def box(base_m: Place, size_m: Vector, yaw_rad: float, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)) -> list[Body]:
-    """A box (width, height, depth) that stands with the middle of its base on base_m, turned about the vertical axis; no bottom."""
+    """Return a box (width, height, depth) that stands with the middle of its base on base_m, turned about the vertical axis; no bottom."""
     width, height, depth = size_m
     right = width * np.array([np.cos(yaw_rad), 0.0, np.sin(yaw_rad)])
     away = depth * np.array([-np.sin(yaw_rad), 0.0, np.cos(yaw_rad)])
@@ -62,7 +64,7 @@ def box(base_m: Place, size_m: Vector, yaw_rad: float, texture: Texture, repeats
 
 
 def ball(centre_m: Place, radius_m: float, texture: Texture, repeats: tuple[float, float] = (2.0, 1.0)) -> Body:
-    """A finely tessellated sphere whose texture runs around the vertical axis."""
+    """Return a finely tessellated sphere whose texture runs around the vertical axis."""
     polar = np.linspace(0.0, np.pi, _ROUND_SIDES // 2 + 1)
     around = np.linspace(0.0, 2.0 * np.pi, _ROUND_SIDES + 1)
     theta, phi = np.meshgrid(polar, around, indexing="ij")
@@ -72,7 +74,7 @@ def ball(centre_m: Place, radius_m: float, texture: Texture, repeats: tuple[floa
 
 
 def wire(points_m: Float[np.ndarray, "points 3"], radius_m: float, texture: Texture, repeat_m: float = 0.05, thin: bool = False) -> Body:
-    """A round wire along a line of points; the texture repeats every `repeat_m` along it."""
+    """Return a round wire along a line of points; the texture repeats every `repeat_m` along it."""
     tangents = np.gradient(points_m, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     aside = np.array([0.0, 0.0, 1.0]) - tangents[:, 2:] * tangents
@@ -96,7 +98,7 @@ def leaf(
     tint: float = 1.0,
     thin: bool = False,
 ) -> Body:
-    """A flat pointed oval in the plane of the first two rows of `turn` (unit vectors); it is lit on the side towards the camera."""
+    """Return a flat pointed oval in the plane of the first two rows of `turn` (unit vectors), lit on the side towards the camera."""
     t = np.linspace(0.0, 1.0, 13)
     half = 0.5 * width_m * np.sin(np.pi * t) ** 0.8
     outline = np.concatenate([np.stack([(t - 0.5) * length_m, half], 1), np.stack([(t - 0.5) * length_m, -half], 1)])
@@ -113,11 +115,6 @@ def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "triangles 3"]:
     upper = np.stack([first, first + 1, first + columns + 1], axis=1)
     lower = np.stack([first, first + columns + 1, first + columns], axis=1)
     return np.concatenate([upper, lower])
-
-
-FACET_COLUMNS = 13
-_LAMP_SIDES = 48
-_BLACK = np.zeros((1, 1, 3), np.float32)
 
 
 @dataclass(frozen=True)
@@ -151,7 +148,7 @@ class TruthScene:
 
 @dataclass(frozen=True, eq=False)
 class PackedScene:
-    """Everything in camera axes; the triangles of the thin foreground come first.
+    """A scene in camera axes; the triangles of the thin foreground come first.
 
     facets (T, 13): per triangle uv of its three corners (6), light of the sun and of the sky at them (3 + 3), tint.
     facet_texture (T, 3): start in `texels`, width, height. facet_normals (T, 3): unit, towards the camera.
@@ -224,7 +221,7 @@ def _facets(body: Body, scene: TruthScene, sun: Float[np.ndarray, "3"]) -> Float
 
 
 def _lamp_body(lamp: Lamp) -> Body:
-    """The lamp as an obstacle: black, since its light is traced forwards."""
+    """Return the lamp as an obstacle: black, since its light is traced forwards."""
     around = np.arange(_LAMP_SIDES)
     angle = 2.0 * np.pi * around / _LAMP_SIDES
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(_LAMP_SIDES)], axis=1)

@@ -1,4 +1,4 @@
-"""The loop of tests.bench.blur_methods, compiled."""
+"""The loop of tests.bench.blur_methods.gathered, compiled."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def gather_rows(
     first: int,
     end: int,
 ) -> None:
-    """Rows first:end of out (H, W * C): each pixel takes values at itself less every tap of its cell.
+    """Fill rows first:end of out (H, W * C): each pixel takes values at itself less every tap of its cell.
 
     values (H + 2 margin, (W + 2 margin) * C); cells (H, W); taps (N, 2) x, y of cell i at starts[i]:starts[i + 1], none farther than
     the margin. Neighbours of one cell go together, so that a tap is one run of multiplications.

@@ -56,8 +56,9 @@ GAUSSIANS_PX, RADII_PX, CAPSULES_PX = (25.0, 40.0, 55.0), (25.0, 50.0, 100.0), (
 _DEGREE = 3
 PLAIN = Sparsification(least_points=1, lloyd_steps=0, annealing_steps=0)
 SUMS = replace(PLAIN, fit=False)
-
 Part = dict[str, Any]
+_SLOW = {"ablation": 3, "sample_counts": 2}
+"""Parts that take a share of the kernels: annealing tries 400 sets of points for each."""
 
 
 def codes(corpus: Corpus) -> Part:
@@ -195,10 +196,6 @@ def _shapes() -> Iterable[tuple[str, np.ndarray]]:
         yield f"disc {size}", clean(model.exact(np.array([2.0 * radius_px, 0.0])))
     for size, (radius_px, length_px) in zip("SML", CAPSULES_PX, strict=True):
         yield f"capsule {size}", clean(model.exact(np.array([2.0 * radius_px, length_px])))
-
-
-_SLOW = {"ablation": 3, "sample_counts": 2}
-"""Parts that take a share of the kernels: annealing tries 400 sets of points for each."""
 
 
 def analyse(out: Path, parts: list[str], largest_px: float, count: int, seed: int) -> int:

@@ -34,6 +34,13 @@ from mrbokeh.system.errors import InputError
 from tests.bench.blur_methods import SPARSIFICATIONS, BlurMethods, bank_of, composited, read_global_layers, read_moving_layers
 
 _TIMED_SHARE = 16
+_RIM_PX = 2
+_TRACED = ("simple", "combined")
+_GAMMA, _STRENGTHS = 2.2, (4.0, 8.0, 16.0, 32.0, 64.0)
+Picture = Float32[np.ndarray, "height width 3"]
+SCENES = ("whirl", "coins", "rain", "gear")
+_SPP = 4
+_NOT_THERE = "-"
 
 
 @dataclass(frozen=True)
@@ -80,13 +87,6 @@ class BlurScene:
         return scene if moves else replace(scene, movers=tuple(replace(each, velocity_m=(0.0, 0.0, 0.0)) for each in scene.movers))
 
 
-_RIM_PX = 2
-_TRACED = ("simple", "combined")
-_GAMMA, _STRENGTHS = 2.2, (4.0, 8.0, 16.0, 32.0, 64.0)
-
-Picture = Float32[np.ndarray, "height width 3"]
-
-
 @dataclass(frozen=True)
 class Row:
     """A scene seen through a PSF model.
@@ -104,7 +104,6 @@ class Row:
         return f"{self.scene}_{self.model}" + ("" if self.way == "layers" else f"_{self.way}")
 
 
-SCENES = ("whirl", "coins", "rain", "gear")
 ROWS: tuple[Row, ...] = (
     *(Row(scene, "combined") for scene in SCENES),
     Row("rain", "physical"),
@@ -209,10 +208,6 @@ def _milliseconds(run: Callable[[], object]) -> float:
     started_s = time.perf_counter()
     run()
     return 1e3 * (time.perf_counter() - started_s)
-
-
-_SPP = 4
-_NOT_THERE = "-"
 
 
 def make_tables(out: Path, rows: Sequence[Row], width_px: int, height_px: int, reference_spp: int, repeats: int) -> int:

@@ -1,20 +1,15 @@
-"""FILTER, the competitor of Leimkuehler et al. 2018, Section 7: every pixel gathers light with its own PSF instead of giving it away.
+"""OURS, SPLAT and FILTER of Leimkuehler et al. 2018, Section 7: three ways to add up light with the kernels of one bank.
 
-Where all pixels share one PSF it is the same as splatting. Where they do not, a pixel in focus takes no light from a blurred
-neighbour, and a blurred one takes it from what is sharp: the defect of all methods that filter pictures.
+Layers are global, as in their Section 6: light is added up linearly within a layer, layers lie over one another. They are those of the
+sampler: what is far in front of the focus, and everything else as if that were not there. Coverage goes through the same PSFs as
+colour; where several PSFs do not add up to 1, colour is weighted anew by it (Lee et al. 2008). It is plainer than
+mrbokeh.layering.layering, which cuts every layer into slices: comparisons made with it compare the ways to add up light, nothing else.
 
-Global depth layers as in Leimkuehler et al. 2018, Section 6: light is added up linearly within a layer, layers lie over one another.
+FILTER gathers: every pixel takes light with its own PSF instead of giving it away. Where all pixels share one PSF that is the same as
+splatting. Where they do not, a pixel in focus takes no light from a blurred neighbour, and a blurred one takes it from what is sharp.
 
-The layers are those of the sampler: what is far in front of the focus, and everything else as if that were not there. Coverage
-goes through the same PSFs as colour; where several PSFs do not add up to 1, colour is weighted anew by it (Lee et al. 2008).
-It is plainer than mrbokeh.layering.layering, which cuts every layer into slices: comparisons made with it compare the ways to add up
-light, and nothing else.
-
-OURS, SPLAT and FILTER of Leimkuehler et al. 2018, Section 7: three ways to add up light with the kernels of one bank.
-
-Banks of the five PSF models of Leimkuehler et al. 2018, Table 1, in the range of blur of the sampler's scenes.
-
-In the sampler's scenes circles of confusion reach 0.105 and motion 0.135 widths of the frame, depths 1.2 to 6.6 m.
+Banks are of the five PSF models of their Table 1, in the range of blur of the sampler's scenes: circles of confusion reach 0.105 and
+motion 0.135 widths of the frame, depths 1.2 to 6.6 m.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -51,6 +46,22 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
 
 _STRIP_ROWS = 16
+_LEAST = np.float32(1e-6)
+_OPAQUE = 0.999
+Light = Float32[np.ndarray, "height width _"]
+COC_SHARE, MOTION_SHARE = 0.125, 0.14
+NEAREST_M, FARTHEST_M = 1.2, 6.6
+BICONVEX_F_NUMBER = 4.0
+_WINDOW_SHARE = 0.25
+_DUST = 1e-6
+_RAYS = {"physical": 1 << 18, "volume": 1 << 19}
+_FINER, _SEED = 4, 0
+SPARSIFICATIONS: Mapping[str, Sparsification] = {
+    # Points are counted by the length of a kernel's outline. A caustic within a wide halo has a short one, and the light that a medium
+    # does not scatter, all in one pixel, a shorter one yet: fewer points than the thirty that hold all moments.
+    "physical": Sparsification(points_per_px=4.0, lloyd_steps=0, annealing_steps=0),
+    "volume": Sparsification(points_per_px=60.0, lloyd_steps=0, annealing_steps=0),
+}
 
 
 def gathered(
@@ -60,7 +71,7 @@ def gathered(
     margin_px: int,
     threads: int = 0,
 ) -> Float32[np.ndarray, "height width channels"]:
-    """At every pixel x the sum over the taps p of its kernel of weight(p) times values(x - p).
+    """Return at every pixel x the sum over the taps p of its kernel of weight(p) times values(x - p).
 
     values: with a margin all around, at least as wide as the taps reach. cells: which of the kernels a pixel takes, from 0.
     """
@@ -86,20 +97,16 @@ def gathered(
     return out.reshape(height, width, channels)
 
 
-def gathered_plainly(
+def gathered_reference(
     values: Float32[np.ndarray, "rows columns channels"], cells: Int32[np.ndarray, "height width"], taps: Points, margin_px: int
 ) -> Float[np.ndarray, "height width channels"]:
-    """The slow and obvious twin of `gathered`, in double precision."""
+    """Return the slow and obvious twin of `gathered`, in double precision."""
     out = np.zeros((*cells.shape, values.shape[2]))
     for y, x in np.ndindex(*cells.shape):
         part = slice(taps.starts[cells[y, x]], taps.starts[cells[y, x] + 1])
         for (right, down), weight in zip(taps.xy[part], taps.weights[part], strict=True):
             out[y, x] += weight * values[y + margin_px - down, x + margin_px - right]
     return out
-
-
-_LEAST = np.float32(1e-6)
-_OPAQUE = 0.999
 
 
 @dataclass(frozen=True)
@@ -120,17 +127,17 @@ Spread = Callable[[GlobalLayer, int], Float32[np.ndarray, "height width _"]]
 
 
 def read_global_layers(folder: Path, lens: Lens, margin_px: int, *, moves: bool = True) -> list[GlobalLayer]:
-    """The layers of a set of samples (datasets_scripts.render_samples), front first; moves: False takes them as at rest."""
+    """Return the layers of a set of samples (datasets_scripts.render_samples), front first; moves: False takes them as at rest."""
     return [global_layer(layer, lens, margin_px, moves=moves) for layer in read_moving_layers(folder)]
 
 
 def read_moving_layers(folder: Path) -> list[Layer]:
-    """The layers with their motion as renderers take it, front first."""
+    """Return the layers with their motion as renderers take it, front first."""
     return [taken_from_channels(read_layer(path, extra=True), 1.0) for path in sorted((folder / "layers").glob("*.exr"))]
 
 
 def global_layer(layer: Layer, lens: Lens, margin_px: int, *, moves: bool = True) -> GlobalLayer:
-    """A layer with its motion in pixels, continued beyond the frame as its border pixels do if it covers all of it."""
+    """Return a layer with its motion in pixels, continued beyond the frame as its border pixels do if it covers all of it."""
     covered, is_opaque = layer.alpha > 0, bool(layer.alpha.min() > _OPAQUE)
     motion_px = np.zeros((*covered.shape, 2), np.float32)
     if moves and MOTION in layer.extra:
@@ -147,7 +154,7 @@ def global_layer(layer: Layer, lens: Lens, margin_px: int, *, moves: bool = True
 
 
 def composited(layers: Sequence[GlobalLayer], spread: Spread, margin_px: int) -> Float32[np.ndarray, "height width 3"]:
-    """All layers spread and laid over one another, front first; what the last leaves open is shared out."""
+    """Return all layers spread and laid over one another, front first; what the last leaves open is shared out."""
     size = [length - 2 * margin_px for length in layers[0].coc_px.shape]
     colour, free = np.zeros((*size, 3)), np.ones((*size, 1))
     for layer in layers:
@@ -164,9 +171,6 @@ def _field_xy(width_px: int, height_px: int, margin_px: int) -> Float32[np.ndarr
     rows, columns = np.indices((height_px + 2 * margin_px, width_px + 2 * margin_px)) + 0.5 - margin_px
     x, y = np.clip(columns, 0, width_px) - 0.5 * width_px, np.clip(rows, 0, height_px) - 0.5 * height_px
     return (np.stack([x, y], axis=2) / (0.5 * np.hypot(width_px, height_px))).astype(np.float32)
-
-
-Light = Float32[np.ndarray, "height width _"]
 
 
 @dataclass(frozen=True)
@@ -187,15 +191,15 @@ class BlurMethods:
         self._taps = BankTables(bank, None)
 
     def ours(self, layer: GlobalLayer, margin_px: int) -> Light:
-        """Spreadlets."""
+        """Splat spreadlets."""
         return _inside(self._sparse.sum_bank_kernels(layer.values, layer.coc_px, layer.place), margin_px)
 
     def splat(self, layer: GlobalLayer, margin_px: int) -> Light:
-        """All taps of the bank's kernels."""
+        """Splat all taps of the bank's kernels."""
         return _inside(self._dense.sum_bank_kernels(layer.values, layer.coc_px, layer.place), margin_px)
 
     def filter(self, layer: GlobalLayer, margin_px: int) -> Light:
-        """Every pixel of the frame gathers with the kernel that it has itself; where the layer is empty, with that of its nearest pixel."""
+        """Gather at every pixel with its own kernel; where the layer is empty, with that of its nearest pixel."""
         whole = layer if layer.is_opaque else _continued(layer)
         coc_px, place = _inside(whole.coc_px, margin_px), _place_inside(whole.place, margin_px)
         codes = self._taps.codes(coc_px, np.zeros(coc_px.shape, np.bool_), place)
@@ -251,7 +255,7 @@ def _place_inside(place: Place, margin_px: int) -> Place:
 
 
 def _continued(layer: GlobalLayer) -> GlobalLayer:
-    """What decides on the kernels, continued from the nearest covered pixel."""
+    """Continue what decides on the kernels from the nearest covered pixel."""
     covered: Bool[np.ndarray, "height width"] = layer.values[..., 3] > 0
     if not covered.any():
         return layer
@@ -259,22 +263,6 @@ def _continued(layer: GlobalLayer) -> GlobalLayer:
     planes = (layer.place.motion_px, layer.place.field_xy, layer.place.depth_m)
     place = Place(*(None if plane is None else plane[rows, columns] for plane in planes))
     return replace(layer, coc_px=layer.coc_px[rows, columns], place=place)
-
-
-COC_SHARE, MOTION_SHARE = 0.125, 0.14
-NEAREST_M, FARTHEST_M = 1.2, 6.6
-BICONVEX_F_NUMBER = 4.0
-_WINDOW_SHARE = 0.25
-_DUST = 1e-6
-_RAYS = {"physical": 1 << 18, "volume": 1 << 19}
-_FINER, _SEED = 4, 0
-
-SPARSIFICATIONS: Mapping[str, Sparsification] = {
-    # Points are counted by the length of a kernel's outline. A caustic within a wide halo has a short one, and the light that a medium
-    # does not scatter, all in one pixel, a shorter one yet: fewer points than the thirty that hold all moments.
-    "physical": Sparsification(points_per_px=4.0, lloyd_steps=0, annealing_steps=0),
-    "volume": Sparsification(points_per_px=60.0, lloyd_steps=0, annealing_steps=0),
-}
 
 
 def _simple(lens: Lens, width_px: int, finer: int) -> PsfModel:  # noqa: ARG001
@@ -316,7 +304,7 @@ MODELS: Mapping[str, Callable[[Lens, int, int], PsfModel]] = {
 
 
 def bank_of(model: str, folder: Path, lens: Lens, width_px: int, *, finer: bool = False) -> PsfBank:
-    """A bank, built in FOLDER unless it is there. finer: with four times the steps of the grid in all, to stand for exact kernels.
+    """Return a bank, built in FOLDER unless it is there. finer: with four times the steps of the grid in all, to stand for exact kernels.
 
     Raises InputError where the folder holds another bank.
     """
@@ -336,7 +324,7 @@ def without_dust(bank: PsfBank) -> PsfBank:
 
 
 def star(size_px: int = 128) -> Float32[np.ndarray, "size size 3"]:
-    """The picture of the stylised PSF: a five-pointed star in a ring."""
+    """Return the picture of the stylised PSF: a five-pointed star in a ring."""
     place: Float64[np.ndarray, "2 size size"] = (np.indices((size_px, size_px)) + 0.5) / size_px * 2.0 - 1.0
     radius, angle = np.hypot(*place), np.arctan2(place[1], -place[0])
     fifth = np.abs((angle * 5.0 / (2.0 * np.pi)) % 1.0 - 0.5) * 2.0  # 1 at the points, 0 between them

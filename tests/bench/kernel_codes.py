@@ -1,10 +1,8 @@
-"""PSFs as quad trees, the sparse code that Leimkuehler et al. 2018 compare spreadlets with (Section 7.3, "Laplacian Domain").
+"""Sparse codes of kernels compared: quad trees beside spreadlets, and the test set of Leimkuehler et al. 2018, Section 7.3.
 
 `quad_tree` is theirs: squares of even light, split where they fit worst; each square that is not dark is one splat, into the level
 of a pyramid that has its size. `quad_tree_points` keeps to the Laplacian and takes the squares of a tree, split where most charge
-is, in place of the Voronoi cells of darts.
-
-The test set of Leimkuehler et al. 2018, Section 7.3: kernels of COMBINED, and how sparse and how alike their sparse forms are.
+is, in place of the Voronoi cells of darts. The test set are kernels of COMBINED.
 """
 
 import heapq
@@ -23,8 +21,13 @@ from mrbokeh.renderers.kernels.laplacian_integration import integrate, laplacian
 from mrbokeh.renderers.kernels.spreadlets import Spreadlet, fitted_values, potential_of, table_for, whole_laplacian
 
 _LEAST_LINES = 3
-
 Square = tuple[int, int, int]
+COUNTS = (75, 75)
+"""Steps of the nested grid with 392 cells; the paper has 400."""
+Kernel = Float64[np.ndarray, "size size"]
+Window = Float64[np.ndarray, "window window"]
+_SSIM_BORDER_PX = 5  # that SSIM leaves out
+_FAR_PX = 8  # to the border on which light is 0, as renderers have it
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class QuadTree:
     side_px: int
 
     def picture(self) -> Float64[np.ndarray, "side side"]:
-        """The squares filled; the middle of the kernel is pixel (side / 2, side / 2)."""
+        """Return the squares filled; the middle of the kernel is pixel (side / 2, side / 2)."""
         out = np.zeros((self.side_px, self.side_px))
         for (top, left, size), value in zip(self.leaves.tolist(), self.values, strict=True):
             out[top : top + size, left : left + size] = value
@@ -44,7 +47,7 @@ class QuadTree:
 
 
 def quad_tree(kernel: Float[np.ndarray, "size size"], leaves: int) -> QuadTree:
-    """A kernel (odd size) as so many squares that are not dark, or a few more; each holds the mean, so the light is kept.
+    """Return a kernel (odd size) as so many squares that are not dark, or a few more; each holds the mean, so the light is kept.
 
     The leaf with the largest squared error is split first.
     """
@@ -60,7 +63,7 @@ def quad_tree(kernel: Float[np.ndarray, "size size"], leaves: int) -> QuadTree:
 
 
 def quad_tree_points(kernel: Float[np.ndarray, "size size"], points: int, fit: bool) -> Spreadlet:
-    """The Laplacian gathered in squares: one point in each that is not empty, at the centroid of its charges.
+    """Return the Laplacian gathered in squares: one point in each that is not empty, at the centroid of its charges.
 
     fit: values by least squares, as kernels.spreadlets has them, else the sums; points in three rows or columns or fewer cannot
     hold the moments that a fit keeps, and take the sums, too.
@@ -126,20 +129,13 @@ class _Sums:
 
 
 def _in_a_power_of_two(picture: Float64[np.ndarray, "size size"]) -> Float64[np.ndarray, "side side"]:
-    """With zeros around it, the middle pixel at (side / 2, side / 2)."""
+    """Pad with zeros, so that the middle pixel is (side / 2, side / 2)."""
     radius = len(picture) // 2
     side = 1 << int(np.ceil(np.log2(2 * radius + 2)))
     out = np.zeros((side, side))
     part = slice(side // 2 - radius, side // 2 + radius + 1)
     out[part, part] = picture
     return out
-
-
-COUNTS = (75, 75)
-"""Steps of the nested grid with 392 cells; the paper has 400."""
-
-Kernel = Float64[np.ndarray, "size size"]
-Window = Float64[np.ndarray, "window window"]
 
 
 @dataclass(frozen=True)
@@ -168,7 +164,9 @@ class Corpus:
 
 @dataclass(frozen=True)
 class Likeness:
-    """sparsity: points over taps, at most 1 (with as many the kernel is splatted as it is). similarity: SSIM within the window that
+    """Likeness of a sparse form to its kernel.
+
+    sparsity: points over taps, at most 1 (with as many the kernel is splatted as it is). similarity: SSIM within the window that
     all kernels share, as the paper's; similarity_near: within the kernel's own square. l1: sum of absolute differences.
     """
 
@@ -186,12 +184,12 @@ def clean(kernel: Float[np.ndarray, "size size 1"]) -> Kernel:
 
 
 def is_line(kernel: Kernel) -> bool:
-    """Whether all light lies in one row."""
+    """Return whether all light lies in one row."""
     return bool(np.count_nonzero(kernel.any(axis=1)) == 1)
 
 
 def likeness_of(sparse: Spreadlet | QuadTree, kernel: Kernel, window_px: int) -> Likeness:
-    """A sparse form against its kernel."""
+    """Return a sparse form against its kernel."""
     points = len(sparse.values)
     taps = int(np.count_nonzero(kernel))
     if points >= taps:
@@ -201,7 +199,7 @@ def likeness_of(sparse: Spreadlet | QuadTree, kernel: Kernel, window_px: int) ->
 
 
 def alike(found: Window, truth: Window, near_px: int) -> tuple[float, float, float]:
-    """SSIM with the truth's peak as 1, within the window and within near_px around its middle; L1."""
+    """Return SSIM with the truth's peak as 1, within the window and within near_px around its middle; L1."""
     peak = float(truth.max())
     wide, wide_truth = np.pad(found, _SSIM_BORDER_PX) / peak, np.pad(truth, _SSIM_BORDER_PX) / peak
     first = len(truth) // 2 - near_px // 2
@@ -209,11 +207,8 @@ def alike(found: Window, truth: Window, near_px: int) -> tuple[float, float, flo
     return ssim(wide, wide_truth), ssim(wide[near, near], wide_truth[near, near]), float(np.abs(found - truth).sum())
 
 
-_SSIM_BORDER_PX = 5  # that SSIM leaves out
-
-
 def picture_of(sparse: Spreadlet | QuadTree, window_px: int) -> Window:
-    """The kernel that a sparse form stands for, in the middle of a window (odd)."""
+    """Return the kernel that a sparse form stands for, in the middle of a window (odd)."""
     if isinstance(sparse, QuadTree):
         side = max(sparse.side_px, window_px + 1)
         picture = np.pad(sparse.picture(), (side - sparse.side_px) // 2)
@@ -227,16 +222,13 @@ def picture_of(sparse: Spreadlet | QuadTree, window_px: int) -> Window:
     return integrate(source)[first : first + window_px, first : first + window_px, 0]
 
 
-_FAR_PX = 8  # to the border on which light is 0, as renderers have it
-
-
 def around(kernel: Kernel, window_px: int) -> Window:
-    """The kernel with zeros around it."""
+    """Return the kernel with zeros around it."""
     return np.pad(kernel, (window_px - len(kernel)) // 2)
 
 
 def mean_of(found: Sequence[Likeness]) -> dict[str, float]:
-    """Means, and the paper's efficiency: similarity over sparsity."""
+    """Return means, and the paper's efficiency: similarity over sparsity."""
     names = ("sparsity", "similarity", "similarity_near", "l1")
     means = {name: float(np.mean([getattr(each, name) for each in found])) for name in names}
     return {**means, "efficiency": means["similarity"] / means["sparsity"]}

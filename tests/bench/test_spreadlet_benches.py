@@ -19,7 +19,7 @@ from mrbokeh.system.errors import InputError
 from tests.bench import bench_spreadlet_scenes
 from tests.bench.bench_spreadlet_kernels import analyse
 from tests.bench.bench_spreadlet_scenes import Row, make_tables
-from tests.bench.blur_methods import BlurMethods, GlobalLayer, composited, gathered, gathered_plainly, global_layer
+from tests.bench.blur_methods import BlurMethods, GlobalLayer, composited, gathered, gathered_reference, global_layer
 from tests.bench.kernel_codes import Corpus, alike, around, is_line, likeness_of, picture_of, quad_tree, quad_tree_points
 
 DIAMETERS_PX = (3.0, 9.0, 30.0)
@@ -53,7 +53,7 @@ def test_the_filter_agrees_with_its_plain_twin() -> None:
     cells = np.random.default_rng(1).integers(0, len(KERNELS), SIZE).astype(np.int32)
     cells[:, 10:30] = 2  # runs of one kernel, too
     np.testing.assert_allclose(
-        gathered(picture(), cells, taps(), MARGIN_PX), gathered_plainly(picture(), cells, taps(), MARGIN_PX), atol=2e-6
+        gathered(picture(), cells, taps(), MARGIN_PX), gathered_reference(picture(), cells, taps(), MARGIN_PX), atol=2e-6
     )
 
 

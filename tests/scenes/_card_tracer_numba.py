@@ -16,14 +16,14 @@ OUT, SOME, ALL = 0, 1, 2
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
 def sharp_from_film(plane: np.ndarray, x: float, y: float, ux: float, uy: float) -> tuple[float, float]:
-    """Where the ray through film point (x, y) and lens point u meets the card."""
+    """Return the place where the ray through film point (x, y) and lens point u meets the card."""
     half_coc = 0.5 * (plane[0] + plane[1] * x + plane[2] * y) / (1.0 + 0.5 * (plane[1] * ux + plane[2] * uy))
     return x - ux * half_coc, y - uy * half_coc
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
 def _inside(solid: np.ndarray, tx: float, ty: float) -> bool:
-    """Whether the bilinear interpolation of `solid` (H, W) at texel position (tx, ty) is above 0; outside the table nothing is."""
+    """Return whether the bilinear value of `solid` (H, W) at texel position (tx, ty) is above 0; outside the table nothing is."""
     if tx < 0.0 or ty < 0.0 or tx >= solid.shape[1] - 1 or ty >= solid.shape[0] - 1:
         return False
     i, j = int(tx), int(ty)
@@ -49,7 +49,7 @@ def _lamp_at(cells: np.ndarray, lamps: np.ndarray, margin_px: int, x: float, y: 
 
 @njit(cache=True, nogil=True, inline="always")
 def _noise(row: int, column: int) -> tuple[int, float, float]:
-    """A large whole number and two numbers in [0, 1) of a pixel, alike for equal pixels and without a pattern."""
+    """Return a large whole number and two numbers in [0, 1) of a pixel, alike for equal pixels and without a pattern."""
     mixed = np.uint64(row * 2654435761 + column * 40503 + 12345)
     mixed = (mixed ^ (mixed >> np.uint64(15))) * np.uint64(0x2C1B3C6D)
     mixed = (mixed ^ (mixed >> np.uint64(12))) * np.uint64(0x297A2D39)
@@ -69,7 +69,7 @@ def _first_card(
     film: tuple[float, float],
     lens: tuple[float, float],
 ) -> tuple[int, bool, float, float]:
-    """(card or -1, whether a lamp is met on it, texel position) that the ray through a film and a lens point meets first."""
+    """Return (card or -1, whether a lamp is met on it, texel position) that the ray through a film and a lens point meets first."""
     margin_px, density = geometry
     for k in range(planes.shape[0]):
         if reach[k] == OUT:
@@ -87,7 +87,7 @@ def _first_card(
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
 def _colour_at(texels: np.ndarray, tx: float, ty: float) -> tuple[float, float, float]:
-    """The bilinear colour at a texel position."""
+    """Return the bilinear colour at a texel position."""
     i, j = int(tx), int(ty)
     fx, fy = tx - i, ty - j
     a, b, c, d = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy

@@ -57,7 +57,7 @@ class PackedCards:
 def trace(
     packed: PackedCards, grid: TexelGrid, planes: Float64[np.ndarray, "cards 3"], aperture: Aperture, positions: int
 ) -> Float32[np.ndarray, "height width 4"]:
-    """Mean RGB and coverage seen through the aperture; planes (K, 3) give each card's CoC as a + bx x + by y.
+    """Return mean RGB and coverage seen through the aperture; planes (K, 3) give each card's CoC as a + bx x + by y.
 
     positions: lens points per pixel for the cards; lamps are followed with as many rays as give their discs the same.
     """
@@ -102,7 +102,7 @@ def transmission(aperture: Aperture, points: Float64[np.ndarray, "points 2"]) ->
 
 
 def _raw_count(aperture: Aperture, positions: int) -> int:
-    """The power of two at which the points within the opening are at least `positions` with a little to spare."""
+    """Return the power of two at which the points within the opening are at least `positions` with a little to spare."""
     side = (np.arange(256) + 0.5) / 128.0 - 1.0
     probe = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) * aperture.unit_radius
     share = float(np.count_nonzero(transmission(aperture, probe))) / len(probe)
@@ -112,7 +112,7 @@ def _raw_count(aperture: Aperture, positions: int) -> int:
 def reach_of(
     packed: PackedCards, grid: TexelGrid, planes: Float64[np.ndarray, "cards 3"], unit_radius: float
 ) -> Int8[np.ndarray, "height width cards"]:
-    """For every pixel and card whether no ray, some or all rays of the pixel meet it: what the compiled loop may skip.
+    """Return for every pixel and card whether no ray, some or all rays of the pixel meet it: what the compiled loop may skip.
 
     A distance field changes by at most a pixel per pixel, so its value in the middle of the rays' footprint tells.
     """
@@ -143,7 +143,7 @@ def _trace_cards(
     reach: Int8[np.ndarray, "height width cards"],
     coverage: Float64[np.ndarray, "_ _ _"],
 ) -> Float64[np.ndarray, "height width 4"]:
-    """The cards with black lamps, in pieces of rows; each pixel has its own samples, so threads change nothing."""
+    """Return the cards with black lamps, in pieces of rows; each pixel has its own samples, so threads change nothing."""
     from tests.scenes._card_tracer_numba import trace_rows
 
     samples, starts = lens_samples(aperture, positions, _BLOCKS)
@@ -166,7 +166,7 @@ def _trace_lamps(
     positions: int,
     reach: Int8[np.ndarray, "height width cards"],
 ) -> Float64[np.ndarray, "height width 4"]:
-    """The light of the lamps, one after the other: rays in proportion to the area over which a lamp spreads."""
+    """Return the light of the lamps, one after the other: rays in proportion to the area over which a lamp spreads."""
     from tests.scenes._card_tracer_numba import add_lamp
 
     arrays = (planes, packed.solid, packed.cells, packed.lamps, reach, (grid.margin_px, grid.density))
@@ -184,6 +184,6 @@ def _trace_lamps(
 
 
 def _on_unit_disc(samples: Float64[np.ndarray, "samples 5"]) -> Float64[np.ndarray, "samples 5"]:
-    """The second points moved from the unit square to the unit disc, area for area."""
+    """Return the second points moved from the unit square to the unit disc, area for area."""
     radius, angle_rad = np.sqrt(samples[:, 2]), 2.0 * np.pi * samples[:, 3]
     return np.column_stack([samples[:, :2], radius * np.cos(angle_rad), radius * np.sin(angle_rad), samples[:, 4]])

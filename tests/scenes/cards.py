@@ -1,8 +1,7 @@
-"""Outlines of flat cards as distance fields: positive inside, in pixels, on a grid finer than the pixels.
+"""Flat cards with lamps on them, all from one random generator: shapes, textures and places.
 
-The grid covers the frame and a margin round it; between its points it is read bilinearly, and that is the exact shape.
-
-What hangs where in the card scene: shapes, textures and lamps, all from one random generator.
+Outlines are distance fields, positive inside, in pixels, on a grid finer than the pixels. The grid covers the frame and a margin round
+it; between its points it is read bilinearly, and that is the exact shape.
 """
 
 from collections.abc import Sequence
@@ -16,11 +15,17 @@ from datasets_scripts.scenes.textures import coloured, fractal_noise, page_of_te
 from datasets_scripts.tracers.traced_scene import Texture, Vector
 
 Distances = Float[np.ndarray, "rows columns"]
+_LAMPS_PER_CARD = (9, 5, 8, 6, 8, 10, 14)
+_TINTS = ((1.0, 0.72, 0.4), (1.0, 0.88, 0.66), (0.6, 0.78, 1.0), (1.0, 0.5, 0.34), (0.65, 1.0, 0.6))
+_LEAST_RADIANCE, _MOST_RADIANCE = 15.0, 150.0
+_LAMP_RADIUS_PX = (0.5, 1.0)
+_LAMP_GAP_PX = 5.0
+_LAMP_FROM_BORDER = 0.09
 
 
 @dataclass(frozen=True)
 class TexelGrid:
-    """Where the texels of a card lie: `density` per pixel over a frame with `margin_px` more on every side."""
+    """Places of the texels of a card: `density` per pixel over a frame with `margin_px` more on every side."""
 
     height_px: int
     width_px: int
@@ -32,7 +37,7 @@ class TexelGrid:
         return (self.height_px + 2 * self.margin_px) * self.density, (self.width_px + 2 * self.margin_px) * self.density
 
     def positions_px(self) -> tuple[Distances, Distances]:
-        """x and y of every texel centre in pixels of the frame."""
+        """Return x and y of every texel centre in pixels of the frame."""
         rows, columns = self.shape
         x = (np.arange(columns) + 0.5) / self.density - self.margin_px
         y = (np.arange(rows) + 0.5) / self.density - self.margin_px
@@ -40,7 +45,7 @@ class TexelGrid:
 
 
 def mirrored_beyond(grid: TexelGrid, texels: Float[np.ndarray, "rows columns *channels"]) -> Float[np.ndarray, "rows columns *channels"]:
-    """The same within the frame; beyond it, its mirror image."""
+    """Return the same within the frame and its mirror image beyond it."""
     margin = grid.margin_px * grid.density
     frame = texels[margin:-margin, margin:-margin]
     return np.pad(frame, ((margin, margin), (margin, margin)) + ((0, 0),) * (texels.ndim - 2), mode="symmetric")
@@ -55,7 +60,7 @@ def nowhere(grid: TexelGrid) -> Distances:
 
 
 def rectangle(grid: TexelGrid, left: float, top: float, right: float, bottom: float, turn_rad: float = 0.0) -> Distances:
-    """A rectangle turned about its centre."""
+    """Return a rectangle turned about its centre."""
     x, y = grid.positions_px()
     dx, dy = x - 0.5 * (left + right), y - 0.5 * (top + bottom)
     along, across = np.cos(turn_rad) * dx + np.sin(turn_rad) * dy, np.cos(turn_rad) * dy - np.sin(turn_rad) * dx
@@ -68,7 +73,7 @@ def disc(grid: TexelGrid, x_px: float, y_px: float, radius_px: float) -> Distanc
 
 
 def leaf(grid: TexelGrid, x_px: float, y_px: float, length_px: float, turn_rad: float, slender: float = 0.42) -> Distances:
-    """A pointed leaf: the overlap of two discs; `slender` is its width over its length."""
+    """Return a pointed leaf: the overlap of two discs; `slender` is its width over its length."""
     half, sag = 0.5 * length_px, 0.5 * length_px * slender
     radius = (half**2 + sag**2) / (2.0 * sag)
     away, nx, ny = radius - sag, -np.sin(turn_rad), np.cos(turn_rad)
@@ -76,7 +81,7 @@ def leaf(grid: TexelGrid, x_px: float, y_px: float, length_px: float, turn_rad: 
 
 
 def wire(grid: TexelGrid, points_px: Sequence[tuple[float, float]], width_px: float) -> Distances:
-    """A chain of straight pieces of one width with round ends."""
+    """Return a chain of straight pieces of one width with round ends."""
     x, y = grid.positions_px()
     distance = np.full(grid.shape, np.inf)
     for (x0, y0), (x1, y1) in pairwise(points_px):
@@ -92,14 +97,6 @@ def union(*shapes: Distances) -> Distances:
 
 def without(shape: Distances, hole: Distances) -> Distances:
     return np.minimum(shape, -hole)
-
-
-_LAMPS_PER_CARD = (9, 5, 8, 6, 8, 10, 14)
-_TINTS = ((1.0, 0.72, 0.4), (1.0, 0.88, 0.66), (0.6, 0.78, 1.0), (1.0, 0.5, 0.34), (0.65, 1.0, 0.6))
-_LEAST_RADIANCE, _MOST_RADIANCE = 15.0, 150.0
-_LAMP_RADIUS_PX = (0.5, 1.0)
-_LAMP_GAP_PX = 5.0
-_LAMP_FROM_BORDER = 0.09
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +147,7 @@ def cards_of(grid: TexelGrid, focus_dioptres: float, farthest_off: float, rng: n
 
 
 def lamps_of(cards: tuple[Card, ...], grid: TexelGrid, rng: np.random.Generator) -> tuple[Lamp, ...]:
-    """Sixty lamps on the cards, each on its card where no card hides it, with radiances spread evenly in their logarithm."""
+    """Place sixty lamps on the cards, each where no card hides it, with radiances spread evenly in their logarithm."""
     radiances = np.geomspace(_LEAST_RADIANCE, _MOST_RADIANCE, sum(_LAMPS_PER_CARD))
     rng.shuffle(radiances)
     lamps: list[Lamp] = []
@@ -164,7 +161,7 @@ def lamps_of(cards: tuple[Card, ...], grid: TexelGrid, rng: np.random.Generator)
 
 
 def _places(open_to_view: Distances, grid: TexelGrid, count: int, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Random places where `open_to_view` is positive, a few pixels apart, and so far from the border that their discs stay in."""
+    """Draw places where `open_to_view` is positive, a few pixels apart, so far from the border that their discs stay in."""
     x, y = grid.positions_px()
     away = _LAMP_FROM_BORDER * grid.height_px
     candidates = np.argwhere((open_to_view > 0) & (np.minimum(x, grid.width_px - x) > away) & (np.minimum(y, grid.height_px - y) > away))
@@ -200,7 +197,7 @@ def _leaves(grid: TexelGrid, rng: np.random.Generator) -> Distances:
 
 
 def _slanted_board(grid: TexelGrid, focus_dioptres: float, farthest_off: float, rng: np.random.Generator) -> Card:
-    """Right of the middle: its lower edge is near, its upper edge a little behind the focus."""
+    """Return a board right of the middle: its lower edge is near, its upper edge a little behind the focus."""
     top, bottom = 0.3 * grid.height_px, 0.94 * grid.height_px
     solid = rectangle(grid, 0.55 * grid.width_px, top, 0.93 * grid.width_px, bottom)
     slope = farthest_off * (0.55 - -0.22) / (bottom - top)
@@ -209,7 +206,7 @@ def _slanted_board(grid: TexelGrid, focus_dioptres: float, farthest_off: float, 
 
 
 def _poster(grid: TexelGrid) -> Distances:
-    """Left of the middle, with a round and a square hole."""
+    """Return a sheet left of the middle, with a round and a square hole."""
     width, height = grid.width_px, grid.height_px
     sheet = rectangle(grid, 0.08 * width, 0.16 * height, 0.47 * width, 0.86 * height, 0.05)
     round_hole = disc(grid, 0.36 * width, 0.36 * height, 0.11 * height)
