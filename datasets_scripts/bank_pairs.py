@@ -18,7 +18,7 @@ import numpy as np
 import typer
 from jaxtyping import Bool, Float32
 
-from datasets_scripts.made_sets.stack_manifest import LICENCE, focus_index, slice_name, stack_record
+from datasets_scripts.made_sets.set_files import LICENCE, focus_index, slice_name, stack_record
 from datasets_scripts.scenes.textures import checks, mottled, wood
 from datasets_scripts.tracers.traced_scene import Texture
 from mrbokeh.images.camera_rgb import write_camera_rgb

@@ -18,8 +18,7 @@ import typer
 
 from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StacksPlan
 from datasets_scripts.made_sets.bokeh_view import StackView, dataset_of
-from datasets_scripts.made_sets.file_job import claim_folder
-from datasets_scripts.made_sets.stack_manifest import LICENCE
+from datasets_scripts.made_sets.set_files import LICENCE, claim_folder
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.scene.mitsuba.mitsuba_tracer import load
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, write_focal_stack_dataset

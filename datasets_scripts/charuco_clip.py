@@ -3,7 +3,9 @@
     mrbokeh viewfinder board --out board.pdf                      # also writes board.json
     python -m datasets_scripts.charuco_clip board.json clip.mp4   # and clip.json: the camera of each frame
 
-Any board will do: of board.json only black_mm is read, rectangles of x, y, width, height in millimetres.
+Any board will do: of board.json only black_mm is read, rectangles of x, y, width, height in millimetres. Every edge of the print is
+exact, not a texture. The sheet lies in the plane z = 0, x right, y down, z into the table (board axes of OpenCV); a camera above it has
+z < 0. A ray leaves a pixel through a point of the round pupil and the focus plane (Cook et al. 1984), as in `tracers.thin_lens`.
 """
 
 from collections.abc import Iterator
@@ -14,12 +16,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from datasets_scripts.scenes.textures import mottled
-from datasets_scripts.tracers._sheet_numba import PackedTable
-from datasets_scripts.tracers.sheet import Sheet, trace_sheet, with_noise
+from datasets_scripts.tracers._sheet_numba import PackedLens, PackedTable, shade
 from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
 from mrbokeh.optics.lens import MM_PER_M, Lens
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
@@ -32,6 +33,45 @@ _SWAY = ((0.23, 1.0), (0.41, 0.5), (0.87, 0.25))
 _TREMOR = ((6.1, 1.0), (8.3, 0.7), (10.9, 0.4))
 _FOCAL_LENGTH_MM, _SENSOR_WIDTH_MM = 22.0, 24.0
 _TABLE_TEXELS = 256
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A printed sheet. black_mm: (N, 4) x, y, width, height, without overlap. margin_mm: white paper around. paper, ink: reflectances."""
+
+    black_mm: Float64[np.ndarray, "rectangles 4"]
+    margin_mm: float = 12.0
+    paper: float = 0.62
+    ink: float = 0.03
+
+    @property
+    def middle_m(self) -> Float64[np.ndarray, "3"]:
+        ends = self.black_mm[:, :2] + self.black_mm[:, 2:]
+        return np.append((self.black_mm[:, :2].min(axis=0) + ends.max(axis=0)) / 2.0, 0.0) / MM_PER_M
+
+
+def trace_sheet(
+    table: PackedTable, camera: Camera, lens: Lens | None, samples: int, seed: int = 0
+) -> Float32[np.ndarray, "height width 3"]:
+    """Return scene-linear RGB. lens: None is a pinhole; else its focus and aperture blur, while the geometry is that of the camera.
+
+    samples: rays per pixel, Sobol points that every pixel shifts by its own vector.
+    """
+    from scipy.stats import qmc
+
+    rng = np.random.default_rng(seed)
+    points = qmc.Sobol(4, scramble=True, rng=rng).random_base2(int(np.ceil(np.log2(samples))))[:samples]
+    rgb = np.empty((camera.height_px, camera.width_px, 3), np.float32)
+    radius_m, focus_m = (0.0, 1.0) if lens is None else (lens.aperture_diameter_mm / 2.0 / MM_PER_M, lens.focus_distance_m)
+    intrinsics = np.array(camera.focal_px), np.array(camera.principal_px)
+    shade(table, PackedLens(camera.world_from_camera, *intrinsics, radius_m, focus_m), points, rng.random((*rgb.shape[:2], 4)), rgb)
+    return rgb
+
+
+def with_noise(rgb: Float[np.ndarray, "height width 3"], noise: float, rng: np.random.Generator) -> Float32[np.ndarray, "height width 3"]:
+    """Add noise. noise: standard deviation at radiance 1; photons make it fall with the root, read noise adds a tenth of it."""
+    sigma = noise * np.sqrt(np.maximum(rgb, 0.0) + 0.01)
+    return (rgb + sigma * rng.standard_normal(rgb.shape)).astype(np.float32)
 
 
 @dataclass(frozen=True)

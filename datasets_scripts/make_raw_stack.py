@@ -19,7 +19,7 @@ import numpy as np
 import typer
 from jaxtyping import Float
 
-from datasets_scripts.made_sets.file_job import Job, claim_folder
+from datasets_scripts.made_sets.set_files import Job, claim_folder
 from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, film_plane_distance_m, write_dng
 from datasets_scripts.scenes.stack_scenes import STACK_SCENES, StackScene
 from datasets_scripts.tracers.thin_lens import trace, trace_pinhole

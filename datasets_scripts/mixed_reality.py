@@ -18,7 +18,7 @@ import numpy as np
 import typer
 from jaxtyping import Float
 
-from datasets_scripts.made_sets.file_job import Job
+from datasets_scripts.made_sets.set_files import Job
 from datasets_scripts.made_sets.truth_plan import TruthPlan, truth_name, view_document
 from datasets_scripts.made_sets.truth_set import ViewFiles, make_missing, truth_command
 from datasets_scripts.scenes.textures import checks, spots

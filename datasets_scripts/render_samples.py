@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from datasets_scripts.made_sets.file_job import claim_folder
+from datasets_scripts.made_sets.set_files import claim_folder
 from datasets_scripts.scenes.moving_scenes import LENS, SCENES, make_scene
 from datasets_scripts.tracers.samples import WIDEST_PX, Advance, SampleArrays, SampleTracer
 from datasets_scripts.tracers.traced_scene import MovingScene

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from datasets_scripts.made_sets.bokeh_plan import StacksPlan
-from datasets_scripts.made_sets.file_job import Job
-from datasets_scripts.made_sets.stack_manifest import LICENCE, focus_index, slice_name, stack_record
+from datasets_scripts.made_sets.set_files import LICENCE, Job, focus_index, slice_name, stack_record
 from datasets_scripts.scenes.bokeh_scenes import bokeh_scene
 from datasets_scripts.tracers.truth import Opening, Picture, TruthTracer, make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import pack

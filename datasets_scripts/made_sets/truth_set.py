@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from datasets_scripts.made_sets.file_job import Job, claim_folder
+from datasets_scripts.made_sets.set_files import Job, claim_folder
 from datasets_scripts.made_sets.truth_plan import SHAPE_NAMES, TruthPlan, truth_name, view_document
 from datasets_scripts.scenes.truth_scenes import make_scene
 from datasets_scripts.tracers.truth import Part, Picture, TruthTracer, make_tracer, sharp_layer

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy import ndimage
 
-from datasets_scripts.made_sets.stack_manifest import focus_index, slice_name, stack_record
+from datasets_scripts.made_sets.set_files import focus_index, slice_name, stack_record
 from datasets_scripts.public_sets.adapters import PublicLens, PublicSlice, PublicStack
 from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
 from mrbokeh.images.exr_io import read_exr

@@ -1,4 +1,4 @@
-"""Compiled ray casting of a printed sheet on a table; see `sheet`."""
+"""Compiled ray casting of a printed sheet on a table; see `charuco_clip`."""
 
 from typing import NamedTuple
 

@@ -13,12 +13,12 @@ from itertools import pairwise
 from os import cpu_count
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt32
+from jaxtyping import Bool, Float, Float32, Int
 
 from datasets_scripts.tracers import _moving_bodies_numba as layout
 from datasets_scripts.tracers._moving_bodies_numba import DIMENSIONS, LAMP, RADIANCE, LensTable, PackedBodies
 from datasets_scripts.tracers._samples_numba import TILE_PX, Pinhole, follow_lamp, gather_rows, mean_rows, sample_rows, sharp_rows
-from datasets_scripts.tracers.sobol import reversed_bits
+from datasets_scripts.tracers.sobol import mirrored_sobol
 from datasets_scripts.tracers.traced_scene import Mover, MovingScene, Quad, Sphere, plain_texture
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.aperture import Aperture
@@ -163,16 +163,6 @@ def _executor(threads: int) -> Iterator[ThreadPoolExecutor]:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def mirrored_sobol(count: int) -> UInt32[np.ndarray, "count 5"]:
-    """Return the first points of the five-dimensional Sobol sequence as 32-bit fractions with their bits in reverse order."""
-    from scipy.stats import qmc
-
-    if count < 1:
-        raise InputError(f"expected at least 1 sample per pixel, got {count}")
-    points = qmc.Sobol(DIMENSIONS, scramble=False, bits=32).random_base2((count - 1).bit_length())[:count]
-    return reversed_bits(np.round(points * 2.0**32).astype(np.uint64).astype(np.uint32))
 
 
 def pinhole_of(lens: Lens, width_px: int, height_px: int) -> Pinhole:

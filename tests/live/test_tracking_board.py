@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datasets_scripts.charuco_clip import HandHeld, pack_table
-from datasets_scripts.tracers.sheet import Sheet, trace_sheet
+from datasets_scripts.charuco_clip import HandHeld, Sheet, pack_table, trace_sheet
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens

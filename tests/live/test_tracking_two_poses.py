@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datasets_scripts.charuco_clip import BoardClip, HandHeld
-from datasets_scripts.tracers.sheet import Sheet
+from datasets_scripts.charuco_clip import BoardClip, HandHeld, Sheet
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.camera_track.board_track import poses_of
@@ -19,7 +18,7 @@ from mrbokeh.tracking.charuco.board_alignment import AlignedDetector
 from mrbokeh.tracking.charuco.detector import Corners
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot
 from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
-from tests.live.test_tracking_charuco_pose import pose_from_plane
+from tests.live.test_tracking_charuco import pose_from_plane
 from tests.scenes.immediate_detections import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, camera_frames
 from viewfinder.frames import CameraFrame

@@ -15,8 +15,8 @@ from datasets_scripts import render_samples as command
 from datasets_scripts.render_samples import SamplesPlan, SamplesSet, in_a_row, render_samples
 from datasets_scripts.scenes.moving_scenes import LENS, SCENES, Stage, checkerboard, make_scene
 from datasets_scripts.tracers import thin_lens
-from datasets_scripts.tracers.samples import SampleArrays, SampleTracer, gathered_lamps, lens_table, light_through, mirrored_sobol, pack
-from datasets_scripts.tracers.sobol import owen_scrambled, reversed_bits, scramble_seed
+from datasets_scripts.tracers.samples import SampleArrays, SampleTracer, gathered_lamps, lens_table, light_through, pack
+from datasets_scripts.tracers.sobol import mirrored_sobol, owen_scrambled, reversed_bits, scramble_seed
 from datasets_scripts.tracers.traced_scene import Mover, MovingScene, Quad, plain_texture
 from mrbokeh.images.image_io import read_image, read_layer
 from mrbokeh.images.image_metrics import psnr

@@ -7,8 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from datasets_scripts.charuco_clip import pack_table
-from datasets_scripts.tracers.sheet import trace_sheet
+from datasets_scripts.charuco_clip import pack_table, trace_sheet
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.optics.lens import Lens

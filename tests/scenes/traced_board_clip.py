@@ -6,8 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from datasets_scripts.charuco_clip import BoardClip, HandHeld
-from datasets_scripts.tracers.sheet import Sheet
+from datasets_scripts.charuco_clip import BoardClip, HandHeld, Sheet
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import MM_PER_M, Lens

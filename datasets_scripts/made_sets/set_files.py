@@ -1,7 +1,10 @@
-"""What made and converted sets of focal stacks share: names of slices, index of focus, and the manifest's record of a stack."""
+"""Files of data sets: those still missing, made piece by piece, so that an interrupted run goes on where it stopped, and the manifest's
+record of a focal stack.
+"""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +12,44 @@ from jaxtyping import Float32
 
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import FileRecord, Part, RadianceRange, StackRecord
+from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.errors import InputError
 
 LICENCE = (
     "These pictures are computed from scenes that a program of this project makes up; no photograph, model or texture of anybody is in "
     "them. Use them as you like (CC0 1.0)."
 )
 _QUANTILES = ("0.5", "0.99", "0.999", "0.9999")
+
+
+@dataclass(frozen=True)
+class Job:
+    """Files that are made together."""
+
+    paths: tuple[Path, ...]
+    make: Callable[[], None]
+
+    @property
+    def done(self) -> bool:
+        return all(path.is_file() for path in self.paths)
+
+
+def claim_folder(description: Path, document: dict[str, object], files: Iterable[Path], overwrite: bool) -> None:
+    """Go on only in a folder that is empty or was made with the same settings: `description`, written first, says which.
+
+    files: all that will be made there. Those that exist already are deleted if `overwrite` asks for that. Raises InputError where
+    the description is another one, and where files stand without one.
+    """
+    folder, made = description.parent, [path for path in files if path.exists()]
+    if overwrite:
+        for path in (*made, description):
+            path.unlink(missing_ok=True)
+    elif description.exists():
+        if read_json(description, f"the settings of a data set ({description.name})") != document:
+            raise InputError(f"{folder} was made with other settings: choose another folder, or --overwrite to replace its files")
+    elif made:
+        raise InputError(f"{folder} holds files without a {description.name}: choose another folder, or --overwrite to replace them")
+    write_json(description, document)
 
 
 def slice_name(index: int) -> str:
