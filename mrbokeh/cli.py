@@ -3,6 +3,8 @@
 import os
 import signal
 import sys
+import tempfile
+import traceback
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -13,7 +15,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from mrbokeh.system.errors import INTERRUPTED, InputError, MissingExtraError
+from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, MissingExtraError
 
 # OpenCV's threads otherwise spin while they wait for work: a tenth of the CPU time of a merge. It is read when OpenCV is imported.
 os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")
@@ -94,6 +96,7 @@ def _print_version(wanted: bool | None) -> None:
 @app.callback()
 def _root(
     version: bool | None = typer.Option(None, "--version", callback=_print_version, is_eager=True, help="Print the version and leave."),
+    debug: bool = typer.Option(False, "--debug", help="First of all options: show the traceback of a fault of mrbokeh itself."),
 ) -> None:
     """Rendered 3D objects in real photographs, videos and a live viewfinder, with the blur of the real lens.
 
@@ -102,25 +105,42 @@ def _root(
 
 
 def main() -> None:
-    """Run the console script: mistakes of the user end in one sentence and exit code 2, without a traceback."""
+    """Run the console script: mistakes of the user end in one sentence and exit code 2, faults of ours in one and exit code 1."""
     interrupted = _noted_interrupts()
     try:
         app()
-    except InputError as error:
-        _fail(str(error))
-    except ModuleNotFoundError as error:
-        extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
-        if extra is None:
-            raise
-        _fail(str(MissingExtraError(str(error.name), extra)))
-    except OSError as error:
-        if error.filename is None or isinstance(error.filename, int):
-            raise
-        _fail(_refused(error))
-    except Exception:
+    except Exception as error:
+        mistake = _mistake(error)
+        if mistake:
+            _fail(mistake)
         if interrupted:
             sys.exit(INTERRUPTED)
-        raise
+        if sys.argv[1:2] == ["--debug"]:
+            raise
+        _fail(_fault(error), FAULT)
+
+
+def _mistake(error: Exception) -> str:
+    """Return the sentence for an error that the user can mend, else ""."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, ModuleNotFoundError):
+        extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
+        return str(MissingExtraError(str(error.name), extra)) if extra else ""
+    if isinstance(error, OSError) and isinstance(error.filename, str | bytes):
+        return _refused(error)
+    return ""
+
+
+def _fault(error: Exception) -> str:
+    """Keep the traceback in a file and return what to do with it."""
+    with tempfile.NamedTemporaryFile("w", prefix="mrbokeh-fault-", suffix=".txt", delete=False, encoding="utf-8") as file:
+        file.write(" ".join(sys.argv) + "\n\n" + "".join(traceback.format_exception(error)))
+    first = (str(error).splitlines() or [""])[0]
+    return (
+        f"this is a fault of mrbokeh ({type(error).__name__}{': ' + first if first else ''}), your files are as they were. "
+        f"Please report it with {file.name}; `mrbokeh --debug ...` shows it here"
+    )
 
 
 def _noted_interrupts() -> list[int]:
@@ -147,11 +167,11 @@ def _refused(error: OSError) -> str:
     return f"{shown}: {(error.strerror or 'the system refused it').lower()}; check the name, the space left and who may write there"
 
 
-def _fail(message: str) -> None:
+def _fail(message: str, code: int = 2) -> None:
     console = Console(stderr=True, soft_wrap=True)
     console.print("error:", style="bold red", end=" ")
     console.print(message, markup=False, highlight=False)
-    sys.exit(2)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -181,7 +181,9 @@ def leave_one_out(stack: FocalStack, renderer: Renderer) -> Iterator[LeftOut]:
         mask = stack.slice_masks(index).valid
         nearest = max(psnr(stack.slice_rgb(other), truth, mask=mask) for other in (before, after))
         predicted = [psnr(way.slice_at(focus_m, leave_out=index), truth, mask=mask) for way in (plain, full)]
-        yield LeftOut(index, focus_m, predicted[0], predicted[1], nearest)
+        yield LeftOut(
+            index=index, focus_distance_m=focus_m, rendered_db=predicted[0], with_residuals_db=predicted[1], nearest_slice_db=nearest
+        )
 
 
 _CLIPPED_FROM, _CLIPPED_AT = 0.97, 0.995

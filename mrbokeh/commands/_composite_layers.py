@@ -100,7 +100,15 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
     stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*_pair(options.at_pixel))
     light = Lighting(options.environment, exposure=options.exposure)
     turn, tilt = math.radians(options.turn), math.radians(options.tilt)
-    one = OneObject(glb, stands_at_m, _height_m(options.height, first, stands_at_m[2]), turn, tilt, light, options.shadow)
+    one = OneObject(
+        glb=glb,
+        stands_at_m=stands_at_m,
+        height_m=_height_m(options.height, first, stands_at_m[2]),
+        turn_rad=turn,
+        tilt_rad=tilt,
+        light=light,
+        shadow=options.shadow,
+    )
     return _filmed(one.described(), rendering, lambda plate: one.seen_by(plate.camera))
 
 

@@ -133,7 +133,9 @@ def _write_layers(out: Path, inserted: Inserted, plate: Plate, sharp: Layer) -> 
     coc_px = plate.lens.coc_px(depth_m, depth_m.shape[1]).astype(np.float32)
     alpha = alpha_with(plate.alpha, inserted.virtual.alpha)
     layers = {"virtual": _bare(inserted.virtual), "sharp": _bare(sharp)}
-    write_composite_exr(out, CompositeLayers(inserted.rgb, alpha, depth_m, layers, inserted.virtual.alpha, coc_px))
+    write_composite_exr(
+        out, CompositeLayers(rgb=inserted.rgb, alpha=alpha, depth_m=depth_m, layers=layers, matte=inserted.virtual.alpha, coc_px=coc_px)
+    )
 
 
 def _bare(layer: Layer) -> Layer:

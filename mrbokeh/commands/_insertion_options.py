@@ -197,5 +197,15 @@ class LookGroup:
     def wanted(self) -> "LookOptions":
         from mrbokeh.compositing.plate_look.finishing import LookOptions
 
-        matched = (self.match_grey, self.grey_value, self.match_exposure, self.match_white, self.match_black)
-        return LookOptions(*matched, self.vignetting, self.grain, self.light_wrap, self.seed, self.plate_exposure)
+        return LookOptions(
+            match_grey=self.match_grey,
+            grey_value=self.grey_value,
+            match_exposure=self.match_exposure,
+            match_white_k=self.match_white,
+            match_black=self.match_black,
+            vignetting=self.vignetting,
+            grain=self.grain,
+            light_wrap=self.light_wrap,
+            seed=self.seed,
+            plate_exposure=self.plate_exposure,
+        )

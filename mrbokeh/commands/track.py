@@ -144,7 +144,14 @@ def convert(
     from mrbokeh.tracking.camera_track.track import TrackOptions
 
     refuse_existing(out, result.overwrite)
-    options = TrackOptions(facts.up, _size_px(facts.size), facts.rotation_order, facts.sensor_width, facts.metric, facts.distortion)
+    options = TrackOptions(
+        up=facts.up,
+        size_px=_size_px(facts.size),
+        rotation_order=facts.rotation_order,
+        sensor_width_mm=facts.sensor_width,
+        metric=facts.metric,
+        keep_distortion=facts.distortion,
+    )
     read = read_track(source, options, from_).shifted(frames.frame_offset)
     read = read.timed(frames.frame_rate) if frames.frame_rate is not None else read
     _write(out, read, TrackOptions(result.out_up, None, facts.rotation_order, facts.sensor_width), result.format_)

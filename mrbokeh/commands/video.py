@@ -78,7 +78,7 @@ def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour:
     encoding = result.encoding or keeping or ("prores4444-alpha" if result.virtual_only else None)
     sound = None if is_pattern(source.path) else source.path
     even_rate = None if result.constant_rate is None else parse_rate(result.constant_rate)
-    return VideoTarget(out.resolve(), encoding, sound, colour.of_result, even_rate)
+    return VideoTarget(path=out.resolve(), encoding=encoding, audio_from=sound, space=colour.of_result, even_rate=even_rate)
 
 
 def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, frames: str, segment_s: float) -> Shot:
@@ -87,7 +87,8 @@ def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, fram
     if start >= count:
         raise InputError(f"--frames {frames} leaves nothing of {source.path}: expected a range within its {count} frames")
     last = min(count, count if stop is None else stop)
-    return Shot(source, recipe, target, start, last, max(1, round(segment_s * source.info.frame_rate)))
+    frames_of_segment = max(1, round(segment_s * source.info.frame_rate))
+    return Shot(source=source, recipe=recipe, target=target, start=start, stop=last, segment_frames=frames_of_segment)
 
 
 def parse_frames(text: str) -> tuple[int, int | None]:
@@ -133,7 +134,9 @@ def _look(look: LookGroup, source: PictureSource, taken: options.ClipOptions) ->
     if look.wanted == LookOptions(seed=look.seed):
         return None
     start, _ = parse_frames(taken.frames)
-    return ClipLook(look.wanted, source.path, taken.rate, start, _first_number(source, taken), source.space)
+    return ClipLook(
+        options=look.wanted, clip=source.path, rate=taken.rate, start=start, first_number=_first_number(source, taken), space=source.space
+    )
 
 
 def _holding(source: PictureSource, lens: Path) -> SensorOrientation:

@@ -112,7 +112,14 @@ def _cut_plate(plate: Plate, box: Box) -> Plate:
     known = {"depth_m": plate.depth_m, "sharp_rgb": plate.sharp_rgb, "near_alpha": plate.near_alpha}
     cut = {name: box.cut(plane, "edge") for name, plane in known.items() if plane is not None}
     lens, camera = box.lens_of(plate.lens, plate.rgb.shape[1]), box.camera_of(plate.camera)
-    return Plate(box.cut(plate.rgb, "edge"), cut.get("depth_m"), lens, camera, cut.get("sharp_rgb"), cut.get("near_alpha"))
+    return Plate(
+        rgb=box.cut(plate.rgb, "edge"),
+        depth_m=cut.get("depth_m"),
+        lens=lens,
+        camera=camera,
+        sharp_rgb=cut.get("sharp_rgb"),
+        near_alpha=cut.get("near_alpha"),
+    )
 
 
 MODES: dict[str, Insertion] = {

@@ -144,7 +144,7 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
-    plate = Plate(rgb, stack.depth_m(), focused, upright, stack.all_in_focus())
+    plate = Plate(rgb=rgb, depth_m=stack.depth_m(), lens=focused, camera=upright, sharp_rgb=stack.all_in_focus())
     return replace(plate, metres_guessed=not stack.metres_known, lens_guessed=lens is None and is_lens_guessed(stack))
 
 

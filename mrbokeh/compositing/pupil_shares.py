@@ -107,7 +107,9 @@ class Rays:
                 work = lambda first, end: gather(sums, places, which, near, in_reach, dark, far, self.coc_px, pupil, first, end)  # noqa: B023, E731
                 in_bands(pool, len(which), _BAND_PLACES, work)
         f, a, f_a, past = (sums[:, c] for c in (0, 1, 2, 15))
-        return PupilMeans(f, a, f_a, sums[:, 3:6], sums[:, 6:9], sums[:, 9:12], sums[:, 12:15], past)
+        return PupilMeans(
+            f=f, a=a, f_a=f_a, virtual=sums[:, 3:6], f_virtual=sums[:, 6:9], f_far=sums[:, 9:12], past_far=sums[:, 12:15], past=past
+        )
 
     @cached_property
     def virtual_rgba(self) -> Float32[np.ndarray, "height width 4"]:

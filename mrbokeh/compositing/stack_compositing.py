@@ -74,7 +74,7 @@ def _plate(stack: FocalStack, index: int, depth_m: Float32[np.ndarray, "height w
     lens = stack.registered_lens_of(index) if other is None else other.focused_at(stack.lens_of(index).focus_distance_m)
     rgb = stack.slice_rgb(index)
     camera = stack.camera or plate_of(rgb, stack.lens_of(stack.reference)).camera
-    return Plate(rgb, depth_m, lens, replace(camera, camera_from_world=np.eye(4)), sharp_rgb)
+    return Plate(rgb=rgb, depth_m=depth_m, lens=lens, camera=replace(camera, camera_from_world=np.eye(4)), sharp_rgb=sharp_rgb)
 
 
 def _write_slice(stack: FocalStack, index: int, inserted: Inserted, folder: Path) -> None:

@@ -99,12 +99,34 @@ class Placement:
 
 
 DESK = (
-    Placement("cake_sharp", "cakeBirthday.glb", 1, "330,330", 0.075, 20.0, 10.0, 0.7),
-    Placement("cake_blurred", "cakeBirthday.glb", 5, "330,330", 0.075, 20.0, 10.0, 0.7),
+    Placement(
+        name="cake_sharp",
+        glb="cakeBirthday.glb",
+        slice_index=1,
+        at_pixel="330,330",
+        height_m=0.075,
+        turn_deg=20.0,
+        tilt_deg=10.0,
+        exposure=0.7,
+    ),
+    Placement(
+        name="cake_blurred",
+        glb="cakeBirthday.glb",
+        slice_index=5,
+        at_pixel="330,330",
+        height_m=0.075,
+        turn_deg=20.0,
+        tilt_deg=10.0,
+        exposure=0.7,
+    ),
 )
 BOARD = (
-    Placement("alien_sharp", "alien.glb", 0, "185,265", 0.012, 25.0, 35.0, 0.6),
-    Placement("alien_blurred", "alien.glb", 4, "185,265", 0.012, 25.0, 35.0, 0.6),
+    Placement(
+        name="alien_sharp", glb="alien.glb", slice_index=0, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0, exposure=0.6
+    ),
+    Placement(
+        name="alien_blurred", glb="alien.glb", slice_index=4, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0, exposure=0.6
+    ),
 )
 
 

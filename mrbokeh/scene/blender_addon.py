@@ -106,15 +106,15 @@ def film_of(scene: Any, camera: Any) -> Film:
     render, data = scene.render, camera.data
     share = render.resolution_percentage / 100
     return Film(
-        int(render.resolution_x * share),
-        int(render.resolution_y * share),
-        data.lens,
-        data.sensor_width,
-        data.sensor_height,
-        data.sensor_fit,
-        data.shift_x,
-        data.shift_y,
-        (render.pixel_aspect_x, render.pixel_aspect_y),
+        width_px=int(render.resolution_x * share),
+        height_px=int(render.resolution_y * share),
+        lens_mm=data.lens,
+        sensor_width_mm=data.sensor_width,
+        sensor_height_mm=data.sensor_height,
+        sensor_fit=data.sensor_fit,
+        shift_x=data.shift_x,
+        shift_y=data.shift_y,
+        pixel_aspect=(render.pixel_aspect_x, render.pixel_aspect_y),
     )
 
 

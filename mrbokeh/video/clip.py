@@ -154,7 +154,16 @@ def probe(path: Path, *, as_codes: bool = False) -> VideoInfo:
         width_px, height_px = (frame.height, frame.width) if quarter_turns(frame, path) % 2 else (frame.width, frame.height)
         color = color_of(frame, str(path), as_codes=as_codes)
         count, turned = stream.frames or None, frame.rotation
-        return VideoInfo(width_px, height_px, frame_rate(stream), stream.time_base, count, color, turned, has_alpha(frame))
+        return VideoInfo(
+            width_px=width_px,
+            height_px=height_px,
+            frame_rate=frame_rate(stream),
+            time_base=stream.time_base,
+            frame_count=count,
+            color=color,
+            rotation_deg=turned,
+            has_alpha=has_alpha(frame),
+        )
 
 
 def read_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[Frame]:

@@ -42,19 +42,34 @@ _X264 = {"preset": "medium", "x264-params": "cpu-independent=1:rc-lookahead=20"}
 _X265 = "open-gop=0:frame-threads=1:pools=none:log-level=none"
 
 ENCODINGS = {
-    "h264": Encoding("libx264", "yuv420p", 8, _H26X, {"crf": "14", **_X264}),
-    "h264-10bit": Encoding("libx264", "yuv420p10le", 10, _H26X, {"crf": "12", **_X264}),
+    "h264": Encoding(codec="libx264", pixel_format="yuv420p", bits=8, suffixes=_H26X, options={"crf": "14", **_X264}),
+    "h264-10bit": Encoding(codec="libx264", pixel_format="yuv420p10le", bits=10, suffixes=_H26X, options={"crf": "12", **_X264}),
     "h265-10bit": Encoding(
-        "libx265", "yuv420p10le", 10, _H26X, {"crf": "12", "preset": "medium", "x265-params": _X265}, tag="hvc1", least_px=(32, 32)
+        codec="libx265",
+        pixel_format="yuv420p10le",
+        bits=10,
+        suffixes=_H26X,
+        options={"crf": "12", "preset": "medium", "x265-params": _X265},
+        tag="hvc1",
+        least_px=(32, 32),
     ),
-    "prores4444": Encoding("prores_ks", "yuv444p10le", 10, (".mov",), {"profile": "4444", **_PRORES}),
+    "prores4444": Encoding(
+        codec="prores_ks", pixel_format="yuv444p10le", bits=10, suffixes=(".mov",), options={"profile": "4444", **_PRORES}
+    ),
     "prores4444-alpha": Encoding(
-        "prores_ks", "yuva444p10le", 10, (".mov",), {"profile": "4444", "alpha_bits": "16", **_PRORES}, alpha=True
+        codec="prores_ks",
+        pixel_format="yuva444p10le",
+        bits=10,
+        suffixes=(".mov",),
+        options={"profile": "4444", "alpha_bits": "16", **_PRORES},
+        alpha=True,
     ),
-    "prores422": Encoding("prores_ks", "yuv422p10le", 10, (".mov",), {"profile": "hq", **_PRORES}),
-    "dnxhr-hqx": Encoding("dnxhd", "yuv422p10le", 10, (".mov", ".mxf"), {"profile": "dnxhr_hqx"}, least_px=(256, 120)),
-    "ffv1": Encoding("ffv1", "gbrp16le", 16, (".mkv",), _FFV1),
-    "ffv1-alpha": Encoding("ffv1", "gbrap16le", 16, (".mkv",), _FFV1, alpha=True),
+    "prores422": Encoding(codec="prores_ks", pixel_format="yuv422p10le", bits=10, suffixes=(".mov",), options={"profile": "hq", **_PRORES}),
+    "dnxhr-hqx": Encoding(
+        codec="dnxhd", pixel_format="yuv422p10le", bits=10, suffixes=(".mov", ".mxf"), options={"profile": "dnxhr_hqx"}, least_px=(256, 120)
+    ),
+    "ffv1": Encoding(codec="ffv1", pixel_format="gbrp16le", bits=16, suffixes=(".mkv",), options=_FFV1),
+    "ffv1-alpha": Encoding(codec="ffv1", pixel_format="gbrap16le", bits=16, suffixes=(".mkv",), options=_FFV1, alpha=True),
 }
 _BY_SUFFIX = {".mp4": "h264", ".mov": "prores4444", ".mkv": "ffv1", ".mxf": "dnxhr-hqx"}
 _BY_SUFFIX_WITH_ALPHA = {".mov": "prores4444-alpha", ".mkv": "ffv1-alpha"}

@@ -123,7 +123,16 @@ class ImageSequence:
         transfer = _LINEAR if pattern.suffix.lower() in LINEAR_SUFFIXES else _SRGB
         color = VideoColor(matrix=0, code_range=FULL, transfer=transfer, primaries=1)
         time_base, turned_deg = 1 / (frame_rate * 1000), 90 * quarter_turns(orientation)
-        info = VideoInfo(width, height, frame_rate, time_base, numbered.count, color, turned_deg, stores_alpha(first))
+        info = VideoInfo(
+            width_px=width,
+            height_px=height,
+            frame_rate=frame_rate,
+            time_base=time_base,
+            frame_count=numbered.count,
+            color=color,
+            rotation_deg=turned_deg,
+            has_alpha=stores_alpha(first),
+        )
         return cls(numbered, info, space, orientation)
 
     @property

@@ -46,7 +46,13 @@ def window(ready: PreparedScene, camera: Camera) -> tuple[slice, slice]:
 def cut(camera: Camera, rows: slice, columns: slice) -> Camera:
     """The camera that sees only these pixels."""
     principal = (camera.principal_px[0] - columns.start, camera.principal_px[1] - rows.start)
-    return Camera(columns.stop - columns.start, rows.stop - rows.start, camera.focal_px, principal, camera.camera_from_world)
+    return Camera(
+        width_px=columns.stop - columns.start,
+        height_px=rows.stop - rows.start,
+        focal_px=camera.focal_px,
+        principal_px=principal,
+        camera_from_world=camera.camera_from_world,
+    )
 
 
 def row_centres_px(camera: Camera, first: int) -> Float64[np.ndarray, "points 2"]:
@@ -140,7 +146,13 @@ class EmbreeRaycaster:
         if step == 1:
             return self._shadow_mask(placed, scene.lighting[0], camera, catcher)
         columns, rows = -(-camera.width_px // step), -(-camera.height_px // step)
-        covering = Camera(columns * step, rows * step, camera.focal_px, camera.principal_px, camera.camera_from_world)
+        covering = Camera(
+            width_px=columns * step,
+            height_px=rows * step,
+            focal_px=camera.focal_px,
+            principal_px=camera.principal_px,
+            camera_from_world=camera.camera_from_world,
+        )
         mask = self._shadow_mask(placed, scene.lighting[0], covering.resized(columns, rows), catcher)
         whole = cv2.resize(mask, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
         return np.ascontiguousarray(whole[: camera.height_px, : camera.width_px])

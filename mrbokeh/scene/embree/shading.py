@@ -181,7 +181,7 @@ def shaded(
         start = np.maximum(surfaces.depth, start) + STEP * (scene.reach_m + np.abs(eye).max()) / length
         active, start = active[goes_on], start[goes_on]
     alpha = np.where(shines_through <= NOTHING_LEFT, 1.0, 1.0 - shines_through).astype(np.float32)
-    return RaySamples(rgb, alpha, depth_m, mesh, normal, lit)
+    return RaySamples(rgb=rgb, alpha=alpha, depth_m=depth_m, mesh=mesh, normal=normal, lit=lit)
 
 
 def _radiance(

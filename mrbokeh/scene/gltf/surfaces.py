@@ -138,20 +138,47 @@ class Primitive:
             normals = unit(np.einsum("vab,vb->va", np.stack(rows, axis=1), normals))
         if tangents is not None:
             tangents = np.concatenate([unit(np.einsum("vab,vb->va", linear, tangents[:, :3])), tangents[:, 3:]], axis=1)
-        return Primitive(positions, self.triangles, self.uvs, normals, tangents, self.colors, self.joints, self.weights)
+        return Primitive(
+            positions=positions,
+            triangles=self.triangles,
+            uvs=self.uvs,
+            normals=normals,
+            tangents=tangents,
+            colors=self.colors,
+            joints=self.joints,
+            weights=self.weights,
+        )
 
     def mesh(self, material: Material, name: str) -> Mesh:
         """Convert to a Mesh; without normals each triangle gets its own vertices and is flat."""
         if self.normals is not None:
             tangents = None if self.tangents is None else self.tangents.astype(np.float32)
             normals = self.normals.astype(np.float32)
-            return Mesh(self.positions, self.triangles, normals, self.uvs, material, tangents, self.colors, name)
+            return Mesh(
+                positions_m=self.positions,
+                triangles=self.triangles,
+                normals=normals,
+                uvs=self.uvs,
+                material=material,
+                tangents=tangents,
+                colors=self.colors,
+                name=name,
+            )
         corner = self.triangles.ravel()
         positions = self.positions[corner]
         normals = np.repeat(face_normals(positions.reshape(-1, 3, 3)), 3, axis=0).astype(np.float32)
         colors = None if self.colors is None else self.colors[corner]
         triangles = np.arange(len(corner), dtype=np.int32).reshape(-1, 3)
-        return Mesh(positions, triangles, normals, np.ascontiguousarray(self.uvs[:, corner]), material, None, colors, name)
+        return Mesh(
+            positions_m=positions,
+            triangles=triangles,
+            normals=normals,
+            uvs=np.ascontiguousarray(self.uvs[:, corner]),
+            material=material,
+            tangents=None,
+            colors=colors,
+            name=name,
+        )
 
 
 def read_primitive(file: GltfFile, primitive: Any, morph_weights: Float[np.ndarray, " targets"]) -> Primitive:

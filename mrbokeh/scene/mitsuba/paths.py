@@ -138,7 +138,13 @@ def followed(world: World, rays: Rays, sampler: Any, most_bounces: int) -> PathR
     ends = dr.while_loop(start, lambda *path: _Path(*path).active, lambda *path: tuple(_stepped(world, rays, most, _Path(*path))))
     path = _Path(*ends)
     finite = dr.isfinite(path.radiance.x + path.radiance.y + path.radiance.z)
-    return PathResult(dr.select(finite, path.radiance, 0.0), path.first != _NOTHING, path.first, path.albedo, path.normal)
+    return PathResult(
+        radiance=dr.select(finite, path.radiance, 0.0),
+        stands=path.first != _NOTHING,
+        first=path.first,
+        albedo=path.albedo,
+        normal=path.normal,
+    )
 
 
 def _started(rays: Rays, sampler: Any) -> _Path:
@@ -179,7 +185,9 @@ def _meeting(world: World, rays: Rays, path: _Path) -> _Meeting:
         through |= path.at_start & ~point.seen
     through &= met
     stands = met & ~through
-    return _Meeting(point, world.surfaces.surface(point, path.direction, stands), hit.t, met, through, stands)
+    return _Meeting(
+        point=point, surface=world.surfaces.surface(point, path.direction, stands), distance=hit.t, met=met, through=through, stands=stands
+    )
 
 
 def _lit_from_afar(world: World, rays: Rays, path: _Path, missed: Any) -> _Path:

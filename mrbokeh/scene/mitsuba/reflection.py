@@ -94,7 +94,7 @@ def reflection(surface: Surface, table: ShareTable) -> Reflection:
     scatters = luminance(surface.diffuse * below)
     both = dr.maximum(mirrors + scatters, 1e-6)
     mirror_share = dr.select(mirrors > 0.0, dr.select(scatters > 0.0, dr.clip(mirrors / both, 0.1, 0.9), 1.0), 0.0)
-    return Reflection(surface, n_v, roughness**4, gain, below, mirror_share)
+    return Reflection(surface=surface, n_v=n_v, alpha2=roughness**4, gain=gain, below=below, mirror_share=mirror_share)
 
 
 def _masked(cosine: Any, alpha2: Any) -> Any:

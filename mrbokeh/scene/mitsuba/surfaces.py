@@ -138,7 +138,19 @@ class SurfaceTables:
         position, double_sided = _mixed(weights, a, b, c), flags.x > 0.5
         seen = (facing > 0.0) | double_sided
         return Point(
-            triangle, weights, material, position, face * facing, facing, double_sided, flags.y > 0.5, uv, uv_width, base, alpha, seen
+            triangle=triangle,
+            weights=weights,
+            material=material,
+            position=position,
+            face=face * facing,
+            facing=facing,
+            double_sided=double_sided,
+            unlit=flags.y > 0.5,
+            uv=uv,
+            width=uv_width,
+            base=base,
+            alpha=alpha,
+            seen=seen,
         )
 
     def surface(self, point: Point, direction: Any, active: Any) -> Surface:

@@ -34,7 +34,7 @@ def world_of(scene: Scene, surroundings: Sequence[Mesh], like: "World | None" = 
     points = np.concatenate([mesh.positions_m[mesh.triangles].reshape(-1, 3) for mesh in drawn or surroundings])
     centre_m = (points.min(0) + points.max(0)) / 2
     lights, environment = scene.lighting
-    return World([*drawn, *surroundings], lights, environment, centre_m, like)
+    return World(meshes=[*drawn, *surroundings], lights=lights, environment=environment, centre_m=centre_m, like=like)
 
 
 class World:

@@ -103,9 +103,9 @@ class OneObject:
         """The scene in a world whose vertical is true and whose origin is the camera."""
         foot_m = _world_from_camera(self.tilt_rad) @ np.asarray(self.stands_at_m)
         place = (float(foot_m[0]), float(foot_m[1]), float(foot_m[2]))
-        placed = PlacedObject(self.glb.stem, self.glb, place, self.turn_rad, self.height_m)
+        placed = PlacedObject(name=self.glb.stem, glb=self.glb, position_m=place, yaw_rad=self.turn_rad, height_m=self.height_m)
         shadow = ShadowPlane(_SHADOW_SIZE_M, self.shadow, place) if self.shadow > 0 else None
-        return SceneDescription(self.glb, "-y", (placed,), self.light, shadow)
+        return SceneDescription(path=self.glb, up="-y", objects=(placed,), light=self.light, shadow=shadow)
 
     def seen_by(self, camera: Camera) -> Camera:
         """The camera in that world: turned about its x axis by the tilt."""

@@ -158,7 +158,14 @@ class Shading:
     def canvas(self, targets: Targets, layered: bool) -> Canvas:
         count, room = targets.size_px[0] * targets.size_px[1], self._gpu.empty_buffer
         through = room(4 * _SAMPLES * count if layered else 16)
-        return Canvas(targets, room(16 * count), room(8 * count), through, room(4 * (_HEADER + 2 * count)), room(4 * _HEADER, "INDIRECT"))
+        return Canvas(
+            targets=targets,
+            rgba=room(16 * count),
+            pixels=room(8 * count),
+            shines_through=through,
+            work=room(4 * (_HEADER + 2 * count)),
+            sizes=room(4 * _HEADER, "INDIRECT"),
+        )
 
     def run(self, encoder: Any, job: "Job", canvas: Canvas, layer: int, is_last: bool) -> None:
         """Add one layer of the picture; the last is what is solid, those before it are blended."""

@@ -115,7 +115,13 @@ def _lamp_view(
     camera_from_point = np.eye(4)
     camera_from_point[:3, :3], camera_from_point[:3, 3] = axes, -axes @ position
     focal_px = size_px / (2 * half)
-    camera = Camera(size_px, size_px, (focal_px, focal_px), (size_px / 2, size_px / 2), camera_from_point)
+    camera = Camera(
+        width_px=size_px,
+        height_px=size_px,
+        focal_px=(focal_px, focal_px),
+        principal_px=(size_px / 2, size_px / 2),
+        camera_from_world=camera_from_point,
+    )
     return camera_view(camera, np.zeros(3), nearest_m(camera, np.zeros(3), box_m))
 
 

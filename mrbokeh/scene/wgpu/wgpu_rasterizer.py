@@ -74,7 +74,9 @@ class WgpuRasterizer:
         if ready is None:
             return picture
         for place, part in _parts(camera, ready.geometry):
-            canvas = self._drawn(Job(ready.geometry, ready.group, ready.group, part, ready.lighting))
+            canvas = self._drawn(
+                Job(geometry=ready.geometry, group=ready.group, shading_group=ready.group, camera=part, lighting=ready.lighting)
+            )
             rgba, deciding = self._shading.read(canvas, part)
             picture.rgb[place], picture.alpha[place] = rgba[..., :3], rgba[..., 3]
             depth_m = _exact_depth_m(ready.geometry, part, deciding)
@@ -90,7 +92,12 @@ class WgpuRasterizer:
         ground, group = self._ground(catcher)
         shading_group = self._visibility.geometry_group(ground, materials_of=ready.geometry)
         for place, part in _parts(camera, ground):
-            mask[place] = self._shading.read_mask(self._drawn(Job(ground, group, shading_group, part, ready.lighting, is_mask=True)), part)
+            mask[place] = self._shading.read_mask(
+                self._drawn(
+                    Job(geometry=ground, group=group, shading_group=shading_group, camera=part, lighting=ready.lighting, is_mask=True)
+                ),
+                part,
+            )
         return mask
 
     def _drawn(self, job: Job) -> Canvas:
