@@ -93,7 +93,9 @@ def make_bank_pairs(bank: PsfBank, out: Path, plan: PairsPlan, lens: Lens | None
             _make_stack(out / name, plan, number, used, renderer)
     records = tuple(stack_record(out, name, "test" if name in plan.tested else "train") for name in plan.names)
     metadata = {"made_by": "datasets_scripts.bank_pairs", "plan": asdict(plan), "bank": fingerprint(bank.kernels), "model": bank.model}
-    dataset = FocalStackDataset(out, LICENCE, max(each.radiance.largest for each in records), records, metadata)
+    dataset = FocalStackDataset(
+        folder=out, licence=LICENCE, radiance_scale=max(each.radiance.largest for each in records), stacks=records, metadata=metadata
+    )
     write_focal_stack_dataset(dataset)
     return dataset
 
@@ -188,7 +190,7 @@ def main(
 ) -> None:
     """Render the missing stacks of a set by a bank of kernels."""
     try:
-        plan = PairsPlan(scenes, focuses, width, height, seed)
+        plan = PairsPlan(scenes=scenes, focuses=focuses, width_px=width, height_px=height, seed=seed)
         dataset = make_bank_pairs(read_bank(bank), out, plan, None if lens is None else read_lens(lens), overwrite=overwrite)
     except InputError as error:
         typer.echo(f"error: {error}", err=True)

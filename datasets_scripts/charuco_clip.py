@@ -123,7 +123,9 @@ def pack_table(sheet: Sheet, seed: int = 0) -> PackedTable:
     outline = np.concatenate([begin.min(axis=0) - sheet.margin_mm, end.max(axis=0) + sheet.margin_mm])
     table = mottled(_TABLE_TEXELS, np.random.default_rng(seed), (0.10, 0.07, 0.05), (0.34, 0.25, 0.18)).astype(np.float64)
     white, ink = np.full(3, sheet.paper), np.full(3, sheet.ink)
-    return PackedTable(edges[0] / MM_PER_M, edges[1] / MM_PER_M, black, outline / MM_PER_M, white, ink, table)
+    return PackedTable(
+        edges_x=edges[0] / MM_PER_M, edges_y=edges[1] / MM_PER_M, black=black, sheet=outline / MM_PER_M, paper=white, ink=ink, table=table
+    )
 
 
 def _merged(edges_mm: Float64[np.ndarray, " edges"]) -> Float64[np.ndarray, " merged"]:
@@ -148,7 +150,13 @@ class BoardClip:
     def camera(self, frame: int) -> Camera:
         focal_px = self.lens.focal_px(self.width_px)
         pose = self.motion.camera_from_world(frame / self.fps)
-        return Camera(self.width_px, self.height_px, (focal_px, focal_px), (self.width_px / 2, self.height_px / 2), pose)
+        return Camera(
+            width_px=self.width_px,
+            height_px=self.height_px,
+            focal_px=(focal_px, focal_px),
+            principal_px=(self.width_px / 2, self.height_px / 2),
+            camera_from_world=pose,
+        )
 
     def pictures(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
         """Yield scene-linear RGB, frame by frame; the same numbers at every call."""
@@ -210,7 +218,21 @@ def main(
         target = (float(middle[0]), float(middle[1]), 0.0)
         motion = HandHeld(target, distance_m, elevation_deg, sway_m=0.1 * distance_m, seed=seed)
         lens = Lens(_FOCAL_LENGTH_MM, f_number, focus_m, _SENSOR_WIDTH_MM)
-        write_clip(out, BoardClip(sheet, motion, lens, width, height, frames, fps, noise, samples), overwrite=overwrite)
+        write_clip(
+            out,
+            BoardClip(
+                sheet=sheet,
+                motion=motion,
+                lens=lens,
+                width_px=width,
+                height_px=height,
+                frames=frames,
+                fps=fps,
+                noise=noise,
+                samples=samples,
+            ),
+            overwrite=overwrite,
+        )
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from None

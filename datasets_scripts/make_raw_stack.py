@@ -247,7 +247,19 @@ def main(
     """Make DNG focal stacks of a still life with their all-in-focus image, depth and camera as truth."""
     # The black level keeps its share of the range at every bit depth.
     sensor = SensorModel(bits=bits, black_level=1008 * 2**bits // 2**14, full_well_electrons=full_well)
-    plan = StackPlan(viewpoints, slices, width, height, seed, samples, sensor, scene, stacks, jitter_px, jitter_deg)
+    plan = StackPlan(
+        viewpoints=viewpoints,
+        slices=slices,
+        width_px=width,
+        height_px=height,
+        seed=seed,
+        samples=samples,
+        sensor=sensor,
+        scene=scene,
+        stacks=stacks,
+        jitter_px=jitter_px,
+        jitter_deg=jitter_deg,
+    )
     try:
         ran = make_raw_stack(out, plan, overwrite=overwrite)
     except InputError as error:

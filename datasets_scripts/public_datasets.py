@@ -83,7 +83,9 @@ def main(
         chosen = KINDS[kind]
         given = {"focal_length_mm": focal_length_mm, "f_number": f_number, "sensor_width_mm": sensor_width_mm}
         lens = replace(chosen.lens, **{name: value for name, value in given.items() if value is not None})
-        conversion = Conversion(kind, lens, chosen.licence, DepthMaps(depth, near_m, far_m), focus_m, crop_of(crop))
+        conversion = Conversion(
+            kind=kind, lens=lens, licence=chosen.licence, depth=DepthMaps(depth, near_m, far_m), focus_m=focus_m, crop_px=crop_of(crop)
+        )
         dataset = convert(chosen.stacks(source)[: only or None], out, conversion, overwrite=overwrite)
     except InputError as error:
         typer.echo(f"error: {error}", err=True)

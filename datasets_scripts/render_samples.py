@@ -70,7 +70,9 @@ class SamplesPlan:
 
     def tracer(self, scene: MovingScene, threads: int = 0, repeat: int = 0) -> SampleTracer:
         """Return the sampler of a scene; another `repeat` draws other numbers."""
-        return SampleTracer(scene, self.lens, self.width_px, self.height_px, 2 * self.seed + repeat, threads)
+        return SampleTracer(
+            scene=scene, lens=self.lens, width_px=self.width_px, height_px=self.height_px, seed=2 * self.seed + repeat, threads=threads
+        )
 
     def document(self, scene: MovingScene) -> dict[str, Any]:
         """Return the content of meta.json."""
@@ -191,7 +193,10 @@ def main(
 ) -> None:
     """Render the missing files of sets of samples."""
     try:
-        plans = [SamplesPlan(name, seed, width, height, spp, reference_spp) for name in scene.split(",")]
+        plans = [
+            SamplesPlan(scene=name, seed=seed, width_px=width, height_px=height, spp=spp, reference_spp=reference_spp)
+            for name in scene.split(",")
+        ]
         made = sum(render_samples(out, plan, measure=measure_noise, overwrite=overwrite) for plan in plans)
     except InputError as error:
         typer.echo(f"error: {error}", err=True)

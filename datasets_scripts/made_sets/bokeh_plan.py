@@ -95,8 +95,26 @@ class StackSize:
 
 # full: as many as Mandl et al. 2024 rendered (section 4.1), with their "large" blur of about 81 px (Table 2).
 SIZES = {
-    "small": StackSize(("garlands_1", "fence_1", "checkers_1", "leaves_1", "garlands_2"), 2, 5, 192, 112, 1.1, 128, 1 << 16),
-    "full": StackSize(tuple(f"{kind}_{number}" for number in (1, 2, 3) for kind in KINDS), 15, 10, 1920, 1080, 2.0, 256, 1 << 21),
+    "small": StackSize(
+        scenes=("garlands_1", "fence_1", "checkers_1", "leaves_1", "garlands_2"),
+        views=2,
+        focuses=5,
+        width_px=192,
+        height_px=112,
+        f_number=1.1,
+        samples=128,
+        lamp_rays=1 << 16,
+    ),
+    "full": StackSize(
+        scenes=tuple(f"{kind}_{number}" for number in (1, 2, 3) for kind in KINDS),
+        views=15,
+        focuses=10,
+        width_px=1920,
+        height_px=1080,
+        f_number=2.0,
+        samples=256,
+        lamp_rays=1 << 21,
+    ),
 }
 
 
@@ -152,11 +170,23 @@ class StacksPlan:
         camera_from_world = np.eye(4)
         camera_from_world[:3, 3] = rng.uniform(-1.0, 1.0, 3) * _MOST_ASIDE_M * min(view, 1)
         middle_px = (0.5 * self.size.width_px, 0.5 * self.size.height_px)
-        return Camera(self.size.width_px, self.size.height_px, (focal_px, focal_px), middle_px, camera_from_world)
+        return Camera(
+            width_px=self.size.width_px,
+            height_px=self.size.height_px,
+            focal_px=(focal_px, focal_px),
+            principal_px=middle_px,
+            camera_from_world=camera_from_world,
+        )
 
     def lens(self, focus_distance_m: float) -> Lens:
         """Return the lens that the lens file states."""
-        return Lens(FOCAL_LENGTH_MM, self.size.f_number, focus_distance_m, SENSOR_WIDTH_MM, self.opening.stated)
+        return Lens(
+            focal_length_mm=FOCAL_LENGTH_MM,
+            f_number=self.size.f_number,
+            focus_distance_m=focus_distance_m,
+            sensor_width_mm=SENSOR_WIDTH_MM,
+            aperture=self.opening.stated,
+        )
 
     def traced_opening(self, focus_distance_m: float) -> Opening:
         """Return the pupil that gives the fixed camera the blur of `Lens.coc_px`: it grows as the lens moves out to focus nearer."""

@@ -102,7 +102,9 @@ def dataset_of(out: Path, plan: StacksPlan) -> FocalStackDataset:
         "noise_floor_is": "PSNR of a slice against one without noise, linear radiance clipped to [0, 1], from two halves of the samples",
         "split_by": "whole scenes, and the last viewpoints of the others",
     }
-    return FocalStackDataset(out, LICENCE, max(each.radiance.largest for each in records), records, metadata)
+    return FocalStackDataset(
+        folder=out, licence=LICENCE, radiance_scale=max(each.radiance.largest for each in records), stacks=records, metadata=metadata
+    )
 
 
 def noise_floors_db(stack: FocalStack) -> list[float]:

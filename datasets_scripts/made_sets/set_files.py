@@ -70,7 +70,17 @@ def stack_record(out: Path, name: str, part: Part) -> StackRecord:
     largest_px = max(float(np.abs(stack.coc_px(index, depth_m)).max()) for index in range(len(stack)))
     paths = [FILE_NAME, *(each.path for each in stack.slices), stack.all_in_focus_path.name, stack.depth_path.name]
     files = {path: _file_record(stack.folder / path) for path in paths}
-    return StackRecord(name, part, len(stack), depth_m.shape[1], depth_m.shape[0], largest_px, _radiance_range(stack), {"any": 0.0}, files)
+    return StackRecord(
+        name=name,
+        part=part,
+        slices=len(stack),
+        width_px=depth_m.shape[1],
+        height_px=depth_m.shape[0],
+        largest_coc_px=largest_px,
+        radiance=_radiance_range(stack),
+        excluded_shares={"any": 0.0},
+        files=files,
+    )
 
 
 def _radiance_range(stack: FocalStack) -> RadianceRange:

@@ -82,10 +82,22 @@ class TruthPlan:
         angle_rad, aside_m = 2.4 * view, _STEP_ASIDE_M * min(view, 1)
         camera_from_world = np.eye(4)
         camera_from_world[:2, 3] = -aside_m * np.array([np.cos(angle_rad), 0.5 * np.sin(angle_rad)])
-        return Camera(self.width_px, self.height_px, (focal_px, focal_px), (0.5 * self.width_px, 0.5 * self.height_px), camera_from_world)
+        return Camera(
+            width_px=self.width_px,
+            height_px=self.height_px,
+            focal_px=(focal_px, focal_px),
+            principal_px=(0.5 * self.width_px, 0.5 * self.height_px),
+            camera_from_world=camera_from_world,
+        )
 
     def lens(self, shape: str, focus_distance_m: float) -> Lens:
-        return Lens(FOCAL_LENGTH_MM, F_NUMBER, focus_distance_m, SENSOR_WIDTH_MM, lens_shape(shape))
+        return Lens(
+            focal_length_mm=FOCAL_LENGTH_MM,
+            f_number=F_NUMBER,
+            focus_distance_m=focus_distance_m,
+            sensor_width_mm=SENSOR_WIDTH_MM,
+            aperture=lens_shape(shape),
+        )
 
     def opening(self, shape: str, focus_distance_m: float) -> Opening:
         """Return the pupil that gives the fixed camera exactly the blur of `Lens.coc_px`.

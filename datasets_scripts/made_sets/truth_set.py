@@ -81,7 +81,15 @@ def truth_command(make_set: Callable[..., int], scene_names: Sequence[str], shap
     ) -> None:
         """Render the missing files of a truth set."""
         try:
-            plan = TruthPlan(width, height, samples, seed, views, tuple(scenes.split(",")), tuple(shapes.split(",")))
+            plan = TruthPlan(
+                width_px=width,
+                height_px=height,
+                samples=samples,
+                seed=seed,
+                views=views,
+                scenes=tuple(scenes.split(",")),
+                shapes=tuple(shapes.split(",")),
+            )
             made = make_set(out, plan, overwrite=overwrite)
         except InputError as error:
             typer.echo(f"error: {error}", err=True)

@@ -111,7 +111,9 @@ def ebb_stacks(source: Path) -> list[PublicStack]:
     both = [name for name in sharp if name in blurred]
     if not both:
         raise unlike(source, "EBB!", "train/original and train/bokeh with pictures of the same names")
-    return [PublicStack(f"ebb/{name}", "train", name, sharp[name], (PublicSlice(blurred[name]),)) for name in both]
+    return [
+        PublicStack(name=f"ebb/{name}", part="train", key=name, sharp=sharp[name], slices=(PublicSlice(blurred[name]),)) for name in both
+    ]
 
 
 def dpdd_stacks(source: Path) -> list[PublicStack]:
@@ -122,7 +124,10 @@ def dpdd_stacks(source: Path) -> list[PublicStack]:
         if len(blurred) != len(sharp):
             raise unlike(source, "DPDD", f"as many pictures in {split}_c/source ({len(blurred)}) as in {split}_c/target ({len(sharp)})")
         pairs = zip(sharp, blurred, strict=True)
-        found += [PublicStack(f"dpdd_{split}/{one.stem}", _part(split), one.stem, one, (PublicSlice(two),)) for one, two in pairs]
+        found += [
+            PublicStack(name=f"dpdd_{split}/{one.stem}", part=_part(split), key=one.stem, sharp=one, slices=(PublicSlice(two),))
+            for one, two in pairs
+        ]
     if not found:
         raise unlike(source, "DPDD", "train_c/source with blurred pictures and train_c/target with sharp ones")
     return found
@@ -148,7 +153,7 @@ def _by_f_number(folder: Path, part: Part) -> Iterator[PublicStack]:
         narrow = max(numbers)
         slices = tuple(PublicSlice(path, f_number=number) for number, path in sorted(numbers.items()) if number != narrow)
         facts = {"sharp_f_number": narrow}
-        yield PublicStack(f"{folder.name}/{scene.name}", part, scene.name, numbers[narrow], slices, facts=facts)
+        yield PublicStack(name=f"{folder.name}/{scene.name}", part=part, key=scene.name, sharp=numbers[narrow], slices=slices, facts=facts)
 
 
 def _part(split: str) -> Part:
@@ -173,7 +178,14 @@ def _stack(root: Path, split: str, path: Path) -> PublicStack:
         targets = zip(facts["target_images"], facts["target_avs"], strict=True)
         slices = tuple(PublicSlice(root / name, distance_m, float(number), focal_length_mm) for name, number in targets)
         told = {key: facts[key] for key in ("source_av", "focus_plane_uncertainty", "ISO", "EV") if key in facts}
-        return PublicStack(f"realbokeh_{split}/{path.stem}", _SPLITS[split], path.stem, root / facts["source_image"], slices, facts=told)
+        return PublicStack(
+            name=f"realbokeh_{split}/{path.stem}",
+            part=_SPLITS[split],
+            key=path.stem,
+            sharp=root / facts["source_image"],
+            slices=slices,
+            facts=told,
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected source_image, target_images, target_avs, focal_length, focus_plane_distance as in RealBokeh_3MP ({error!r})"
@@ -209,7 +221,16 @@ def _level(scene: Path, level: int, px_per_dioptre: float, focuses_m: list[float
     sharp = _picture(scene, "image")
     power = None if sharp.suffix == ".exr" else _GAMMA
     facts: dict[str, Any] = {key: info[key] for key in ("focal_length", "sensor_width", "f_stops") if key in info}
-    return PublicStack(f"{scene.name}/level_{level:02d}", "test", scene.name, sharp, slices, scene / "depth.exr", power, facts)
+    return PublicStack(
+        name=f"{scene.name}/level_{level:02d}",
+        part="test",
+        key=scene.name,
+        sharp=sharp,
+        slices=slices,
+        depth=scene / "depth.exr",
+        power=power,
+        facts=facts,
+    )
 
 
 def _picture(scene: Path, name: str) -> Path:

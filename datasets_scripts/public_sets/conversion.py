@@ -100,7 +100,13 @@ def convert(stacks: Sequence[PublicStack], out: Path, conversion: Conversion, *,
         "depth": "of the set" if stacks[0].depth else "given",
         "clipped": "8-bit and 16-bit pictures are clipped at white: lights have lost light, in the sharp picture too",
     }
-    dataset = FocalStackDataset(out, conversion.licence, max(each.radiance.largest for each in records), records, metadata)
+    dataset = FocalStackDataset(
+        folder=out,
+        licence=conversion.licence,
+        radiance_scale=max(each.radiance.largest for each in records),
+        stacks=records,
+        metadata=metadata,
+    )
     (out / "LICENCE.txt").write_text(conversion.licence + "\n", encoding="utf-8")
     write_focal_stack_dataset(dataset)
     return dataset
@@ -154,7 +160,13 @@ def _px_per_dioptre(source: PublicSlice, lens: PublicLens, distance_m: float, wi
 def _stated(conversion: Conversion, distance_m: float) -> Lens:
     lens = conversion.lens
     assert lens.focal_length_mm is not None
-    return Lens(lens.focal_length_mm, lens.f_number, distance_m, lens.sensor_width_mm, Aperture.disc())
+    return Lens(
+        focal_length_mm=lens.focal_length_mm,
+        f_number=lens.f_number,
+        focus_distance_m=distance_m,
+        sensor_width_mm=lens.sensor_width_mm,
+        aperture=Aperture.disc(),
+    )
 
 
 def _linear(path: Path, power: float | None) -> tuple[Rgb, Mask]:

@@ -65,7 +65,13 @@ def camera_at(view: Viewpoint, width_px: int, height_px: int, lens: Lens) -> Cam
     camera_from_world[:3, :3] = pitch @ yaw
     camera_from_world[:3, 3] = -pitch @ yaw @ np.asarray(view.position_m)
     focal_px = lens.focal_px(width_px)
-    return Camera(width_px, height_px, (focal_px, focal_px), (0.5 * width_px, 0.5 * height_px), camera_from_world)
+    return Camera(
+        width_px=width_px,
+        height_px=height_px,
+        focal_px=(focal_px, focal_px),
+        principal_px=(0.5 * width_px, 0.5 * height_px),
+        camera_from_world=camera_from_world,
+    )
 
 
 def desk_scene(seed: int) -> Scene:
@@ -80,15 +86,25 @@ def desk_furniture(rng: np.random.Generator) -> Scene:
     """Build room, books, boxes, cards and balls under the sun; no lamps, light not baked yet."""
     sun = np.asarray(_SUN_TOWARDS) / np.linalg.norm(_SUN_TOWARDS)
     quads = (*_room(rng), *_books(rng), *_boxes(rng), *_cards(rng))
-    return Scene(quads, _balls(rng), (), vector(sun), 0.46, 0.3, (0.05, 0.05, 0.06))
+    return Scene(
+        quads=quads, spheres=_balls(rng), lights=(), sun_direction=vector(sun), sun=0.46, ambient=0.3, background_rgb=(0.05, 0.05, 0.06)
+    )
 
 
 def _room(rng: np.random.Generator) -> tuple[Quad, ...]:
     table = wood(1024, rng, (0.16, 0.09, 0.05), (0.6, 0.41, 0.25), planks=8)
     wall = mottled(1024, rng, (0.22, 0.27, 0.3), (0.5, 0.52, 0.5), finest=5.0, slope=0.15, contrast=0.26)
     return (
-        Quad((-1.5, TABLE_Y_M, WALL_Z_M), (3.0, 0.0, 0.0), (0.0, 0.0, 0.05 - WALL_Z_M), table, (3.0, 1.9)),
-        Quad((-2.0, TABLE_Y_M - 1.6, WALL_Z_M), (4.0, 0.0, 0.0), (0.0, 1.6, 0.0), wall, (2.0, 0.8)),
+        Quad(
+            corner_m=(-1.5, TABLE_Y_M, WALL_Z_M),
+            edge_u_m=(3.0, 0.0, 0.0),
+            edge_v_m=(0.0, 0.0, 0.05 - WALL_Z_M),
+            texture=table,
+            repeats=(3.0, 1.9),
+        ),
+        Quad(
+            corner_m=(-2.0, TABLE_Y_M - 1.6, WALL_Z_M), edge_u_m=(4.0, 0.0, 0.0), edge_v_m=(0.0, 1.6, 0.0), texture=wall, repeats=(2.0, 0.8)
+        ),
     )
 
 
@@ -121,7 +137,10 @@ class _Box:
             (front_left + away, -away, down, side),
             (front_left + away, right, -away, top),
         )
-        return tuple(Quad(vector(start), vector(u), vector(v), texture, self.repeats) for start, u, v, texture in faces)
+        return tuple(
+            Quad(corner_m=vector(start), edge_u_m=vector(u), edge_v_m=vector(v), texture=texture, repeats=self.repeats)
+            for start, u, v, texture in faces
+        )
 
 
 def _books(rng: np.random.Generator) -> tuple[Quad, ...]:
@@ -137,7 +156,7 @@ def _books(rng: np.random.Generator) -> tuple[Quad, ...]:
     for x_m, z_m, size_m, yaw_rad, base_m, cover, letters in piles:
         spine = page_of_text(96, 448, rng, letters, cover, cell=5, headline=False)
         front = page_of_text(288, 400, rng, letters, cover, cell=6)
-        faces += _Box(x_m, z_m, size_m, yaw_rad, (spine, pages, front), base_y_m=TABLE_Y_M - base_m).quads()
+        faces += _Box(x_m=x_m, z_m=z_m, size_m=size_m, yaw_rad=yaw_rad, skin=(spine, pages, front), base_y_m=TABLE_Y_M - base_m).quads()
     return tuple(faces)
 
 
@@ -148,12 +167,12 @@ def _boxes(rng: np.random.Generator) -> tuple[Quad, ...]:
     stone = mottled(512, rng, (0.2, 0.21, 0.2), (0.62, 0.6, 0.55), slope=0.4)
     crate = wood(512, rng, (0.22, 0.13, 0.06), (0.68, 0.5, 0.3), planks=5)
     boxes = (
-        _Box(-0.4, 1.58, (0.24, 0.27, 0.16), 0.3, (brick, brick, stone)),
-        _Box(0.27, 0.98, (0.11, 0.12, 0.1), -0.45, (check, check, check)),
-        _Box(0.13, 1.5, (0.2, 0.2, 0.15), 0.2, (dots, dots, stone), (0.6, 0.6)),
-        _Box(-0.09, 1.36, (0.13, 0.15, 0.12), -0.3, (crate, crate, crate)),
-        _Box(0.72, 1.45, (0.2, 0.24, 0.16), -0.2, (stone, brick, crate)),
-        _Box(0.27, 0.98, (0.07, 0.06, 0.07), 0.2, (stone, crate, crate), base_y_m=TABLE_Y_M - 0.12),
+        _Box(x_m=-0.4, z_m=1.58, size_m=(0.24, 0.27, 0.16), yaw_rad=0.3, skin=(brick, brick, stone)),
+        _Box(x_m=0.27, z_m=0.98, size_m=(0.11, 0.12, 0.1), yaw_rad=-0.45, skin=(check, check, check)),
+        _Box(x_m=0.13, z_m=1.5, size_m=(0.2, 0.2, 0.15), yaw_rad=0.2, skin=(dots, dots, stone), repeats=(0.6, 0.6)),
+        _Box(x_m=-0.09, z_m=1.36, size_m=(0.13, 0.15, 0.12), yaw_rad=-0.3, skin=(crate, crate, crate)),
+        _Box(x_m=0.72, z_m=1.45, size_m=(0.2, 0.24, 0.16), yaw_rad=-0.2, skin=(stone, brick, crate)),
+        _Box(x_m=0.27, z_m=0.98, size_m=(0.07, 0.06, 0.07), yaw_rad=0.2, skin=(stone, crate, crate), base_y_m=TABLE_Y_M - 0.12),
     )
     return tuple(quad for box in boxes for quad in box.quads())
 

@@ -71,7 +71,13 @@ class Stage:
         along = half_size[0] * unit_m * np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
         flat = np.cos(tilt_rad)
         down = half_size[1] * unit_m * np.array([-np.sin(turn_rad) * flat, np.cos(turn_rad) * flat, np.sin(tilt_rad)])
-        return Quad(vector(centre_m - along - down), vector(2.0 * along), vector(2.0 * down), texture, repeats)
+        return Quad(
+            corner_m=vector(centre_m - along - down),
+            edge_u_m=vector(2.0 * along),
+            edge_v_m=vector(2.0 * down),
+            texture=texture,
+            repeats=repeats,
+        )
 
     def backdrop(self, coc: float, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)) -> Mover:
         """Return a wall that fills the frame and all that its blur can reach."""

@@ -47,7 +47,9 @@ _LIGHT_RADIANCE = (4.0, 40.0)
 _BEFORE_CARD_M = 0.002
 _TINTS = ((1.0, 0.9, 0.75), (1.0, 0.75, 0.45), (0.7, 0.85, 1.0), (1.0, 0.55, 0.4), (0.7, 1.0, 0.7))
 # A ring on purpose: it is point-symmetric, so that front and back blur look alike to a network fed with |CoC|.
-_DESK_LENS = Lens(35.0, 2.0, NEAR_FOCUS_M, 23.5, Aperture.disc().obstructed(0.5))
+_DESK_LENS = Lens(
+    focal_length_mm=35.0, f_number=2.0, focus_distance_m=NEAR_FOCUS_M, sensor_width_mm=23.5, aperture=Aperture.disc().obstructed(0.5)
+)
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,16 @@ def _desk(seed: int) -> Scene:
 
 
 STACK_SCENES = {
-    "desk": StackScene(_desk, desk_camera, len(VIEWPOINTS), _DESK_LENS, NEAR_FOCUS_M, FAR_FOCUS_M),
+    "desk": StackScene(
+        build=_desk, camera=desk_camera, viewpoints=len(VIEWPOINTS), lens=_DESK_LENS, near_m=NEAR_FOCUS_M, far_m=FAR_FOCUS_M
+    ),
     "lab": StackScene(
-        lab_scene, lab_camera, len(LAB_VIEWPOINTS), Lens(28.0, 2.8, LAB_NEAR_M, 23.5), LAB_NEAR_M, LAB_FAR_M, facts=lab_facts()
+        build=lab_scene,
+        camera=lab_camera,
+        viewpoints=len(LAB_VIEWPOINTS),
+        lens=Lens(28.0, 2.8, LAB_NEAR_M, 23.5),
+        near_m=LAB_NEAR_M,
+        far_m=LAB_FAR_M,
+        facts=lab_facts(),
     ),
 }

@@ -167,7 +167,13 @@ def _executor(threads: int) -> Iterator[ThreadPoolExecutor]:
 
 def pinhole_of(lens: Lens, width_px: int, height_px: int) -> Pinhole:
     pupil_radius_m = 0.5e-3 * lens.aperture_diameter_mm
-    return Pinhole(width_px, height_px, lens.focal_px(width_px), pupil_radius_m, 1.0 / lens.focus_distance_m)
+    return Pinhole(
+        width=width_px,
+        height=height_px,
+        focal=lens.focal_px(width_px),
+        pupil_radius=pupil_radius_m,
+        inverse_focus=1.0 / lens.focus_distance_m,
+    )
 
 
 def pack(scene: MovingScene, view: Pinhole, unit_radius: float) -> PackedBodies:

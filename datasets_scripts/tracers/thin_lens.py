@@ -102,9 +102,20 @@ def pack_view(
     vertices, starts, weights = aperture.packed()
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
     return PackedView(
-        camera.width_px, camera.height_px, fx, fy, cx, cy, footprint_px, pupil_radius_m, inverse_focus_per_m,
-        float(np.abs(vertices).max()), vertices, starts, weights,
-    )  # fmt: skip
+        width=camera.width_px,
+        height=camera.height_px,
+        focal_x=fx,
+        focal_y=fy,
+        principal_x=cx,
+        principal_y=cy,
+        footprint=footprint_px,
+        pupil_radius=pupil_radius_m,
+        inverse_focus=inverse_focus_per_m,
+        pupil_extent=float(np.abs(vertices).max()),
+        vertices=vertices,
+        starts=starts,
+        weights=weights,
+    )
 
 
 def pack_scene(scene: Scene, camera: Camera, view: PackedView) -> PackedScene:

@@ -86,7 +86,9 @@ def emissive_quad(
     corner_m: Vector, edge_u_m: Vector, edge_v_m: Vector, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)
 ) -> Quad:
     """Return a quad whose texture is the radiance that it sends out, whatever the scene's light is."""
-    return Quad(corner_m, edge_u_m, edge_v_m, texture, repeats, np.ones((1, 1), np.float32))
+    return Quad(
+        corner_m=corner_m, edge_u_m=edge_u_m, edge_v_m=edge_v_m, texture=texture, repeats=repeats, lightmap=np.ones((1, 1), np.float32)
+    )
 
 
 def plain_texture(rgb: Vector) -> Texture:
@@ -133,13 +135,13 @@ class MovingScene:
         """Return all bodies where they are at a time of the exposure, 0 to 1."""
         moved = [_moved(mover.body, (time - 0.5) * np.asarray(mover.velocity_m)) for mover in self.ordered]
         return Scene(
-            tuple(body for body in moved if isinstance(body, Quad)),
-            tuple(body for body in moved if isinstance(body, Sphere)),
-            tuple(body for body in moved if isinstance(body, DiscLight)),
-            self.sun_direction,
-            self.sun,
-            self.ambient,
-            self.background_rgb,
+            quads=tuple(body for body in moved if isinstance(body, Quad)),
+            spheres=tuple(body for body in moved if isinstance(body, Sphere)),
+            lights=tuple(body for body in moved if isinstance(body, DiscLight)),
+            sun_direction=self.sun_direction,
+            sun=self.sun,
+            ambient=self.ambient,
+            background_rgb=self.background_rgb,
         )
 
 

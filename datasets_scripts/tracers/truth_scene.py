@@ -43,7 +43,13 @@ def quad(corner_m: Place, edge_u_m: Place, edge_v_m: Place, texture: Texture, re
     normal = np.cross(edge_v, edge_u)
     normals = np.tile(normal / np.linalg.norm(normal), (4, 1))
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
-    return Body(corner + unit_uv @ np.stack([edge_u, edge_v]), normals, unit_uv * repeats, triangles, texture)
+    return Body(
+        vertices_m=corner + unit_uv @ np.stack([edge_u, edge_v]),
+        normals=normals,
+        uv=unit_uv * repeats,
+        triangles=triangles,
+        texture=texture,
+    )
 
 
 def box(base_m: Place, size_m: Vector, yaw_rad: float, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)) -> list[Body]:
@@ -70,7 +76,13 @@ def ball(centre_m: Place, radius_m: float, texture: Texture, repeats: tuple[floa
     theta, phi = np.meshgrid(polar, around, indexing="ij")
     normals = np.stack([np.sin(theta) * np.cos(phi), -np.cos(theta), np.sin(theta) * np.sin(phi)], axis=-1).reshape(-1, 3)
     uv = np.stack([phi / (2.0 * np.pi), theta / np.pi], axis=-1).reshape(-1, 2) * repeats
-    return Body(np.asarray(centre_m) + radius_m * normals, normals, uv, _grid_triangles(*theta.shape), texture)
+    return Body(
+        vertices_m=np.asarray(centre_m) + radius_m * normals,
+        normals=normals,
+        uv=uv,
+        triangles=_grid_triangles(*theta.shape),
+        texture=texture,
+    )
 
 
 def wire(points_m: Float[np.ndarray, "points 3"], radius_m: float, texture: Texture, repeat_m: float = 0.05, thin: bool = False) -> Body:
@@ -86,7 +98,14 @@ def wire(points_m: Float[np.ndarray, "points 3"], radius_m: float, texture: Text
     uv = np.stack(np.broadcast_arrays(along[:, None], around[None]), axis=-1)
     vertices = points_m[:, None] + radius_m * normals
     triangles = _grid_triangles(len(points_m), _WIRE_SIDES + 1)
-    return Body(vertices.reshape(-1, 3), normals.reshape(-1, 3), uv.reshape(-1, 2), triangles, texture, thin=thin)
+    return Body(
+        vertices_m=vertices.reshape(-1, 3),
+        normals=normals.reshape(-1, 3),
+        uv=uv.reshape(-1, 2),
+        triangles=triangles,
+        texture=texture,
+        thin=thin,
+    )
 
 
 def leaf(
@@ -107,7 +126,9 @@ def leaf(
     normal = turn[2] if turn[2, 2] < 0 else -turn[2]
     uv = outline / length_m + 0.5
     vertices = np.asarray(centre_m) + outline @ turn[:2]
-    return Body(vertices, np.tile(normal, (len(vertices), 1)), uv, triangles, texture, tint, thin)
+    return Body(
+        vertices_m=vertices, normals=np.tile(normal, (len(vertices), 1)), uv=uv, triangles=triangles, texture=texture, tint=tint, thin=thin
+    )
 
 
 def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "triangles 3"]:
@@ -228,7 +249,9 @@ def _lamp_body(lamp: Lamp) -> Body:
     vertices_m = np.asarray(lamp.centre_m) + lamp.radius_m * np.concatenate([np.zeros((1, 3)), rim])
     triangles = np.stack([np.zeros(_LAMP_SIDES, int), around + 1, (around + 1) % _LAMP_SIDES + 1], axis=1)
     normals = np.tile([0.0, 0.0, -1.0], (len(vertices_m), 1))
-    return Body(vertices_m, normals, np.zeros((len(vertices_m), 2)), triangles, _BLACK, thin=lamp.thin)
+    return Body(
+        vertices_m=vertices_m, normals=normals, uv=np.zeros((len(vertices_m), 2)), triangles=triangles, texture=_BLACK, thin=lamp.thin
+    )
 
 
 def _facing_camera(vertices_m: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:

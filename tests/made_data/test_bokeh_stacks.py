@@ -31,7 +31,7 @@ from training.data.training_data import training_data
 NEAR_FOCUS_M, FAR_FOCUS_M = 0.9, 6.5
 # Left, middle, right and a corner of the frame, as places of pixels.
 PLACES = {"left": (24, 56), "middle": (96, 56), "right": (168, 60), "corner": (160, 20)}
-TINY = StackSize(("garlands_1", "checkers_1"), 2, 2, 32, 20, 1.1, 4, 512)
+TINY = StackSize(scenes=("garlands_1", "checkers_1"), views=2, focuses=2, width_px=32, height_px=20, f_number=1.1, samples=4, lamp_rays=512)
 
 
 @pytest.fixture(autouse=True)

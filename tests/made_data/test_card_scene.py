@@ -41,7 +41,7 @@ def noise_texture(seed: int) -> np.ndarray:
 
 
 def truth_of(scene_cards: list[Card], lamps: tuple[Lamp, ...] = (), aperture: Aperture | None = None, positions: int = 1600) -> np.ndarray:
-    lens = Lens(50.0, 2.0, 2.0, 36.0, aperture or Aperture.disc())
+    lens = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=36.0, aperture=aperture or Aperture.disc())
     return cards.truth(cards.scene_of(tuple(scene_cards), lamps, GRID), lens, positions)
 
 

@@ -57,14 +57,14 @@ def test_the_gallery_is_made_by_the_commands(tmp_path: Path) -> None:
         build(tmp_path / "out", ENTRIES[:1], demo)
     (demo / "report.html").write_text("done")
     commands = ("mrbokeh lens new lens.json --focal-length 50 --f-number 2 --focus 1", "mrbokeh lens show lens.json --out lens.png")
-    made = Entry("a lens", commands, "A lens", Path("docs/pictures/a.jpg"), "lens.png")
+    made = Entry(title="a lens", commands=commands, caption="A lens", picture=Path("docs/pictures/a.jpg"), shows="lens.png")
     build(tmp_path / "out", [made], demo)
     assert decoded((tmp_path / "out" / "a.jpg").read_bytes()).std() > 5.0
     assert "mrbokeh lens show" in (tmp_path / "out" / "gallery.html").read_text()
     (tmp_path / "out" / "a.jpg").unlink()
     build(tmp_path / "out", [made], demo)  # would be refused if `lens new` ran again
     assert (tmp_path / "out" / "repository" / "README.md").is_file() and (tmp_path / "out" / "demo_out" / "report.html").is_file()
-    broken = Entry("b", ("mrbokeh lens show none.json --out b.png",), "", Path("b.jpg"), "b.png")
+    broken = Entry(title="b", commands=("mrbokeh lens show none.json --out b.png",), caption="", picture=Path("b.jpg"), shows="b.png")
     with pytest.raises(InputError, match=r"(?s)ended with 2.*none\.json"):
         build(tmp_path / "out", [broken], demo)
 
@@ -79,7 +79,11 @@ def test_what_a_check_finds_is_its_result(tmp_path: Path) -> None:
     write_image(tmp_path / "out" / "out.png", plate)
     write_layer(tmp_path / "out" / "layer.exr", Layer(plate * 0.0, plate[..., 0] * 0.0, np.full((16, 24), np.inf, np.float32)))
     commands = ("mrbokeh demo --out demo_out", "mrbokeh check out.png --against plate.png --virtual layer.exr --map leaks.png")
-    build(tmp_path / "out", [Entry("check", commands, "", Path("check.jpg"), "out.png leaks.png")], tmp_path)
+    build(
+        tmp_path / "out",
+        [Entry(title="check", commands=commands, caption="", picture=Path("check.jpg"), shows="out.png leaks.png")],
+        tmp_path,
+    )
     assert decoded((tmp_path / "out" / "check.jpg").read_bytes()).shape == (16, 48, 3)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["out", "report.html"]
 

@@ -236,7 +236,11 @@ def test_cropping_keeps_the_size_of_blur(tmp_path: Path) -> None:
 @pytest.mark.parametrize("focus_m", [NEAR_M, FAR_M])
 def test_the_focus_is_found_where_detail_is_kept(focus_m: float) -> None:
     sharp = texture()
-    assert sharpest_depth_m(sharp, blurred(sharp, Lens(50.0, 2.0, focus_m, 22.3, Aperture.disc())), depth_m()) == pytest.approx(focus_m)
+    assert sharpest_depth_m(
+        sharp,
+        blurred(sharp, Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=focus_m, sensor_width_mm=22.3, aperture=Aperture.disc())),
+        depth_m(),
+    ) == pytest.approx(focus_m)
     flat = np.full_like(sharp, 0.5)
     with pytest.raises(InputError, match="no detail"):
         sharpest_depth_m(flat, flat, depth_m())

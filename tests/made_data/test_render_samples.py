@@ -35,7 +35,7 @@ WHITE = plain_texture((1.0, 1.0, 1.0))
 
 
 def tracer(*movers: Mover, seed: int = 0, threads: int = 0, lens=LENS, **light: object) -> SampleTracer:
-    return SampleTracer(MovingScene(movers, **light), lens, W, H, seed, threads)  # type: ignore[arg-type]
+    return SampleTracer(scene=MovingScene(movers, **light), lens=lens, width_px=W, height_px=H, seed=seed, threads=threads)  # type: ignore[arg-type]
 
 
 def projected_px(points_m: np.ndarray) -> np.ndarray:
@@ -223,7 +223,10 @@ def test_bodies_left_out_of_a_tile_are_not_to_be_seen_there(name: str, monkeypat
 
 def test_the_seed_decides_every_bit_whatever_the_threads() -> None:
     scene = make_scene("whirl", 2, LENS, H / W)
-    one, three, other = (SampleTracer(scene, LENS, W, H, seed, threads) for seed, threads in ((7, 1), (7, 3), (8, 1)))
+    one, three, other = (
+        SampleTracer(scene=scene, lens=LENS, width_px=W, height_px=H, seed=seed, threads=threads)
+        for seed, threads in ((7, 1), (7, 3), (8, 1))
+    )
     first, again = one.samples(4), three.samples(4)
     for field in ("xy_px", "lens_uv", "time", "rgb", "depth_m", "motion_px"):
         np.testing.assert_array_equal(getattr(first, field), getattr(again, field))
@@ -364,7 +367,13 @@ def test_the_shipped_samples_are_what_the_sampler_makes(name: str) -> None:
 
     meta = read_json(folder / "meta.json", "the description of a set of samples (meta.json)")
     plan = SamplesPlan(
-        meta["scene"], meta["seed"], meta["width_px"], meta["height_px"], meta["spp"], meta["reference_spp"], meta["sharp_spp"]
+        scene=meta["scene"],
+        seed=meta["seed"],
+        width_px=meta["width_px"],
+        height_px=meta["height_px"],
+        spp=meta["spp"],
+        reference_spp=meta["reference_spp"],
+        sharp_spp=meta["sharp_spp"],
     )
     files = SamplesSet(DATA, plan)
     assert meta == plan.document(files.scene)

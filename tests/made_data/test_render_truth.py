@@ -323,7 +323,7 @@ def test_parts_make_the_whole(small_leaves: tuple[TruthPlan, TruthScene]) -> Non
 
 def test_the_script_makes_a_set_goes_on_and_refuses_another(tmp_path: Path) -> None:
     require_mitsuba()
-    plan = TruthPlan(32, 18, 2, 1, 1, ("fence",), ("disc",))
+    plan = TruthPlan(width_px=32, height_px=18, samples=2, seed=1, views=1, scenes=("fence",), shapes=("disc",))
     assert render_truth(tmp_path, plan) == 6
     folder = tmp_path / "fence_1" / "view_00"
     assert (folder / "sheet.png").is_file() and read_layer(folder / "layers" / "00.exr").width_px == 32

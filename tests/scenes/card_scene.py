@@ -78,7 +78,13 @@ def lens_of_radius(radius_px: float, width_px: int, aperture: Aperture | None = 
     wanted_px_per_dioptre = 2.0 * radius_px / FARTHEST_DIOPTRES_OFF
     at_f1 = Lens(_FOCAL_LENGTH_MM, 1.0, FOCUS_DISTANCE_M, _SENSOR_WIDTH_MM)
     f_number = at_f1.coc_px_per_dioptre(width_px) / wanted_px_per_dioptre
-    return Lens(_FOCAL_LENGTH_MM, f_number, FOCUS_DISTANCE_M, _SENSOR_WIDTH_MM, aperture or Aperture.disc())
+    return Lens(
+        focal_length_mm=_FOCAL_LENGTH_MM,
+        f_number=f_number,
+        focus_distance_m=FOCUS_DISTANCE_M,
+        sensor_width_mm=_SENSOR_WIDTH_MM,
+        aperture=aperture or Aperture.disc(),
+    )
 
 
 def truth(scene: CardScene, lens: Lens, positions: int = 1600) -> Float32[np.ndarray, "height width 3"]:

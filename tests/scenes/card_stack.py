@@ -12,7 +12,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 
 SIZE = (48, 72)
-LENS = Lens(35.0, 2.8, 1.0, 3.5, Aperture.blades(6, 0.2))
+LENS = Lens(focal_length_mm=35.0, f_number=2.8, focus_distance_m=1.0, sensor_width_mm=3.5, aperture=Aperture.blades(6, 0.2))
 CARD_M, WALL_M = 0.5, 0.7
 FOCUS_M = (CARD_M, 0.55, WALL_M)
 CARD_PX = 30
